@@ -316,7 +316,7 @@ def _exponent(weighting: str) -> float:
 RECORD_BAND_HZ: Final = (0.0, 50.0)
 """Band of the whole-record fits, where the record's rate holds it."""
 
-LARGEST_SHARE_OF_RATE: Final = 0.4
+LARGEST_FRACTION_OF_RATE: Final = 0.4
 """Highest frequency that is fitted, over the sampling rate: filters need room up to half of it."""
 
 PAPER_BAND_HZ: Final = (0.5875, 50.0)

@@ -98,12 +98,12 @@ class OnlineEstimate:
     @property
     def doubt(self) -> str | None:
         """Why no number is to be believed; None if some are."""
-        told = self.headline
-        if told is None:
+        headline = self.headline
+        if headline is None:
             return self.problem
         numbers = [
-            *told.parameters.values(),
-            *(each for mode in told.modes for each in (mode.frequency_hz, mode.damping_ratio)),
+            *headline.parameters.values(),
+            *(each for mode in headline.modes for each in (mode.frequency_hz, mode.damping_ratio)),
         ]
         flags = [each.flag for each in numbers]
         return None if None in flags else flags[0]
@@ -118,12 +118,12 @@ class OnlineEstimate:
         from analysis.identify import INTEGER
         from analysis.models import COEFFICIENT_OF
 
-        told, analysis = self.headline, self.analysis
-        if told is None or analysis is None:
+        headline, analysis = self.headline, self.analysis
+        if headline is None or analysis is None:
             return None
-        fit = told.with_both
-        untold = {name for name in COEFFICIENT_OF if name in told.flags}
-        if not untold or fit is not told.fit:
+        fit = headline.with_both
+        flagged = {name for name in COEFFICIENT_OF if name in headline.flags}
+        if not flagged or fit is not headline.fit:
             return fit
         return next((each for each in analysis.fits if each.structure is INTEGER), fit)
 
@@ -134,13 +134,13 @@ class OnlineEstimate:
         Where a uniform beam does not predict the modal constants, each mode has a stiffness of its
         own.
         """
-        told, fit = self.headline, self.predicting
-        if told is None or fit is None:
+        headline, fit = self.headline, self.predicting
+        if headline is None or fit is None:
             return None
-        test = told.uniform_beam
-        if told.modal is None or test is None or test.status == "passed":
+        test = headline.uniform_beam
+        if headline.modal is None or test is None or test.status == "passed":
             return fit.plant
-        return told.modal.plant_like(fit.plant)
+        return headline.modal.plant_like(fit.plant)
 
     def as_json(self) -> dict[str, Any]:
         """As `json.dumps` takes it (docs/online_fit.md)."""
@@ -158,9 +158,9 @@ class OnlineEstimate:
             "findings": [each.sentence for each in self.findings],
             "modes": [],
         }
-        told, fit, plant = self.headline, self.predicting, self.plant
-        if told and fit and plant and self.analysis:
-            content |= headline_json(None, told, self.orders, self.findings, self.validity)
+        headline, fit, plant = self.headline, self.predicting, self.plant
+        if headline and fit and plant and self.analysis:
+            content |= headline_json(None, headline, self.orders, self.findings, self.validity)
             content |= {
                 "predicting": fit.structure.name,
                 "plant": asdict(plant),
@@ -231,8 +231,10 @@ class OnlineFit:
         from analysis.record import MAX_SAMPLES, RECORD_FIELDS
 
         if self._count <= MAX_SAMPLES:  # one more than that, and `record` says that it is too long
-            kept = samples[list(RECORD_FIELDS)]
-            self._blocks.append(kept.astype([(name, kept.dtype[name]) for name in RECORD_FIELDS]))
+            fields = samples[list(RECORD_FIELDS)]
+            self._blocks.append(
+                fields.astype([(name, fields.dtype[name]) for name in RECORD_FIELDS])
+            )
             self._count += len(samples)
 
     def record(self, up_to_tick: int | None = None) -> Record:
@@ -312,11 +314,11 @@ class OnlineFit:
                 before = self._judged if from_last else None
                 selection = select(measurement, band_hz=band_hz, earlier=before)
                 self._judged = selection
-                told, analysis = selection.headline, selection.analysis
+                headline, analysis = selection.headline, selection.analysis
                 found = selection.verdict.findings
                 orders = (selection.verdict.alpha, selection.verdict.lambda_)
             else:
-                told, found, analysis = freest_alone(measurement, band_hz)
+                headline, found, analysis = freest_alone(measurement, band_hz)
         except (SessionError, RecordError, ArithmeticError, ValueError) as error:
             # A running session is told, and goes on; later samples may do.
             foreseen = isinstance(error, SessionError | RecordError | MeasurementError)
@@ -324,14 +326,14 @@ class OnlineFit:
             problem = str(error).removeprefix(f"{self._path}: ") if foreseen else problem
             took_s = time.monotonic() - began_s
             return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
-        shows = bool(told.visible_modes)
-        plant = told.fit.plant
+        shows = bool(headline.visible_modes)
+        plant = headline.fit.plant
         return OnlineEstimate(
             tick=tick,
             duration_s=duration_s,
             whole=whole,
             took_s=time.monotonic() - began_s,
-            headline=told if shows else None,
+            headline=headline if shows else None,
             orders=orders if shows else (),
             findings=found
             if shows

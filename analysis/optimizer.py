@@ -219,10 +219,10 @@ def descend(
             break
         trial = region.end(x, step)
         step = trial - x  # cut off or bent: what is promised is promised of this
-        promised = -float(step @ (2 * here.gradient + model @ step))
+        predicted = -float(step @ (2 * here.gradient + model @ step))
         if float(np.abs(step).max()) < _SHORTEST_STEP * (1 + float(np.abs(x).max())):
             break
-        if 0 <= promised < relative_tolerance * here.cost and damping < 1:
+        if 0 <= predicted < relative_tolerance * here.cost and damping < 1:
             break
         there = problem(trial)
         evaluations += 1
@@ -232,7 +232,7 @@ def descend(
             bend = float(step @ second @ step)
             uses_second = abs(gained - (foretold - bend)) <= abs(gained - foretold)
             second = _learned(second, step, here, there)
-            quality = gained / promised if promised > 0 else 0.0
+            quality = gained / predicted if predicted > 0 else 0.0
             damping *= max(_LEAST_RELIEF, 1 - (2 * quality - 1) ** 3)
             growth = 2.0
             x, here = trial, there
@@ -294,8 +294,8 @@ def _learned(
     turned = second @ step
     size = abs(float(step @ turned))
     if size > 0:  # what was learned farther up may be too large here
-        share = min(1.0, abs(float(step @ bend)) / size)
-        second, turned = share * second, share * turned
+        overlap = min(1.0, abs(float(step @ bend)) / size)
+        second, turned = overlap * second, overlap * turned
     miss = bend - turned
     both = np.outer(miss, change)
     return (
@@ -309,7 +309,7 @@ def _learned(
 
 _Value = TypeVar("_Value")
 
-_KEPT: Final = 2
+_STORED: Final = 2
 """The last step of a descent may have been taken back."""
 
 
@@ -338,7 +338,7 @@ class Recent(Generic[_Value]):
         """
         key = x.tobytes()
         if key not in self._values:
-            if len(self._values) == _KEPT:
+            if len(self._values) == _STORED:
                 del self._values[next(iter(self._values))]
             self._values[key] = compute(x)
         return self._values[key]

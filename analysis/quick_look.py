@@ -104,14 +104,16 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         session_id = about.get("id", path.stem)
         start_utc_ns = _whole_number(about.get("start_utc_ns", ""))
         flags += record.warnings
-        told, validity, more = _headline(record)
-        modes = [] if told is None else [_mode(each) for each in told.modes]
+        headline, validity, more = _headline(record)
+        modes = [] if headline is None else [_mode(each) for each in headline.modes]
         flags += more
         response, coherence, more = _response(record)
         flags += more
-        if told is not None and response is not None:
-            model = _model(told, record, response["frequency_hz"])
-    before = _look_of(last) if last is not None else _last_look(path, specimen, start_utc_ns)
+        if headline is not None and response is not None:
+            model = _model(headline, record, response["frequency_hz"])
+    before = (
+        _quick_look_of(last) if last is not None else _last_quick_look(path, specimen, start_utc_ns)
+    )
     if before is not None and any(mode["shown"] for mode in modes):
         compared = _against(modes, before)
     document = {
@@ -142,32 +144,32 @@ def _headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:
     from analysis.suited import record_band_hz
     from analysis.validity import record_validity, stated_validity
 
-    said = []
+    sentences = []
     length_s = record.time_s.size / record.rate_hz
-    told: Headline
+    headline: Headline
     found: tuple[Finding, ...]
     try:
         if length_s <= _JUDGED_S:
             whole = whole_record(record)
-            told, found, validity = whole.headline, whole.verdict.findings, whole.validity
+            headline, found, validity = whole.headline, whole.verdict.findings, whole.validity
         else:
-            told, found, _ = freest_alone(Measurement.of_record(record), record_band_hz(record))
-            model = told.fit.plant.beam, told.fit.plant.damping
+            headline, found, _ = freest_alone(Measurement.of_record(record), record_band_hz(record))
+            model = headline.fit.plant.beam, headline.fit.plant.damping
             validity = record_validity(record.metadata, record.angle_rad, record.rate_hz, model)
-            said.append(
-                f"The record is long ({length_s:.0f} s): type {told.name} alone was fitted; "
+            sentences.append(
+                f"The record is long ({length_s:.0f} s): type {headline.name} alone was fitted; "
                 "non-uniform beams, air drag, nonlinear forces and changes along the record were "
                 "not tried. analyze tries them."
             )
     except MeasurementError as error:
         no_modes = f"No modes: {_without_name(str(error), record.path)}"
         return None, stated_validity(record.metadata), [no_modes]
-    if told.uniform_beam is not None:
-        validity = replace(validity, uniform_beam=told.uniform_beam.summary)
-    said += [each.sentence for each in found]
-    if not told.modes:
-        said.append("No modes: none lies in the excited band.")
-    return told, validity, said
+    if headline.uniform_beam is not None:
+        validity = replace(validity, uniform_beam=headline.uniform_beam.summary)
+    sentences += [each.sentence for each in found]
+    if not headline.modes:
+        sentences.append("No modes: none lies in the excited band.")
+    return headline, validity, sentences
 
 
 def _mode(mode: Mode) -> dict[str, Any]:
@@ -181,7 +183,7 @@ def _mode(mode: Mode) -> dict[str, Any]:
     }
 
 
-def _model(told: Headline, record: Record, shown_hz: Sequence[float]) -> dict[str, Any] | None:
+def _model(headline: Headline, record: Record, shown_hz: Sequence[float]) -> dict[str, Any] | None:
     """Return the response of the model shown first with its 95 % band, where it was excited.
 
     None if it does not explain the record, or depends on the amplitude, as with drag: there is no
@@ -193,19 +195,19 @@ def _model(told: Headline, record: Record, shown_hz: Sequence[float]) -> dict[st
     from analysis.report.bands import dense_grid
     from rigd.view.frequency_charts import response_thinning
 
-    if not told.explained or told.drag_speed_m_s is not None or len(shown_hz) == 0:
+    if not headline.explained or headline.drag_speed_m_s is not None or len(shown_hz) == 0:
         return None
-    shown = ShownModel.of(told, record)
+    shown = ShownModel.of(headline, record)
     peaks_hz = [mode.frequency_hz for mode in shown.modes]
     band = shown.band(dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
     magnitude, limits = np.abs(band.response), band.magnitude_limits()
-    kept = response_thinning(band.frequency_hz).extremes(magnitude)
+    selected = response_thinning(band.frequency_hz).extremes(magnitude)
     return {
-        "frequency_hz": _rounded(band.frequency_hz[kept]),
-        "magnitude": _rounded(magnitude[kept]),
-        "magnitude_low_95": _rounded(limits[0][kept]),
-        "magnitude_high_95": _rounded(limits[1][kept]),
-        "phase_rad": _rounded(np.angle(band.response[kept])),
+        "frequency_hz": _rounded(band.frequency_hz[selected]),
+        "magnitude": _rounded(magnitude[selected]),
+        "magnitude_low_95": _rounded(limits[0][selected]),
+        "magnitude_high_95": _rounded(limits[1][selected]),
+        "phase_rad": _rounded(np.angle(band.response[selected])),
     }
 
 
@@ -213,12 +215,12 @@ def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], li
     """Estimate response and coherence as the live view does, where the reference has excited it."""
     import numpy as np
 
-    from analysis.models import LARGEST_SHARE_OF_RATE
+    from analysis.models import LARGEST_FRACTION_OF_RATE
     from analysis.suited import against_welch
     from rigd.spectral import SpectralError, segmentation_of
     from rigd.view.frequency_charts import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_thinning
 
-    last_hz = min(LAST_HZ, LARGEST_SHARE_OF_RATE * record.rate_hz)
+    last_hz = min(LAST_HZ, LARGEST_FRACTION_OF_RATE * record.rate_hz)
     segments = segmentation_of(record.first_sweep_samples, record.rate_hz)
     resolution_hz = _HAMMING_BINS * record.rate_hz / segments.segment_length
     try:
@@ -236,12 +238,12 @@ def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], li
     )
     shown = estimate.excited & (found.frequency_hz >= FIRST_HZ) & np.isfinite(found.response)
     hz, values = found.frequency_hz[shown], found.response[shown]
-    kept = response_thinning(hz).extremes(np.abs(values))
+    selected = response_thinning(hz).extremes(np.abs(values))
     response = {
-        "frequency_hz": _rounded(hz[kept]),
-        "magnitude": _rounded(np.abs(values[kept])),
-        "phase_rad": _rounded(np.angle(values[kept])),
-        "coherence": None if coherence is None else _rounded(coherence[shown][kept]),
+        "frequency_hz": _rounded(hz[selected]),
+        "magnitude": _rounded(np.abs(values[selected])),
+        "phase_rad": _rounded(np.angle(values[selected])),
+        "coherence": None if coherence is None else _rounded(coherence[shown][selected]),
         "resolution_hz": round(resolution_hz, 4),
     }
     if coherence is None or hz.size == 0:
@@ -309,7 +311,7 @@ def _no_coherence() -> dict[str, Any]:
 # Against the last session
 
 
-def _look_of(last: Path) -> dict[str, Any]:
+def _quick_look_of(last: Path) -> dict[str, Any]:
     look = read_look(look_path(last))
     if look is None:
         raise LookError(
@@ -319,7 +321,7 @@ def _look_of(last: Path) -> dict[str, Any]:
     return look
 
 
-def _last_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
+def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
     """Find the last session of a specimen before a time, by the looks beside its file."""
     found = last_look(
         path.parent,
@@ -445,22 +447,22 @@ def write_look(document: Mapping[str, Any], path: Path) -> Path:
     LookError
         It cannot be written, or something else has its name.
     """
-    place = look_path(path)
-    there = read_look(place)
+    target = look_path(path)
+    there = read_look(target)
     if there is not None and there["made_utc_ns"] > document["made_utc_ns"]:
-        return place
-    new = place.with_name(f".{place.name}.{os.getpid()}")
+        return target
+    new = target.with_name(f".{target.name}.{os.getpid()}")
     try:
-        if there is None and place.exists() and place.stat().st_size > 0:
-            raise LookError(f"{place} is not a quick look of this version; move it away.")
+        if there is None and target.exists() and target.stat().st_size > 0:
+            raise LookError(f"{target} is not a quick look of this version; move it away.")
         new.write_text(json.dumps(document, allow_nan=False), "utf-8")
-        new.replace(place)
+        new.replace(target)
     except OSError as error:
-        raise LookError(f"{place} cannot be written ({error.strerror}).") from None
+        raise LookError(f"{target} cannot be written ({error.strerror}).") from None
     finally:
         with suppress(OSError):
             new.unlink(missing_ok=True)
-    return place
+    return target
 
 
 # The program
@@ -474,13 +476,13 @@ def main() -> None:
     parser.add_argument(
         "--last", type=Path, metavar="FILE", help="Session to compare with (default: the last one)."
     )
-    asked = begin_background(parser)
+    arguments = begin_background(parser)
     # Not as the last of all programs: no session runs meanwhile, and others may never pause.
     with suppress(OSError):
         os.nice(_NICE)
     try:
-        document = look_at(asked.file, asked.last)
-        write_look(document, asked.file)
+        document = look_at(arguments.file, arguments.last)
+        write_look(document, arguments.file)
     except (SessionError, LookError) as error:
         sys.exit(f"Error: {error}")
     except KeyboardInterrupt:

@@ -337,10 +337,10 @@ def check_clock(
     # Compared, not subtracted: a difference of what a file states may overflow.
     back = np.flatnonzero(t_ns[1:] <= t_ns[:-1])
     if back.size:
-        place = int(back[0])
+        index = int(back[0])
         raise RecordError(
-            f"{path}: the time stamp t_ns goes from {t_ns[place]} ns at tick {ticks[place]} to "
-            f"{t_ns[place + 1]} ns at tick {ticks[place + 1]}, but time must go forward; it does "
+            f"{path}: the time stamp t_ns goes from {t_ns[index]} ns at tick {ticks[index]} to "
+            f"{t_ns[index + 1]} ns at tick {ticks[index + 1]}, but time must go forward; it does "
             f"not at {back.size} of {len(ticks)} samples. Correct the program that wrote the file."
         )
     elapsed_ns = max(int(t_ns[-1]) - int(t_ns[0]), 1)

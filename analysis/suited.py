@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.models import (
-    LARGEST_SHARE_OF_RATE,
+    LARGEST_FRACTION_OF_RATE,
     PAPER_BAND_HZ,
     RECORD_BAND_HZ,
     WelchSettings,
@@ -75,11 +75,11 @@ def check_record_band(record: Record, asked_hz: Band | None) -> None:
     """
     from analysis.paper import SettingsError
 
-    limit_hz = LARGEST_SHARE_OF_RATE * record.rate_hz
+    limit_hz = LARGEST_FRACTION_OF_RATE * record.rate_hz
     if asked_hz is not None and asked_hz[1] > limit_hz:
         raise SettingsError(
             f"{record.path}: the band reaches {asked_hz[1]:g} Hz, but whole-record fits end at "
-            f"{limit_hz:g} Hz, {LARGEST_SHARE_OF_RATE:g} of the rate of {record.rate_hz:g} Hz; "
+            f"{limit_hz:g} Hz, {LARGEST_FRACTION_OF_RATE:g} of the rate of {record.rate_hz:g} Hz; "
             "lower --band."
         )
 
@@ -116,15 +116,15 @@ def remarks(record: Record, asked_hz: Band | None = None) -> tuple[str, ...]:
     asked_hz : tuple of float, optional
         Band that was asked for, in Hz.
     """
-    said = (_TOUCH,) if record.metadata.get("excitation") == "touch" else ()
+    sentences = (_TOUCH,) if record.metadata.get("excitation") == "touch" else ()
     if record.there is not None:
-        said = (*said, _TWO_SWEEPS)
+        sentences = (*sentences, _TWO_SWEEPS)
     _, last_hz = record_band_hz(record, asked_hz)
     if asked_hz is not None or last_hz == RECORD_BAND_HZ[1]:
-        return said
+        return sentences
     return (
-        *said,
-        f"Fits end at {last_hz:g} Hz, {LARGEST_SHARE_OF_RATE:g} of the record's rate of "
+        *sentences,
+        f"Fits end at {last_hz:g} Hz, {LARGEST_FRACTION_OF_RATE:g} of the record's rate of "
         f"{record.rate_hz:g} Hz, instead of {RECORD_BAND_HZ[1]:g} Hz.",
     )
 
@@ -205,12 +205,12 @@ def against_welch(record: Record, asked_hz: Band | None = None) -> str | None:
     )
 
 
-def _reached_hz(record: Record, share: float) -> float | None:
+def _reached_hz(record: Record, fraction: float) -> float | None:
     """Frequency that an upward sweep had reached after a share of its duration."""
     start_hz, stop_hz = _number(record, "start_hz"), _number(record, "stop_hz")
     if start_hz is None or stop_hz is None or stop_hz <= start_hz:
         return None
-    return start_hz + share * (stop_hz - start_hz)
+    return start_hz + fraction * (stop_hz - start_hz)
 
 
 def _number(record: Record, key: str) -> float | None:
@@ -223,5 +223,5 @@ def _number(record: Record, key: str) -> float | None:
 def _within(band_hz: Band, rate_hz: float) -> Band:
     """As much of a band as a rate holds; all of it where nothing would be left."""
     first_hz, last_hz = band_hz
-    limit_hz = min(last_hz, LARGEST_SHARE_OF_RATE * rate_hz)
+    limit_hz = min(last_hz, LARGEST_FRACTION_OF_RATE * rate_hz)
     return (first_hz, limit_hz) if first_hz < limit_hz else band_hz

@@ -352,15 +352,15 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
         return SensorFilter(corner_hz, order)
     delay_s = session.number("sensor_filter_delay_s", 0.0)
     # A mean of n records of a tick is (n - 1) / 2n of a tick old, the triangle twice as much.
-    share = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(kind, inf)
-    if not 0.0 <= share < _MOST_OF_TICK:
+    fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(kind, inf)
+    if not 0.0 <= fraction < _MOST_OF_TICK:
         raise RecordError(
             f"{session.path}: sensor_filter is {kind[:100]!r} with sensor_filter_delay_s = "
             f"{delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} s) "
             f"or a triangle (shorter than a period); correct the file's metadata."
         )
-    records = round(1 / (1 - share))
-    spacing_s = share / rate_hz / max(records - 1, 1)
+    records = round(1 / (1 - fraction))
+    spacing_s = fraction / rate_hz / max(records - 1, 1)
     return SensorFilter.of_records(corner_hz, order, kind, records, spacing_s)
 
 

@@ -232,7 +232,7 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     modes : tuple of int
     """
     basis = _basis()
-    length, places = beam.length_m, np.array(modes) - 1
+    length, indices = beam.length_m, np.array(modes) - 1
     count = len(alteration.lumps)
 
     def padded(array: NDArray[np.float64], value: float = 0.0) -> NDArray[np.float64]:
@@ -249,17 +249,20 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     mass_arm = padded(basis.arms + basis.shapes @ (basis.weights * heavier * basis.x))
     lump, lump_arm = np.zeros_like(mass), np.zeros_like(mass_arm)
     tension, tension_arm = padded(basis.tension), padded(basis.arms_of_tension)
-    for place, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS):
-        share, shape = mass_kg / (beam.density_kg_per_m * length), padded(_at_lump(position).copy())
+    for index, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS):
+        fraction, shape = (
+            mass_kg / (beam.density_kg_per_m * length),
+            padded(_at_lump(position).copy()),
+        )
         # All modes beyond the basis give way to a lump as one spring, and move as one mode.
         beyond = position**3 / 3 - float(np.sum((shape[:_BASIS] / basis.z**2) ** 2))
-        shape[place] = math.sqrt(max(beyond, 0.0)) * _NEXT**2
-        lump += share * np.outer(shape, shape)
-        lump_arm += share * position * shape
+        shape[index] = math.sqrt(max(beyond, 0.0)) * _NEXT**2
+        lump += fraction * np.outer(shape, shape)
+        lump_arm += fraction * position * shape
         if alteration.gravity_m_s2:
-            inside = np.where(basis.x < position, share, 0.0)
+            inside = np.where(basis.x < position, fraction, 0.0)
             tension = tension + padded(basis.weighted(basis.slopes, inside))
-            tension_arm = tension_arm + share * shape
+            tension_arm = tension_arm + fraction * shape
     # Flexibility to loads of the basis' shapes: of the beam, of the clamp
     moments = basis.curvatures / basis.z[:, None] ** 4
     softer = 1 / (1 + basis.deviation(alteration.stiffness))
@@ -273,7 +276,7 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     inverse, vectors = np.linalg.eigh(lower @ (mass + lump) @ lower.T)
     inverse, vectors = inverse[::-1], vectors[:, ::-1]
     every = lower.T @ vectors / np.sqrt(inverse)  # of modal mass 1
-    shapes: Terms = every[:, places]
+    shapes: Terms = every[:, indices]
     if alteration.clamp_loss:
         turns = turns / (1 + 1j * alteration.clamp_loss)
         elastic = np.linalg.inv(bends + turns)
@@ -281,11 +284,11 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     loads = elastic @ shapes
     size = np.sum(shapes * shapes, axis=0)
     # What the losses change in the shapes, to first order, turns the residues a little.
-    apart = 1 / inverse[places] - 1 / inverse[:, None]
-    apart[places, np.arange(places.size)] = np.inf
+    separation = 1 / inverse[indices] - 1 / inverse[:, None]
+    separation[indices, np.arange(indices.size)] = np.inf
     arms = (mass_arm + lump_arm) @ every
-    medium = arms @ ((every.T @ shapes) / apart)
-    internal = arms @ (((elastic @ every).T @ bends @ loads) / apart)
+    medium = arms @ ((every.T @ shapes) / separation)
+    internal = arms @ (((elastic @ every).T @ bends @ loads) / separation)
 
     def of_shapes(matrix: NDArray[np.float64]) -> Terms:
         found: Terms = np.sum(shapes * (matrix @ shapes), axis=0) / size

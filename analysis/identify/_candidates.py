@@ -105,8 +105,8 @@ class CandidateSet:
         if misread := tuple(wrong_scale(Comparison.of(measurement, band_hz))):
             # No beam explains such a record: one structure shows what remains as well as all.
             return replace(cls.of_freest(measurement, fixed, band_hz), misread=misread)
-        field = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
-        return field._without_leakage()
+        candidate_set = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
+        return candidate_set._without_leakage()
 
     @classmethod
     def from_earlier(
@@ -143,11 +143,15 @@ class CandidateSet:
         found = refit_record(measurement, unknowns, first.fit.plant, band_hz=band_hz)
         if found is None:
             return None
-        field = cls._fitted(found, fixed, (replace(first, fit=found.fits[0]),))
-        before = replace(field, candidates=tuple(earlier))
-        every = (before._brought_to(field, c, MANY) for c in others)
-        field = field.ranked((*field.candidates, *every))._without_leakage().cross_checked()
-        return field._renewed()
+        candidate_set = cls._fitted(found, fixed, (replace(first, fit=found.fits[0]),))
+        before = replace(candidate_set, candidates=tuple(earlier))
+        every = (before._brought_to(candidate_set, c, MANY) for c in others)
+        candidate_set = (
+            candidate_set.ranked((*candidate_set.candidates, *every))
+            ._without_leakage()
+            .cross_checked()
+        )
+        return candidate_set._renewed()
 
     @classmethod
     def of_freest(
@@ -155,7 +159,7 @@ class CandidateSet:
         measurement: Measurement,
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
-        beside: tuple[Structure, ...] = (),
+        additional: tuple[Structure, ...] = (),
     ) -> CandidateSet:
         """Fit the structure with every order free, on a uniform beam, and few others beside it.
 
@@ -164,7 +168,7 @@ class CandidateSet:
         MeasurementError
             The record cannot be used.
         """
-        structures = (_FREEST, *beside)
+        structures = (_FREEST, *additional)
         return cls._uniform(
             fit_record(measurement, structures, fixed=fixed, band_hz=band_hz), fixed
         )
@@ -254,22 +258,22 @@ class CandidateSet:
 
     def _renewed(self) -> CandidateSet:
         """Tell anew, with the best beam, what followed the reference; `self` if that is settled."""
-        field = self
+        candidate_set = self
         for _ in range(RENEWALS):
-            best = field.best
-            comparison = field.comparison.renewed(best.fit.plant, field.noise)
-            if comparison is field.comparison:
+            best = candidate_set.best
+            comparison = candidate_set.comparison.renewed(best.fit.plant, candidate_set.noise)
+            if comparison is candidate_set.comparison:
                 break
-            alone = replace(field, comparison=comparison, candidates=(best,))
+            alone = replace(candidate_set, comparison=comparison, candidates=(best,))
             noise = alone.refit(best, FEW).noise_here()
             alone = replace(alone, noise=noise)
-            field = replace(alone, candidates=(alone.refit(best, FEW).candidate(),))
-        if field is self:
+            candidate_set = replace(alone, candidates=(alone.refit(best, FEW).candidate(),))
+        if candidate_set is self:
             return self
         # The others from where they were: they have seen their best's noise only.
         others = (c for c in self.candidates if c is not self.best)
-        every = (self._brought_to(field, c, MANY) for c in others)
-        return field.ranked((*field.candidates, *every)).cross_checked()
+        every = (self._brought_to(candidate_set, c, MANY) for c in others)
+        return candidate_set.ranked((*candidate_set.candidates, *every)).cross_checked()
 
     def _without_leakage(self) -> CandidateSet:
         """Leave out the bins that a disturbance beyond the band leaks into."""
@@ -288,15 +292,16 @@ class CandidateSet:
 
     def cross_checked(self) -> CandidateSet:
         """Start each from where the best is: over a flat valley a search may miss what is there."""
-        field = self
+        candidate_set = self
         for _ in range(_CROSS_CHECKS):
-            best = field.best
-            field = field.ranked(
-                c if c is best else field._from_plant(c, best.fit.plant) for c in field.candidates
+            best = candidate_set.best
+            candidate_set = candidate_set.ranked(
+                c if c is best else candidate_set._from_plant(c, best.fit.plant)
+                for c in candidate_set.candidates
             )
-            if field.best is best:
+            if candidate_set.best is best:
                 break
-        return field
+        return candidate_set
 
     def tried_from(self, plant: Plant) -> CandidateSet:
         """Start each from a plant that a search has found."""
@@ -309,7 +314,7 @@ class CandidateSet:
             return candidate
         outlook = self.descent_from(plant, structure, 1)
         least = candidate.fit.cost * (1 - MISSED)
-        if outlook.promised_cost > least:
+        if outlook.predicted_cost > least:
             return candidate
         first = outlook.further(FEW)
         if first.cost > candidate.fit.cost * (1 + _NEARLY):
@@ -329,8 +334,8 @@ class CandidateSet:
         doubtful = [_INTEGER] if not low <= 1 <= high else []
         doubtful += _may_lack_one(fit)
         found = (self.descent_from(fit.plant, structure).candidate() for structure in doubtful)
-        field = self.ranked((*self.candidates, *found)).cross_checked()
-        return field.led_by(field.freest)
+        candidate_set = self.ranked((*self.candidates, *found)).cross_checked()
+        return candidate_set.led_by(candidate_set.freest)
 
     def with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
         """Fit a candidate with the damping that it lacks, so that its modes count that as unknown.
@@ -362,19 +367,19 @@ class CandidateSet:
         free = tuple(name for name in PARAMETERS if name not in fixed)
         both = replace(structure, free=free, fixed=fixed)
         unknowns = self.unknowns(both)
-        place = unknowns.names.index(coefficient)
+        index = unknowns.names.index(coefficient)
         little = self.descent(unknowns, unknowns.vector(own.plant), 1)
-        growth = 1 + float(little.promised_step[place])  # linear in the loss, not in its logarithm
+        growth = 1 + float(little.predicted_step[index])  # linear in the loss, not in its logarithm
         if growth > 1:
             start = little.x.copy()
-            start[place] += math.log(growth)
+            start[index] += math.log(growth)
             found = self.descent(unknowns, start, MANY)
-            if found.x[place] > little.x[place]:
+            if found.x[index] > little.x[index]:
                 return found.fit(), False
         scaled, scale = little.equations.scaled_hessian()
-        spread = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))[place, place] ** 0.5
+        spread = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))[index, index] ** 0.5
         x = little.x.copy()
-        x[place] += max(math.log(spread / scale[place]), 0.0)
+        x[index] += max(math.log(spread / scale[index]), 0.0)
         return self.descent(unknowns, x, 1).fit(), True
 
     def with_orders_free(self) -> CandidateSet:
@@ -423,10 +428,10 @@ class CandidateSet:
 
 def _may_lack_one(fit: RecordFit) -> list[Structure]:
     """Structures without one of the dampings, where a fit does not show it beyond doubt."""
-    beside = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
+    additional = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
     return [
         structure
-        for structure, other in beside
+        for structure, other in additional
         if other is None or other.value < _CERTAIN * other.std
     ]
 

@@ -64,8 +64,8 @@ def _tilt(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
     return own[0], "deg", words
 
 
-def _mass_kg(share: float, beam: Beam) -> float:
-    return share * beam.density_kg_per_m * beam.length_m
+def _mass_kg(fraction: float, beam: Beam) -> float:
+    return fraction * beam.density_kg_per_m * beam.length_m
 
 
 def _with_tip_mass(stated: Alteration, own: Sequence[float], beam: Beam) -> Alteration:
@@ -176,7 +176,7 @@ CAUSES: Final = (
         lambda own, plant: replace(plant, tip_mass_kg=_mass_kg(own[0], plant.beam)),
     ),
     Cause(
-        "lump", tuple((0.05 * place, 0.01) for place in range(3, 20, 2)),
+        "lump", tuple((0.05 * index, 0.01) for index in range(3, 20, 2)),
         (0.02, 0.0), (0.99, 0.5), _with_lump, _lump, special=("tip mass",),
     ),
     _uneven_mass("taper", "a mass per length that changes by {} from root to tip"),

@@ -39,8 +39,8 @@ def clipping(measurement: Measurement) -> Iterator[Finding]:
     flat = []
     for limit in (torque[known].max(), torque[known].min()):
         at = known & (torque == limit)
-        beside = at & (np.roll(at, 1) | np.roll(at, -1))
-        if limit != 0 and np.count_nonzero(beside) >= _FEWEST_FLAT:
+        repeated = at & (np.roll(at, 1) | np.roll(at, -1))
+        if limit != 0 and np.count_nonzero(repeated) >= _FEWEST_FLAT:
             flat.append((float(limit), int(np.count_nonzero(at))))
     if not flat:
         return
@@ -60,16 +60,16 @@ def clipping(measurement: Measurement) -> Iterator[Finding]:
 
 def stops(measurement: Measurement) -> Iterator[Finding]:
     """Detect a motor at rest although the reference moves."""
-    asked = measurement.reference_rad
-    if asked is None:
+    reference_rad = measurement.reference_rad
+    if reference_rad is None:
         return
     length = max(round(_STILL_S * measurement.rate_hz), 2)
-    blocks = asked.size // length
+    blocks = reference_rad.size // length
     if blocks == 0:
         return
     moved, wanted = (
         np.ptp(values[: blocks * length].reshape(blocks, length), axis=1)
-        for values in (measurement.angle_rad, asked)
+        for values in (measurement.angle_rad, reference_rad)
     )
     still = (wanted > np.median(wanted)) & (moved < _STILL * wanted)
     if not still.any():
@@ -123,9 +123,9 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
     driven = power > _DRIVEN * power.max()
     beam = comparison.measurement.nominal.beam
     expected = transfer(2j * np.pi * comparison.frequency_hz[driven], beam, Damping(zeta=_LOSS_S))
-    share = torque[driven] / (angle[driven] * expected)
-    size = np.abs(share)
-    cosine = float(np.median(share.real / np.maximum(size, np.finfo(float).tiny)))
+    torque_ratio = torque[driven] / (angle[driven] * expected)
+    size = np.abs(torque_ratio)
+    cosine = float(np.median(torque_ratio.real / np.maximum(size, np.finfo(float).tiny)))
     if abs(cosine) < _ALIGNED:
         return
     if cosine < 0:
@@ -173,14 +173,14 @@ _BEYOND_CHANCE: Final = 10.0
 """Scatter of the means over what noise alone makes of them."""
 
 
-def drift_of_zero(field: CandidateSet) -> float:
+def drift_of_zero(candidate_set: CandidateSet) -> float:
     """Range of the means over parts of the record in N·m; 0 if noise alone may make it."""
-    comparison = field.comparison
-    torque, _ = comparison.prediction.torque(field.best.fit.plant)
+    comparison = candidate_set.comparison
+    torque, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
     left = comparison.torque_nm[comparison.kept] - torque
     length = left.size // _PARTS
     means = left[: _PARTS * length].reshape(_PARTS, length).mean(axis=1)
     # White noise as loud as that of the band's upper half.
-    upper = field.noise.power[field.noise.power.size // 2 :]
+    upper = candidate_set.noise.power[candidate_set.noise.power.size // 2 :]
     chance = math.sqrt(float(np.median(upper)) / comparison.samples / length)
     return float(np.ptp(means)) if float(means.std()) > _BEYOND_CHANCE * chance else 0.0

@@ -21,7 +21,7 @@ from analysis.identify._free_decay import (
 )
 from analysis.identify._instrument import following
 from analysis.identify._predictor import Prediction
-from analysis.models import LARGEST_SHARE_OF_RATE
+from analysis.models import LARGEST_FRACTION_OF_RATE
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -101,12 +101,12 @@ class Comparison:
     visible_modes: int
     decays: DecaySpectra
     later_decays: tuple[LaterDecaySpectra, ...] = ()
-    apart_nm: NDArray[np.float64] | float = 0.0
-    apart_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    removed_nm: NDArray[np.float64] | float = 0.0
+    removed_at_unknown_nm: NDArray[np.float64] | float = 0.0
     hum: tuple[Hum, ...] = ()
-    rest_rad: NDArray[np.float64] | float = 0.0
-    rest_nm: NDArray[np.float64] | float = 0.0
-    rest_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    incoherent_rad: NDArray[np.float64] | float = 0.0
+    incoherent_nm: NDArray[np.float64] | float = 0.0
+    incoherent_at_unknown_nm: NDArray[np.float64] | float = 0.0
     drag: DragExpansion | None = None
     struck: NDArray[np.complex128] | None = None
     last_poles_rad_s: list[complex] = field(default_factory=list)
@@ -130,11 +130,11 @@ class Comparison:
             The record cannot be used, or is too short for the band.
         """
         lowest_hz, highest_hz = band_hz
-        limit_hz = LARGEST_SHARE_OF_RATE * measurement.rate_hz
+        limit_hz = LARGEST_FRACTION_OF_RATE * measurement.rate_hz
         if not 0 <= lowest_hz < highest_hz <= limit_hz:
             raise MeasurementError(
                 f"{measurement.name}: the band {lowest_hz:g}-{highest_hz:g} Hz is empty, negative "
-                f"or beyond {LARGEST_SHARE_OF_RATE:g} of the sampling rate ({limit_hz:g} Hz); "
+                f"or beyond {LARGEST_FRACTION_OF_RATE:g} of the sampling rate ({limit_hz:g} Hz); "
                 "choose another --band."
             )
         measurement.check(highest_hz)
@@ -193,7 +193,7 @@ class Comparison:
         """Take out the knocks as well as they are known; the rest of them is projected out."""
         rate_hz, knocks = self.decimation.rate_hz, self.measurement.knocks
         grid_s = self.times_s()
-        ticks = self._places(~self.measurement.torque_known)
+        ticks = self._decimated_indices(~self.measurement.torque_known)
         reach_s = self.decimation.reach / rate_hz
         unknown_s = ticks / self.measurement.rate_hz - reach_s
         taken_nm, at_unknown_nm = (
@@ -212,8 +212,8 @@ class Comparison:
         return replace(
             self,
             torque_nm=left_nm,
-            apart_nm=self.apart_nm + torque_nm,
-            apart_at_unknown_nm=self.apart_at_unknown_nm + at_unknown_nm,
+            removed_nm=self.removed_nm + torque_nm,
+            removed_at_unknown_nm=self.removed_at_unknown_nm + at_unknown_nm,
         )
 
     def times_s(self) -> NDArray[np.float64]:
@@ -253,7 +253,7 @@ class Comparison:
         every[self.bins] = spectrum
         return np.fft.irfft(every, self.samples)
 
-    def followed_rad(self) -> NDArray[np.float64]:
+    def coherent_rad(self) -> NDArray[np.float64]:
         """Part of the angle that is coherent with the reference, shape (m,).
 
         All of it without a reference, or with one that does not explain it.
@@ -299,9 +299,9 @@ class Comparison:
         Returns
         -------
         Comparison
-            `self` if all of the angle counts as such: see `followed_rad`.
+            `self` if all of the angle counts as such: see `coherent_rad`.
         """
-        followed = self.followed_rad()
+        followed = self.coherent_rad()
         if followed is self.angle_rad:
             return self
         return self._split(self.angle_rad, followed, plant)
@@ -317,25 +317,27 @@ class Comparison:
             self,
             angle_rad=followed,
             prediction=self.prediction.of_other(followed),
-            rest_rad=moved_rad - followed,
-        ).with_rest_of(plant)
+            incoherent_rad=moved_rad - followed,
+        ).with_incoherent_part_of(plant)
 
-    def with_rest_of(self, plant: Plant | ModalModel) -> Comparison:
+    def with_incoherent_part_of(self, plant: Plant | ModalModel) -> Comparison:
         """Take out what a plant makes of the angle that followed no reference, in place of before.
 
         Parameters
         ----------
         plant : Plant
         """
-        if not isinstance(self.rest_rad, np.ndarray):
+        if not isinstance(self.incoherent_rad, np.ndarray):
             return self
-        rest = self.prediction.of_other(self.rest_rad)
-        rest_nm = rest.torque(plant)[0]
+        rest = self.prediction.of_other(self.incoherent_rad)
+        incoherent_nm = rest.torque(plant)[0]
         at_unknown_nm = rest.torque_between(
-            plant, self.decimation.factor, self._places(~self.measurement.torque_known)
+            plant, self.decimation.factor, self._decimated_indices(~self.measurement.torque_known)
         )[0]
-        told = replace(self, rest_nm=rest_nm, rest_at_unknown_nm=at_unknown_nm)
-        return told._without(rest_nm - self.rest_nm, at_unknown_nm - self.rest_at_unknown_nm)
+        updated = replace(self, incoherent_nm=incoherent_nm, incoherent_at_unknown_nm=at_unknown_nm)
+        return updated._without(
+            incoherent_nm - self.incoherent_nm, at_unknown_nm - self.incoherent_at_unknown_nm
+        )
 
     def renewed(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
         """Tell anew what followed the reference, with a plant better than the one before.
@@ -352,13 +354,13 @@ class Comparison:
             `self` if the torque of what followed no reference is the same with either plant, but
             for what moves a parameter by a third of its standard deviation at most.
         """
-        other = self.with_rest_of(plant)
+        other = self.with_incoherent_part_of(plant)
         if other is self:
             return self
-        change = self.spectrum(other.rest_nm - np.asarray(self.rest_nm)) * noise.weight
+        change = self.spectrum(other.incoherent_nm - np.asarray(self.incoherent_nm)) * noise.weight
         if np.vdot(change, change).real <= _LARGEST_CHANGE:
             return self
-        moved_rad, followed = self.angle_rad + self.rest_rad, self.angle_rad
+        moved_rad, followed = self.angle_rad + self.incoherent_rad, self.angle_rad
         felt = Prediction(followed, self.decimation.rate_hz, slice(0, self._recorded))
         # What rings moves the motor, which makes it ring otherwise.
         for _ in range(_FEEDBACKS):
@@ -373,7 +375,7 @@ class Comparison:
     def without_hum(self, hum: tuple[Hum, ...]) -> Comparison:
         """Take out hum, in place of what was taken out before."""
         other = replace(self, hum=hum)
-        ticks = self._places(~self.measurement.torque_known)
+        ticks = self._decimated_indices(~self.measurement.torque_known)
         first_s = self.kept.start / self.decimation.rate_hz
         time_s = ticks / self.measurement.rate_hz - first_s
         return other._without(
@@ -395,14 +397,14 @@ class Comparison:
             The drag is too large to be followed.
         """
         # All that moves is braked, whether or not it followed a reference.
-        moved_rad = self.angle_rad + self.rest_rad
+        moved_rad = self.angle_rad + self.incoherent_rad
         response = DragResponse(moved_rad, self.decimation.rate_hz, plant)
         found = response.torque(law, range(1, self.visible_modes + 1))
 
         def band(values: NDArray[np.float64]) -> NDArray[np.complex128]:
             return self.spectrum(values[..., self.kept])
 
-        unknown = self._places(~self.measurement.torque_known)
+        unknown = self._decimated_indices(~self.measurement.torque_known)
         between = np.fft.irfft(
             self.decimation.factor * np.fft.rfft(found.torque_nm),
             self.decimation.factor * found.torque_nm.size,
@@ -410,8 +412,8 @@ class Comparison:
         return replace(
             self,
             torque_nm=self.torque_nm - found.torque_nm,
-            apart_nm=self.apart_nm + found.torque_nm[self.kept],
-            apart_at_unknown_nm=self.apart_at_unknown_nm + between[unknown],
+            removed_nm=self.removed_nm + found.torque_nm[self.kept],
+            removed_at_unknown_nm=self.removed_at_unknown_nm + between[unknown],
             drag=DragExpansion(
                 plant=plant,
                 law=law,
@@ -474,11 +476,13 @@ class Comparison:
             return self
         torque = self.measurement.torque_nm.copy()
         torque[~known] = (
-            self.apart_at_unknown_nm
-            + self.prediction.torque_between(plant, self.decimation.factor, self._places(~known))[0]
+            self.removed_at_unknown_nm
+            + self.prediction.torque_between(
+                plant, self.decimation.factor, self._decimated_indices(~known)
+            )[0]
         )
         torque_nm = self.decimation.apply(torque)
-        torque_nm[self.kept] -= self.apart_nm
+        torque_nm[self.kept] -= self.removed_nm
         return replace(self, torque_nm=torque_nm)
 
     def lost_gradient(self, plant: Plant, wrt: tuple[str, ...]) -> NDArray[np.complex128]:
@@ -495,7 +499,7 @@ class Comparison:
         lost = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
         if unknown.any():
             _, gradient = self.prediction.torque_between(
-                plant, self.decimation.factor, self._places(unknown), wrt
+                plant, self.decimation.factor, self._decimated_indices(unknown), wrt
             )
             for row, values in zip(lost, gradient, strict=True):
                 only = np.zeros(unknown.size)
@@ -503,7 +507,7 @@ class Comparison:
                 row[:] = self.spectrum(self.decimation.apply(only)[self.kept])
         return lost
 
-    def _places(self, ticks: NDArray[np.bool_]) -> NDArray[np.intp]:
+    def _decimated_indices(self, ticks: NDArray[np.bool_]) -> NDArray[np.intp]:
         """Ticks counted from the first decimated sample on."""
         return np.flatnonzero(ticks) + self.decimation.reach * self.decimation.factor
 

@@ -114,9 +114,9 @@ class RecordedImpact:
         """
         half_s = 0.5 / rate_hz
         touched = (time_s > self.first_s - half_s) & (time_s < self.last_s - half_s)
-        places = np.flatnonzero(touched)
-        single = np.zeros((places.size, time_s.size))
-        single[np.arange(places.size), places] = 1.0
+        indices = np.flatnonzero(touched)
+        single = np.zeros((indices.size, time_s.size))
+        single[np.arange(indices.size), indices] = 1.0
         return np.concatenate([self.decays(time_s), single])
 
     def torque(
@@ -309,7 +309,7 @@ class Measurement:
             First tick of each, and the first after it of which the torque's channel, which is
             late, has forgotten it.
         """
-        told = MAX_ANGLE_GAP_PERIODS / highest_hz * self.rate_hz
+        longest = MAX_ANGLE_GAP_PERIODS / highest_hz * self.rate_hz
         late_s = abs(self.delay_s) + _FILTERS_FORGET * (
             self.filter_time_constant_s + self.second_order_filter_time_constant_s
         )
@@ -317,7 +317,7 @@ class Measurement:
         return tuple(
             (int(start), min(int(end) + late, len(self.angle_rad)))
             for start, end in zip(*_runs(~self.angle_known), strict=True)
-            if end - start > told
+            if end - start > longest
         )
 
     def without_torque_in(self, gaps: Iterable[tuple[int, int]]) -> Measurement:
@@ -346,7 +346,7 @@ class Measurement:
         )
 
     @property
-    def torque_share(self) -> float:
+    def known_torque_fraction(self) -> float:
         """Share of the torque that is known."""
         return float(np.mean(self.torque_known))
 
@@ -402,10 +402,10 @@ def bridged(
 @lru_cache(maxsize=64)
 def _weights(neighbours: tuple[int, ...], length: int, highest: float) -> NDArray[np.float64]:
     """Weights of the neighbours in each of `length` values from place 0 on."""
-    places = np.array(neighbours)
-    among = np.sinc(2 * highest * np.subtract.outer(places, places))
-    among += _NOISE_POWER * np.eye(places.size)
-    across = np.sinc(2 * highest * np.subtract.outer(np.arange(length), places))
+    indices = np.array(neighbours)
+    among = np.sinc(2 * highest * np.subtract.outer(indices, indices))
+    among += _NOISE_POWER * np.eye(indices.size)
+    across = np.sinc(2 * highest * np.subtract.outer(np.arange(length), indices))
     weights: NDArray[np.float64] = np.linalg.solve(among, across.T).T
     return weights
 

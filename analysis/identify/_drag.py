@@ -59,7 +59,7 @@ _ROUNDS: Final = 15
 _FEW: Final = 12
 """Evaluations of a descent before the drag is recomputed."""
 
-_A_LOOK: Final = 4
+_EARLY_EVALUATIONS: Final = 4
 """Evaluations that show whether a structure is hopeless."""
 
 _MANY: Final = 40
@@ -155,7 +155,7 @@ def _is_evident(uniform: CandidateSet) -> bool:
     return size > 0 and saved > max(_EVIDENT, _ALL_BUT_NOISE * (refit.cost - refit.expected_cost))
 
 
-def with_air_drag(field: CandidateSet) -> CandidateSet:
+def with_air_drag(candidate_set: CandidateSet) -> CandidateSet:
     """Refit all candidates with the air's drag, if that explains the record better.
 
     To first order a column of known shape tells what drag could save beside each of a few
@@ -171,29 +171,29 @@ def with_air_drag(field: CandidateSet) -> CandidateSet:
     CandidateSet
         The one given, if there is no drag; else with `drag`, the lowest BIC first.
     """
-    return _with_drag(field) if _promising(field) else field
+    return _with_drag(candidate_set) if _promising(candidate_set) else candidate_set
 
 
-def _with_drag(field: CandidateSet) -> CandidateSet:
+def _with_drag(candidate_set: CandidateSet) -> CandidateSet:
     """Fit all structures with drag; the set given if that is no better."""
-    lead = next((c for c in field.candidates if c.structure.name == _LEAD), None)
-    start = None if lead is None else _start(field, lead)
+    lead = next((c for c in candidate_set.candidates if c.structure.name == _LEAD), None)
+    start = None if lead is None else _start(candidate_set, lead)
     if start is None:
-        return field
-    settled = _settled(field, start, STRUCTURES[_LEAD], tolerance=_ROUGHLY)
+        return candidate_set
+    settled = _settled(candidate_set, start, STRUCTURES[_LEAD], tolerance=_ROUGHLY)
     if settled is None:
-        return field
+        return candidate_set
     # Thence to the freest damping; without drag its fit may be that of no beam at all.
     known, point = settled.objective.comparison, _DragPoint.of(settled)
     for name in (_FREEST, _LEAD):
-        settled = _settled(field, point, STRUCTURES[name], known=known)
+        settled = _settled(candidate_set, point, STRUCTURES[name], known=known)
         if settled is not None:
             break
     else:
-        return field
-    found = _all(field, settled)
+        return candidate_set
+    found = _all(candidate_set, settled)
     assert found.drag is not None
-    return found if found.drag.value_m > 0 and found.bic < field.bic else field
+    return found if found.drag.value_m > 0 and found.bic < candidate_set.bic else candidate_set
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,13 +213,13 @@ class _DragPoint:
         return cls(refit.plant, structure, _law_at(refit), refit.noise, two)
 
 
-def _promising(field: CandidateSet) -> bool:
+def _promising(candidate_set: CandidateSet) -> bool:
     """Whether some structure with drag could be better than the best without."""
-    best = field.best
-    for candidate in field.candidates:
+    best = candidate_set.best
+    for candidate in candidate_set.candidates:
         if candidate is not best and candidate.structure.name not in _SCORED:
             continue
-        refit = field.refit(candidate, 1)
+        refit = candidate_set.refit(candidate, 1)
         size, saved = _first_amplitude(refit)
         before = refit.cost
         cost = max(before - saved, 1e-3 * before)
@@ -231,14 +231,16 @@ def _promising(field: CandidateSet) -> bool:
 
 def small_drag(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
     """Spectrum of a small drag's torque, over C_D d, shape (1, K)."""
-    moved_rad = comparison.angle_rad + comparison.rest_rad
+    moved_rad = comparison.angle_rad + comparison.incoherent_rad
     response = DragResponse(moved_rad, comparison.decimation.rate_hz, plant)
     return comparison.spectrum(response.first_order()[None, comparison.kept])
 
 
 def _first_amplitude(refit: Refit) -> tuple[float, float]:
     """Size of a small drag beside a fit without it, all else free, and the squares it saves."""
-    (column,), residual = refit.beside(small_drag(refit.objective.comparison, refit.plant))
+    (column,), residual = refit.unexplained_columns(
+        small_drag(refit.objective.comparison, refit.plant)
+    )
     square = float(np.vdot(column, column).real)
     if square <= 0:
         return 0.0, 0.0
@@ -246,16 +248,20 @@ def _first_amplitude(refit: Refit) -> tuple[float, float]:
     return -along / square, along**2 / square
 
 
-def _start(field: CandidateSet, lead: Candidate) -> _DragPoint | None:
+def _start(candidate_set: CandidateSet, lead: Candidate) -> _DragPoint | None:
     """Fit with the first order of the drag; None if the air would have to push."""
-    column = small_drag(field.comparison, lead.fit.plant)
-    refit = replace(field, columns=column).refit(lead, _FEW)
+    column = small_drag(candidate_set.comparison, lead.fit.plant)
+    refit = replace(candidate_set, columns=column).refit(lead, _FEW)
     size = float(refit.amplitudes()[0][0])
-    return _DragPoint(refit.plant, lead.structure, DragLaw(size), field.noise) if size > 0 else None
+    return (
+        _DragPoint(refit.plant, lead.structure, DragLaw(size), candidate_set.noise)
+        if size > 0
+        else None
+    )
 
 
 def _settled(
-    field: CandidateSet,
+    candidate_set: CandidateSet,
     point: _DragPoint,
     structure: Structure,
     *,
@@ -281,7 +287,7 @@ def _settled(
     Refit or None
         None if the air would have to push, the drag cannot be followed, or nothing settles.
     """
-    unknowns = field.unknowns(structure)
+    unknowns = candidate_set.unknowns(structure)
     x = unknowns.vector(point.plant)
     law, noise, two = point.law, point.noise, point.two
     comparison, roughly, saved = known, tolerance > _SETTLED, math.inf
@@ -290,7 +296,9 @@ def _settled(
             plant = unknowns.plant(x)
             # Without drag the beam seemed to be another, and so what the rest of the angle did.
             try:
-                comparison = field.comparison.with_rest_of(plant).with_drag(plant, law)
+                comparison = candidate_set.comparison.with_incoherent_part_of(plant).with_drag(
+                    plant, law
+                )
             except DragError:
                 return None
         drag = comparison.drag
@@ -299,7 +307,7 @@ def _settled(
         at_first = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=1)
         here = at_first.further(_FEW)
         if two or roughly or _known_to(here) > _ONE_NUMBER:
-            before, saved = saved, at_first.cost - max(at_first.promised_cost, here.cost)
+            before, saved = saved, at_first.cost - max(at_first.predicted_cost, here.cost)
             if saved < tolerance or before / 2 < saved < _IN_VAIN:
                 return at_first
         else:
@@ -328,18 +336,18 @@ def _law_at(refit: Refit) -> DragLaw:
     return DragLaw(expansion.law.constant_m + step[0], slowing)
 
 
-def _all(field: CandidateSet, settled: Refit) -> CandidateSet:
+def _all(candidate_set: CandidateSet, settled: Refit) -> CandidateSet:
     """Fit all structures with the drag that one has settled on, and estimate its size."""
     other = replace(
-        field,
+        candidate_set,
         comparison=settled.objective.comparison,
         columns=settled.columns,
         noise=settled.noise_here(),
     )
     least = other.descent(settled.objective.unknowns, settled.x, 1).cost
-    most = least * math.exp(_HOPELESS / field.best.values)
+    most = least * math.exp(_HOPELESS / candidate_set.best.values)
     begun = []
-    for each in field.candidates:
+    for each in candidate_set.candidates:
         unknowns = other.unknowns(each.structure)
         refit = Refit.descend(
             other.comparison,
@@ -349,21 +357,21 @@ def _all(field: CandidateSet, settled: Refit) -> CandidateSet:
             other.columns,
             max_evaluations=_FEW,
             relative_tolerance=MISSED,
-            hopeless=(_A_LOOK, most),
+            hopeless=(_EARLY_EVALUATIONS, most),
         )
         begun.append((refit.candidate(), refit))
     candidates = [
-        refit.further(_MANY).candidate() if refit.promised_cost < most else candidate
+        refit.further(_MANY).candidate() if refit.predicted_cost < most else candidate
         for candidate, refit in begun
     ]
     found = other.ranked(candidates).cross_checked()
     return replace(found, drag=_estimate(found))
 
 
-def _estimate(field: CandidateSet) -> DragEstimate:
+def _estimate(candidate_set: CandidateSet) -> DragEstimate:
     """Drag with its deviation, beside all the damping that the best beam may have."""
-    freest = max(field.candidates, key=lambda c: (len(c.structure.free), -c.bic))
-    refit = field.refit(freest)
+    freest = max(candidate_set.candidates, key=lambda c: (len(c.structure.free), -c.bic))
+    refit = candidate_set.refit(freest)
     law, covariance = _law_at(refit), refit.amplitude_covariance()[1]
     covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom
     expansion = refit.objective.comparison.drag
@@ -417,20 +425,20 @@ class DampingAt:
     std: float
 
 
-def damping_with_amplitude(field: CandidateSet) -> tuple[DampingAt, ...]:
+def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAt, ...]:
     """Damping of the first modes that show at several amplitudes; nothing without drag."""
-    drag = field.drag
+    drag = candidate_set.drag
     if drag is None:
         return ()
-    fit = field.best.fit
+    fit = candidate_set.best.fit
     numbers = np.array([drag.law.constant_m, drag.law.slowing])[: len(drag.covariance)]
     covariance = np.array(drag.covariance)
     found = []
     for mode in fit.modes:
         if mode.number not in _MODES or mode.frequency_hz <= 0:
             continue
-        for share in _DEFLECTIONS:
-            amplitude = share * fit.plant.beam.length_m
+        for fraction in _DEFLECTIONS:
+            amplitude = fraction * fit.plant.beam.length_m
             slopes = by_law(
                 mode.number,
                 2 * math.pi * mode.frequency_hz,

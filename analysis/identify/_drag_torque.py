@@ -232,8 +232,8 @@ class DragResponse:
         carried = self._leverage[:, None] * self._follow * spectra[:-1]
         for mode in modes:
             pole = self._pairs[mode - 1][0]
-            share, mirror = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
-            for change in (share + mirror, 1j * (share - mirror)):
+            term, mirror = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
+            for change in (term + mirror, 1j * (term - mirror)):
                 sources.append((mode - 1, self._fine(moved[mode - 1] * change)))
                 direct.append(self.in_time(carried[mode - 1] * change))
         for mode in _LOWEST:
@@ -282,8 +282,8 @@ class DragResponse:
 
     def _brake(self, speed: Real, law: DragLaw) -> None:
         """Turn the speeds without drag into those with it, in place."""
-        told, by_state, by_force = self._stepping()
-        step = np.concatenate([self._grid.shapes.T @ told, by_state])
+        output, by_state, by_force = self._stepping()
+        step = np.concatenate([self._grid.shapes.T @ output, by_state])
         of_force = by_force @ self._grid.to_modes
         state, force, magnitude = np.zeros(len(by_state)), *np.zeros((2, POINTS))
         out = np.zeros(len(step))
@@ -319,8 +319,8 @@ class DragResponse:
         sources : list of (int, ndarray of shape (3 m,))
             Which mode (from 0) moves faster, and by how much.
         """
-        told, by_state, by_force = self._stepping()
-        step = np.concatenate([told, by_state])
+        output, by_state, by_force = self._stepping()
+        step = np.concatenate([output, by_state])
         of_force = np.hstack([by_force, np.zeros((len(by_force), 1))])  # none of the moment
         runs, weights = len(sources) + 2, self._to_root
         coupling = (weights[:, None] * self._grid.shapes).reshape(-1, POINTS).T
@@ -356,7 +356,7 @@ class DragResponse:
         n, step_s = MODES, 1 / (_OVERSAMPLING * self._rate_hz)
         states = 2 * n + _PAST * n
         by_state, by_force = np.zeros((states, states)), np.zeros((states, n))
-        told = np.zeros((n, states))
+        output = np.zeros((n, states))
         z_prime = self._slopes()
         for i, (pair, slope) in enumerate(zip(self._pairs, z_prime, strict=True)):
             rows = slice(2 * i, 2 * i + 2)
@@ -367,13 +367,13 @@ class DragResponse:
                 a, b = decay[0].real, decay[0].imag
                 by_state[rows, rows] = [[a, -b], [b, a]]
                 parts = np.array([inputs[0].real, inputs[0].imag])
-                told[i, rows] = 2 * gain[0].real, -2 * gain[0].imag
+                output[i, rows] = 2 * gain[0].real, -2 * gain[0].imag
             elif np.isnan(pair[0]):
                 continue
             else:
                 by_state[rows, rows] = np.diag(decay.real)
                 parts = inputs.real
-                told[i, rows] = gain.real
+                output[i, rows] = gain.real
             by_force[rows, i] = parts[:, 0]
             by_state[rows, 2 * n + i :: n] = parts[:, 1:]
         # The forces move on by one place.
@@ -384,7 +384,7 @@ class DragResponse:
         for back, factor in enumerate((3.0, -3.0, 1.0)):
             columns = slice((2 + back) * n, (3 + back) * n)
             foreseen[:, columns] += factor * by_force[: 2 * n]
-        return told[:, : 2 * n] @ foreseen, by_state, by_force
+        return output[:, : 2 * n] @ foreseen, by_state, by_force
 
     def _slopes(self) -> Complex:
         """Slope of Z at the poles, shape (MODES, 2)."""
@@ -440,8 +440,8 @@ class DragResponse:
 
         The mode's poles are in all of it, and in nothing else of the torque.
         """
-        share = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode - 1]
-        torque: Complex = share * self._inertial * self._driven[mode - 1] / self.s
+        term = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode - 1]
+        torque: Complex = term * self._inertial * self._driven[mode - 1] / self.s
         return torque
 
     def _fine(self, spectrum: Complex) -> Real:
@@ -474,11 +474,11 @@ def _polynomial_inputs(pole: Complex, step_s: float) -> Complex:
     """
     node, weight = np.polynomial.legendre.leggauss(_QUADRATURE)
     at = 0.5 * (node + 1)
-    places = 1.0 - np.arange(1 + _PAST)
+    nodes = 1.0 - np.arange(1 + _PAST)
     lagrange = np.array(
         [
-            np.prod([(at - other) / (own - other) for other in places if other != own], axis=0)
-            for own in places
+            np.prod([(at - other) / (own - other) for other in nodes if other != own], axis=0)
+            for own in nodes
         ]
     )
     growth = np.exp(pole[:, None] * (step_s * (1 - at)))
@@ -527,7 +527,7 @@ class DragExpansion:
     speed_m_s: float
     top_speed_m_s: float
 
-    def beside(
+    def change_to(
         self, plant: Plant, poles: Sequence[Pole], names: Sequence[str], chain: Real
     ) -> tuple[Complex, Complex]:
         """Spectrum (K,) of what another beam changes, and its derivatives by the unknowns (k, K).

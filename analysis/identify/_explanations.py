@@ -250,13 +250,13 @@ class _CauseSearch:
             cost = float(deviation @ deviation)
             if cost < least:
                 least, best = cost, y
-            step, promised = _step(
+            step, predicted = _step(
                 deviation,
                 rows * scale[:, None],
                 (self._lower - y) / scale,
                 (self._upper - y) / scale,
             )
-            if cost - promised < _CLOSE * max(cost, 1.0):
+            if cost - predicted < _CLOSE * max(cost, 1.0):
                 break
             step = step * scale * min(1.0, _LONGEST / float(np.abs(step).max()))
             for _ in range(_HALVINGS):

@@ -47,7 +47,7 @@ _PATIENCE: Final = 20
 """Evaluations after which a structure far behind the closest one is left where it is: it creeps
 along a valley that damping of the wrong kind makes."""
 
-_A_LOOK: Final = 4
+_EARLY_EVALUATIONS: Final = 4
 """The same for one that was far behind before."""
 
 _REPEATS: Final = 3
@@ -224,7 +224,7 @@ def _still_behind(before: Descent, noise: NoiseSpectrum, most: float) -> Descent
     """Look whether a structure stays above a cost from where it was; None if it does not."""
     if before.cost(noise) <= most:
         return None
-    found = before.to_minimum(noise, _TOLERANCE, (_A_LOOK, most))
+    found = before.to_minimum(noise, _TOLERANCE, (_EARLY_EVALUATIONS, most))
     return found if found.cost(noise) > most else None
 
 
@@ -257,7 +257,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
     at = objective.linearise(x)
     projected = objective.project(at, noise.weight)
     # Where a torque is unknown the residual is nought and adds nothing to the sum.
-    compared = round(2 * np.sum(noise.counts) * comparison.measurement.torque_share)
+    compared = round(2 * np.sum(noise.counts) * comparison.measurement.known_torque_fraction)
     freedom = compared - x.size - projected.amplitudes.size
     scatter = projected.cost / freedom
     lower, upper = unknowns.bounds
@@ -270,11 +270,11 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
     std, intervals = dict(of.std), dict(of.interval)
     tool = "tool_inertia_kg_m2"
     if tool in names and held[names.index(tool)]:
-        place = names.index(tool)
-        free = held & (np.arange(held.size) != place)
+        index = names.index(tool)
+        free = held & (np.arange(held.size) != index)
         every, _ = covariance_of_unknowns(jacobian, scatter, free)
         chain = unknowns.estimates_by_unknowns(x)
-        std[tool] = float(chain[place, place] * every[place, place] ** 0.5)
+        std[tool] = float(chain[index, index] * every[index, index] ** 0.5)
     spread = std.get(tool)
     if tool in names and spread:
         intervals[tool] = interval_from_zero(values[tool], spread)

@@ -73,8 +73,8 @@ def mode_poles(
     if plant.tip_mass_kg or plant.root_compliance_rad_per_nm:
         return _loaded_poles(plant, count, wrt, near)
     z = eigenvalues(count).copy()
-    for place, offset in enumerate(plant.stiffness_offsets[: count - 1], start=1):
-        z[place] *= (1 + offset) ** 0.25
+    for index, offset in enumerate(plant.stiffness_offsets[: count - 1], start=1):
+        z[index] *= (1 + offset) ** 0.25
     found = []
     for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, near)):
         if np.isnan(pair[0]):
@@ -133,16 +133,16 @@ class DecaySpectra:
     ) -> NDArray[np.complex128]:
         """Differentiate ``amplitudes @ columns(poles)`` through the poles, shape (k, K)."""
         turned = []
-        place = 0
+        index = 0
         for pole in poles:
             if pole.oscillates:
                 # t exp(p t) times the pole's motion, seen along the two amplitudes.
-                moved = complex(amplitudes[place], -amplitudes[place + 1]) * pole.derivative
+                moved = complex(amplitudes[index], -amplitudes[index + 1]) * pole.derivative
                 turned += [moved.real, -moved.imag]
-                place += 2
+                index += 2
             else:
-                turned.append(amplitudes[place] * pole.derivative.real)
-                place += 1
+                turned.append(amplitudes[index] * pole.derivative.real)
+                index += 1
         parts: NDArray[np.float64] = np.array(turned).T @ self.growing(poles).view(np.float64)
         total: NDArray[np.complex128] = parts.view(np.complex128)
         return total
@@ -168,17 +168,17 @@ class DecaySpectra:
     ) -> NDArray[np.complex128]:
         """Spectra of the real and, if it oscillates, the imaginary part of a complex decay."""
         rows = np.empty((decay_columns(poles), self._turn.size), complex)
-        place = 0
+        index = 0
         for pole in poles:
             of_pole = upper(pole.at_rad_s)
             if pole.oscillates:
                 of_conjugate = upper(pole.at_rad_s.conjugate())
-                np.multiply(of_pole + of_conjugate, 0.5, out=rows[place])
-                np.multiply(of_pole - of_conjugate, -0.5j, out=rows[place + 1])
-                place += 2
+                np.multiply(of_pole + of_conjugate, 0.5, out=rows[index])
+                np.multiply(of_pole - of_conjugate, -0.5j, out=rows[index + 1])
+                index += 2
             else:
-                rows[place] = of_pole
-                place += 1
+                rows[index] = of_pole
+                index += 1
         return rows
 
     def _sum(self, pole: complex) -> NDArray[np.complex128]:

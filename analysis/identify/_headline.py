@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from analysis.identify._plant import OF_BEAM
-from analysis.identify._verdict import ANOTHER_DAMPING, BESIDE_DRAG, EXCLUDED, STRONG
+from analysis.identify._verdict import ANOTHER_DAMPING, EXCLUDED, STRONG, WITH_DRAG
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
@@ -36,7 +36,7 @@ _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 _NOT_DETERMINED: Final = "not identifiable from this record"
 _AT_EDGE: Final = "at the edge of the range searched"
 
-_MODES_TO_TELL_DAMPINGS: Final = 2
+_MODES_TO_SEPARATE_DAMPINGS: Final = 2
 _NOT_APART: Final = "not separable from a damping of unknown order"
 """Damping of a low order is a stiffness, of an order near 2 an inertia."""
 
@@ -286,7 +286,7 @@ class Headline(Numbers):
 
 
 def headline(
-    field: CandidateSet,
+    candidate_set: CandidateSet,
     orders: tuple[OrderVerdict, OrderVerdict],
     visible: tuple[int, ...],
     *,
@@ -296,7 +296,7 @@ def headline(
 
     Parameters
     ----------
-    field : CandidateSet
+    candidate_set : CandidateSet
     orders : tuple of OrderVerdict
         Alpha's and lambda's, judged in the freest structure.
     visible : tuple of int
@@ -304,7 +304,7 @@ def headline(
     unexplained : str or None
         Why nothing is to be believed; None if that structure leaves nothing but noise.
     """
-    freest = field.freest
+    freest = candidate_set.freest
     fractional = frozenset(each.order for each in orders if each.status == "fractional")
     reasons: dict[str, str] = {
         each.order: each.reason for each in orders if each.reason is not None
@@ -314,24 +314,24 @@ def headline(
         for each in orders
         if each.profile.walked and each.order in freest.structure.free
     }
-    told = of_fit(
+    result = of_fit(
         freest.name, freest.fit, visible, reasons, intervals, unexplained,
-        field.with_both_dampings(freest),
+        candidate_set.with_both_dampings(freest),
     )  # fmt: skip
-    if field.drag is not None:
-        drag = field.drag
+    if candidate_set.drag is not None:
+        drag = candidate_set.drag
         at = Quantity(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
         sizes = (
-            each.flagged(BESIDE_DRAG) if each.damping == "external" else each for each in told.sizes
+            each.flagged(WITH_DRAG) if each.damping == "external" else each for each in result.sizes
         )
-        told = replace(
-            told,
-            parameters={**told.parameters, "drag": at},
+        result = replace(
+            result,
+            parameters={**result.parameters, "drag": at},
             sizes=tuple(sizes),
             drag_speed_m_s=drag.speed_m_s,
         )
-    simpler = _simpler(field, fractional) if unexplained is None else None
-    return replace(told, structures=structures(field, fractional), simpler=simpler)
+    simpler = _simpler(candidate_set, fractional) if unexplained is None else None
+    return replace(result, structures=structures(candidate_set, fractional), simpler=simpler)
 
 
 def of_fit(
@@ -362,7 +362,7 @@ def of_fit(
         The same with both dampings (`CandidateSet.with_both_dampings`), which tells the modes.
     """
     with_both, bounded = both or (fit, False)
-    few = ONE_MODE if len(visible) < _MODES_TO_TELL_DAMPINGS else None
+    few = ONE_MODE if len(visible) < _MODES_TO_SEPARATE_DAMPINGS else None
     if ANOTHER_DAMPING in reasons.values():
         few = ANOTHER_DAMPING
     flags: dict[str, str] = {
@@ -403,7 +403,7 @@ def of_fit(
 
 
 def structures(
-    field: CandidateSet, fractional: frozenset[str]
+    candidate_set: CandidateSet, fractional: frozenset[str]
 ) -> tuple[tuple[str, StructureStatus], ...]:
     """Say which structures a record excludes, and which would do.
 
@@ -414,24 +414,26 @@ def structures(
 
     Parameters
     ----------
-    field : CandidateSet
+    candidate_set : CandidateSet
         With the candidates ranked.
     fractional : frozenset of str
         Orders of which 1 is excluded.
     """
-    return tuple((each.name, _status(field, each, fractional)) for each in field.candidates)
+    return tuple(
+        (each.name, _status(candidate_set, each, fractional)) for each in candidate_set.candidates
+    )
 
 
 def _status(
-    field: CandidateSet, candidate: Candidate, fractional: frozenset[str]
+    candidate_set: CandidateSet, candidate: Candidate, fractional: frozenset[str]
 ) -> StructureStatus:
-    freest = field.freest
+    freest = candidate_set.freest
     if candidate is freest:
         return "selected"
     simpler = set(candidate.structure.free) < set(freest.structure.free)
     if not simpler:
         behind = candidate.deviance - freest.deviance > EXCLUDED[0]
-        worse = candidate.bic > field.best.bic + STRONG
+        worse = candidate.bic > candidate_set.best.bic + STRONG
         return "excluded" if behind and worse else "compatible"
     if any(
         candidate.structure.fixed.get(order) == 1.0  # type: ignore[call-overload]
@@ -443,13 +445,14 @@ def _status(
     return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
 
 
-def _simpler(field: CandidateSet, fractional: frozenset[str]) -> Simpler | None:
+def _simpler(candidate_set: CandidateSet, fractional: frozenset[str]) -> Simpler | None:
     """Find the simplest structure that would do."""
-    freest = field.freest
+    freest = candidate_set.freest
     would_do = [
         each
-        for each in field.candidates
-        if each.parameters < freest.parameters and _status(field, each, fractional) == "compatible"
+        for each in candidate_set.candidates
+        if each.parameters < freest.parameters
+        and _status(candidate_set, each, fractional) == "compatible"
     ]
     if not would_do:
         return None

@@ -31,7 +31,7 @@ _RESONANCE: Final = 3.0
 _RESONANCE_BINS: Final = 20
 """The same for the sharpest of them, in bins."""
 
-_BESIDE: Final = 3.0
+_CLEARANCE: Final = 3.0
 """Range of the search for hum, in these units: farther off its skirts do not affect the mode."""
 
 _BLOCK_S: Final = 4.0
@@ -92,7 +92,7 @@ def resonance_reach_hz(pole: Pole, spacing_hz: float) -> float:
     return max(_RESONANCE * abs(pole.at_rad_s.real) / (2 * np.pi), _RESONANCE_BINS * spacing_hz)
 
 
-def hum_beside_modes(
+def hum_near_modes(
     comparison: Comparison,
     plant: Plant,
     poles: tuple[Pole, ...],
@@ -126,7 +126,7 @@ def hum_beside_modes(
         if not pole.oscillates:
             continue
         at_hz = pole.at_rad_s.imag / (2 * np.pi)
-        reach_hz = _BESIDE * resonance_reach_hz(pole, float(hz[1] - hz[0]))
+        reach_hz = _CLEARANCE * resonance_reach_hz(pole, float(hz[1] - hz[0]))
         near = (max(at_hz - reach_hz, hz[0]), min(at_hz + reach_hz, hz[-1]))
         if near[1] - near[0] < reach_hz / 2:
             continue  # a wrong model may have its modes anywhere
@@ -175,8 +175,8 @@ class _Blocks:
         power = chance + (_WRONG * self._largest(predicted, *near_hz)) ** 2
         power += self._largest(decaying, *near_hz) ** 2
         weight = np.zeros(residual.size)
-        for part, share in zip(self.parts, chance / power, strict=True):
-            weight[part] += share * self.window
+        for part, ratio in zip(self.parts, chance / power, strict=True):
+            weight[part] += ratio * self.window
         if weight.mean() < _SILENT:
             return None
         hum, growth_per_s = self._strongest(residual, weight, near_hz)

@@ -88,21 +88,21 @@ class DetectedImpact:
     """
 
     knock: RecordedImpact
-    share: float
+    explained_fraction: float
     before: float
 
     @property
     def evident(self) -> bool:
         """Whether it is the most of what is unexplained, and began at once."""
-        return self.share > _MOST and self.before < _LOUDER
+        return self.explained_fraction > _MOST and self.before < _LOUDER
 
     @property
     def obvious(self) -> bool:
         """Whether nothing else has to be looked for first."""
-        return self.share > _ALL and self.before < _LOUDER
+        return self.explained_fraction > _ALL and self.before < _LOUDER
 
 
-def knocks_in(field: CandidateSet, *, obvious: bool = False) -> Iterator[DetectedImpact]:
+def knocks_in(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator[DetectedImpact]:
     """Search for one more knock; each found may be the one, the likeliest first.
 
     A knock may be louder than all that the motor does, and a fit to the whole record then nonsense.
@@ -115,15 +115,15 @@ def knocks_in(field: CandidateSet, *, obvious: bool = False) -> Iterator[Detecte
     obvious : bool
         Whether to search for an obvious one only.
     """
-    if field.misread or len(field.comparison.measurement.knocks) == MOST_KNOCKS:
+    if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MOST_KNOCKS:
         return
-    first = knock_in(field)
+    first = knock_in(candidate_set)
     if first is not None and first.obvious:
         yield first
         first = None
     if obvious:
         return
-    for start in _from_halves(field):
+    for start in _from_halves(candidate_set):
         found = _knock_in(start)
         if found is not None:
             yield found
@@ -131,39 +131,39 @@ def knocks_in(field: CandidateSet, *, obvious: bool = False) -> Iterator[Detecte
         yield first
 
 
-def knock_in(field: CandidateSet) -> DetectedImpact | None:
+def knock_in(candidate_set: CandidateSet) -> DetectedImpact | None:
     """Search for a knock in what the likeliest candidate leaves."""
-    likeliest = min(field.candidates, key=lambda each: each.fit.cost)
-    return _knock_in(field.refit(likeliest, 1))
+    likeliest = min(candidate_set.candidates, key=lambda each: each.fit.cost)
+    return _knock_in(candidate_set.refit(likeliest, 1))
 
 
 def _knock_in(refit: Refit) -> DetectedImpact | None:
     """Search in what is left at one point."""
-    place = _scan(refit)
-    if place is None:
+    sample = _scan(refit)
+    if sample is None:
         return None
     comparison = refit.objective.comparison
     for width_s in _WINDOWS_S:
         half = math.ceil(width_s * comparison.decimation.rate_hz)
-        first, last = max(place - half, 0), min(place + half, comparison.samples)
+        first, last = max(sample - half, 0), min(sample + half, comparison.samples)
         cleaned = _cleaned(refit, first, last)
         extent = _extent(cleaned, first, last)
         if extent is None:
             return None
         found = _judged(cleaned, *extent)
-        if found.share < _WORTH:
+        if found.explained_fraction < _WORTH:
             return None
         if extent[0] > first:
             return found
-        if found.share < _MOST:
+        if found.explained_fraction < _MOST:
             return None
         # A touch that began before this window.
     return None
 
 
-def _from_halves(field: CandidateSet) -> Iterator[Refit]:
+def _from_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
     """Fit the freest structure to either half alone; give the whole record there if that fits."""
-    comparison = field.comparison
+    comparison = candidate_set.comparison
     measurement, hz = comparison.measurement, comparison.frequency_hz
     band_hz = (0.0 if comparison.bins.start == 1 else float(hz[0]), float(hz[-1]))
     middle = measurement.angle_rad.size // 2
@@ -186,12 +186,12 @@ def _from_halves(field: CandidateSet) -> Iterator[Refit]:
         fit, counts = analysis.fits[0], analysis.noise.counts
         if not whiteness(fit.residual[counts], analysis.comparison.frequency_hz[counts]).white:
             continue
-        plain = comparison.without_hum(()).with_rest_of(fit.plant)
-        unknowns = Unknowns.of(_FREEST, measurement.nominal, field.free)
+        plain = comparison.without_hum(()).with_incoherent_part_of(fit.plant)
+        unknowns = Unknowns.of(_FREEST, measurement.nominal, candidate_set.free)
         there = partial(
             Refit.descend, plain, unknowns, unknowns.vector(fit.plant), max_evaluations=1
         )
-        loud = there(noise=field.noise)
+        loud = there(noise=candidate_set.noise)
         every = replace(loud.noise_here(), counts=np.ones(hz.size, dtype=bool), lines=())
         yield there(noise=every)
 
@@ -254,18 +254,18 @@ def _scan(refit: Refit) -> int | None:
     gram = (decays.conj() @ decays.T).real / np.outer(scale, scale)
     along /= scale[:, None]
     saved = np.sum(along * np.linalg.solve(gram + 1e-9 * np.eye(scale.size), along), axis=0)
-    place = int(np.argmax(saved))
-    deviate = chi_square_deviate(float(saved[place]), scale.size)
+    sample = int(np.argmax(saved))
+    deviate = chi_square_deviate(float(saved[sample]), scale.size)
     if deviate < math.sqrt(2 * largest_of(comparison.samples)):
         return None
     # What a wrong model leaves at a resonance rises and falls with the sweep; a knock does not.
     power = comparison.in_time(residual) ** 2
     rate_hz = comparison.decimation.rate_hz
     apart, until = (math.ceil(each * rate_hz) for each in (_APART_S, _APART_S + _AT_ONCE_S))
-    earlier = power[max(place - until, 0) : max(place - apart, 0)]
-    later = power[place : place + until]
+    earlier = power[max(sample - until, 0) : max(sample - apart, 0)]
+    later = power[sample : sample + until]
     at_once = earlier.size == 0 or earlier.mean() < _RISES * later.mean()
-    return place if at_once else None
+    return sample if at_once else None
 
 
 def _cleaned(refit: Refit, first: int, last: int) -> Refit:
@@ -314,7 +314,7 @@ def _sums(refit: Refit, columns: NDArray[np.float64]) -> NDArray[np.float64]:
     columns : ndarray, shape (c, samples)
         Torque at the samples compared.
     """
-    free, residual = refit.beside(refit.objective.comparison.spectrum(columns))
+    free, residual = refit.unexplained_columns(refit.objective.comparison.spectrum(columns))
     free /= np.maximum(np.linalg.norm(free, axis=1), np.finfo(float).tiny)[:, None]
     # One after the other (Gram and Schmidt's method): each of what the former have left.
     basis, upper = np.linalg.qr(np.ascontiguousarray(free).view(np.float64).T)
@@ -364,8 +364,8 @@ def _judged(refit: Refit, first: int, last: int) -> DetectedImpact:
     in_time = _in_time(comparison, knock)
     cost, expected = refit.cost, refit.expected_cost
     shared = bool(cost < _OVERWHELMING * expected)
-    beside, residual = refit.beside(comparison.spectrum(in_time), beam_free=shared)
-    free = beside.view(np.float64)
+    whitened, residual = refit.unexplained_columns(comparison.spectrum(in_time), beam_free=shared)
+    free = whitened.view(np.float64)
     scale = np.linalg.norm(free, axis=1)
     scale[scale == 0] = 1.0
     free /= scale[:, None]
@@ -383,6 +383,6 @@ def _judged(refit: Refit, first: int, last: int) -> DetectedImpact:
             sizes=tuple(sizes.tolist()),
             largest_nm=float(np.abs(torque_nm[after]).max()),
         ),
-        share=float((cost - explained) / max(cost - expected, 1.0)),
+        explained_fraction=float((cost - explained) / max(cost - expected, 1.0)),
         before=float(np.mean(quiet**2) / np.mean(before**2)) if quiet.size else 0.0,
     )

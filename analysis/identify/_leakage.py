@@ -43,9 +43,9 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
     residual = np.fft.rfft(comparison.torque_nm[comparison.kept] - torque)
     all_hz = np.fft.rfftfreq(samples, 1 / rate_hz).astype(np.float64)
     near = np.abs(all_hz - end_hz) < min(_NEAR_HZ, rate_hz / 2 - end_hz)
-    share = comparison.measurement.torque_share
+    known_fraction = comparison.measurement.known_torque_fraction
     anywhere = np.zeros(np.count_nonzero(near), dtype=bool)
-    found = noise_of(residual[near], all_hz[near], samples, share, near_mode=anywhere)
+    found = noise_of(residual[near], all_hz[near], samples, known_fraction, near_mode=anywhere)
     counts, lines = noise.counts.copy(), list(noise.lines)
     for line in found.lines:
         # A line leaks as peak / (pi distance in bins).
@@ -60,7 +60,7 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
     # What leaked has raised the estimated noise of whole blocks of bins.
     clean = (fit.residual * np.sqrt(noise.power / 2))[counts]
     bins = np.arange(counts.size)
-    power = np.exp(np.interp(bins, bins[counts], np.log(smooth_power(clean) / share)))
+    power = np.exp(np.interp(bins, bins[counts], np.log(smooth_power(clean) / known_fraction)))
     return NoiseSpectrum(power, counts, tuple(lines))
 
 

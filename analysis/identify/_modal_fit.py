@@ -225,7 +225,7 @@ class _ModalSearch:
             comparison = search.comparison.renewed(model, search.noise).filled(model)
             power = smooth_power(residual, finely=True)
             power = with_peaks(residual, power, ~search.near_modes())
-            power /= comparison.measurement.torque_share
+            power /= comparison.measurement.known_torque_fraction
             counts = search.noise.counts
             change = np.abs(np.log(power / search.noise.power)[counts]).mean()
             search = replace(
@@ -280,13 +280,13 @@ class _ModalSearch:
             return self
         undamped = self.descended().x[1::2] < 2 * _NARROWEST
         search = self
-        for place in np.flatnonzero((saved < _EVIDENCE) & undamped)[::-1].tolist():
-            search = search._without(place)
+        for index in np.flatnonzero((saved < _EVIDENCE) & undamped)[::-1].tolist():
+            search = search._without(index)
         return search
 
-    def _without(self, place: int) -> _ModalSearch:
-        numbers = self.numbers[:place] + self.numbers[place + 1 :]
-        return replace(self, numbers=numbers, x=np.delete(self.x, [2 * place, 2 * place + 1]))
+    def _without(self, index: int) -> _ModalSearch:
+        numbers = self.numbers[:index] + self.numbers[index + 1 :]
+        return replace(self, numbers=numbers, x=np.delete(self.x, [2 * index, 2 * index + 1]))
 
     def evidence(self) -> NDArray[np.float64]:
         """Sum of squares that each mode saves with the others where they are, shape (n,)."""
@@ -338,14 +338,14 @@ class _ModalSearch:
 
 
 def _gram(
-    rows: NDArray[np.float64], ridge: float
+    rows: NDArray[np.float64], regularization: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Rows of length 1, their Gram matrix with a ridge, and the lengths that they had."""
     scale = np.sqrt(np.einsum("ij,ij->i", rows, rows))
     scale[scale == 0] = 1.0  # a decay that is over at once
     scaled = rows / scale[:, None]
     gram = scaled @ scaled.T
-    gram[np.diag_indices_from(gram)] += ridge
+    gram[np.diag_indices_from(gram)] += regularization
     return scaled, gram, scale
 
 
@@ -519,10 +519,10 @@ class _ModalProblem:
         count = len(self._numbers)
         first = 2 * count + BACKGROUND
         decays = point.linear[first : first + 2 * count]
-        places = slice(2 * count + first, 2 * count + first + 2 * count)
+        rows = slice(2 * count + first, 2 * count + first + 2 * count)
         return Ringing(
             amplitude_nm=tuple(np.hypot(decays[::2], decays[1::2]).tolist()),
-            chi_square=float(decays @ np.linalg.solve(covariance[places, places], decays)),
+            chi_square=float(decays @ np.linalg.solve(covariance[rows, rows], decays)),
             degrees_of_freedom=decays.size,
         )
 

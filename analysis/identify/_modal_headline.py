@@ -77,11 +77,11 @@ def with_modal_model(
     # What drag does depends on how a mode decays, which the beam takes into account.
     of_beam = test.status == "passed" and (tolerant is None or "drag" in exact.parameters)
     modes = _modes(condition, modal, mode_doubt, half_width, own=of_beam)
-    told = replace(condition, modes=modes, uniform_beam=test, modal=modal)
+    numbers = replace(condition, modes=modes, uniform_beam=test, modal=modal)
     if tolerant is None:
-        return told
+        return numbers
     return replace(
-        told,
+        numbers,
         parameters={
             **{
                 name: quantity
@@ -107,11 +107,11 @@ def with_modal_model(
 
 
 def _modes(
-    told: Numbers, modal: ModalEstimate, doubt: str | None, half_width: float, *, own: bool
+    numbers: Numbers, modal: ModalEstimate, doubt: str | None, half_width: float, *, own: bool
 ) -> tuple[Mode, ...]:
     """Modes that show by the modal model, the others as the beam has them."""
     visible = modal.visible
-    found: dict[int, Mode] = {mode.number: mode for mode in told.modes}
+    found: dict[int, Mode] = {mode.number: mode for mode in numbers.modes}
     for number in visible:
         its = modal.mode(number)
         inertia, spread = modal.inertia(number)

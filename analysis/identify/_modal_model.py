@@ -175,8 +175,8 @@ class ModalEstimate:
         numbers : sequence of int
         """
         each = np.arange(len(CONSTANTS))
-        places = [each + each.size * self.numbers.index(number) for number in numbers]
-        return np.concatenate(places) if places else np.zeros(0, dtype=np.intp)
+        indices = [each + each.size * self.numbers.index(number) for number in numbers]
+        return np.concatenate(indices) if indices else np.zeros(0, dtype=np.intp)
 
     def mode(self, number: int) -> ModeEstimate:
         """Return a mode with its standard deviations.
@@ -209,12 +209,12 @@ class ModalEstimate:
 
     def of_visible(self) -> ModalEstimate:
         """Return the estimate of the visible modes alone, with the same background."""
-        rows, places = self.rows(self.visible), [self.numbers.index(n) for n in self.visible]
+        rows, indices = self.rows(self.visible), [self.numbers.index(n) for n in self.visible]
         joint = np.concatenate([rows, self.constants.size + np.arange(BACKGROUND)])
         return ModalEstimate(
             ModalModel(
-                tuple(self.model.poles_rad_s[place] for place in places),
-                tuple(self.model.residues[place] for place in places),
+                tuple(self.model.poles_rad_s[index] for index in indices),
+                tuple(self.model.residues[index] for index in indices),
                 self.model.background,
             ),
             self.visible,

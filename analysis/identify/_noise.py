@@ -75,7 +75,7 @@ def noise_of(
     residual: NDArray[np.complex128],
     frequency_hz: NDArray[np.float64],
     samples: int,
-    share: float = 1.0,
+    known_fraction: float = 1.0,
     near_mode: NDArray[np.bool_] | None = None,
 ) -> NoiseSpectrum:
     """Separate noise and hum in a residual.
@@ -93,7 +93,7 @@ def noise_of(
         without it no line is looked for. A resonance that is left out is not fitted, and what is
         not fitted there always stands out.
     """
-    power = smooth_power(residual) / share
+    power = smooth_power(residual) / known_fraction
     counts = np.ones(power.size, dtype=bool)
     lines: list[Line] = []
     if near_mode is None:
@@ -106,7 +106,7 @@ def noise_of(
         lines.append(
             Line(
                 frequency_hz=float(own @ frequency_hz[part] / own.sum()),
-                amplitude_nm=float(2 * np.sqrt(own.sum()) / (samples * share)),
+                amplitude_nm=float(2 * np.sqrt(own.sum()) / (samples * known_fraction)),
             )
         )
     return NoiseSpectrum(power, counts, tuple(lines))
@@ -162,11 +162,11 @@ def with_peaks(
 
 def _edges(bins: int) -> NDArray[np.intp]:
     """Borders of the blocks: widths grow with frequency, from `_FEWEST_BINS` up."""
-    places = bins * np.linspace(0, 1, _BLOCKS + 1) ** 2
+    positions = bins * np.linspace(0, 1, _BLOCKS + 1) ** 2
     edges = [0]
-    for place in places[1:-1]:
-        if place - edges[-1] >= _FEWEST_BINS and bins - place >= _FEWEST_BINS:
-            edges.append(round(float(place)))
+    for position in positions[1:-1]:
+        if position - edges[-1] >= _FEWEST_BINS and bins - position >= _FEWEST_BINS:
+            edges.append(round(float(position)))
     return np.array([*edges, bins])
 
 

@@ -118,8 +118,8 @@ class ModalForces:
                     if change < _CONVERGED * most:
                         break
         beam = self._plant.beam
-        share = float(participation(beam, term.mode)[-1]) * beam.bending_stiffness_n_m2
-        torque = -share * k * self._p / resists * force * torque_channel(self._plant, self._s)
+        scale = float(participation(beam, term.mode)[-1]) * beam.bending_stiffness_n_m2
+        torque = -scale * k * self._p / resists * force * torque_channel(self._plant, self._s)
         in_time = np.fft.irfft(torque, self._length)[: self._samples]
         in_time *= self._growth[::_OVERSAMPLING]
         spectrum: NDArray[np.complex128] = self._comparison.spectrum(in_time[self._comparison.kept])
@@ -194,7 +194,7 @@ class NonlinearForce:
 
 
 def nonlinear_forces(
-    field: CandidateSet, modes: tuple[int, ...]
+    candidate_set: CandidateSet, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
     """Add forces one by one while each saves far more than chance would; refit all with them.
 
@@ -215,46 +215,46 @@ def nonlinear_forces(
         The one given, if there is nothing.
     forces : tuple of NonlinearForce
     """
-    best = field.best
-    here = field.refit(best)
-    if _gain(best, here.cost, _most_wanted(field, here, modes, [])[1]) < _HINT:
-        return field, ()
-    for lead in _leads(field):
-        found, forces = _added(field, lead, modes)
-        if forces and found.bic < field.bic - STRONG and _explain(field, found):
+    best = candidate_set.best
+    here = candidate_set.refit(best)
+    if _gain(best, here.cost, _most_wanted(candidate_set, here, modes, [])[1]) < _HINT:
+        return candidate_set, ()
+    for lead in _leads(candidate_set):
+        found, forces = _added(candidate_set, lead, modes)
+        if forces and found.bic < candidate_set.bic - STRONG and _explain(candidate_set, found):
             return found, forces
-    return field, ()
+    return candidate_set, ()
 
 
-def _leads(field: CandidateSet) -> tuple[Candidate, ...]:
+def _leads(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
     """Candidates to start from: the best, and before it those that are simpler."""
-    best = field.best
+    best = candidate_set.best
     if "alpha" not in best.structure.free:
         return (best,)
-    return (*(c for c in field.candidates if c.structure in INTEGER_INTERNAL), best)
+    return (*(c for c in candidate_set.candidates if c.structure in INTEGER_INTERNAL), best)
 
 
 def _added(
-    field: CandidateSet, lead: Candidate, modes: tuple[int, ...]
+    candidate_set: CandidateSet, lead: Candidate, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
     """Add forces to one candidate, then to all."""
     terms: list[Term] = []
     sizes = std = np.zeros(0)
-    best = field.best
-    here = field.refit(lead)
+    best = candidate_set.best
+    here = candidate_set.refit(lead)
     while len(terms) < _MOST_TERMS:
-        term, cost = _most_wanted(field, here, modes, terms)
+        term, cost = _most_wanted(candidate_set, here, modes, terms)
         behind = _gain(best, cost, best.fit.cost)
         if term is None or _gain(best, here.cost, cost) < _GAIN or behind > _HOPELESS:
             break
-        tried = _with_terms(field, here, [*terms, term], np.append(sizes, 0.0))
+        tried = _with_terms(candidate_set, here, [*terms, term], np.append(sizes, 0.0))
         if tried is None or _gain(best, here.cost, tried[0].cost) < _GAIN:
             break
         terms.append(term)
         here, sizes, std = tried
     if not terms:
-        return field, ()
-    every = field.with_columns(here.columns, here.noise_here())
+        return candidate_set, ()
+    every = candidate_set.with_columns(here.columns, here.noise_here())
     forces = zip(terms, sizes.tolist(), std.tolist(), strict=True)
     return every, tuple(NonlinearForce(term, size, s) for term, size, s in forces)
 
@@ -265,12 +265,14 @@ def _gain(candidate: Candidate, before: float, after: float) -> float:
 
 
 def _most_wanted(
-    field: CandidateSet, refit: Refit, modes: tuple[int, ...], taken: list[Term]
+    candidate_set: CandidateSet, refit: Refit, modes: tuple[int, ...], taken: list[Term]
 ) -> tuple[Term | None, float]:
     """Find the term that to first order saves most, and the cost with it."""
-    forces = ModalForces(field.comparison, refit.plant)
+    forces = ModalForces(candidate_set.comparison, refit.plant)
     # Air that brakes the whole beam has been found already, and no mode is braked by itself.
-    kinds = KINDS if field.drag is None else tuple(k for k in KINDS if k != "quadratic drag")
+    kinds = (
+        KINDS if candidate_set.drag is None else tuple(k for k in KINDS if k != "quadratic drag")
+    )
     terms = [Term(kind, mode) for kind in kinds for mode in modes]
     terms = [term for term in terms if term not in taken]
     if not terms:
@@ -281,7 +283,7 @@ def _most_wanted(
 
 
 def _with_terms(
-    field: CandidateSet, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
+    candidate_set: CandidateSet, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
 ) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]] | None:
     """Fit with the columns of these terms, at the sizes that they turn out to have.
 
@@ -289,16 +291,20 @@ def _with_terms(
     """
     std = np.zeros(sizes.size)
     for _ in range(_ROUNDS):
-        forces = ModalForces(field.comparison, refit.plant)
+        forces = ModalForces(candidate_set.comparison, refit.plant)
         of_terms = [forces.column(term, e) for term, e in zip(terms, sizes.tolist(), strict=True)]
         if not np.isfinite(of_terms).all():
             return None
-        columns = np.concatenate([field.columns, of_terms])
+        columns = np.concatenate([candidate_set.columns, of_terms])
         refit = Refit.descend(
-            field.comparison, refit.objective.unknowns, refit.x, field.noise, columns
+            candidate_set.comparison,
+            refit.objective.unknowns,
+            refit.x,
+            candidate_set.noise,
+            columns,
         )
         before = sizes
-        sizes, std = (values[len(field.columns) :] for values in refit.amplitudes())
+        sizes, std = (values[len(candidate_set.columns) :] for values in refit.amplitudes())
         if np.all(np.abs(sizes - before) < np.maximum(0.3 * std, _SETTLED * np.abs(sizes))):
             break
     return refit, sizes, std

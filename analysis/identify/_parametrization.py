@@ -185,9 +185,9 @@ class Unknowns:
         logarithms.
         """
         values, derivative = self._values(x)
-        for place, name in enumerate(self.names):
+        for index, name in enumerate(self.names):
             if name in ("zeta", "gamma"):
-                derivative[place] *= values[name]
+                derivative[index] *= values[name]
         return self._plant_of(values), derivative
 
     def _plant_of(self, values: Mapping[str, float]) -> Plant:
@@ -215,7 +215,7 @@ class Unknowns:
         return MappingProxyType(units)
 
     @cached_property
-    def _places(self) -> Mapping[str, int]:
+    def _indices(self) -> Mapping[str, int]:
         """Place of each free parameter in the vector."""
         return MappingProxyType({name: i for i, name in enumerate(self.names)})
 
@@ -240,7 +240,7 @@ class Unknowns:
 
     def _values(self, x: NDArray[np.float64]) -> tuple[dict[str, float], NDArray[np.float64]]:
         """All parameters at `x`, and `estimates_by_unknowns`."""
-        place = self._places
+        index = self._indices
         given: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))
         values: dict[str, float] = dict(self._given)
         derivative = np.eye(x.size)
@@ -252,28 +252,28 @@ class Unknowns:
             ln_z, slope = _size(given["zeta"], order)
             values["zeta"] = math.exp(ln_z - order * math.log(second))
             stiffening = self._addition(ln_z, order, 1.0, "zeta", "alpha", slope)
-            if "alpha" in place:
-                derivative[place["zeta"], place["alpha"]] = slope - math.log(second)
+            if "alpha" in index:
+                derivative[index["zeta"], index["alpha"]] = slope - math.log(second)
         if self.structure.external:
             values["lambda"] = order = given.get("lambda", values["lambda"])
             ln_g, slope = _size(given["gamma"], order)
             inertial = self._addition(ln_g, order, -1.0, "gamma", "lambda", slope)
-            if "lambda" in place:
-                derivative[place["gamma"], place["lambda"]] = slope - math.log(first)
+            if "lambda" in index:
+                derivative[index["gamma"], index["lambda"]] = slope - math.log(first)
         for name, sign in (("density_over_stiffness", 1.0), ("bending_stiffness_n_m2", -1.0)):
-            if name in place:
+            if name in index:
                 added = sign * stiffening - (inertial if sign > 0 else 0.0)
                 values[name] *= math.exp(given[name] + added[-1])
-                derivative[place[name]] += added[:-1]
+                derivative[index[name]] += added[:-1]
         if self.structure.external:
             ratio = values["density_over_stiffness"]
             values["gamma"] = ratio * math.exp(ln_g + (2 - values["lambda"]) * math.log(first))
-            if "density_over_stiffness" in place:
-                derivative[place["gamma"]] += derivative[place["density_over_stiffness"]]
+            if "density_over_stiffness" in index:
+                derivative[index["gamma"]] += derivative[index["density_over_stiffness"]]
         units = self.units
-        for name in units.keys() & place.keys():
+        for name in units.keys() & index.keys():
             values[name] = given[name] * units[name]
-            derivative[place[name], place[name]] = units[name]
+            derivative[index[name], index[name]] = units[name]
         return values, derivative
 
     def _addition(
@@ -287,10 +287,10 @@ class Unknowns:
         square = 1 + 2 * size * math.cos(angle) + size * size
         by_ln_size = size * (math.cos(angle) + size) / square
         addition = np.zeros(len(self.names) + 1)
-        addition[self._places[coefficient]] = by_ln_size
-        if of in self._places:
+        addition[self._indices[coefficient]] = by_ln_size
+        if of in self._indices:
             turning = -_QUARTER_TURN * size * math.sin(angle) / square
-            addition[self._places[of]] = by_ln_size * slope + turning
+            addition[self._indices[of]] = by_ln_size * slope + turning
         addition[-1] = math.log(square) / 2
         return addition
 
@@ -303,7 +303,7 @@ def _size(ln_loss: float, order: float) -> tuple[float, float]:
 
 # Steps
 
-_SHARE: Final = 0.5
+_STEP_FRACTION: Final = 0.5
 """Longest step of an order, as a share of the way to 0 or 2."""
 
 NEXT_TO_NOTHING: Final = 1e-4
@@ -368,9 +368,9 @@ class Steps:
         """
         least, most = self.lower - x, self.upper - x
         for loss, order, _ in self.dampings:
-            share = _SHARE if x[loss] > self.lower[loss] else 0.0
-            least[order] = max(least[order], -share * x[order])
-            most[order] = min(most[order], share * (2 - x[order]))
+            fraction = _STEP_FRACTION if x[loss] > self.lower[loss] else 0.0
+            least[order] = max(least[order], -fraction * x[order])
+            most[order] = min(most[order], fraction * (2 - x[order]))
         return least, most
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -262,7 +262,7 @@ class Prediction:
         self,
         plant: Plant | ModalModel,
         factor: int,
-        places: NDArray[np.intp],
+        indices: NDArray[np.intp],
         wrt: Sequence[str] = (),
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Predict the same at a multiple of the rate, at some places only.
@@ -283,7 +283,7 @@ class Prediction:
         torque : ndarray, shape (p,)
         gradient : ndarray, shape (k, p)
         """
-        growth = np.exp(self._sigma * places / (factor * self.rate_hz))
+        growth = np.exp(self._sigma * indices / (factor * self.rate_hz))
         spectra = self._spectra(plant, wrt)
         # As many short transforms, each of them shifted by a tick, as the factor says: they stay
         # in the cache, and take less than half the time of a long one.
@@ -292,8 +292,8 @@ class Prediction:
         np.cumprod(shifts, axis=0, out=shifts)
         if self._length % 2 == 0:
             shifts[:, -1] *= 2  # at the longer length this bin and its mirror image are two
-        at = np.empty((len(spectra), places.size))
+        at = np.empty((len(spectra), indices.size))
         for row, spectrum in zip(at, spectra, strict=True):
-            row[:] = np.fft.irfft(shifts * spectrum, self._length).T.ravel()[places]
+            row[:] = np.fft.irfft(shifts * spectrum, self._length).T.ravel()[indices]
         at *= growth
         return at[0], at[1:]

@@ -125,7 +125,7 @@ class Objective:
         residual = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
         jacobian = (chain.T @ _parts(comparison.spectrum(gradient))).view(np.complex128)
         if comparison.drag is not None:
-            change, slopes = comparison.drag.beside(plant, poles, unknowns.names, chain)
+            change, slopes = comparison.drag.change_to(plant, poles, unknowns.names, chain)
             residual += change
             jacobian += slopes
         return Linearisation(

@@ -70,7 +70,7 @@ class LikelihoodProfile:
     values: tuple[float, ...]
     deviance: tuple[float, ...]
     estimate: float
-    valleys: tuple[float, ...]
+    local_minima: tuple[float, ...]
     interval: tuple[float, float]
     open_below: bool
     open_above: bool
@@ -94,15 +94,15 @@ class LikelihoodProfile:
         return len(self.values) > 1
 
     @property
-    def share(self) -> float:
+    def relative_width(self) -> float:
         """Part of the range that the interval spans."""
         return (self.interval[1] - self.interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])
 
     @property
     def identifiable(self) -> bool:
         """Whether the record says anything of use about this order."""
-        narrow = self.share <= WIDEST_SHARE and not (self.open_below or self.open_above)
-        return narrow and len(self.valleys) < 2
+        narrow = self.relative_width <= WIDEST_SHARE and not (self.open_below or self.open_above)
+        return narrow and len(self.local_minima) < 2
 
     @property
     def admits_one(self) -> bool:
@@ -132,7 +132,7 @@ class Profiled:
 
 
 def profile(
-    field: CandidateSet, candidate: Candidate, order: Order, *, elsewhere: bool = True
+    candidate_set: CandidateSet, candidate: Candidate, order: Order, *, elsewhere: bool = True
 ) -> Profiled:
     """Walk away from the minimum both ways until the record excludes what lies beyond.
 
@@ -149,13 +149,13 @@ def profile(
     elsewhere : bool
         Whether there may be another valley.
     """
-    walk = Walk(field, candidate, order)
+    walk = Walk(candidate_set, candidate, order)
     walk.both_ways()
     walk.from_candidates()
     if elsewhere:
         walk.elsewhere()
     values, deviance = walk.curve()
-    bottoms = valleys(values, deviance)
+    bottoms = local_minima(values, deviance)
     interval, open_below, open_above = admitted(values, deviance)
     lowest = min(walk.costs.values())
     return Profiled(
@@ -165,7 +165,7 @@ def profile(
             values=tuple(values.tolist()),
             deviance=tuple(deviance.tolist()),
             estimate=bottoms[0],
-            valleys=bottoms,
+            local_minima=bottoms,
             interval=interval,
             open_below=open_below,
             open_above=open_above,
@@ -184,7 +184,7 @@ _ROUNDS: Final = 3
 
 
 def profiled(
-    field: CandidateSet, settled: Collection[Order] = (), *, walk: bool = True
+    candidate_set: CandidateSet, settled: Collection[Order] = (), *, walk: bool = True
 ) -> tuple[CandidateSet, LikelihoodProfile, LikelihoodProfile]:
     """Profile alpha and lambda in the freest structure.
 
@@ -206,37 +206,37 @@ def profiled(
     alpha, lambda_ : Profile
     """
     for round_ in range(1, _ROUNDS + 1):
-        freest = field.freest
+        freest = candidate_set.freest
         # The order of a damping that does not show could be anything: no walk would tell more.
         walks = {
-            order: profile(field, freest, order, elsewhere=order not in settled)
+            order: profile(candidate_set, freest, order, elsewhere=order not in settled)
             for order in _ORDERS
             if walk and freest.structure.has(order)
         }
-        before = [candidate.fit.cost for candidate in field.candidates]
+        before = [candidate.fit.cost for candidate in candidate_set.candidates]
         if round_ == _ROUNDS:
             break
         for found in walks.values():
-            if _news(field, found):
+            if _news(candidate_set, found):
                 for plant in found.plants:
-                    field = field.tried_from(plant)
-        if [candidate.fit.cost for candidate in field.candidates] == before:
+                    candidate_set = candidate_set.tried_from(plant)
+        if [candidate.fit.cost for candidate in candidate_set.candidates] == before:
             break
     of_alpha, of_lambda = (
         walks[order].profile if order in walks else LikelihoodProfile.unwalked(freest, order)
         for order in _ORDERS
     )
-    return field, of_alpha, of_lambda
+    return candidate_set, of_alpha, of_lambda
 
 
-def _news(field: CandidateSet, found: Profiled) -> bool:
+def _news(candidate_set: CandidateSet, found: Profiled) -> bool:
     """Whether a candidate may be elsewhere than its lowest minimum."""
     if len(found.plants) > 1:
         return True
     free = set(found.structure.free)
     as_free = [
         candidate.fit.cost
-        for candidate in field.candidates
+        for candidate in candidate_set.candidates
         if free <= set(candidate.structure.free)
     ]
     return bool(as_free) and found.cost < min(as_free) * (1 - MISSED)
@@ -260,11 +260,11 @@ _NARROW: Final = 1.1
 
 _SHARPENINGS: Final = 2
 
-_DOUBTFUL_SHARE: Final = 0.025
+_DOUBTFUL_FRACTION: Final = 0.025
 """Share of the range 0 to 2 within the 95 % limit from which there may be another valley."""
 
 _GRID: Final = 0.2
-_LOOKS: Final = 8
+_TRIAL_EVALUATIONS: Final = 8
 """Spacing of the orders at which it is looked for, and evaluations at each."""
 
 
@@ -282,13 +282,15 @@ def with_order(structure: Structure, order: Order) -> Structure:
 class Walk:
     """Refits with one order held, and what they cost."""
 
-    def __init__(self, field: CandidateSet, candidate: Candidate, order: Order) -> None:
+    def __init__(self, candidate_set: CandidateSet, candidate: Candidate, order: Order) -> None:
         self.order = order
         self.structure = with_order(candidate.structure, order)
-        self._field, self._values = field, candidate.values
-        self._unknowns = unknowns = field.unknowns(self.structure)
-        self._place = unknowns.names.index(order)
-        first = field.descent(unknowns, unknowns.vector(candidate.fit.plant), _MAX_EVALUATIONS)
+        self._field, self._values = candidate_set, candidate.values
+        self._unknowns = unknowns = candidate_set.unknowns(self.structure)
+        self._index = unknowns.names.index(order)
+        first = candidate_set.descent(
+            unknowns, unknowns.vector(candidate.fit.plant), _MAX_EVALUATIONS
+        )
         self.costs: dict[float, float] = {}
         self._at: dict[float, Refit] = {}
         self._stand_at(first)
@@ -296,8 +298,8 @@ class Walk:
     def _stand_at(self, bottom: Refit) -> None:
         """Walk from a minimum with the order free."""
         self._first = bottom
-        self._centre = float(bottom.x[self._place])
-        self._keep(self._centre, bottom)
+        self._centre = float(bottom.x[self._index])
+        self._store_lower(self._centre, bottom)
 
     def plant(self, value: float) -> Plant:
         """Everything that was fitted at a value that was looked at."""
@@ -335,28 +337,30 @@ class Walk:
     def elsewhere(self) -> None:
         """Look for another valley, if much of the range is admitted, and walk it."""
         (low, high), open_below, open_above = admitted(*self.curve())
-        wide = high - low > _DOUBTFUL_SHARE * (ORDER_RANGE[1] - ORDER_RANGE[0])
-        places = gaps(list(self.costs), ORDER_RANGE, _GRID)
-        if not (wide or open_below or open_above) or not places:
+        wide = high - low > _DOUBTFUL_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
+        orders = gaps(list(self.costs), ORDER_RANGE, _GRID)
+        if not (wide or open_below or open_above) or not orders:
             return
         # Loss at a mode and order are separate unknowns: the loss stays as the order changes.
-        looks = {}
-        for value in places:
+        trials = {}
+        for value in orders:
             start = self._first.x.copy()
-            start[self._place] = value
-            looks[value] = self._descend(start, _LOOKS, hold=(self.order,))
+            start[self._index] = value
+            trials[value] = self._descend(start, _TRIAL_EVALUATIONS, hold=(self.order,))
         most = min(self.costs.values()) * math.exp(FAR_BEHIND / self._values)
-        for value in dips({value: look.cost for value, look in looks.items()}):
-            bottom = self._descend(looks[value].x, _MAX_EVALUATIONS, hopeless=(_LOOKS, most))
+        for value in dips({value: trial.cost for value, trial in trials.items()}):
+            bottom = self._descend(
+                trials[value].x, _MAX_EVALUATIONS, hopeless=(_TRIAL_EVALUATIONS, most)
+            )
             values, deviance = self.curve()
-            at = float(bottom.x[self._place])
+            at = float(bottom.x[self._index])
             here = self._values * math.log(bottom.cost / min(self.costs.values()))
             known = float(np.interp(at, values, deviance, math.inf, math.inf))
-            if here < min(CHI_SQUARE_95, known - RIDGE):
+            if here < min(CHI_SQUARE_95, known - MIN_BARRIER):
                 self._stand_at(bottom)
                 self.both_ways()
 
-    def _keep(self, value: float, found: Refit) -> None:
+    def _store_lower(self, value: float, found: Refit) -> None:
         """Keep the lower of two refits at one value."""
         if found.cost < self.costs.get(value, math.inf):
             self.costs[value], self._at[value] = found.cost, found
@@ -391,9 +395,9 @@ class Walk:
 
     def _spread(self) -> float:
         """Give the standard deviation of the order, or what stands for it."""
-        (scaled, scale), place = self._first.equations.scaled_hessian(), self._place
+        (scaled, scale), index = self._first.equations.scaled_hessian(), self._index
         inverse = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))
-        variance = inverse[place, place] / scale[place] ** 2
+        variance = inverse[index, index] / scale[index] ** 2
         std = math.sqrt(variance * self._first.cost / self._values) if variance > 0 else _FIRST_STEP
         return min(max(std, 1e-4), 0.25)
 
@@ -406,16 +410,19 @@ class Walk:
         """Fit all else with the order at `value`; give the root of the deviance."""
         hold, most = (self.order,), self.costs[self._centre] * math.exp(FAR_BEHIND / self._values)
         found = self._descend(
-            self._tangent(value, near), _MAX_EVALUATIONS, hold=hold, hopeless=(_LOOKS, most)
+            self._tangent(value, near),
+            _MAX_EVALUATIONS,
+            hold=hold,
+            hopeless=(_TRIAL_EVALUATIONS, most),
         )
         if found.cost > most:
             # Near its ends an order turns a loss into inertia or stiffness: the tangent may lead
             # far astray, where no descent ends. All else stays, the loss at a mode too.
-            found = self._lower(found, near, value, (_LOOKS, most))
+            found = self._lower(found, near, value, (_TRIAL_EVALUATIONS, most))
         if found.cost > most:
             # Without the damping its order says nothing.
             found = self._lower(found, self._without_damping, value)
-        self._keep(value, found)
+        self._store_lower(value, found)
         return self._root(value)
 
     def _lower(
@@ -423,7 +430,7 @@ class Walk:
     ) -> Refit:
         """Descend from another refit with only the order moved; give the lower of the two."""
         start = other.x.copy()
-        start[self._place] = value
+        start[self._index] = value
         again = self._descend(start, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless)
         return min(found, again, key=lambda refit: refit.cost)
 
@@ -432,8 +439,8 @@ class Walk:
         """Fit without the damping whose order is walked along: what it costs at any order."""
         coefficient = COEFFICIENT_OF[self.order]
         start = self._first.x.copy()
-        place = self._unknowns.names.index(coefficient)
-        start[place] = self._unknowns.bounds[0][place]
+        index = self._unknowns.names.index(coefficient)
+        start[index] = self._unknowns.bounds[0][index]
         return self._descend(start, _MAX_EVALUATIONS, hold=(self.order, coefficient))
 
     def _descend(
@@ -445,13 +452,13 @@ class Walk:
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
         """Fit from a vector of unknowns, some of them held where they start."""
-        field = self._field
+        candidate_set = self._field
         return Refit.descend(
-            field.comparison,
+            candidate_set.comparison,
             self._unknowns,
             start,
-            field.noise,
-            field.columns,
+            candidate_set.noise,
+            candidate_set.columns,
             max_evaluations=max_evaluations,
             relative_tolerance=_TOLERANCE,
             hold=hold,
@@ -460,14 +467,14 @@ class Walk:
 
     def _tangent(self, value: float, near: Refit) -> NDArray[np.float64]:
         """Where all else would be with the order at `value`, to first order, shape (k,)."""
-        x, place = near.x.copy(), self._place
+        x, index = near.x.copy(), self._index
         scaled, scale = near.equations.scaled_hessian()
         lower, upper = self._unknowns.bounds
-        others = (x > lower) & (x < upper) & (np.arange(x.size) != place)
+        others = (x > lower) & (x < upper) & (np.arange(x.size) != index)
         block = scaled[np.ix_(others, others)] + 1e-9 * np.eye(int(others.sum()))
-        slope = -np.linalg.solve(block, scaled[others, place]) / scale[others] * scale[place]
-        x[others] += slope * (value - x[place])
-        x[place] = value
+        slope = -np.linalg.solve(block, scaled[others, index]) / scale[others] * scale[index]
+        x[others] += slope * (value - x[index])
+        x[index] = value
         return x
 
 
@@ -476,12 +483,12 @@ class Walk:
 CHI_SQUARE_95: Final = 3.841458820694124
 """Deviance that the true value exceeds once in twenty records (one degree of freedom)."""
 
-RIDGE: Final = 0.5
+MIN_BARRIER: Final = 0.5
 """Deviance by which a ridge must rise over the higher of two valleys to part them: far more than
 the refits' tolerance."""
 
 
-def valleys(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple[float, ...]:
+def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple[float, ...]:
     """Bottoms of the valleys that the 95 % limit admits, the lowest first.
 
     Parameters
@@ -494,12 +501,12 @@ def valleys(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple
     padded = np.concatenate([[np.inf], deviance, [np.inf]])
     lows = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] < padded[2:]))
     lows = lows[deviance[lows] < CHI_SQUARE_95]
-    kept: list[int] = []
+    distinct: list[int] = []
     for low in lows[np.argsort(deviance[lows], kind="stable")].tolist():
-        ridges = (deviance[min(low, k) : max(low, k) + 1].max() for k in kept)
-        if all(ridge > deviance[low] + RIDGE for ridge in ridges):
-            kept.append(low)
-    return tuple(values[kept].tolist())
+        barriers = (deviance[min(low, k) : max(low, k) + 1].max() for k in distinct)
+        if all(barrier > deviance[low] + MIN_BARRIER for barrier in barriers):
+            distinct.append(low)
+    return tuple(values[distinct].tolist())
 
 
 def admitted(
@@ -531,8 +538,8 @@ def crossing(inside: float, outside: float, below: float, above: float) -> float
         Their deviances.
     """
     low, high = math.sqrt(max(below, 0.0)), math.sqrt(max(above, 0.0))
-    share = (math.sqrt(CHI_SQUARE_95) - low) / (high - low)
-    return inside + share * (outside - inside)
+    fraction = (math.sqrt(CHI_SQUARE_95) - low) / (high - low)
+    return inside + fraction * (outside - inside)
 
 
 def gaps(known: list[float], span: tuple[float, float], spacing: float) -> list[float]:
@@ -544,12 +551,12 @@ def gaps(known: list[float], span: tuple[float, float], spacing: float) -> list[
 
 def dips(curve: dict[float, float]) -> list[float]:
     """Places on a coarse curve that are lower than both neighbours, the ends included."""
-    places = sorted(curve)
-    heights = [math.inf, *(curve[place] for place in places), math.inf]
+    values = sorted(curve)
+    heights = [math.inf, *(curve[value] for value in values), math.inf]
     return [
-        place
-        for place, (before, here, after) in zip(
-            places, zip(heights, heights[1:], heights[2:], strict=False), strict=True
+        value
+        for value, (before, here, after) in zip(
+            values, zip(heights, heights[1:], heights[2:], strict=False), strict=True
         )
         if here <= before and here <= after
     ]

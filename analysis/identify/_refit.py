@@ -96,8 +96,8 @@ class Refit:
         region = Steps.of(unknowns, NEXT_TO_NOTHING)
         x = np.clip(start, region.lower, region.upper)
         for name in hold:
-            place = unknowns.names.index(name)
-            region.lower[place] = region.upper[place] = x[place]
+            index = unknowns.names.index(name)
+            region.lower[index] = region.upper[index] = x[index]
         objective, found = Objective(comparison, unknowns, columns).minimum(
             x,
             noise.weight,
@@ -140,16 +140,16 @@ class Refit:
     @property
     def expected_cost(self) -> float:
         """What it is where noise alone is left."""
-        share = self.objective.comparison.measurement.torque_share
-        return float(2 * np.count_nonzero(self.noise.counts) * share)
+        known_fraction = self.objective.comparison.measurement.known_torque_fraction
+        return float(2 * np.count_nonzero(self.noise.counts) * known_fraction)
 
     @property
-    def promised_cost(self) -> float:
+    def predicted_cost(self) -> float:
         """What it would be at the minimum, as far as can be seen from here."""
-        return max(self.cost + float(self.equations.gradient @ self.promised_step), 0.0)
+        return max(self.cost + float(self.equations.gradient @ self.predicted_step), 0.0)
 
     @property
-    def promised_step(self) -> NDArray[np.float64]:
+    def predicted_step(self) -> NDArray[np.float64]:
         """Way to that minimum (Gauss and Newton's), shape (k,)."""
         equations = self.equations
         held = equations.held(self.x, *self.objective.unknowns.bounds)
@@ -191,7 +191,7 @@ class Refit:
         covariance = np.linalg.inv(gram)[first:, first:] / np.outer(own, own)
         return projected.amplitudes[projected.amplitudes.size - len(self.columns) :], covariance
 
-    def beside(
+    def unexplained_columns(
         self, columns: NDArray[np.complex128], *, beam_free: bool = True
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Whiten further columns and leave of them what nothing free already could explain.
@@ -222,7 +222,7 @@ class Refit:
         ----------
         columns : ndarray of complex, shape (c, K)
         """
-        free, residual = self.beside(columns)
+        free, residual = self.unexplained_columns(columns)
         along = (free.conj() @ residual).real
         squares = np.maximum(np.sum(np.abs(free) ** 2, axis=1), np.finfo(float).tiny)
         saved: NDArray[np.float64] = along**2 / squares
@@ -256,8 +256,8 @@ class Refit:
     def noise_here(self) -> NoiseSpectrum:
         """Take for noise what remains here and no column explains; lines stay left out."""
         residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
-        share = self.objective.comparison.measurement.torque_share
-        return replace(self.noise, power=smooth_power(residual) / share)
+        known_fraction = self.objective.comparison.measurement.known_torque_fraction
+        return replace(self.noise, power=smooth_power(residual) / known_fraction)
 
 
 def unexplained_part(
@@ -274,6 +274,6 @@ def unexplained_part(
     scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
     basis = known[scale > 0] / scale[scale > 0, None]
     gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
-    shares = np.linalg.solve(gram, (basis.conj() @ columns.T).real)
-    part: NDArray[np.complex128] = columns - shares.T @ basis
+    coefficients = np.linalg.solve(gram, (basis.conj() @ columns.T).real)
+    part: NDArray[np.complex128] = columns - coefficients.T @ basis
     return part

@@ -144,8 +144,8 @@ def cumulative_periodogram(residual: NDArray[np.complex128]) -> NDArray[np.float
     [0.25 0.5  0.75 1.  ]
     """
     power = np.cumsum(residual.real**2 + residual.imag**2)
-    share: NDArray[np.float64] = power / power[-1]
-    return share
+    cumulative: NDArray[np.float64] = power / power[-1]
+    return cumulative
 
 
 def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64]) -> Whiteness:

@@ -224,7 +224,9 @@ class RecordAnalysis:
             One of `fits`, or one under the same noise.
         """
         comparison, noise = self.comparison, self.noise
-        torque_nm = comparison.torque_nm[comparison.kept] + comparison.apart_nm - comparison.hum_nm
+        torque_nm = (
+            comparison.torque_nm[comparison.kept] + comparison.removed_nm - comparison.hum_nm
+        )
         measured = comparison.spectrum(torque_nm)[noise.counts]
         residual = (fit.residual * np.sqrt(noise.power / 2))[noise.counts]
         return nrmse_percent(residual, measured)

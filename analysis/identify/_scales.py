@@ -92,11 +92,11 @@ def _relative(exponents: Mapping[str, int], uncertainty: Mapping[str, float]) ->
     return math.hypot(*(power * uncertainty.get(scale, 0.0) for scale, power in exponents.items()))
 
 
-def _combined(told: Quantity, relative: float, *, logarithmic: bool) -> Quantity:
+def _combined(quantity: Quantity, relative: float, *, logarithmic: bool) -> Quantity:
     """Widen an interval on either side by what the scales add, in quadrature."""
-    assert told.interval_95 is not None
-    value, (low, high) = told.value, told.interval_95
-    std = math.hypot(told.std or 0.0, value * relative)
+    assert quantity.interval_95 is not None
+    value, (low, high) = quantity.value, quantity.interval_95
+    std = math.hypot(quantity.std or 0.0, value * relative)
     if logarithmic:
         below, above = (
             math.hypot(math.log(end / value), NORMAL_95 * relative) for end in (low, high)
@@ -107,7 +107,7 @@ def _combined(told: Quantity, relative: float, *, logarithmic: bool) -> Quantity
         ends = value - math.hypot(value - low, half), value + math.hypot(high - value, half)
         # What cannot be negative ends at 0.
         ends = max(ends[0], 0.0), ends[1]
-    return replace(told, std=std, interval_95=ends)
+    return replace(quantity, std=std, interval_95=ends)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +157,8 @@ def density_check(
     determined = all(name in fit.determined for name in _ABSORBING)
     if not determined or not uncertainty.keys() >= {*_OF_DENSITY, "density"}:
         return None
-    places = [fit.determined.index(name) for name in _ABSORBING]
-    own = float(fit.covariance[np.ix_(places, places)].sum())
+    indices = [fit.determined.index(name) for name in _ABSORBING]
+    own = float(fit.covariance[np.ix_(indices, indices)].sum())
     found = fit.parameters[_RATIO] * fit.parameters[_STIFFNESS]
     relative = math.sqrt(own + _relative(_OF_DENSITY, uncertainty) ** 2)
     return DensityCheck(

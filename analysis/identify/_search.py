@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._free_decay import decay_columns
-from analysis.identify._hum import hum_beside_modes, resonance_reach_hz
+from analysis.identify._hum import hum_near_modes, resonance_reach_hz
 from analysis.identify._noise import NoiseSpectrum, noise_of
 from analysis.identify._parametrization import Steps
 from analysis.identify._predictor import ResponseGrid
@@ -56,12 +56,12 @@ def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArr
     moderate = unknowns.start(np.array([_MODERATE[name] for name in unknowns.structure.free]))
     shift = np.zeros(moderate.size)
     if "density_over_stiffness" in unknowns.names:
-        place = unknowns.names.index("density_over_stiffness")
+        index = unknowns.names.index("density_over_stiffness")
         costs = []
         for step in _SCAN:
-            shift[place] = step
+            shift[index] = step
             costs.append(cost(unknowns.plant(moderate + shift)))
-        shift[place] = _SCAN[int(np.argmin(costs))]
+        shift[index] = _SCAN[int(np.argmin(costs))]
     return shift
 
 
@@ -92,7 +92,7 @@ class CoarseResponse:
         angle = np.fft.rfft(comparison.angle_rad)[band]
         torque = np.fft.rfft(comparison.torque_nm)[band]
         # Where nothing was asked of the motor it moved with the noise: no response is seen there.
-        given = np.fft.rfft(comparison.followed_rad())[band]
+        given = np.fft.rfft(comparison.coherent_rad())[band]
         power = given.real**2 + given.imag**2
         excited = power > 1e-12 * power.max()
         response, weights = torque[excited] / angle[excited], power[excited]
@@ -186,12 +186,12 @@ def coarse_minima(
         )
         for point in points
     ]
-    kept: list[Minimum] = []
+    distinct: list[Minimum] = []
     for minimum in sorted(found, key=lambda m: m.cost):
         plant = unknowns.plant(minimum.x)
-        if not any(coarse.alike(plant, unknowns.plant(other.x)) for other in kept):
-            kept.append(minimum)
-    return kept
+        if not any(coarse.alike(plant, unknowns.plant(other.x)) for other in distinct):
+            distinct.append(minimum)
+    return distinct
 
 
 # Descents on the whole record
@@ -210,7 +210,7 @@ _MOST_MINIMA: Final = 4
 RENEWALS: Final = 4
 """How often it is told anew at most what followed the reference."""
 
-_LOOKS: Final = 3
+_HUM_SEARCHES: Final = 3
 """Number of searches for hum: the first fit attributed part of it to the beam."""
 
 
@@ -268,12 +268,12 @@ class Descent:
         amplitudes = self.objective.project(at, noise.weight).amplitudes
         decays = decay_columns(at.poles) * (1 + len(comparison.later_decays))
         decaying_nm = comparison.in_time(amplitudes[:decays] @ at.columns[:decays])
-        return hum_beside_modes(comparison, self.plant, at.poles, noise, decaying_nm)
+        return hum_near_modes(comparison, self.plant, at.poles, noise, decaying_nm)
 
     def without_hum(self, tolerance: float) -> Descent:
         """Take out the hum near modes and descend again; `self` if there is none."""
         here = self
-        for _ in range(_LOOKS):
+        for _ in range(_HUM_SEARCHES):
             hum = here.hum()
             if not hum:
                 return self
@@ -299,7 +299,7 @@ class Descent:
             objective.project(at, 1.0).residual,
             comparison.frequency_hz,
             comparison.samples,
-            comparison.measurement.torque_share,
+            comparison.measurement.known_torque_fraction,
             near_mode,
         )
 

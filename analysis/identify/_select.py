@@ -48,9 +48,9 @@ from analysis.identify._verdict import (
     NOT_DETERMINED,
     CandidateRow,
     Verdict,
+    not_reported_reason,
     order_verdict,
     rivals,
-    untold_reason,
 )
 from analysis.identify._visible_modes import visible_modes
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     from analysis.identify._uniform_beam import UniformBeamTest
 
 
-_MODES_TO_JUDGE: Final = 2
+_MODES_TO_TEST: Final = 2
 _TILTED: Final = "the axis is tilted, and fits to the whole record are of one that is plumb"
 _CLIPPED: Final = "the torque is clipped"
 INTEGER: Final = STRUCTURES["III"]
@@ -154,19 +154,19 @@ def select(
         There is no such setting.
     """
     fixed = tuple(fixed)
-    return _with_knocks(measurement, lambda each: _selected(each, fixed, band_hz, earlier)).said
+    return _with_knocks(measurement, lambda each: _selected(each, fixed, band_hz, earlier)).result
 
 
 _T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
-class _Told(Generic[_T]):
+class _Assessment(Generic[_T]):
     """What is said of a record, and what it rests on.
 
     Attributes
     ----------
-    said : _T
+    result : _T
     field : CandidateSet
         Led by the candidate that the numbers are of.
     explained : bool
@@ -175,30 +175,32 @@ class _Told(Generic[_T]):
         Kinds of what was found.
     """
 
-    said: _T
-    field: CandidateSet
+    result: _T
+    candidate_set: CandidateSet
     explained: bool
     kinds: Collection[str]
 
 
-def _with_knocks(measurement: Measurement, tell: Callable[[Measurement], _Told[_T]]) -> _Told[_T]:
+def _with_knocks(
+    measurement: Measurement, assess: Callable[[Measurement], _Assessment[_T]]
+) -> _Assessment[_T]:
     """Judge a record; where all leaves more than noise, with the knocks that explain it."""
-    told = tell(measurement)
+    assessment = assess(measurement)
     for _ in range(MOST_KNOCKS):
-        if told.explained or not _NOT_SEARCHED.isdisjoint(told.kinds):
+        if assessment.explained or not _NOT_SEARCHED.isdisjoint(assessment.kinds):
             break
         better = None
         # A sweep with harmonics has them all along; but a loud knock may pass for some.
-        for found in knocks_in(told.field, obvious="harmonics" in told.kinds):
-            again = tell(with_knock(told.field.comparison.measurement, found))
+        for found in knocks_in(assessment.candidate_set, obvious="harmonics" in assessment.kinds):
+            again = assess(with_knock(assessment.candidate_set.comparison.measurement, found))
             if again.explained or found.evident:
                 better = again
             if again.explained:
                 break
         if better is None:
             break
-        told = better
-    return told
+        assessment = better
+    return assessment
 
 
 def _selected(
@@ -206,13 +208,13 @@ def _selected(
     fixed: tuple[Setting, ...],
     band_hz: tuple[float, float],
     earlier: Selection | None,
-) -> _Told[Selection]:
+) -> _Assessment[Selection]:
     """Choose the structure with what is known to have struck the beam."""
     before = earlier.candidates if earlier else ()
     again = CandidateSet.from_earlier(before, measurement, fixed, band_hz) if before else None
     linear = again or CandidateSet.of(measurement, fixed, band_hz)
     modal = _modal(linear)
-    field, small = linear, None
+    candidate_set, small = linear, None
     forces: tuple[NonlinearForce, ...] = ()
     changes: tuple[TemporalChange, ...] = ()
     plain = modal is not None and _linear_and_constant(linear, modal, band_hz)
@@ -226,36 +228,38 @@ def _selected(
     alone = modal if small is None else _modal(linear, small.column[None])
     suffices = alone is not None and _linear_and_constant(linear, alone, band_hz)
     if not (plain or suffices) or (small is not None and small.large):
-        field, forces, changes = _with_effects(linear, again=again is not None)
-        modal = _modal(field)
-        if suffices and not (modal is not None and _linear_and_constant(field, modal, band_hz)):
-            field, forces, changes, modal = linear, (), (), alone
+        candidate_set, forces, changes = _with_effects(linear, again=again is not None)
+        modal = _modal(candidate_set)
+        if suffices and not (
+            modal is not None and _linear_and_constant(candidate_set, modal, band_hz)
+        ):
+            candidate_set, forces, changes, modal = linear, (), (), alone
         else:
             small = None
     elif small is not None and small.saved > LARGE:
-        field = linear.with_effect(small.column[None])
-        modal = _modal(field)
+        candidate_set = linear.with_effect(small.column[None])
+        modal = _modal(candidate_set)
     else:
         modal = alone
-    field = field.with_orders_free()
-    visible = _visible(field, modal)
+    candidate_set = candidate_set.with_orders_free()
+    visible = _visible(candidate_set, modal)
     test = _uniform_beam_test(measurement, modal)
     refused = test is not None and test.status == "refused"
     # Another valley that a part of the record excludes, all of it does as well.
     settled = earlier.settled if earlier and again else ()
-    walk = untold_reason(field, visible) is None and not refused
-    field, *profiles = profiled(field, settled, walk=walk)
-    told = field.led_by(field.freest)
-    white, related, multiples = _tests(told, modal, band_hz)
+    walk = not_reported_reason(candidate_set, visible) is None and not refused
+    candidate_set, *profiles = profiled(candidate_set, settled, walk=walk)
+    leading = candidate_set.led_by(candidate_set.freest)
+    white, related, multiples = _tests(leading, modal, band_hz)
     explained = white.white and not related.related
-    found = findings(told, forces, multiples)
+    found = findings(leading, forces, multiples)
     kinds = {finding.kind for finding in found}
-    wrong = _wrong(kinds, explained=explained)
+    wrong = _wrong_model_reason(kinds, explained=explained)
     clipped = _CLIPPED if "clipping" in kinds else None
-    doubt = wrong or clipped or _doubt(changes, one_sweep=measurement.one_sweep)
-    alpha, lambda_ = (order_verdict(field, each, visible, doubt=doubt) for each in profiles)
-    orders, close = (alpha, lambda_), rivals(field, EVEN)
-    numbers = headline(field, orders, visible, unexplained=wrong)
+    doubt = wrong or clipped or _doubt_reason(changes, one_sweep=measurement.one_sweep)
+    alpha, lambda_ = (order_verdict(candidate_set, each, visible, doubt=doubt) for each in profiles)
+    orders, close = (alpha, lambda_), rivals(candidate_set, EVEN)
+    numbers = headline(candidate_set, orders, visible, unexplained=wrong)
     if doubt is not None:
         numbers = numbers.doubted(doubt)
     # A change that was fitted too moved the modes to the middle of the record.
@@ -269,26 +273,26 @@ def _selected(
         orders = alpha, lambda_
     if "nonlinear stiffness" in kinds:
         numbers = numbers.with_law_assumed()
-    said, advice = [], []
+    sentences, advice = [], []
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
         along = tuple(changing(changes, one_sweep=measurement.one_sweep))
-        found += _settings(told, numbers, kinds)
+        found += _settings(leading, numbers, kinds)
         found += () if small is None else (small.finding(),)
         if modal is not None and test is not None and refused and wrong is None:
-            found += _explanation(measurement, told, modal, test)
-        found = _as_sure(found, along, wrong, doubt, numbers.flags, explained=explained)
-        found = _with_knocks_and_rest(told, found, white, related)
-        said = of_headline(numbers, orders, alone=doubt is None)
-        advice = experiments(field, orders, visible, found, close)
+            found += _explanation(measurement, leading, modal, test)
+        found = _with_doubts(found, along, wrong, doubt, numbers.flags, explained=explained)
+        found = _with_knocks_and_unexplained(leading, found, white, related)
+        sentences = of_headline(numbers, orders, alone=doubt is None)
+        advice = experiments(candidate_set, orders, visible, found, close)
     advice += [each.remedy for each in found if each.remedy]
-    best = field.best
+    best = candidate_set.best
     selection = Selection(
-        candidates=field.candidates,
+        candidates=candidate_set.candidates,
         headline=numbers,
         analysis=RecordAnalysis.of(
-            (c.fit for c in field.candidates), field.noise, field.comparison
+            (c.fit for c in candidate_set.candidates), candidate_set.noise, candidate_set.comparison
         ),
         verdict=Verdict(
             name=measurement.name,
@@ -300,19 +304,21 @@ def _selected(
             lambda_=lambda_,
             visible_modes=visible,
             findings=found,
-            table=_table(field),
+            table=_table(candidate_set),
             whiteness=white,
             input_relation=related,
             harmonics=multiples,
-            sentences=(*said, *(each.sentence for each in found)),
+            sentences=(*sentences, *(each.sentence for each in found)),
             experiments=tuple(dict.fromkeys(advice)),
-            damping_with_amplitude=damping_with_amplitude(told),
+            damping_with_amplitude=damping_with_amplitude(leading),
         ),
     )
-    return _Told(selection, told, explained, kinds)
+    return _Assessment(selection, leading, explained, kinds)
 
 
-def _modal(field: CandidateSet, further: NDArray[np.complex128] | None = None) -> ModalFit | None:
+def _modal(
+    candidate_set: CandidateSet, further: NDArray[np.complex128] | None = None
+) -> ModalFit | None:
     """Fit the modal model to what a set of candidates was fitted to; None if no mode shows.
 
     Parameters
@@ -321,25 +327,25 @@ def _modal(field: CandidateSet, further: NDArray[np.complex128] | None = None) -
     further : ndarray of complex, shape (c, K), optional
         Spectra of unknown size beside the candidates' own.
     """
-    if field.misread:
+    if candidate_set.misread:
         return None
     starts = [
         (mode.number, mode.frequency_hz, mode.damping_ratio)
-        for mode in field.likeliest.modes
+        for mode in candidate_set.likeliest.modes
         if mode.frequency_hz > 0
     ]
-    columns, drag = field.columns, field.comparison.drag
+    columns, drag = candidate_set.columns, candidate_set.comparison.drag
     if further is not None:
         columns = np.concatenate([columns, further])
     if drag is not None:  # its size is not known exactly
         columns = np.concatenate([columns, drag.by_law])
-    return fit_modes(field.comparison, field.noise, starts, columns)
+    return fit_modes(candidate_set.comparison, candidate_set.noise, starts, columns)
 
 
-def _visible(field: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
+def _visible(candidate_set: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
     """Numbers of the modes that a record shows."""
     if modal is None:
-        return visible_modes(field.comparison, field.noise, field.best.fit)
+        return visible_modes(candidate_set.comparison, candidate_set.noise, candidate_set.best.fit)
     return modal.visible
 
 
@@ -385,31 +391,33 @@ def _uniform_beam_test(measurement: Measurement, modal: ModalFit | None) -> Unif
 
 
 def _explanation(
-    measurement: Measurement, told: CandidateSet, modal: ModalFit, test: UniformBeamTest
+    measurement: Measurement, candidate_set: CandidateSet, modal: ModalFit, test: UniformBeamTest
 ) -> tuple[Finding, ...]:
     """Name simple causes that would explain what a uniform beam does not.
 
     Two modes leave no degree of freedom to test one.
     """
-    if len(modal.visible) <= _MODES_TO_JUDGE:
+    if len(modal.visible) <= _MODES_TO_TEST:
         return ()
     causes = explanations(modal, measurement.nominal, measurement.axis_tilt_deg)
-    step = step_score(told.comparison, modal) if measurement.one_sweep else None
+    step = step_score(candidate_set.comparison, modal) if measurement.one_sweep else None
     return (explanation_finding(test, causes, step),)
 
 
-def _settings(field: CandidateSet, told: Headline, kinds: Collection[str]) -> tuple[Finding, ...]:
+def _settings(
+    candidate_set: CandidateSet, result: Headline, kinds: Collection[str]
+) -> tuple[Finding, ...]:
     """Find what the file states otherwise, where at least two modes show and nothing is absurd."""
-    if "implausible" in kinds or len(told.visible_modes) < _MODES_TO_JUDGE:
+    if "implausible" in kinds or len(result.visible_modes) < _MODES_TO_TEST:
         return ()
-    return tuple(of_settings(field, told))
+    return tuple(of_settings(candidate_set, result))
 
 
 def _linear_and_constant(
-    field: CandidateSet, modal: ModalFit, band_hz: tuple[float, float]
+    candidate_set: CandidateSet, modal: ModalFit, band_hz: tuple[float, float]
 ) -> bool:
     """Whether the modal model leaves nothing but noise: nothing else need be looked for."""
-    _, _, multiples = _tests(field, modal, band_hz)
+    _, _, multiples = _tests(candidate_set, modal, band_hz)
     return modal.explained and not any(each.present for each in multiples)
 
 
@@ -426,24 +434,26 @@ def _with_effects(
     changes : tuple of Change
         Along the record.
     """
-    field = linear if again else with_evident_drag(linear)
-    if field is linear:
-        field = linear if linear.misread else with_air_drag(linear)
+    candidate_set = linear if again else with_evident_drag(linear)
+    if candidate_set is linear:
+        candidate_set = linear if linear.misread else with_air_drag(linear)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
-    field, forces = (field, ()) if field.misread else nonlinear_forces(field, visible)
-    if forces and field.drag is not None:
+    candidate_set, forces = (
+        (candidate_set, ()) if candidate_set.misread else nonlinear_forces(candidate_set, visible)
+    )
+    if forces and candidate_set.drag is not None:
         # A stiffness that depends on the deflection may have passed for a little drag.
         without, alone = nonlinear_forces(linear, visible)
-        if alone and without.bic < field.bic:
-            field, forces = without, alone
-    field, changes = along_time(field.with_orders_free())
+        if alone and without.bic < candidate_set.bic:
+            candidate_set, forces = without, alone
+    candidate_set, changes = along_time(candidate_set.with_orders_free())
     one_sweep = linear.comparison.measurement.one_sweep
-    if not one_sweep and (forces or field.drag is not None):
+    if not one_sweep and (forces or candidate_set.drag is not None):
         # What changes along the record may have looked like an amplitude, which does so as well.
-        other, other_changes = along_time(linear.with_orders_free(), rival_bic=field.bic)
-        if other_changes and other.bic < field.bic:
+        other, other_changes = along_time(linear.with_orders_free(), rival_bic=candidate_set.bic)
+        if other_changes and other.bic < candidate_set.bic:
             return other, (), other_changes
-    return field, forces, changes
+    return candidate_set, forces, changes
 
 
 def freest_alone(
@@ -474,52 +484,56 @@ def freest_alone(
     MeasurementError
         The record cannot be used.
     """
-    return _with_knocks(measurement, lambda each: _freest_alone(each, band_hz)).said
+    return _with_knocks(measurement, lambda each: _freest_alone(each, band_hz)).result
 
 
 def _freest_alone(
     measurement: Measurement, band_hz: tuple[float, float]
-) -> _Told[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
+) -> _Assessment[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
     """Fit the freest structure alone with what is known to have struck the beam."""
     misread = tuple(wrong_scale(Comparison.of(measurement, band_hz)))
-    beside = () if misread else (INTEGER,)
-    field = replace(CandidateSet.of_freest(measurement, (), band_hz, beside), misread=misread)
+    additional = () if misread else (INTEGER,)
+    candidate_set = replace(
+        CandidateSet.of_freest(measurement, (), band_hz, additional), misread=misread
+    )
     if not misread:
-        field = field.with_special_cases()
-    modal = _modal(field)
-    visible = _visible(field, modal)
-    white, related, multiples = _tests(field, modal, band_hz)
-    found = findings(field, (), multiples)
+        candidate_set = candidate_set.with_special_cases()
+    modal = _modal(candidate_set)
+    visible = _visible(candidate_set, modal)
+    white, related, multiples = _tests(candidate_set, modal, band_hz)
+    found = findings(candidate_set, (), multiples)
     kinds = {finding.kind for finding in found}
     explained = white.white and not related.related
-    wrong = _wrong(kinds, explained=explained)
-    told = of_fit(
-        field.best.name,
-        field.best.fit,
+    wrong = _wrong_model_reason(kinds, explained=explained)
+    result = of_fit(
+        candidate_set.best.name,
+        candidate_set.best.fit,
         visible,
-        {} if misread else _untold_orders(field, visible),
+        {} if misread else _unidentifiable_orders(candidate_set, visible),
         unexplained=wrong,
-        both=None if misread else field.with_both_dampings(field.best),
+        both=None if misread else candidate_set.with_both_dampings(candidate_set.best),
     )
     doubt = wrong or (_CLIPPED if "clipping" in kinds else None)
     test = _uniform_beam_test(measurement, modal)
-    told = _with_modes(told, measurement, modal, test, doubt, doubt)
+    result = _with_modes(result, measurement, modal, test, doubt, doubt)
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
-        found += _settings(field, told, kinds)
-        found = _as_sure(found, (), wrong, doubt, told.flags, explained=explained)
-        found = _with_knocks_and_rest(field, found, white, related)
-    told = told.doubted(_CLIPPED) if "clipping" in kinds else told
-    others = (each.fit for each in field.candidates if each.structure is INTEGER)
-    analysis = RecordAnalysis.of((told.fit, *others), field.noise, field.comparison)
-    return _Told((told, found, analysis), field, explained, kinds)
+        found += _settings(candidate_set, result, kinds)
+        found = _with_doubts(found, (), wrong, doubt, result.flags, explained=explained)
+        found = _with_knocks_and_unexplained(candidate_set, found, white, related)
+    result = result.doubted(_CLIPPED) if "clipping" in kinds else result
+    others = (each.fit for each in candidate_set.candidates if each.structure is INTEGER)
+    analysis = RecordAnalysis.of(
+        (result.fit, *others), candidate_set.noise, candidate_set.comparison
+    )
+    return _Assessment((result, found, analysis), candidate_set, explained, kinds)
 
 
-def _untold_orders(field: CandidateSet, visible: tuple[int, ...]) -> dict[str, str]:
+def _unidentifiable_orders(candidate_set: CandidateSet, visible: tuple[int, ...]) -> dict[str, str]:
     """Say by the fit alone which orders are not identifiable, and why."""
-    freest, *others = field.candidates
-    untold = untold_reason(field, visible)
+    freest, *others = candidate_set.candidates
+    reason = not_reported_reason(candidate_set, visible)
     found = {}
     for name in COEFFICIENT_OF.keys() & set(freest.structure.free):
         low, high = freest.fit.interval[name] or (-math.inf, math.inf)
@@ -530,19 +544,19 @@ def _untold_orders(field: CandidateSet, visible: tuple[int, ...]) -> dict[str, s
             and each.deviance - freest.deviance < NORMAL_95**2
             for each in others
         )
-        if untold or too_wide or astray or freest.fit.interval[COEFFICIENT_OF[name]] is None:
-            found[name] = untold or NOT_DETERMINED
+        if reason or too_wide or astray or freest.fit.interval[COEFFICIENT_OF[name]] is None:
+            found[name] = reason or NOT_DETERMINED
     return found
 
 
-def _wrong(kinds: Collection[str], *, explained: bool) -> str | None:
+def _wrong_model_reason(kinds: Collection[str], *, explained: bool) -> str | None:
     """Say why the model is not to be believed, by what was found; None: it may be."""
     if not _MISREAD_KINDS.isdisjoint(kinds):
         return MISREAD
     return UNEXPLAINED if "harmonics" in kinds or not explained else None
 
 
-def _doubt(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> str | None:
+def _doubt_reason(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> str | None:
     """Say why no parameter is to be believed though all of the record is explained, or None.
 
     The modes are what each was when it was passed.
@@ -552,8 +566,8 @@ def _doubt(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> str | Non
     return next((f"{change.name} would explain the record as well" for change in changes), None)
 
 
-def _as_sure(
-    beside: tuple[Finding, ...],
+def _with_doubts(
+    from_model: tuple[Finding, ...],
     along: tuple[Finding, ...],
     wrong: str | None,
     doubt: str | None,
@@ -575,35 +589,38 @@ def _as_sure(
         Whether harmonics are all that remains: then they are what they seem to be.
     """
 
-    def as_sure(each: Finding) -> Finding:
+    def qualified(each: Finding) -> Finding:
         flag = next((flags[name] for name in each.parameters if name in flags), None)
         reason = doubt or flag
         if reason is None or (each.kind == "harmonics" and explained):
             return each
         return doubted(each, reason)
 
-    beside = tuple(map(as_sure, beside))
+    from_model = tuple(map(qualified, from_model))
     if wrong is not None:
         along = tuple(doubted(each, wrong) for each in along)
-    return (*beside, *along)
+    return (*from_model, *along)
 
 
-def _with_knocks_and_rest(
-    told: CandidateSet, found: tuple[Finding, ...], white: Whiteness, related: InputRelation
+def _with_knocks_and_unexplained(
+    candidate_set: CandidateSet,
+    found: tuple[Finding, ...],
+    white: Whiteness,
+    related: InputRelation,
 ) -> tuple[Finding, ...]:
     """Name knocks before all that was found, and after it what remains unexplained."""
     explained = white.white and not related.related
-    knocks = of_knocks(told.comparison.measurement.knocks, explained=explained)
-    rest = () if explained else (unexplained(white, related, told.best.fit.modes),)
+    knocks = of_knocks(candidate_set.comparison.measurement.knocks, explained=explained)
+    rest = () if explained else (unexplained(white, related, candidate_set.best.fit.modes),)
     return (*knocks, *found, *rest)
 
 
 def _tests(
-    field: CandidateSet, modal: ModalFit | None, band_hz: tuple[float, float]
+    candidate_set: CandidateSet, modal: ModalFit | None, band_hz: tuple[float, float]
 ) -> tuple[Whiteness, InputRelation, tuple[Harmonic, ...]]:
     """Test what the modal model leaves, or the first candidate where there is none."""
-    comparison, counts = field.comparison, field.noise.counts
-    residual = field.best.fit.residual if modal is None else modal.residual
+    comparison, counts = candidate_set.comparison, candidate_set.noise.counts
+    residual = candidate_set.best.fit.residual if modal is None else modal.residual
     angle_rad = comparison.angle_rad[comparison.kept]
     of_variance_1 = comparison.in_time(residual) * math.sqrt(comparison.samples / 2)
     multiples = harmonics(angle_rad, of_variance_1, comparison.decimation.rate_hz, band_hz)
@@ -616,8 +633,8 @@ def _tests(
     )
 
 
-def _table(field: CandidateSet) -> tuple[CandidateRow, ...]:
-    best, least_aic = field.best, min(c.aic for c in field.candidates)
+def _table(candidate_set: CandidateSet) -> tuple[CandidateRow, ...]:
+    best, least_aic = candidate_set.best, min(c.aic for c in candidate_set.candidates)
     return tuple(
         CandidateRow(
             structure=c.structure.name,
@@ -626,5 +643,5 @@ def _table(field: CandidateSet) -> tuple[CandidateRow, ...]:
             delta_bic=c.bic - best.bic,
             delta_aic=c.aic - least_aic,
         )
-        for c in field.candidates
+        for c in candidate_set.candidates
     )

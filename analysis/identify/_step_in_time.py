@@ -87,10 +87,10 @@ def step_score(comparison: Comparison, fit: ModalFit) -> Step:
     """
     residual = fit.residual.view(np.float64)
     stiffened = _Stiffened(comparison, fit)
-    best, places = Step(0.0, 0.0, 0.0), np.linspace(0, comparison.samples, _INSTANTS + 2)[1:-1]
-    spacing = float(places[1] - places[0])
+    best, instants = Step(0.0, 0.0, 0.0), np.linspace(0, comparison.samples, _INSTANTS + 2)[1:-1]
+    spacing = float(instants[1] - instants[0])
     for _ in range(2):
-        found = np.array([stiffened.spectrum(int(place)) for place in places])
+        found = np.array([stiffened.spectrum(int(instant)) for instant in instants])
         rows = np.ascontiguousarray(found * fit.noise.weight).view(np.float64)
         rows = rows - (rows @ fit.span.T) @ fit.span
         sizes = np.einsum("ij,ij->i", rows, rows)
@@ -101,11 +101,12 @@ def step_score(comparison: Comparison, fit: ModalFit) -> Step:
         if scores[first] > best.score:
             best = Step(
                 score=float(scores[first]),
-                instant_s=comparison.first_s + float(places[first]) / comparison.decimation.rate_hz,
+                instant_s=comparison.first_s
+                + float(instants[first]) / comparison.decimation.rate_hz,
                 relative_change=float(along[first] / sizes[first]),
             )
-        places = places[first] + spacing * np.linspace(-1, 1, 2 * _FINER + 3)[1:-1]
-        places = places[(places > 0) & (places < comparison.samples)]
+        instants = instants[first] + spacing * np.linspace(-1, 1, 2 * _FINER + 3)[1:-1]
+        instants = instants[(instants > 0) & (instants < comparison.samples)]
     return best
 
 
@@ -133,11 +134,11 @@ class _Stiffened:
                 answers.append(turned * inertia * square * follows)
         self._vibrations, self._answers = np.array(vibrations), np.array(answers)
 
-    def spectrum(self, place: int) -> NDArray[np.complex128]:
+    def spectrum(self, instant: int) -> NDArray[np.complex128]:
         """Spectrum of the torque by a change of 1 from a sample on, over the change, (K,)."""
         kept = self._comparison.kept
         later = self._vibrations.copy()
-        later[:, : kept.start + place] = 0.0
+        later[:, : kept.start + instant] = 0.0
         forces = np.fft.rfft(later, self._length)
         torque = np.fft.irfft(np.sum(forces * self._answers, axis=0), self._length)
         torque = torque[: self._decay.size] / self._decay

@@ -103,7 +103,7 @@ class TemporalChange:
 
 
 def along_time(
-    field: CandidateSet, rival_bic: float = math.inf
+    candidate_set: CandidateSet, rival_bic: float = math.inf
 ) -> tuple[CandidateSet, tuple[TemporalChange, ...]]:
     """Find what changes along the record; refit all with it if nothing else explains it as well.
 
@@ -121,15 +121,15 @@ def along_time(
     changes : tuple of Change
         What explains the record best of all, or as well as the best candidate.
     """
-    if field.misread:
-        return field, ()
-    lag = _lag_of_play(field.comparison)
-    most = field.best.bic + min(STRONG, _IN_SIGHT * (rival_bic - field.bic))
+    if candidate_set.misread:
+        return candidate_set, ()
+    lag = _lag_of_play(candidate_set.comparison)
+    most = candidate_set.best.bic + min(STRONG, _IN_SIGHT * (rival_bic - candidate_set.bic))
     tried: dict[What, tuple[float, Refit]] = {}
-    for lead in _leads(field):
-        for what, promised in _promising(field, lead, lag, most):
-            if promised < tried.get(what, (math.inf,))[0]:
-                refit, bic = _fitted(field, lead, what, lag)
+    for lead in _leads(candidate_set):
+        for what, predicted in _promising(candidate_set, lead, lag, most):
+            if predicted < tried.get(what, (math.inf,))[0]:
+                refit, bic = _fitted(candidate_set, lead, what, lag)
                 if bic < tried.get(what, (math.inf,))[0]:
                     tried[what] = (bic, refit)
     found = []
@@ -137,18 +137,18 @@ def along_time(
         sizes, std = refit.amplitudes()
         unit = _UNITS.get(what, 1.0)
         change = TemporalChange(
-            what, unit * float(sizes[-1]), unit * float(std[-1]), bic - field.best.bic
+            what, unit * float(sizes[-1]), unit * float(std[-1]), bic - candidate_set.best.bic
         )
         if change.behind < STRONG and _possible(change):
             found.append((change, refit))
     found.sort(key=lambda pair: pair[0].behind)
     if not found:
-        return field, ()
+        return candidate_set, ()
     first, refit = found[0]
     changes = tuple(c for c, _ in found if c.behind < first.behind + STRONG)
     if not first.certain or len(changes) > 1:
-        return field, changes
-    return field.with_columns(refit.columns, refit.noise_here()), changes
+        return candidate_set, changes
+    return candidate_set.with_columns(refit.columns, refit.noise_here()), changes
 
 
 def _possible(change: TemporalChange) -> bool:
@@ -156,20 +156,20 @@ def _possible(change: TemporalChange) -> bool:
     return change.size > 0 if change.what == "play" else abs(change.size) < 1
 
 
-def _leads(field: CandidateSet) -> Iterator[Candidate]:
+def _leads(candidate_set: CandidateSet) -> Iterator[Candidate]:
     """Give the best candidate, and the simple ones that something may stand beside instead."""
-    yield field.best
-    for candidate in field.candidates[1:]:
+    yield candidate_set.best
+    for candidate in candidate_set.candidates[1:]:
         if candidate.structure in _LEADS:
             yield candidate
 
 
 def _promising(
-    field: CandidateSet, lead: Candidate, lag: NDArray[np.float64], most_bic: float
+    candidate_set: CandidateSet, lead: Candidate, lag: NDArray[np.float64], most_bic: float
 ) -> Iterator[tuple[What, float]]:
     """Columns that to first order would make a candidate the best, with the BIC they promise."""
-    refit = field.refit(lead, 1)
-    columns = _columns(field.comparison, lead.fit.plant, lag)
+    refit = candidate_set.refit(lead, 1)
+    columns = _columns(candidate_set.comparison, lead.fit.plant, lag)
     saved = refit.saved_by(np.array(list(columns.values())))
     for what, squares in zip(columns, saved.tolist(), strict=True):
         left = max(refit.cost - squares, 1e-3 * refit.cost)
@@ -180,18 +180,23 @@ def _promising(
 
 
 def _fitted(
-    field: CandidateSet, lead: Candidate, what: What, lag: NDArray[np.float64]
+    candidate_set: CandidateSet, lead: Candidate, what: What, lag: NDArray[np.float64]
 ) -> tuple[Refit, float]:
     """Fit a candidate with one column beside it; give its BIC as well."""
-    refit = field.refit(lead, 1)
+    refit = candidate_set.refit(lead, 1)
     unknowns = refit.objective.unknowns
     size = 0.0
     for _ in range(_ROUNDS):
-        column = _column(field.comparison, refit.plant, lag, what, size)
-        columns = np.concatenate([field.columns, column[None]])
+        column = _column(candidate_set.comparison, refit.plant, lag, what, size)
+        columns = np.concatenate([candidate_set.columns, column[None]])
         before = refit.cost
         refit = Refit.descend(
-            field.comparison, unknowns, refit.x, field.noise, columns, max_evaluations=MANY
+            candidate_set.comparison,
+            unknowns,
+            refit.x,
+            candidate_set.noise,
+            columns,
+            max_evaluations=MANY,
         )
         moved, size = size, float(refit.amplitudes()[0][-1])
         settled = abs(size - moved) < _SETTLED * abs(size)
@@ -353,8 +358,8 @@ def remembered(
         return found
 
     of_modes = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
-    shares = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * of_modes)
-    for share, k in zip(shares.tolist(), of_modes.tolist(), strict=True):
+    stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * of_modes)
+    for stiffness, k in zip(stiffnesses.tolist(), of_modes.tolist(), strict=True):
         compliance = 1 / ((1 + internal) * k + inertial)
         follows = inertial * compliance
         at_first = own * k * -follows + external * (1 - follows)
@@ -365,9 +370,11 @@ def remembered(
             before, stress = stress, steady + size * (own * k + external) * moved
             if np.abs(stress - before).max() < _SMALL * np.abs(steady).max():
                 break
-        place = (1 - follows) * angle + size * moved
-        late = in_time(inertial * moved) + w * in_time(external * place)
-        total += share * (late - w * in_time(external * (1 - follows) * angle - follows * steady))
+        deflection = (1 - follows) * angle + size * moved
+        late = in_time(inertial * moved) + w * in_time(external * deflection)
+        total += stiffness * (
+            late - w * in_time(external * (1 - follows) * angle - follows * steady)
+        )
     return total[kept]
 
 

@@ -284,16 +284,16 @@ def ringing(
     explained = float(decays @ projected.amplitude_gram[:count, :count] @ decays)
     if len(hum) and decays.size:
         without = projected.residual - decays @ columns
-        beside, left = _combination(without, np.concatenate([columns, hum]))
+        combined, left = _combination(without, np.concatenate([columns, hum]))
         explained = _combination(without, hum)[1] - left
-        decays = beside[: decays.size]
+        decays = combined[: decays.size]
     amplitudes: dict[int, float] = {}
-    place = 0
+    start = 0
     for pole in poles:
         width = 2 if pole.oscillates else 1
-        size = float(np.linalg.norm(decays[place : place + width]))
+        size = float(np.linalg.norm(decays[start : start + width]))
         amplitudes[pole.mode] = max(amplitudes.get(pole.mode, 0.0), size)
-        place += width
+        start += width
     return Ringing(
         amplitude_nm=tuple(amplitudes.values()),
         chi_square=explained / scatter,

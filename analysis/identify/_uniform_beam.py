@@ -125,16 +125,16 @@ class ConstantsProblem:
         uniformity: float = 0.0,
         tilt_deg: float | None = None,
     ) -> None:
-        places = fit.rows(modes)
+        rows = fit.rows(modes)
         count = len(modes)
         self.modes = tuple(modes)
         self.nominal = nominal
         self.uniformity = uniformity
-        self.measured = fit.constants[places]
+        self.measured = fit.constants[rows]
         extra = np.zeros((count, len(CONSTANTS)))
         extra[:, CONSTANTS.index("ln_frequency")] = uniformity
         extra[:, CONSTANTS.index("ln_residue")] = 3 * uniformity
-        self.covariance = fit.covariance[np.ix_(places, places)] + np.diag(extra.ravel() ** 2)
+        self.covariance = fit.covariance[np.ix_(rows, rows)] + np.diag(extra.ravel() ** 2)
         self.compared = count * len(CONSTANTS)
         self._whitener = np.linalg.inv(np.linalg.cholesky(self.covariance))
         length = nominal.beam.length_m
@@ -308,7 +308,7 @@ class ConstantsProblem:
     def _minima(self, starts: Sequence[NDArray[np.float64]]) -> list[Minimum]:
         return sorted((self.minimum(x) for x in starts), key=lambda each: each.cost)
 
-    def held_at_edge(self, place: int, x: NDArray[np.float64]) -> Minimum:
+    def held_at_edge(self, index: int, x: NDArray[np.float64]) -> Minimum:
         """Descend with the size of a damping at the lower edge, where it does nothing.
 
         Parameters
@@ -319,10 +319,10 @@ class ConstantsProblem:
             Unknowns from which the search begins.
         """
         high = self.upper.copy()
-        high[place] = self.lower[place]
+        high[index] = self.lower[index]
         return _descend(self.equations, x, self.lower, high)
 
-    def held(self, place: int, value: float, x: NDArray[np.float64]) -> Minimum:
+    def held(self, index: int, value: float, x: NDArray[np.float64]) -> Minimum:
         """Descend with one of `PARAMETERS` held; `x` of the result are the unknowns.
 
         Parameters
@@ -336,10 +336,10 @@ class ConstantsProblem:
         """
         # The parameter takes the place of the unknown that it is made of with factor 1.
         forward = np.eye(x.size)
-        forward[place] = self.transform[place] / self.transform[place, place]
+        forward[index] = self.transform[index] / self.transform[index, index]
         backward = np.linalg.inv(forward)
         low, high = self.lower.copy(), self.upper.copy()
-        low[place] = high[place] = (value - self._offset[place]) / self.transform[place, place]
+        low[index] = high[index] = (value - self._offset[index]) / self.transform[index, index]
 
         def equations(y: NDArray[np.float64]) -> NormalEquations:
             found = self.equations(backward @ y)
@@ -407,13 +407,13 @@ class UniformBeamTest:
             "degrees_of_freedom": self.degrees_of_freedom,
             "constants": [
                 {
-                    "mode": self.modes[place // len(CONSTANTS)],
-                    "name": CONSTANTS[place % len(CONSTANTS)],
+                    "mode": self.modes[index // len(CONSTANTS)],
+                    "name": CONSTANTS[index % len(CONSTANTS)],
                     "measured": measured,
                     "std": std,
                     "predicted": predicted,
                 }
-                for place, (measured, std, predicted) in enumerate(
+                for index, (measured, std, predicted) in enumerate(
                     zip(
                         self.measured.tolist(),
                         self.std.tolist(),
@@ -487,9 +487,9 @@ def uniform_beam_test(
         Inclination of the plane of motion along the beam at rest as the file states it.
     """
     modes = fit.visible
-    places = fit.rows(modes)
-    measured, std = fit.constants[places], np.sqrt(np.diag(fit.covariance)[places])
-    freedom = len(places) - len(PARAMETERS)
+    rows = fit.rows(modes)
+    measured, std = fit.constants[rows], np.sqrt(np.diag(fit.covariance)[rows])
+    freedom = len(rows) - len(PARAMETERS)
     if freedom <= 0:
         none = np.full(measured.size, np.nan)
         return UniformBeamTest("not tested", math.nan, 0, None, modes, measured, none, std)
@@ -594,11 +594,11 @@ def _estimate(
     near = [each for each in minima if each.cost - best.cost < NORMAL_95**2]
     ends: dict[str, tuple[float, float]] = {}
     std: dict[str, float] = {}
-    for place, name in enumerate(PARAMETERS):
-        value, spread = float(values[place]), float(spreads[place])
+    for index, name in enumerate(PARAMETERS):
+        value, spread = float(values[index]), float(spreads[index])
         if name in _PROFILED:
-            low, high = (_end(problem, place, best, side * spread) for side in (-1.0, 1.0))
-            others = [float(problem.parameters(each.x)[place]) for each in near]
+            low, high = (_end(problem, index, best, side * spread) for side in (-1.0, 1.0))
+            others = [float(problem.parameters(each.x)[index]) for each in near]
             low, high = min(low, *others), max(high, *others)
         else:
             low, high = value - NORMAL_95 * spread, value + NORMAL_95 * spread
@@ -621,21 +621,21 @@ def _estimate(
     )
 
 
-def _end(problem: ConstantsProblem, place: int, best: Minimum, spread: float) -> float:
+def _end(problem: ConstantsProblem, index: int, best: Minimum, spread: float) -> float:
     """End of a 95 % interval: where the profile of chi-square has risen by 3.84.
 
     Where it does not rise so far within the range of an order, the edge of that.
     """
-    centre = float(problem.parameters(best.x)[place])
+    centre = float(problem.parameters(best.x)[index])
     edge = math.copysign(math.inf, spread)
-    if PARAMETERS[place] in ("alpha", "lambda"):
+    if PARAMETERS[index] in ("alpha", "lambda"):
         edge = _ORDER_RANGE[0 if spread < 0 else 1]
     inside, rise, x = centre, 0.0, best.x
     trial = centre + NORMAL_95 * spread
     outside: float | None = None
     for _ in range(_PROFILE_STEPS):
         trial = max(trial, edge) if spread < 0 else min(trial, edge)
-        found = problem.held(place, trial, x)
+        found = problem.held(index, trial, x)
         root = math.sqrt(max(found.cost - best.cost, 0.0))
         if abs(root - NORMAL_95) < _CLOSE:
             return trial

@@ -34,7 +34,7 @@ parameters that it lacks: chi-square's 0.1 %. A true one is excluded once in a t
 
 NOT_DETERMINED: Final = "the record does not determine the order"
 
-BESIDE_DRAG: Final = "air drag contributes to it, and its law is known to a few per cent only"
+WITH_DRAG: Final = "air drag contributes to it, and its law is known to a few per cent only"
 """Why external damping beside drag must not be taken for a property of the beam: of two records
 of one rig, one had lambda four standard deviations off, with a drag that fell with the speed."""
 
@@ -79,7 +79,11 @@ class OrderVerdict:
 
 
 def order_verdict(
-    field: CandidateSet, profile: LikelihoodProfile, visible: tuple[int, ...], *, doubt: str | None
+    candidate_set: CandidateSet,
+    profile: LikelihoodProfile,
+    visible: tuple[int, ...],
+    *,
+    doubt: str | None,
 ) -> OrderVerdict:
     """Judge one order.
 
@@ -93,7 +97,7 @@ def order_verdict(
     doubt : str or None
         Why nothing that rests on that structure is to be believed; None: it may be.
     """
-    status, reason = _judged(field, profile, visible, doubt=doubt)
+    status, reason = _judged(candidate_set, profile, visible, doubt=doubt)
     known = status not in ("not identifiable", "absent")
     return OrderVerdict(
         order=profile.order,
@@ -105,7 +109,7 @@ def order_verdict(
     )
 
 
-def untold_reason(field: CandidateSet, visible: tuple[int, ...]) -> str | None:
+def not_reported_reason(candidate_set: CandidateSet, visible: tuple[int, ...]) -> str | None:
     """Say why no order can be told from a record, whatever its likelihood says; None if it may.
 
     Parameters
@@ -114,7 +118,7 @@ def untold_reason(field: CandidateSet, visible: tuple[int, ...]) -> str | None:
     visible : tuple of int
         Modes that the record shows.
     """
-    return too_few_modes(field.freest.structure, len(visible))
+    return too_few_modes(candidate_set.freest.structure, len(visible))
 
 
 def too_few_modes(structure: Structure, modes: int) -> str | None:
@@ -147,20 +151,24 @@ def deviance_of_one(profile: LikelihoodProfile) -> float:
 
 
 def _judged(
-    field: CandidateSet, profile: LikelihoodProfile, visible: tuple[int, ...], *, doubt: str | None
+    candidate_set: CandidateSet,
+    profile: LikelihoodProfile,
+    visible: tuple[int, ...],
+    *,
+    doubt: str | None,
 ) -> tuple[Status, str | None]:
-    freest, order = field.freest, profile.order
-    untold = untold_reason(field, visible)
-    if untold is not None:
-        return "not identifiable", untold
+    freest, order = candidate_set.freest, profile.order
+    reason = not_reported_reason(candidate_set, visible)
+    if reason is not None:
+        return "not identifiable", reason
     if not freest.structure.has(order):
         return "absent", "no such damping shows"
     if not profile.identifiable:
         return "not identifiable", NOT_DETERMINED
     if doubt is not None:
         return "open", doubt
-    if order == "lambda" and field.drag is not None:
-        return "open", BESIDE_DRAG
+    if order == "lambda" and candidate_set.drag is not None:
+        return "open", WITH_DRAG
     if profile.admits_one:
         return "compatible", None
     return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
@@ -249,10 +257,10 @@ class Verdict:
         return plain
 
 
-def rivals(field: CandidateSet, within: float) -> tuple[Candidate, ...]:
+def rivals(candidate_set: CandidateSet, within: float) -> tuple[Candidate, ...]:
     """Candidates whose BIC is less than so much above that of the first, without the first."""
-    limit = field.best.bic + within
-    return tuple(c for c in field.candidates[1:] if c.bic < limit)
+    limit = candidate_set.best.bic + within
+    return tuple(c for c in candidate_set.candidates[1:] if c.bic < limit)
 
 
 def _plain(value: object) -> object:

@@ -69,10 +69,10 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
             torque[near] * weight, angle[near] * weight, offset[near] / reach_hz
         )
         # Chance does neither: together they are nearly eight standard deviations, or more.
-        stands_out = left - freedom > _EVIDENCE and left > _OVER_NOISE * freedom
+        significant = left - freedom > _EVIDENCE and left > _OVER_NOISE * freedom
         # In many bins a resonance need not stand out of the noise, where the fit knows where it is.
         own = float(np.vdot(fit.residual[near], fit.residual[near]).real)
-        if stands_out or left - own > _EVIDENCE:
+        if significant or left - own > _EVIDENCE:
             found.append(mode.number)
     return tuple(found)
 
@@ -80,10 +80,10 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
 def driven(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
     """Whether the motor was driven near one frequency nearly as much as near another."""
     measurement = comparison.measurement
-    asked = measurement.reference_rad
-    asked_rad = measurement.angle_from_rest(1.0) if asked is None else asked - asked[0]
-    power = np.abs(np.fft.rfft(asked_rad)) ** 2
-    hz = np.fft.rfftfreq(asked_rad.size, 1 / measurement.rate_hz)
+    reference = measurement.reference_rad
+    moved_rad = measurement.angle_from_rest(1.0) if reference is None else reference - reference[0]
+    power = np.abs(np.fft.rfft(moved_rad)) ** 2
+    hz = np.fft.rfftfreq(moved_rad.size, 1 / measurement.rate_hz)
 
     def amplitude(at_hz: float) -> float:
         near = np.abs(hz - at_hz) <= max(_NEAR * at_hz, _FEWEST_BINS * hz[1])
@@ -95,12 +95,12 @@ def driven(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -
 def _reach_hz(comparison: Comparison, frequency_hz: float, damping_ratio: float) -> float:
     """How far to either side of a mode is looked."""
     spacing_hz = float(comparison.frequency_hz[1] - comparison.frequency_hz[0])
-    share = min(max(_NEAR, _HALF_WIDTHS * damping_ratio), _FARTHEST)
-    return max(share * frequency_hz, (_FEWEST_BINS + 0.5) * spacing_hz)
+    fraction = min(max(_NEAR, _HALF_WIDTHS * damping_ratio), _FARTHEST)
+    return max(fraction * frequency_hz, (_FEWEST_BINS + 0.5) * spacing_hz)
 
 
 def _chi_square_of_smooth(
-    torque: NDArray[np.complex128], angle: NDArray[np.complex128], place: NDArray[np.float64]
+    torque: NDArray[np.complex128], angle: NDArray[np.complex128], position: NDArray[np.float64]
 ) -> float:
     """Sum of squares that the best smooth response leaves.
 
@@ -111,6 +111,6 @@ def _chi_square_of_smooth(
     place : ndarray, shape (K,)
         Within the window, -1 to 1.
     """
-    columns, _ = np.linalg.qr(np.array([place**k * angle for k in range(_DEGREE + 1)]).T)
+    columns, _ = np.linalg.qr(np.array([position**k * angle for k in range(_DEGREE + 1)]).T)
     left = torque - columns @ (columns.conj().T @ torque)
     return float(np.vdot(left, left).real)

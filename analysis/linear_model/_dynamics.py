@@ -237,8 +237,8 @@ def modal_dynamics(
         pairs=np.concatenate([modes, residual]),
         names=(
             *(
-                f"mode_{number}" if number else f"resonance_{place}"
-                for place, number in enumerate(numbers, start=1)
+                f"mode_{number}" if number else f"resonance_{index}"
+                for index, number in enumerate(numbers, start=1)
             ),
             *(f"residual_{number}" for number in range(1, residual.size + 1)),
         ),

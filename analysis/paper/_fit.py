@@ -182,10 +182,10 @@ def fit_many(
     grids: list[tuple[_Grid, _Grid]] = []
     for weighting in weightings:
         every = weights(omega, weighting)
-        index, share = thinned(response, every, _THINNED_POINTS)
+        index, point_weights = thinned(response, every, _THINNED_POINTS)
         few_model = FrequencyResponseModel(frequency_hz[index], beam, tool_inertia_kg_m2)
         grids.append(
-            (_Grid(few_model, response[index], share), _Grid(whole_model, response, every))
+            (_Grid(few_model, response[index], point_weights), _Grid(whole_model, response, every))
         )
     return tuple(
         _fit(structure, weighting_name(weighting), few, whole)
@@ -280,11 +280,11 @@ def _polished(problem: _FrfProblem, rough: Minimum, bounds: Box) -> Minimum:
 
 def _different(found: list[Minimum]) -> list[Minimum]:
     """Minima that differ, the lowest first."""
-    kept: list[Minimum] = []
+    distinct: list[Minimum] = []
     for minimum in sorted(found, key=lambda m: m.cost):
-        if all(np.abs(minimum.x - other.x).max() > _SAME_MINIMUM for other in kept):
-            kept.append(minimum)
-    return kept
+        if all(np.abs(minimum.x - other.x).max() > _SAME_MINIMUM for other in distinct):
+            distinct.append(minimum)
+    return distinct
 
 
 def _standard_deviations(problem: _FrfProblem, x: NDArray[np.float64]) -> dict[str, float] | None:

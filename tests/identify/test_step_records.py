@@ -32,7 +32,7 @@ def test_a_profile_looks_for_no_valley_where_there_is_none(without_delay):
     from analysis.identify._profile_likelihood import profiled
 
     field, alpha, _ = profiled(without_delay)
-    assert len(alpha.valleys) == 1
+    assert len(alpha.local_minima) == 1
     assert alpha.estimate == pytest.approx(field.best.fit.parameters["alpha"], abs=1e-4)
 
 
