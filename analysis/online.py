@@ -1,10 +1,9 @@
 """Online fit: the estimate of a session that still runs, from the samples recorded so far.
 
-`OnlineFit` is fed with samples and fits as often as it is asked, by the very functions of
-`analyze`, so that the last estimate of a session is that of its file. As a program,
-``python -m analysis.online``, it takes the samples on standard input, as `rigd.session.online_fit`
-writes them, and answers on standard output, one line of JSON per estimate
-(docs/online_fit.md).
+`OnlineFit` receives samples and fits them on request, by the functions of `analyze`, so that the
+last estimate of a session equals that of its file. As a program, ``python -m analysis.online``, it
+takes the samples on standard input, as `rigd.session.online_fit` writes them, and answers on
+standard output, one line of JSON per estimate (docs/online_fit.md).
 """
 
 from __future__ import annotations
@@ -45,8 +44,8 @@ if TYPE_CHECKING:
 
 _NOISE_POINTS: Final = 40
 _NICE: Final = 5
-"""Niceness of the program while somebody waits for its answers: behind the rig's own processes, a
-third of a processor beside another program."""
+"""Niceness of the program while its estimates are awaited: below the rig's own processes, a third
+of a processor in competition with another program."""
 
 _NEED_NO_MODE: Final = frozenset({"sign", "unit", "clipping", "stop", "hum", "sensor drift"})
 """Kinds of findings that do not rest on a fitted beam."""
@@ -54,25 +53,25 @@ _NEED_NO_MODE: Final = frozenset({"sign", "unit", "clipping", "stop", "hum", "se
 
 @dataclass(frozen=True, slots=True)
 class OnlineEstimate:
-    """What the samples up to a tick tell.
+    """Estimate from the samples up to a tick.
 
     Attributes
     ----------
     tick : int
-        First tick that was left out.
+        First tick that was excluded.
     duration_s : float
         Length of the record used.
     whole : bool
-        Whether every structure was tried, as `analysis.select` does; otherwise the freest alone,
-        under the same tests of what it leaves.
+        Whether every structure was tested, as `analysis.select` does; otherwise the freest alone,
+        with the same tests of its residual.
     took_s : float
-        Time that it took.
+        Computing time.
     headline : Headline or None
         The numbers, with flags; None if there was no fit.
     orders : tuple of OrderVerdict
-        Judgement of alpha and lambda; empty unless `whole`.
+        Verdicts on alpha and lambda; empty unless `whole`.
     findings : tuple of Finding
-        Effects beside the beam, and what makes the numbers doubtful.
+        Effects in addition to the beam, and reasons against the numbers.
     analysis : RecordAnalysis or None
         The fits with the noise.
     warnings : tuple of str
@@ -97,7 +96,7 @@ class OnlineEstimate:
 
     @property
     def doubt(self) -> str | None:
-        """Why no number is to be believed; None if some are."""
+        """Return the reason against all numbers; None if some are valid."""
         headline = self.headline
         if headline is None:
             return self.problem
@@ -110,10 +109,10 @@ class OnlineEstimate:
 
     @property
     def predicting(self) -> RecordFit | None:
-        """The fit to predict the next excitation's answer with; None if there was no fit.
+        """Return the fit for predictions of the next excitation; None if there was no fit.
 
-        It has both dampings. One that does not show, or whose order is not identifiable and which
-        may thus be a stiffness or an inertia in truth, has order 1.
+        It has both dampings. An insignificant damping, or one without an identifiable order (which
+        may be a stiffness or an inertia), has order 1.
         """
         from analysis.identify import INTEGER
         from analysis.models import COEFFICIENT_OF
@@ -129,9 +128,9 @@ class OnlineEstimate:
 
     @property
     def plant(self) -> Plant | None:
-        """That of `predicting`, its modes where the record shows them; None if there was no fit.
+        """Return the plant of `predicting` with the measured modes; None if there was no fit.
 
-        Where a uniform beam does not predict the modal constants, each mode has a stiffness of its
+        If a uniform beam does not predict the modal constants, each mode has a stiffness of its
         own.
         """
         headline, fit = self.headline, self.predicting
@@ -143,7 +142,7 @@ class OnlineEstimate:
         return headline.modal.plant_like(fit.plant)
 
     def as_json(self) -> dict[str, Any]:
-        """As `json.dumps` takes it (docs/online_fit.md)."""
+        """Return the estimate as `json.dumps` takes it (docs/online_fit.md)."""
         from analysis.identify import headline_json
         from analysis.results import finite
 
@@ -172,7 +171,7 @@ class OnlineEstimate:
 
 
 def _noise(analysis: RecordAnalysis) -> dict[str, Any]:
-    """Thin out the spectrum of the noise."""
+    """Return the noise spectrum on fewer points."""
     import numpy as np
 
     hz = analysis.frequency_hz
@@ -182,16 +181,16 @@ def _noise(analysis: RecordAnalysis) -> dict[str, Any]:
 
 
 class OnlineFit:
-    """Fit of a session as far as it has been recorded.
+    """Fit of the recorded part of a running session.
 
     Parameters
     ----------
     metadata : mapping of str to str
         The record ``session`` of its file (docs/session_format.md): rate, beam, delays.
     segments : mapping of str to (int, int), optional
-        Name → first tick and end (exclusive), as planned.
+        Planned segments: name → first tick and end (exclusive).
     name : str
-        What messages call it.
+        Name in messages.
 
     Examples
     --------
@@ -221,7 +220,7 @@ class OnlineFit:
         self._judged: Selection | None = None
 
     def feed(self, samples: NDArray[np.void]) -> None:
-        """Take the next samples.
+        """Append the next samples.
 
         Parameters
         ----------
@@ -238,17 +237,17 @@ class OnlineFit:
             self._count += len(samples)
 
     def record(self, up_to_tick: int | None = None) -> Record:
-        """Return the record so far, as `analysis.load` would of a file with these samples.
+        """Return the record so far, as `analysis.load` returns it for a file with these samples.
 
         Parameters
         ----------
         up_to_tick : int, optional
-            Samples from this tick on are left out.
+            Samples from this tick on are excluded.
 
         Raises
         ------
         SessionError, RecordError
-            There is none, or it cannot be analysed.
+            There is no record, or it cannot be analysed.
         """
         import numpy as np
 
@@ -280,22 +279,22 @@ class OnlineFit:
     def estimate(
         self, up_to_tick: int | None = None, *, whole: bool = False, from_last: bool = False
     ) -> OnlineEstimate:
-        """Fit what has been recorded.
+        """Return the estimate from the samples recorded so far.
 
         Parameters
         ----------
         up_to_tick : int, optional
-            Samples from this tick on are left out.
+            Samples from this tick on are excluded.
         whole : bool
-            Try every structure, as `analysis.select` does, in four times the time.
+            Test every structure, as `analysis.select` does, in four times the time.
         from_last : bool
-            Such an estimate may start from what the last one found, where that explains these
-            samples too: in a third of the time, but of several minima it may miss one.
+            Allow such an estimate to start from the last one, if that explains these samples too.
+            This takes a third of the time, but may miss one of several minima.
 
         Returns
         -------
         OnlineEstimate
-            Where nothing can be fitted, one that says why.
+            Estimate, or the reason why nothing can be fitted.
         """
         from analysis.identify import Measurement, MeasurementError, freest_alone, select
         from analysis.record import RecordError
@@ -320,7 +319,7 @@ class OnlineFit:
             else:
                 headline, found, analysis = freest_alone(measurement, band_hz)
         except (SessionError, RecordError, ArithmeticError, ValueError) as error:
-            # A running session is told, and goes on; later samples may do.
+            # A running session gets the reason, and goes on; later samples may suffice.
             foreseen = isinstance(error, SessionError | RecordError | MeasurementError)
             problem = f"The record so far cannot be fitted ({error!r})."
             problem = str(error).removeprefix(f"{self._path}: ") if foreseen else problem
@@ -351,13 +350,13 @@ class OnlineFit:
 
 
 def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateRequest]) -> None:
-    """Answer to what comes, until it ends.
+    """Answer requests until the stream ends.
 
     Parameters
     ----------
     start : StreamStart
     frames : iterator
-        As `rigd.session.read_frames` gives them.
+        Frames from `rigd.session.read_frames`.
 
     Raises
     ------
@@ -369,7 +368,7 @@ def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateReques
     came = queue.SimpleQueue()
 
     def read() -> None:
-        # Beside the fit, so that the sender never waits for it.
+        # In another thread than the fit, so that the sender never waits for it.
         end = None
         try:
             for frame in frames:
@@ -413,7 +412,7 @@ def _answer(fit: OnlineFit, request: EstimateRequest) -> None:
 
 
 def main() -> None:
-    """Answer on standard output to the stream on standard input."""
+    """Answer the stream on standard input on standard output."""
     # Ctrl-C stops the session safely; this ends with the stream.
     ignore()
     parser = argparse.ArgumentParser(prog="python -m analysis.online", description=__doc__)

@@ -1,8 +1,8 @@
-"""Quick look at one session: its modes, the coherence, what is flagged, against the last session.
+"""Quick look at one session: modes, coherence and flags, compared with the last session.
 
-As a program, ``python -m analysis.quick_look FILE``, it writes the look beside the session file, as
-``STEM.look.json``, and prints its text. `rigd run` and the daemon start it after each session, at
-a low priority. The report of `analyze` says more and takes longer.
+As a program, ``python -m analysis.quick_look FILE``, it writes the quick look into the folder of
+the session file, as ``STEM.look.json``, and prints its text. `rigd run` and the daemon start it
+after each session, at a low priority. The report of `analyze` is more complete and takes longer.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _JUDGED_S: Final = 300.0
 1 kHz, the freest structure alone 4 ms."""
 
 _NEAR: Final = 0.1
-"""Distance of two such bands, relative to their frequency, below which they are told as one."""
+"""Distance of two such bands, relative to their frequency, below which they are reported as one."""
 
 _HAMMING_BINS: Final = 1.30
 """Width of a Hamming window's main lobe at half its power, in bins of the segment."""
@@ -53,26 +53,26 @@ _HAMMING_BINS: Final = 1.30
 _QUANTITIES: Final = ("frequency_hz", "damping_ratio")
 
 _NICE: Final = 10
-"""Niceness of the program: a tenth of what an ordinary one gets beside it."""
+"""Niceness of the program: a tenth of the processor time of an ordinary one."""
 
 
 class LookError(ValueError):
-    """A look cannot be made or written; the message says why, and what to do."""
+    """A quick look cannot be made or written; the message states cause and remedy."""
 
 
-# The look
+# The quick look
 
 
 def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
-    """Look at a session.
+    """Return the quick look at a session.
 
     Parameters
     ----------
     path : Path
         Session file.
     last : Path, optional
-        Session to compare with, by its look; by default the last one of the same specimen among
-        the looks beside the file.
+        Session to compare with, by its quick look; by default the last one of the same specimen in
+        the folder of the file.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
     Raises
     ------
     rigd.session.SessionError, LookError
-        There is no session file, or no look of `last`.
+        There is no session file, or no quick look of `last`.
     """
     from analysis.record import RecordError, load_record
     from analysis.results import finite
@@ -138,7 +138,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
 
 
 def _headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:
-    """Fit the record; return the numbers, None without any, their validity, and the sentences."""
+    """Fit the record; return its numbers (or None), their validity, and sentences."""
     from analysis.identify import Measurement, MeasurementError, freest_alone
     from analysis.results import whole_record
     from analysis.suited import record_band_hz
@@ -184,10 +184,10 @@ def _mode(mode: Mode) -> dict[str, Any]:
 
 
 def _model(headline: Headline, record: Record, shown_hz: Sequence[float]) -> dict[str, Any] | None:
-    """Return the response of the model shown first with its 95 % band, where it was excited.
+    """Return the response of the first model with its 95 % band, where it was excited.
 
-    None if it does not explain the record, or depends on the amplitude, as with drag: there is no
-    band for it then.
+    Return None if the model does not explain the record or depends on the amplitude, as with drag:
+    there is no band then.
     """
     import numpy as np
 
@@ -212,7 +212,7 @@ def _model(headline: Headline, record: Record, shown_hz: Sequence[float]) -> dic
 
 
 def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], list[str]]:
-    """Estimate response and coherence as the live view does, where the reference has excited it."""
+    """Estimate response and coherence like the live view, where the reference has excited it."""
     import numpy as np
 
     from analysis.models import LARGEST_FRACTION_OF_RATE
@@ -225,7 +225,7 @@ def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], li
     resolution_hz = _HAMMING_BINS * record.rate_hz / segments.segment_length
     try:
         estimate = _estimate(record, segments, last_hz)
-        # Of steps, multisines and narrow sweeps it would tell of the segments, not of the rig.
+        # For steps, multisines and narrow sweeps it would show the segments, not the rig.
         coherence = None
         if estimate is not None and against_welch(record, (FIRST_HZ, last_hz)) is None:
             coherence, segments = _coherence(record, estimate, segments, last_hz)
@@ -275,7 +275,7 @@ def _estimate(record: Record, segments: Segmentation, last_hz: float) -> Running
 def _coherence(
     record: Record, estimate: RunningEstimate, segments: Segmentation, last_hz: float
 ) -> tuple[Real | None, Segmentation]:
-    """Return the coherence, and the segments that it is of: of a single one there is none."""
+    """Return the coherence and its segments; a single segment has no coherence."""
     from rigd.spectral import PAPER_OVERLAP_FRACTION, PAPER_SEGMENTS, segment_lengths
 
     if estimate.response.coherence is None:
@@ -291,9 +291,9 @@ def _coherence(
 def _bands(
     frequency_hz: Real, low: NDArray[np.bool_], resolved_hz: float
 ) -> Iterator[tuple[float, float]]:
-    """Join bins to bands: what is nearer than a tenth of its frequency is one band.
+    """Join bins to bands: bins nearer than a tenth of their frequency form one band.
 
-    A band narrower than segments resolve is left out.
+    A band narrower than the resolution of the segments is omitted.
     """
     import numpy as np
 
@@ -322,7 +322,7 @@ def _quick_look_of(last: Path) -> dict[str, Any]:
 
 
 def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
-    """Find the last session of a specimen before a time, by the looks beside its file."""
+    """Return the last quick look of a specimen before a time, from the folder of the file."""
     found = last_look(
         path.parent,
         specimen,
@@ -377,7 +377,7 @@ def _against(modes: list[dict[str, Any]], before: Mapping[str, Any]) -> dict[str
 
 
 def _text(document: Mapping[str, Any]) -> Iterator[str]:
-    """Say it in a few lines for a terminal."""
+    """Return the quick look in a few lines for a terminal."""
     from rigd.view.frequency_charts import LOW_COHERENCE
 
     specimen = f" ({document['specimen']})" if document["specimen"] else ""
@@ -410,7 +410,7 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _rounded(values: Real) -> list[float]:
-    """Six digits: more than an estimate has."""
+    """Round to six digits: more than the accuracy of an estimate."""
     return [float(f"{value:.6g}") for value in values]
 
 
@@ -426,14 +426,14 @@ def _without_name(sentence: str, path: Path) -> str:
 
 
 def write_look(document: Mapping[str, Any], path: Path) -> Path:
-    """Write a look beside its session file, whole or not at all.
+    """Write a quick look to the folder of its session file, whole or not at all.
 
-    An older look at the same session is replaced; one that was made later stays.
+    An older quick look of the same session is replaced; one that was made later stays.
 
     Parameters
     ----------
     document : mapping
-        As `look_at` gives it.
+        Result of `look_at`.
     path : Path
         Session file.
 
@@ -445,7 +445,7 @@ def write_look(document: Mapping[str, Any], path: Path) -> Path:
     Raises
     ------
     LookError
-        It cannot be written, or something else has its name.
+        It cannot be written, or another file has its name.
     """
     target = look_path(path)
     there = read_look(target)
@@ -469,7 +469,7 @@ def write_look(document: Mapping[str, Any], path: Path) -> Path:
 
 
 def main() -> None:
-    """Look at the session that the command line names."""
+    """Write the quick look of the session on the command line."""
     raise_on(signal.SIGINT)
     parser = argparse.ArgumentParser(prog="python -m analysis.quick_look", description=__doc__)
     parser.add_argument("file", type=Path, metavar="FILE", help="Session file.")

@@ -42,7 +42,7 @@ _DISMISSED: Final = 10.0
 again."""
 
 _SHOWS: Final = 4.0
-"""Deviance that a damping must save to stay in the freest structure: one that saves less moves no
+"""Deviance reduction that a damping needs to stay in the freest structure: with less it moves no
 other parameter by more than two standard deviations, and only makes them uncertain."""
 
 _CERTAIN: Final = 5.0
@@ -61,23 +61,23 @@ _NEARLY: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class CandidateSet:
-    """All candidates on one record, and what it takes to fit again.
+    """All candidates on one record, with the data that another fit needs.
 
     Attributes
     ----------
     comparison : Comparison
     noise : Noise
-        The one under which all were fitted.
+        Noise under which all of them were fitted.
     free : tuple of str
         Settings that are free.
     candidates : tuple of Candidate
         The lowest BIC first.
     columns : ndarray of complex, shape (c, K)
-        What all were allowed beside the linear beam.
+        Spectra that all of them include in addition to the linear beam.
     drag : DragEstimate, optional
-        Drag of the air, if the record calls for it; it is then in all candidates.
+        Air drag, if the record shows it; all candidates then include it.
     misread : tuple of Finding
-        A wrong sign or unit, which makes every number wrong; empty where there is none.
+        Findings of a wrong sign or unit, which invalidates every number; usually empty.
     """
 
     comparison: Comparison
@@ -95,7 +95,7 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet:
-        """Fit every structure on a uniform beam; the freest alone where a sign or a unit is wrong.
+        """Fit every structure on a uniform beam; only the freest one if a sign or unit is wrong.
 
         Raises
         ------
@@ -116,7 +116,7 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet | None:
-        """Fit what was fitted to an earlier part of the record, each from where it was.
+        """Fit the candidates of an earlier part of the record again, each from its last estimate.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ class CandidateSet:
         Returns
         -------
         CandidateSet or None
-            None if the first leaves more than noise now: a search has to find out why.
+            None if the residual of the first exceeds the noise: then a search is needed.
 
         Raises
         ------
@@ -161,7 +161,7 @@ class CandidateSet:
         band_hz: tuple[float, float],
         additional: tuple[Structure, ...] = (),
     ) -> CandidateSet:
-        """Fit the structure with every order free, on a uniform beam, and few others beside it.
+        """Fit the structure with every order free, and some additional ones, on a uniform beam.
 
         Raises
         ------
@@ -175,14 +175,14 @@ class CandidateSet:
 
     @classmethod
     def _uniform(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> CandidateSet:
-        """Take over what was fitted with a uniform beam."""
+        """Return the candidates of fits to a uniform beam."""
         return cls._fitted(uniform, fixed, (Candidate(fit.structure, fit) for fit in uniform.fits))
 
     @classmethod
     def _fitted(
         cls, analysis: RecordAnalysis, fixed: tuple[Setting, ...], candidates: Iterable[Candidate]
     ) -> CandidateSet:
-        """Take over what was fitted, as candidates."""
+        """Return a set with given fits as its candidates."""
         comparison = analysis.comparison
         return cls(
             comparison=comparison,
@@ -194,16 +194,16 @@ class CandidateSet:
 
     @property
     def best(self) -> Candidate:
-        """The first: the lowest BIC, unless the field is led by another (`led_by`)."""
+        """Return the first candidate: the lowest BIC, unless `led_by` put another first."""
         return self.candidates[0]
 
     @property
     def freest(self) -> Candidate:
-        """The freest structure that the record supports; a damping that does not show is left out.
+        """Return the freest structure that the record supports, without insignificant dampings.
 
-        All orders are free, so its intervals hold whichever simpler structure is the true one;
-        those of the lowest BIC hold only if that is. The best where no structure was fitted with
-        its orders free.
+        All orders are free, so its intervals are valid whichever simpler structure is the true one.
+        The intervals of the lowest BIC are valid only if that structure is true. If no structure
+        was fitted with free orders, this is the best one.
         """
         alike = {c.structure.name: c for c in self.candidates}
         freest = alike.get(_FREEST.name)
@@ -214,32 +214,32 @@ class CandidateSet:
         return least if least.deviance - freest.deviance < _SHOWS else freest
 
     def led_by(self, candidate: Candidate) -> CandidateSet:
-        """Put one candidate first: the one whose numbers are told."""
+        """Return the set with one candidate first: the one whose numbers are reported."""
         others = (c for c in self.candidates if c is not candidate)
         return replace(self, candidates=(candidate, *others))
 
     @property
     def likeliest(self) -> RecordFit:
-        """The lowest sum of squares, however many parameters it took."""
+        """Return the candidate with the lowest sum of squares, whatever its parameters."""
         return min((candidate.fit for candidate in self.candidates), key=lambda fit: fit.cost)
 
     @property
     def bic(self) -> float:
-        """The lowest, comparable between fields whose noise has been estimated again."""
+        """Return the lowest BIC; it is comparable between sets with different noise."""
         return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
 
     def unknowns(self, structure: Structure) -> Unknowns:
-        """Search space of a structure on this record."""
+        """Return the search space of a structure on this record."""
         return Unknowns.of(structure, self.comparison.measurement.nominal, self.free)
 
     def refit(self, candidate: Candidate, max_evaluations: int = MANY) -> Refit:
-        """Descend from where a candidate is."""
+        """Descend from the estimate of a candidate."""
         return self.descent_from(candidate.fit.plant, candidate.structure, max_evaluations)
 
     def descent_from(
         self, plant: Plant, structure: Structure, max_evaluations: int = MANY
     ) -> Refit:
-        """Descend from a plant, with a structure."""
+        """Descend from a plant with a structure."""
         unknowns = self.unknowns(structure)
         return self.descent(unknowns, unknowns.vector(plant), max_evaluations)
 
@@ -257,7 +257,7 @@ class CandidateSet:
         )
 
     def _renewed(self) -> CandidateSet:
-        """Tell anew, with the best beam, what followed the reference; `self` if that is settled."""
+        """Re-estimate the angle that follows the reference; `self` after convergence."""
         candidate_set = self
         for _ in range(RENEWALS):
             best = candidate_set.best
@@ -276,22 +276,22 @@ class CandidateSet:
         return candidate_set.ranked((*candidate_set.candidates, *every)).cross_checked()
 
     def _without_leakage(self) -> CandidateSet:
-        """Leave out the bins that a disturbance beyond the band leaks into."""
+        """Exclude the bins that a disturbance beyond the band leaks into."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
         return self.under(noise) if noise is not self.noise else self
 
     def under(self, noise: NoiseSpectrum) -> CandidateSet:
-        """Fit again under a noise that differs a little."""
+        """Fit again under a slightly different noise spectrum."""
         other = replace(self, noise=noise)
         return other.ranked(self._brought_to(other, c, FEW) for c in self.candidates)
 
     def _brought_to(self, other: CandidateSet, c: Candidate, max_evaluations: int) -> Candidate:
-        """Fit a candidate in a set that differs a little; roughly where it is far behind."""
+        """Fit a candidate in a slightly different set; only roughly if its BIC is far higher."""
         behind = c.bic - min(each.bic for each in self.candidates)
         return other.refit(c, max_evaluations if behind < FAR_BEHIND else _A_STEP).candidate()
 
     def cross_checked(self) -> CandidateSet:
-        """Start each from where the best is: over a flat valley a search may miss what is there."""
+        """Start each candidate from the best one: a search may miss a flat minimum."""
         candidate_set = self
         for _ in range(_CROSS_CHECKS):
             best = candidate_set.best
@@ -304,11 +304,11 @@ class CandidateSet:
         return candidate_set
 
     def tried_from(self, plant: Plant) -> CandidateSet:
-        """Start each from a plant that a search has found."""
+        """Start each candidate from a plant that another search found."""
         return self.ranked(self._from_plant(c, plant) for c in self.candidates).cross_checked()
 
     def _from_plant(self, candidate: Candidate, plant: Plant) -> Candidate:
-        """Fit a candidate from another's plant, where that has no other kind of damping."""
+        """Fit a candidate from the plant of another, unless that has other dampings."""
         structure, damping = candidate.structure, plant.damping
         if (damping.zeta and not structure.internal) or (damping.gamma and not structure.external):
             return candidate
@@ -323,11 +323,11 @@ class CandidateSet:
         return candidate if found.cost > least else found.candidate()
 
     def with_special_cases(self) -> CandidateSet:
-        """Fit special cases of the freest structure from where that is, if they may be better.
+        """Fit special cases of the freest structure from its estimate, if they may be better.
 
-        An internal damping whose order is near 2 is an inertia, with a minimum of its own, which
-        the search for the freest may take for the lowest: from an order of 1 there is none. A
-        damping that does not show is left out, as of the freest of all structures (`freest`).
+        An internal damping whose order is near 2 is an inertia. It has a minimum of its own, and
+        the search for the freest structure may take it for the lowest; from an order of 1 this
+        minimum does not exist. An insignificant damping is left out, as in `freest`.
         """
         fit = next(each.fit for each in self.candidates if each.structure is _FREEST)
         low, high = fit.interval["alpha"] or (math.inf, -math.inf)
@@ -338,20 +338,20 @@ class CandidateSet:
         return candidate_set.led_by(candidate_set.freest)
 
     def with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
-        """Fit a candidate with the damping that it lacks, so that its modes count that as unknown.
+        """Fit a candidate with the damping that it lacks, for the uncertainty of its modes.
 
-        A damping that does not show may be there, and a mode's damping ratio is that of both: where
-        the mode was excited for no longer than it rings, this is most of its uncertainty. So the
-        other damping is estimated beside, with order 1. One whose order rests on the edge of its
-        range is an inertia or a stiffness, and counts as absent, too.
+        An insignificant damping may still exist, and the damping ratio of a mode is the sum of
+        both. If the mode was excited for less time than it rings, this dominates its uncertainty.
+        So the other damping is estimated as well, with order 1. A damping whose order is at the
+        edge of its range is an inertia or a stiffness, and counts as absent, too.
 
         Returns
         -------
         fit : RecordFit
-            The candidate's own if it lacks none.
+            The fit of the candidate itself if it lacks none.
         bounded : bool
-            Whether the other damping would have to be negative: it is one standard deviation of it
-            then, and the fit no minimum.
+            Whether the other damping would have to be negative. It is then one standard
+            deviation, and the fit is not a minimum.
         """
         structure, own = candidate.structure, candidate.fit
         absent = [
@@ -383,7 +383,7 @@ class CandidateSet:
         return self.descent(unknowns, x, 1).fit(), True
 
     def with_orders_free(self) -> CandidateSet:
-        """Free the orders too, if that was not done."""
+        """Fit the structures with free orders, unless they have been fitted."""
         best = self.best
         alike = {c.structure.name: c.fit for c in self.candidates}
         found: list[Refit] = []
@@ -406,28 +406,28 @@ class CandidateSet:
         return freed.under(min(found, key=lambda refit: refit.cost).noise_here())
 
     def with_effect(self, columns: NDArray[np.complex128]) -> CandidateSet:
-        """Fit all with spectra of unknown size, under the noise that the best then leaves."""
+        """Fit all with spectra of unknown size, under the noise estimated from the new residual."""
         every = np.concatenate([self.columns, columns])
         best = replace(self, columns=every).refit(self.best)
         return self.with_columns(every, best.noise_here())
 
     def with_columns(self, columns: NDArray[np.complex128], noise: NoiseSpectrum) -> CandidateSet:
-        """Fit all again, with what is not linear in addition to the beam."""
+        """Fit all again with columns of nonlinear effects in addition to the beam."""
         other = replace(self, columns=columns, noise=noise)
         return other.ranked(other.refit(c).candidate() for c in self.candidates).cross_checked()
 
     def ranked(self, candidates: Iterable[Candidate]) -> CandidateSet:
-        """Hold these candidates, the lowest BIC first."""
+        """Return the set with these candidates, the lowest BIC first."""
         return replace(self, candidates=_ranked(candidates))
 
     def all_but_white(self, fit: RecordFit) -> bool:
-        """Whether chance may have shaped what a fit leaves, once in a hundred records at least."""
+        """Return whether chance exceeds the residual of a fit in one record of 100."""
         counts = self.noise.counts
         return whiteness(fit.residual[counts], self.comparison.frequency_hz[counts]).all_but_white
 
 
 def _may_lack_one(fit: RecordFit) -> list[Structure]:
-    """Structures without one of the dampings, where a fit does not show it beyond doubt."""
+    """Return the structures without one of the dampings that is not clearly significant."""
     additional = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
     return [
         structure

@@ -1,6 +1,6 @@
 """Diagnostics of a record: effects other than the beam of Eq. 25, by name and size.
 
-Settings at the edge of what is searched or not as the file states them, disturbances of the torque,
+Settings at the edge of the search range or different from the file, disturbances of the torque,
 forces that are not linear, drag, a free decay at the start, and what remains unexplained.
 """
 
@@ -32,15 +32,15 @@ def findings(
     forces: tuple[NonlinearForce, ...],
     multiples: tuple[Harmonic, ...],
 ) -> tuple[Finding, ...]:
-    """Name what is there: of a record with a wrong sign or unit, only what needs no model.
+    """Return the findings; for a record with a wrong sign or unit, only those without a model.
 
     Parameters
     ----------
-    field : CandidateSet
+    candidate_set : CandidateSet
     forces : tuple of NonlinearForce
-        Those the record calls for.
+        Significant forces.
     multiples : tuple of Harmonic
-        What the residual holds at multiples of the sweep's frequency.
+        Residual at multiples of the sweep's frequency.
     """
     measurement = candidate_set.comparison.measurement
     seen = (*candidate_set.misread, *clipping(measurement), *stops(measurement))
@@ -59,14 +59,14 @@ def findings(
 # Settings at an edge, or not as the file states them
 
 _DELAY_OFF_S: Final = 1e-4
-"""Delay worth a word: backlash of a few tenths of a milliradian passes for a shorter one."""
+"""Smallest reported delay: backlash of a few tenths of a milliradian passes for a shorter one."""
 
 _BEAM_OFF: Final = 0.003
-"""Deviation of stiffness or density, relative to the file's, worth a word."""
+"""Deviation of stiffness or density, relative to the file, that is reported."""
 
 
 def at_edges(candidate_set: CandidateSet) -> Iterator[Finding]:
-    """Find settings that the search took as far as it goes; no rig is so far from its file."""
+    """Yield settings at the edge of the search range, which no real rig reaches."""
     fit = candidate_set.best.fit
     for name, words, factor, unit in (
         ("delay_s", "The delay between the channels", 1e3, "ms"),
@@ -92,13 +92,9 @@ def at_edges(candidate_set: CandidateSet) -> Iterator[Finding]:
 
 
 def of_settings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Find what of delay, inertia, beam and start is not as the file states it.
+    """Yield delay, inertia, beam data and initial ringing that differ from the file.
 
-    Parameters
-    ----------
-    field : CandidateSet
-    told : Headline
-        Numbers with flags: what carries one is no finding.
+    Parameters with a flag in `headline` are no finding.
     """
     yield from _of_instruments(candidate_set, headline)
     yield from _of_beam(candidate_set, headline)
@@ -108,9 +104,9 @@ def of_settings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Fin
 def _difference(
     candidate_set: CandidateSet, headline: Headline, name: Setting
 ) -> tuple[float, float, float] | None:
-    """By how much a setting differs from what the file states, with the ends of its interval.
+    """Return the difference of a setting from the file, with the ends of its interval.
 
-    None where it does not beyond chance, or where its value carries a flag.
+    Return None if chance explains the difference, or if the value carries a flag.
     """
     quantity, stated = headline.parameters.get(name), _stated(candidate_set, name)
     if quantity is None or quantity.flag or not quantity.std or quantity.interval_95 is None:
@@ -122,7 +118,7 @@ def _difference(
 
 
 def _of_instruments(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Find a delay and an inertia that the file does not state."""
+    """Yield a delay and an inertia that the file does not state."""
     off = _difference(candidate_set, headline, "delay_s")
     if off is not None and abs(off[0]) > _DELAY_OFF_S:
         value, *interval = off
@@ -161,7 +157,7 @@ def _of_instruments(candidate_set: CandidateSet, headline: Headline) -> Iterator
 
 
 def _of_beam(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Find density and stiffness that are not the file's."""
+    """Yield density and stiffness that differ from the file."""
     beam: tuple[tuple[Setting, str], ...] = (
         ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)"),
         ("bending_stiffness_n_m2", "The bending stiffness (EI)"),
@@ -189,7 +185,7 @@ def _of_beam(candidate_set: CandidateSet, headline: Headline) -> Iterator[Findin
 
 
 def _or_else(candidate_set: CandidateSet, name: Setting) -> str:
-    """Name what does to the torque just what such a deviation does; the sentence's end."""
+    """Return the end of the sentence that names other causes with the same effect on the torque."""
     if name == "bending_stiffness_n_m2":
         return ", or the torque's gain is"
     fit, beam = candidate_set.best.fit, candidate_set.comparison.measurement.beam
@@ -205,12 +201,12 @@ def _or_else(candidate_set: CandidateSet, name: Setting) -> str:
 
 
 def _of_start(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Say that the beam rang when the record began, where the modal model shows it."""
+    """Yield a finding if the modal model shows that the beam rang at the beginning."""
     ringing = None if headline.modal is None else headline.modal.ringing
     if ringing is None or not ringing.degrees_of_freedom:
         return
     loudest = max(ringing.amplitude_nm)
-    # A hum begins and ends with the record, which looks a little like a decay.
+    # A hum begins and ends with the record, and so resembles a decay.
     hum = max((line.amplitude_nm for line in candidate_set.noise.lines), default=0.0)
     if loudest <= hum or chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) < SURE:
         return
@@ -227,7 +223,7 @@ def _of_start(candidate_set: CandidateSet, headline: Headline) -> Iterator[Findi
 
 
 def _stated(candidate_set: CandidateSet, name: Setting) -> float:
-    """Give the value of a setting in the file."""
+    """Return the value of a setting in the file."""
     measurement = candidate_set.comparison.measurement
     return {
         "density_over_stiffness": measurement.beam.density_over_stiffness,
@@ -250,7 +246,7 @@ _SAME_TURN: Final = 0.5
 
 
 def mains(frequency_hz: float) -> str:
-    """Name the mains if that may be the source, else nothing."""
+    """Return the name of the mains if it may be the source, else an empty string."""
     for base in (50, 60):
         for n in range(1, 9):
             if abs(frequency_hz - n * base) < _MAINS_WANDER * n * base:
@@ -261,7 +257,7 @@ def mains(frequency_hz: float) -> str:
 def unexplained(
     white: Whiteness, related: InputRelation, modes: tuple[ModeEstimate, ...]
 ) -> Finding:
-    """Describe what remains and has no name."""
+    """Return the finding that describes the unexplained residual."""
     low, high = white.loudest_hz
     at_mode = [mode.number for mode in modes if low <= mode.frequency_hz <= high]
     if related.related:

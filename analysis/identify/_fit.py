@@ -44,8 +44,8 @@ _BEFORE_LINES: Final = 1e-4
 """The same while noise and lines are still to be found: a standard deviation."""
 
 _PATIENCE: Final = 20
-"""Evaluations after which a structure far behind the closest one is left where it is: it creeps
-along a valley that damping of the wrong kind makes."""
+"""Evaluations after which a structure far behind the closest one is left where it is: it
+converges slowly along a flat direction that damping of the wrong kind causes."""
 
 _EARLY_EVALUATIONS: Final = 4
 """The same for one that was far behind before."""
@@ -63,19 +63,19 @@ def fit_record(
 ) -> RecordAnalysis:
     """Fit structures to a whole record in the band.
 
-    The torque is predicted from the measured angle (`Prediction`); the squares of what the
-    measurement differs by, whitened with the spectrum of the noise found in it, are minimised over
-    the damping and over density over stiffness, stiffness, delay and tool inertia. For noise in
-    the torque alone that is the maximum-likelihood estimate, whatever the excitation. Where a
-    controller held the motor to a reference, the part coherent with that is used as input
-    (`analysis.identify._instrument`): the noise then moves the motor as well.
+    The torque is predicted from the measured angle (`Prediction`); the squared residual, whitened
+    with the estimated noise spectrum, is minimised over the damping and over density over
+    stiffness, stiffness, delay and tool inertia. For noise in the torque alone that is the
+    maximum-likelihood estimate, whatever the excitation. Where a controller held the motor to a
+    reference, the part coherent with that is used as input (`analysis.identify._instrument`): the
+    noise then moves the motor as well.
 
     Parameters
     ----------
     measurement : Measurement
     structures : iterable of Structure
-        They share one noise spectrum, that of the one closest to the coarse response, so that
-        their costs compare.
+        All use one noise spectrum, that of the one closest to the coarse response, so that their
+        costs are comparable.
     fixed : iterable of str
         Settings (`SETTINGS`) that stay at the values the file states.
     band_hz : tuple of float
@@ -129,7 +129,7 @@ def fit_record(
         closest = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
         reference = descents[closest]
         if not _explains(reference, noise):
-            break  # what none of these explains is not told apart any better by them
+            break  # none of these explains it, so a further pass does not distinguish them better
         renewed = reference.renewed(noise, _BEFORE_LINES)
         if renewed is reference:
             break
@@ -156,7 +156,7 @@ def refit_record(
     Returns
     -------
     RecordAnalysis or None
-        None where that leaves more than noise, or a hum: then a search is needed.
+        None if the residual is more than noise, or a hum: then a search is needed.
 
     Raises
     ------
@@ -180,21 +180,14 @@ def refit_record(
 def _under_its_noise(
     searches: list[StructureSearch], closest: int, reference: Descent, before: list[Descent]
 ) -> tuple[NoiseSpectrum, list[Descent]]:
-    """Descend with all structures under the noise that the closest one leaves.
+    """Descend with all structures under the noise of the closest one's residual.
 
-    Parameters
-    ----------
-    searches : list of Search
-        One for each structure.
-    closest : int
-        Place of the closest structure.
-    reference : Descent
-        Where that is.
-    before : list of Descent
-        Where all were before it was told anew what follows the reference; empty the first time.
-        One that stays far behind from there is not searched for again.
+    `searches` holds one search for each structure; `closest` is the index of the closest one, and
+    `reference` its descent. `before` holds the descents before the part that follows the reference
+    was re-estimated, and is empty the first time: a structure far behind then is not searched for
+    again.
     """
-    # Lines are looked for once, in what a fit to every bin leaves.
+    # Lines are searched for once, in the residual of a fit to every bin.
     noise = reference.noise(with_lines=True)
     hum = reference.objective.comparison.hum
     noise = replace(noise, lines=(*noise.lines, *(each.line for each in hum)))
@@ -213,7 +206,7 @@ def _under_its_noise(
 
 
 def _explains(closest: Descent, noise: NoiseSpectrum) -> bool:
-    """Whether chance may have shaped what a structure leaves."""
+    """Return whether chance explains the residual of a structure."""
     objective, counts = closest.objective, noise.counts
     residual = objective.project(objective.linearise(closest.x), noise.weight).residual
     hz = objective.comparison.frequency_hz
@@ -221,7 +214,7 @@ def _explains(closest: Descent, noise: NoiseSpectrum) -> bool:
 
 
 def _still_behind(before: Descent, noise: NoiseSpectrum, most: float) -> Descent | None:
-    """Look whether a structure stays above a cost from where it was; None if it does not."""
+    """Return the descent of a structure that stays above a cost; None if it does not."""
     if before.cost(noise) <= most:
         return None
     found = before.to_minimum(noise, _TOLERANCE, (_EARLY_EVALUATIONS, most))
@@ -229,7 +222,7 @@ def _still_behind(before: Descent, noise: NoiseSpectrum, most: float) -> Descent
 
 
 def _followed_again(clean: Descent, whole: Comparison) -> Descent:
-    """Recompute the part that follows no reference: the first was biased by a disturbance."""
+    """Recompute the incoherent part: the first estimate was biased by a disturbance."""
     hum, unknowns = clean.objective.comparison.hum, clean.objective.unknowns
     for _ in range(_REPEATS):
         comparison = whole.following_reference(clean.plant).without_hum(hum)
@@ -243,7 +236,7 @@ def _followed_again(clean: Descent, whole: Comparison) -> Descent:
 
 
 def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) -> RecordFit:
-    """Parameters, uncertainty, modes and residual at a minimum.
+    """Return parameters, uncertainty, modes and residual at a minimum.
 
     Parameters
     ----------
@@ -304,7 +297,7 @@ def _compared_jacobian(
     projected: Projected,
     noise: NoiseSpectrum,
 ) -> NDArray[np.complex128]:
-    """Jacobian of the torques that are known, shape (k, K)."""
+    """Return the Jacobian of the known torques, shape (k, K)."""
     comparison, unknowns = objective.comparison, objective.unknowns
     if comparison.measurement.torque_known.all():
         return projected.jacobian

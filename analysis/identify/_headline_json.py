@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 
 class JudgedOrder(Protocol):
-    """What is known of one order, from one record or from all of a campaign."""
+    """Result on one order, from one record or from a campaign."""
 
     @property
     def order(self) -> str:
-        """Either "alpha" or "lambda"."""
+        """Return "alpha" or "lambda"."""
 
     @property
     def status(self) -> str:
-        """As `OrderVerdict` has it."""
+        """Return the status, as in `OrderVerdict`."""
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 %."""
+        """Return the 95 % interval."""
 
 
 def headline_json(
@@ -37,13 +37,13 @@ def headline_json(
     findings: Iterable[Finding],
     validity: Validity,
 ) -> dict[str, Any]:
-    """Write a headline as the JSON document has it.
+    """Return a headline as the content of the JSON document.
 
     Parameters
     ----------
     file : str or None
         None for the estimate of a whole campaign.
-    told : Numbers
+    estimates : Numbers
     orders : iterable of JudgedOrder
     findings : iterable of Finding
     validity : Validity
@@ -113,7 +113,7 @@ def _mode_json(mode: Mode) -> dict[str, Any]:
 
 
 def _exact_json(exact: Numbers) -> dict[str, Any]:
-    """Numbers that hold if the beam is uniform to 1e-5."""
+    """Return the estimates that are valid if the beam is uniform to 1e-5."""
     return {
         "condition": EXACT_CONDITION,
         "parameters": {name: each.as_json() for name, each in exact.parameters.items()},

@@ -1,10 +1,10 @@
-"""Knocks: the beam was struck or touched once during the record, and rang on by itself.
+"""Impacts (knocks): the beam was struck or touched once during the record, and rang freely.
 
-While it is touched the torque is anybody's guess; from then on it is the free decay of the beam's
-modes. So a knock adds to the torque one unknown value at each sample for as long as it lasts, and a
-decay of unknown amplitude and phase of each mode. Each decay may have a pole slightly off the
-model's, to first order (a column that grows with the time in front of the decay): a blow that bends
-the beam farther than the excitation does, or poles that are not known well yet, bias nothing.
+During the contact the torque is unknown; afterwards it is the free decay of the beam's modes. So an
+impact adds to the torque one unknown value at each sample of the contact, and a decay of unknown
+amplitude and phase of each mode. Each decay may have a pole slightly off the model's, to first
+order (a column that grows with the time in front of the decay): so a larger deflection than that of
+the excitation, or inaccurate poles, cause no bias.
 """
 
 from __future__ import annotations
@@ -37,54 +37,53 @@ if TYPE_CHECKING:
 _FREEST: Final = STRUCTURES["VI"]
 
 MOST_KNOCKS: Final = 3
-"""In one record: more of them are not looked for."""
+"""Limit of impacts in one record."""
 
 _WINDOWS_S: Final = (0.08, 0.5)
-"""To either side of the instant that a scan finds: a blow lies within the first, a touch within the
-second."""
+"""Windows to either side of the instant from the scan: for a blow, and for a touch."""
 
 _APART_S: Final = 0.1
 _AT_ONCE_S: Final = 0.4
 _RISES: Final = 0.5
-"""Largest power of the residual in that time before a knock, and so far apart from it, relative to
-that after it."""
+"""Largest power of the residual before an impact, in that time and at that distance, relative to
+the power after it."""
 
 _ROUNDS: Final = 2
-"""Each finds the poles and the noise anew, with the knock out of both."""
+"""Rounds of estimates of poles and noise, each without the impact."""
 
 _MOST: Final = 0.8
-"""Least share of what is unexplained that a knock has to explain."""
+"""Least fraction of the unexplained squares that an impact has to explain."""
 
 _WORTH: Final = 0.5
-"""Least share with which it is worth to look whether nothing else is in the record."""
+"""Least fraction that justifies a fit with the impact removed."""
 
 _ALL: Final = 0.95
-"""Share with which it is the explanation before any other has been looked for."""
+"""Fraction with which the impact is accepted before any other explanation is tested."""
 
 _RINGS: Final = 0.5
-"""Least share of the squares that a knock saves by the decays after it, not while it lasts."""
+"""Least fraction of the reduction by the decays after the impact, not during it."""
 
 _OVERWHELMING: Final = 10.0
-"""Squares over those of the noise from which on what knock and beam could both explain counts as
-the knock's, beside which the beam was fitted. Of what a wrong model leaves, at most 3 times the
-noise, it counts as the beam's: else decays would explain all of that."""
+"""Squares over those of the noise above which the part that impact and beam could both explain is
+attributed to the impact. Below it is attributed to the beam: the residual of a wrong model is at
+most 3 times the noise, and decays would explain all of it."""
 
 _QUIET_S: Final = 2.0
 _LOUDER: Final = 1.5
-"""Largest power of the residual in that time before a knock, relative to the noise's."""
+"""Largest power of the residual in that time before an impact, relative to the noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectedImpact:
-    """A knock, and how much of a record it explains.
+    """Impact, with the fraction of the record's residual that it explains.
 
     Attributes
     ----------
-    knock : Knock
-    share : float
-        Share of what was unexplained that it explains.
+    knock : RecordedImpact
+    explained_fraction : float
+        Fraction of the unexplained squares that it explains.
     before : float
-        Power of what is left in the two seconds before it, relative to the noise's.
+        Power of the residual in the two seconds before it, relative to the noise.
     """
 
     knock: RecordedImpact
@@ -93,27 +92,21 @@ class DetectedImpact:
 
     @property
     def evident(self) -> bool:
-        """Whether it is the most of what is unexplained, and began at once."""
+        """Return whether it explains most of the residual and began abruptly."""
         return self.explained_fraction > _MOST and self.before < _LOUDER
 
     @property
     def obvious(self) -> bool:
-        """Whether nothing else has to be looked for first."""
+        """Return whether no other effect needs to be tested first."""
         return self.explained_fraction > _ALL and self.before < _LOUDER
 
 
 def knocks_in(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator[DetectedImpact]:
-    """Search for one more knock; each found may be the one, the likeliest first.
+    """Search for one more impact; yield alternatives, the likeliest first.
 
-    A knock may be louder than all that the motor does, and a fit to the whole record then nonsense.
-    But one half of the record it has spared, or left a free decay at its start: so it is searched
-    also in what a beam leaves that was fitted to one half.
-
-    Parameters
-    ----------
-    field : CandidateSet
-    obvious : bool
-        Whether to search for an obvious one only.
+    An impact may be larger than the response to the motor, so that a fit to the whole record fails.
+    One half of the record then holds no impact, or only its free decay at the start. So the search
+    also uses the residual of fits to either half. With `obvious` it is limited to obvious impacts.
     """
     if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MOST_KNOCKS:
         return
@@ -132,13 +125,13 @@ def knocks_in(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator
 
 
 def knock_in(candidate_set: CandidateSet) -> DetectedImpact | None:
-    """Search for a knock in what the likeliest candidate leaves."""
+    """Search for an impact in the residual of the likeliest candidate."""
     likeliest = min(candidate_set.candidates, key=lambda each: each.fit.cost)
     return _knock_in(candidate_set.refit(likeliest, 1))
 
 
 def _knock_in(refit: Refit) -> DetectedImpact | None:
-    """Search in what is left at one point."""
+    """Search for an impact in the residual of a refit."""
     sample = _scan(refit)
     if sample is None:
         return None
@@ -162,7 +155,7 @@ def _knock_in(refit: Refit) -> DetectedImpact | None:
 
 
 def _from_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
-    """Fit the freest structure to either half alone; give the whole record there if that fits."""
+    """Fit the freest structure to either half alone; return it for the record if it fits."""
     comparison = candidate_set.comparison
     measurement, hz = comparison.measurement, comparison.frequency_hz
     band_hz = (0.0 if comparison.bins.start == 1 else float(hz[0]), float(hz[-1]))
@@ -197,18 +190,14 @@ def _from_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
 
 
 def with_knock(measurement: Measurement, found: DetectedImpact) -> Measurement:
-    """Take a knock for known."""
+    """Return the measurement with a known impact."""
     return replace(measurement, knocks=(*measurement.knocks, found.knock))
 
 
 def of_knocks(knocks: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
-    """Name the knocks of a record.
+    """Yield the findings of the impacts of a record.
 
-    Parameters
-    ----------
-    knocks : tuple of Knock
-    explained : bool
-        Whether all else in the record is explained.
+    `explained` states whether the remaining record is explained.
     """
     for knock in knocks:
         within_s = knock.resolution_s
@@ -235,10 +224,10 @@ def of_knocks(knocks: tuple[RecordedImpact, ...], *, explained: bool) -> Iterato
 
 
 def _scan(refit: Refit) -> int | None:
-    """Sample at which decays of all modes would explain most; None if chance may explain as much.
+    """Return the sample at which decays of all modes explain most; None if chance may do so.
 
-    By one correlation per column: the sums that decide for all samples at once are those for a
-    decay from the first on, turned in time.
+    This takes one correlation per column: the sums for a decay from the first sample on, reversed
+    in time, give those for all samples at once.
     """
     comparison, weight = refit.objective.comparison, refit.noise.weight
     poles = comparison.poles(refit.plant)
@@ -269,7 +258,7 @@ def _scan(refit: Refit) -> int | None:
 
 
 def _cleaned(refit: Refit, first: int, last: int) -> Refit:
-    """Fit with a knock between two samples, the noise being what remains then."""
+    """Fit with an impact between two samples, under the noise of the new residual."""
     comparison, before = refit.objective.comparison, refit.columns
     for _ in range(_ROUNDS):
         knock = _knock(refit, first, last)
@@ -285,7 +274,7 @@ def _cleaned(refit: Refit, first: int, last: int) -> Refit:
 
 
 def _knock(refit: Refit, first: int, last: int) -> RecordedImpact:
-    """Knock between two samples with the poles found, of no size."""
+    """Return an impact of no size between two samples, with the poles of the fit."""
     comparison = refit.objective.comparison
     rate_hz = comparison.decimation.rate_hz
     poles = comparison.poles(refit.plant)
@@ -299,20 +288,14 @@ def _knock(refit: Refit, first: int, last: int) -> RecordedImpact:
 
 
 def _in_time(comparison: Comparison, knock: RecordedImpact) -> NDArray[np.float64]:
-    """Columns of a knock at the samples compared, shape (c, samples)."""
+    """Return the columns of an impact at the compared samples, shape (c, samples)."""
     return knock.columns(comparison.times_s(), comparison.decimation.rate_hz)
 
 
 def _sums(refit: Refit, columns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Squares saved by each of some columns beside those before it, shape (c,).
+    """Return the cost reduction by each column in addition to those before it, shape (c,).
 
-    Everything that is free already stays free, to first order.
-
-    Parameters
-    ----------
-    refit : Refit
-    columns : ndarray, shape (c, samples)
-        Torque at the samples compared.
+    All free parameters stay free, to first order. The columns are torques at the compared samples.
     """
     free, residual = refit.unexplained_columns(refit.objective.comparison.spectrum(columns))
     free /= np.maximum(np.linalg.norm(free, axis=1), np.finfo(float).tiny)[:, None]
@@ -329,10 +312,10 @@ _DEPENDENT: Final = 1e-6
 
 
 def _extent(refit: Refit, first: int, last: int) -> tuple[int, int] | None:
-    """First sample of a knock within a window, and the one after its last; None if there is none.
+    """Return first sample and end of an impact within a window; None if there is none.
 
-    Each sample of unknown torque has to save what BIC counts a parameter as. There is no knock
-    where the samples do without the decays: then it was the sensor that was disturbed.
+    Each sample of unknown torque has to save the BIC penalty of a parameter. There is no impact if
+    the samples suffice without the decays: then the sensor was disturbed.
     """
     price = math.log(2 * np.count_nonzero(refit.noise.counts))
     comparison = refit.objective.comparison
@@ -358,7 +341,7 @@ def _extent(refit: Refit, first: int, last: int) -> tuple[int, int] | None:
 
 
 def _judged(refit: Refit, first: int, last: int) -> DetectedImpact:
-    """Give a knock its size, and say how much it explains."""
+    """Return an impact with its size and the fraction that it explains."""
     comparison = refit.objective.comparison
     knock = _knock(refit, first, last)
     in_time = _in_time(comparison, knock)

@@ -27,15 +27,15 @@ _LEAKS: Final = 0.3
 
 
 def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit) -> NoiseSpectrum:
-    """Leave out the bins into which a line beyond the band leaks, and name the line.
+    """Exclude the bins into which a line beyond the band leaks, and return the line.
 
     Parameters
     ----------
     noise : Noise
-        As the estimator found it.
+        Estimated noise.
     comparison : Comparison
     fit : RecordFit
-        What explains the record best under that noise: its torque is taken off.
+        Best fit under that noise: its torque is subtracted.
     """
     rate_hz, samples = comparison.decimation.rate_hz, comparison.samples
     end_hz = float(comparison.frequency_hz[-1])
@@ -65,7 +65,7 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
 
 
 def repeats_after_s(comparison: Comparison) -> float:
-    """Period of the angle's motion in s, 0 if it does not repeat at least once as a whole."""
+    """Return the period of the angle in s, 0 if it does not repeat at least once as a whole."""
     angle = comparison.angle_rad[comparison.kept]
     angle = angle - angle.mean()
     count = angle.size

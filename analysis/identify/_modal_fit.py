@@ -63,7 +63,7 @@ _SETTLED: Final = 0.02
 """Change of the noise's mean logarithm below which it is not estimated again."""
 
 _MOST_FURTHER: Final = 2
-"""Resonances beyond those of the beam that are looked for: of the sensor or the mount."""
+"""Limit of resonances in addition to those of the beam: of the sensor or the mount."""
 
 _EVIDENCE: Final = 60.0
 """Deviance that a further resonance must save."""
@@ -79,7 +79,7 @@ class ModalFit(ModalEstimate):
     Attributes
     ----------
     evidence : tuple of float
-        Deviance that each mode saves.
+        Deviance reduction by each mode.
     residual : ndarray of complex, shape (K,)
         Whitened; parts of variance 1 where chance is all that remains.
     noise : Noise
@@ -102,7 +102,7 @@ class ModalFit(ModalEstimate):
     span: NDArray[np.float64]
 
     def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Squares that each of some further columns would save, shape (c,).
+        """Return the squares that each of some further columns would save, shape (c,).
 
         Parameters
         ----------
@@ -118,17 +118,17 @@ class ModalFit(ModalEstimate):
 
     @property
     def explained(self) -> bool:
-        """Whether nothing but noise remains."""
+        """Return whether only noise remains."""
         return self.whiteness.white and not self.input_relation.related
 
     @property
     def visible(self) -> tuple[int, ...]:
-        """Numbers of the beam's modes that the record shows."""
+        """Return the numbers of the beam's modes that the record shows."""
         shown = zip(self.numbers, self.evidence, strict=True)
         return tuple(sorted(number for number, saved in shown if number and saved > _VISIBLE))
 
     def plant_like(self, plant: Plant) -> Plant:
-        """Give a plant the frequencies of the visible modes, each by a stiffness of its own.
+        """Return a plant with the frequencies of the visible modes, each by its own stiffness.
 
         Parameters
         ----------
@@ -153,17 +153,17 @@ def fit_modes(
     starts: Sequence[tuple[int, float, float]],
     columns: NDArray[np.complex128] | None = None,
 ) -> ModalFit | None:
-    """Fit the modal model.
+    """Fit the modal model to a record.
 
     Parameters
     ----------
     comparison : Comparison
     noise : Noise
-        First estimate; its lines stay left out.
+        First estimate; its lines stay excluded.
     starts : sequence of (int, float, float)
         Number, frequency (Hz) and damping ratio of each mode, roughly.
     columns : ndarray of complex, shape (c, K), optional
-        Spectra of known shape and unknown size, as `Objective` takes them.
+        Spectra of known shape and unknown size, as for `Objective`.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def fit_modes(
 
 @dataclass(frozen=True, slots=True)
 class _ModalSearch:
-    """Modes at one point of the search, under one estimate of the noise."""
+    """Modes at one point of the search, under one noise estimate."""
 
     comparison: Comparison
     noise: NoiseSpectrum
@@ -198,7 +198,7 @@ class _ModalSearch:
     x: NDArray[np.float64]
 
     def problem(self) -> _ModalProblem:
-        """Residual of these modes under this noise."""
+        """Return the residual of these modes under this noise."""
         return _ModalProblem(self.comparison, self.noise.weight, self.further, self.numbers)
 
     def descended(self) -> _ModalSearch:
@@ -215,7 +215,7 @@ class _ModalSearch:
         return replace(self, x=found.x)
 
     def settled(self) -> _ModalSearch:
-        """Descend, and estimate the noise and what is unknown of the record, in turns."""
+        """Alternate descents with estimates of noise and unknown torque until they converge."""
         search = self
         for _ in range(_NOISE_PASSES):
             search = search.descended()
@@ -236,7 +236,7 @@ class _ModalSearch:
         return search.descended()
 
     def near_modes(self) -> NDArray[np.bool_]:
-        """Bins in which what remains may be a mode's, not the noise's, shape (K,)."""
+        """Return the bins in which the residual may belong to a mode, shape (K,)."""
         hz = self.comparison.frequency_hz[:, None]
         frequencies, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
         bins_hz = _NEAREST_BINS * float(hz[1, 0] - hz[0, 0])
@@ -245,12 +245,12 @@ class _ModalSearch:
         return near
 
     def cost(self) -> float:
-        """Sum of whitened squares at this point."""
+        """Return the sum of whitened squares at this point."""
         residual = self.problem().at(self.x).residual
         return float(residual @ residual)
 
     def with_further_resonances(self) -> _ModalSearch:
-        """Add a resonance where the residual still follows the angle, if that explains it."""
+        """Add a resonance where the residual still follows the angle, if it explains that."""
         search = self
         for _ in range(_MOST_FURTHER):
             related = search.relation(search.problem().at(search.x))
@@ -267,14 +267,14 @@ class _ModalSearch:
         return search
 
     def last_overlaps(self) -> bool:
-        """Whether the last resonance lies within the width of another: they share one peak."""
+        """Return whether the last resonance lies within the width of another."""
         frequencies = np.exp(self.x[::2])
         half_widths = frequencies * self.x[1::2] / 2
         reach = _HALF_WIDTHS * (half_widths[:-1] + half_widths[-1])
         return bool(np.any(np.abs(frequencies[:-1] - frequencies[-1]) < reach))
 
     def without_unexcited_modes(self) -> _ModalSearch:
-        """Leave out modes that save nothing at first and then follow a line of the noise."""
+        """Remove modes that save nothing at first and then follow a line of the noise."""
         saved = self.evidence()
         if saved.min() >= _EVIDENCE:
             return self
@@ -289,12 +289,12 @@ class _ModalSearch:
         return replace(self, numbers=numbers, x=np.delete(self.x, [2 * index, 2 * index + 1]))
 
     def evidence(self) -> NDArray[np.float64]:
-        """Sum of squares that each mode saves with the others where they are, shape (n,)."""
+        """Return the cost reduction by each mode with the others unchanged, shape (n,)."""
         own = self.cost()
         return np.array([self._without(i).cost() - own for i in range(len(self.numbers))])
 
     def relation(self, point: _ModalPoint) -> InputRelation:
-        """Relation of the residual at this point to the angle."""
+        """Return the relation of the residual at this point to the angle."""
         residual = point.residual.view(np.complex128)
         angle = self.comparison.spectrum(self.comparison.angle_rad[self.comparison.kept])
         counts = self.noise.counts
@@ -340,7 +340,7 @@ class _ModalSearch:
 def _gram(
     rows: NDArray[np.float64], regularization: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Rows of length 1, their Gram matrix with a ridge, and the lengths that they had."""
+    """Return rows of length 1, their regularized Gram matrix, and their original lengths."""
     scale = np.sqrt(np.einsum("ij,ij->i", rows, rows))
     scale[scale == 0] = 1.0  # a decay that is over at once
     scaled = rows / scale[:, None]
@@ -350,7 +350,7 @@ def _gram(
 
 
 def _orthonormal(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Orthonormal rows that span some rows, and the factor that times these gives the rows."""
+    """Return orthonormal rows with the same span, and the factor that restores the rows."""
     scaled, gram, scale = _gram(rows, 1e-13)
     factor = np.linalg.cholesky(gram)
     return np.linalg.solve(factor, scaled), factor * scale[:, None]
@@ -369,7 +369,7 @@ class _ModalPoint:
 
 
 def _unit_pole(eta: float) -> complex:
-    """Upper root of ``1 + eta q + q²``."""
+    """Return the upper root of ``1 + eta q + q²``."""
     return complex(-eta / 2, math.sqrt(1 - eta * eta / 4))
 
 
@@ -379,7 +379,7 @@ def _unit_pole_slope(eta: float) -> complex:
 
 
 class _ModalProblem:
-    """Whitened residual of a number of modes over their frequencies and damping."""
+    """Whitened residual of some modes as a function of frequencies and damping."""
 
     def __init__(
         self,
@@ -407,7 +407,7 @@ class _ModalProblem:
         return self._white(comparison.spectrum(comparison.prediction.in_time(responses)))
 
     def _poles(self, x: NDArray[np.float64]) -> list[Pole]:
-        """Poles at a point, differentiated by it."""
+        """Return the poles at a point, with derivatives by it."""
         poles = []
         for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
             omega, q = math.exp(log_omega), _unit_pole(eta)
@@ -421,7 +421,7 @@ class _ModalProblem:
         return np.concatenate([self._comparison.nuisance(poles), self._further])
 
     def _drag(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Change of the torque by drag with the poles, and its derivatives, shape (1 + k, K)."""
+        """Return the change of the torque by drag with the poles, and derivatives, (1 + k, K)."""
         total = np.zeros((1 + 2 * len(poles), self._weight.size), dtype=np.complex128)
         drag = self._comparison.drag
         if drag is None:
@@ -439,7 +439,7 @@ class _ModalProblem:
     def at(self, x: NDArray[np.float64]) -> _ModalPoint:
         """Eliminate the linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
 
-        The last two points cost nothing again.
+        The last two points are cached.
         """
         return self._recent.at(x, self._at)
 
@@ -481,7 +481,7 @@ class _ModalProblem:
         return _ModalPoint(residual, linear, columns, span, jacobian, projected)
 
     def model(self, x: NDArray[np.float64]) -> ModalModel:
-        """Modal model at a point."""
+        """Return the modal model at a point."""
         linear = self.at(x).linear
         modes = x.reshape(-1, 2)
         poles, residues = [], []
@@ -498,7 +498,7 @@ class _ModalProblem:
         return ModalModel(tuple(poles), tuple(residues), tuple(background.tolist()))
 
     def residual(self, x: NDArray[np.float64], model: ModalModel) -> NDArray[np.complex128]:
-        """Residual of the model at a point in N·m, not whitened."""
+        """Return the residual of the model at a point in N·m, not whitened."""
         first = 2 * len(self._numbers) + BACKGROUND
         amplitudes = self.at(x).linear[first:]
         here = self._poles(x)
@@ -509,13 +509,13 @@ class _ModalProblem:
         return drag + bare + amplitudes @ self._nuisance(here)
 
     def covariance(self, point: _ModalPoint) -> NDArray[np.float64]:
-        """Covariance of the unknowns and the linear parameters."""
+        """Return the covariance of the unknowns and the linear parameters."""
         _, gram, scale = _gram(np.concatenate([point.full_jacobian, point.columns]), 1e-14)
         covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(scale, scale)
         return covariance
 
     def ringing(self, point: _ModalPoint, covariance: NDArray[np.float64]) -> Ringing:
-        """Free decay at the beginning, two amplitudes a mode, and its chi-square."""
+        """Return the free decay at the beginning, two amplitudes a mode, and its chi-square."""
         count = len(self._numbers)
         first = 2 * count + BACKGROUND
         decays = point.linear[first : first + 2 * count]
@@ -529,10 +529,10 @@ class _ModalProblem:
     def constants(
         self, point: _ModalPoint, x: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """`CONSTANTS` of all modes, and their covariance with that of the background."""
+        """Return `CONSTANTS` of all modes, and their covariance with that of the background."""
         count = x.size // 2
         constants = np.empty(4 * count)
-        linear = x.size + 2 * count  # place of the first coefficient of the background
+        linear = x.size + 2 * count  # index of the first coefficient of the background
         chain = np.zeros((4 * count + BACKGROUND, linear + BACKGROUND))
         background = chain[4 * count :]
         background[:, linear:] = np.diag(self.scale_rad_s ** -np.arange(float(BACKGROUND)))
@@ -565,7 +565,7 @@ class _ModalProblem:
         return constants, chain @ own @ chain.T
 
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
-        """As the descent takes them (Kaufman's Jacobian)."""
+        """Return the normal equations for the descent (Kaufman's Jacobian)."""
         point = self.at(x)
         return NormalEquations(
             cost=float(point.residual @ point.residual),

@@ -7,7 +7,7 @@ Mode i, relative to its root, is driven by the angle; a further restoring force 
 
 with, relative to the largest deflection R and the largest speed V that the mode reaches,
 
-* ``n = e r³ / R²``: stiffness that rises by the share e at R; acts at once and three times the
+* ``n = e r³ / R²``: stiffness that rises by the fraction e at R; acts at once and three times the
   drive's frequency (odd harmonics);
 * ``n = e r² / R``: stiffness that differs from side to side; even harmonics;
 * ``n = 2 e r'|r'| / (omega V)``: drag that grows with the square of the speed, as of air; the
@@ -58,20 +58,20 @@ _CONVERGED: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One restoring force that is not linear, of one mode."""
+    """One nonlinear restoring force of one mode."""
 
     kind: Kind
     mode: int
 
 
 class ModalForces:
-    """Columns of a record: torque by restoring forces of unit size.
+    """Torque columns of a record by restoring forces of unit size.
 
     Parameters
     ----------
     comparison : Comparison
     plant : Plant
-        The linear part.
+        Linear plant.
     """
 
     __slots__ = ("_comparison", "_growth", "_length", "_p", "_plant", "_s", "_samples")
@@ -90,9 +90,9 @@ class ModalForces:
         self._p = ratio * self._s**2 + damping.gamma * self._s**damping.lambda_
 
     def column(self, term: Term, size: float = 0.0) -> NDArray[np.complex128]:
-        """Spectrum, shape (K,), of the torque by a force, divided by its `size`.
+        """Return the spectrum, shape (K,), of the torque by a force, divided by its `size`.
 
-        Not finite where the repeated substitution leads nowhere: so large a force is not known.
+        It is not finite if the repeated substitution diverges: the force is then too large.
 
         Parameters
         ----------
@@ -126,7 +126,7 @@ class ModalForces:
         return spectrum
 
     def _stiffness(self, mode: int) -> tuple[float, NDArray[np.complex128]]:
-        """k⁴ of a mode, and the same with its damping."""
+        """Return k⁴ of a mode, and k⁴ with its damping."""
         plant = self._plant
         k = float(clamped_free_eigenvalues(mode)[-1] / plant.beam.length_m) ** 4
         damped = k * (1 + plant.damping.zeta * self._s**plant.damping.alpha)
@@ -135,7 +135,7 @@ class ModalForces:
     def _force(
         self, kind: Kind, moved: NDArray[np.complex128], linear: NDArray[np.complex128]
     ) -> NDArray[np.complex128]:
-        """Transform of n, shape (length // 2 + 1,), for a motion; the linear one sets R and V."""
+        """Return the transform of n, shape (length // 2 + 1,); the linear motion sets R and V."""
         if kind == "quadratic drag":
             speed = self._fine(moved * self._s)
             fastest = np.abs(self._fine(linear * self._s)).max()
@@ -151,7 +151,7 @@ class ModalForces:
         return spectrum / _OVERSAMPLING
 
     def _fine(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Values over the record at the multiple of the rate."""
+        """Return values over the record at the multiple of the rate."""
         fine = np.fft.irfft(_OVERSAMPLING * spectrum, _OVERSAMPLING * self._length)
         values: NDArray[np.float64] = fine[: self._growth.size] * self._growth
         return values
@@ -163,28 +163,29 @@ _MOST_TERMS: Final = 2
 _ROUNDS: Final = 6
 _SETTLED: Final = 0.005
 _GAIN: Final = SURE**2 + 2 * math.log(30)
-"""Deviance that a term must save: three forces on three modes and three rounds are tried."""
+"""Deviance reduction that a term needs: three forces on three modes are tested in three rounds."""
 
 _HINT: Final = 6.0
-"""Deviance that the most wanted term must promise before any is tried; chance promises as much in
+"""Predicted deviance reduction of the best term from which terms are tested; chance reaches it in
 one record of ten."""
 
 _HOPELESS: Final = 2000.0
-"""Deviance behind the best, to first order, from which no substitution leads back."""
+"""First-order deviance above the best from which no substitution recovers."""
 
 _EXPLAINED: Final = 0.5
-"""Share of what exceeds chance that the terms must explain; else something else is there."""
+"""Fraction of the squares beyond chance that the terms must explain; else there is another
+cause."""
 
 
 @dataclass(frozen=True, slots=True)
 class NonlinearForce:
-    """A restoring force that is not linear.
+    """Estimated nonlinear restoring force.
 
     Attributes
     ----------
     term : Term
     size : float
-        Share of the stiffness at the largest deflection, or damping ratio at the largest speed.
+        Fraction of the stiffness at the largest deflection, or damping ratio at the largest speed.
     std : float
     """
 
@@ -196,24 +197,12 @@ class NonlinearForce:
 def nonlinear_forces(
     candidate_set: CandidateSet, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
-    """Add forces one by one while each saves far more than chance would; refit all with them.
+    """Add significant nonlinear forces one by one; refit all candidates with them.
 
-    A mode whose stiffness rises looks much like one that lies elsewhere, or like a fractional
-    order. Where the best candidate has these, the search also starts from those without. But even
-    then such a force leaves its trace, by which the best would gain; without one nothing is tried.
-
-    Parameters
-    ----------
-    field : CandidateSet
-        Without such forces.
-    modes : tuple of int
-        Modes that the record shows.
-
-    Returns
-    -------
-    field : CandidateSet
-        The one given, if there is nothing.
-    forces : tuple of NonlinearForce
+    A mode whose stiffness rises resembles a mode at another frequency, or a fractional order. If
+    the best candidate has these, the search also starts from those without. Even then such a force
+    leaves a trace that would improve the best candidate; without that trace nothing is tested.
+    `modes` are the visible modes. Returns the set with the forces, or the given set and no forces.
     """
     best = candidate_set.best
     here = candidate_set.refit(best)
@@ -227,7 +216,7 @@ def nonlinear_forces(
 
 
 def _leads(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
-    """Candidates to start from: the best, and before it those that are simpler."""
+    """Return the candidates to start from: simpler ones, then the best."""
     best = candidate_set.best
     if "alpha" not in best.structure.free:
         return (best,)
@@ -260,14 +249,14 @@ def _added(
 
 
 def _gain(candidate: Candidate, before: float, after: float) -> float:
-    """Deviance saved between two sums of squares."""
+    """Return the reduction of deviance between two sums of squares."""
     return candidate.values * math.log(before / after)
 
 
 def _most_wanted(
     candidate_set: CandidateSet, refit: Refit, modes: tuple[int, ...], taken: list[Term]
 ) -> tuple[Term | None, float]:
-    """Find the term that to first order saves most, and the cost with it."""
+    """Return the term with the largest first-order reduction, and the cost with it."""
     forces = ModalForces(candidate_set.comparison, refit.plant)
     # Air that brakes the whole beam has been found already, and no mode is braked by itself.
     kinds = (
@@ -285,9 +274,9 @@ def _most_wanted(
 def _with_terms(
     candidate_set: CandidateSet, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
 ) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]] | None:
-    """Fit with the columns of these terms, at the sizes that they turn out to have.
+    """Fit with the columns of these terms, iterating over their sizes.
 
-    None if these are larger than the columns are known for.
+    Return None if the sizes exceed the range in which the columns are known.
     """
     std = np.zeros(sizes.size)
     for _ in range(_ROUNDS):
@@ -311,7 +300,7 @@ def _with_terms(
 
 
 def _explain(without: CandidateSet, within: CandidateSet) -> bool:
-    """Whether the forces explain what the linear beam left, or at least half of it."""
+    """Return whether the forces explain the residual of the linear beam, or at least half of it."""
     power = np.abs(without.best.fit.residual) ** 2
     before = without.best.fit.cost - without.best.fit.degrees_of_freedom
     chance = SURE * math.sqrt(2 * power.size * 2)

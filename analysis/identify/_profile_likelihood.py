@@ -1,8 +1,8 @@
-"""Profile likelihood of the damping's orders: everything else is refitted at each value.
+"""Profile likelihood of the damping orders: all other parameters are refitted at each value.
 
-The 95 % interval is all that the chi-square limit of one degree of freedom admits. A walk goes from
-the minimum both ways until the record excludes what lies beyond, and looks on a coarse grid for
-valleys that it would not come to.
+The 95 % interval holds all values within the chi-square limit of one degree of freedom. A walk goes
+from the minimum in both directions until the record excludes the values beyond. A coarse grid finds
+other local minima.
 """
 
 from __future__ import annotations
@@ -34,35 +34,35 @@ if TYPE_CHECKING:
 Order = Literal["alpha", "lambda"]
 
 WIDEST_SHARE: Final = 0.25
-"""Share of the range 0 to 2: an order known to ±0.25 only tells no material from another."""
+"""Fraction of the range 0 to 2: an order with ±0.25 does not distinguish materials."""
 
 
 @dataclass(frozen=True, slots=True)
 class LikelihoodProfile:
-    """Deviance of an order's values, everything else refitted at each.
+    """Deviance of the values of an order, with all other parameters refitted at each.
 
     Attributes
     ----------
     order : str
         "alpha" or "lambda".
     structure : str
-        In which it was free.
+        Structure in which the order was free.
     values : tuple of float
         Increasing.
     deviance : tuple of float
         Above the lowest.
     estimate : float
         Value of the lowest deviance.
-    valleys : tuple of float
-        Values that explain the record equally, the lowest deviance first: bottoms of valleys that
-        the 95 % limit admits, parted by a ridge.
+    local_minima : tuple of float
+        Values that explain the record equally, the lowest deviance first: local minima within the
+        95 % limit, separated by a barrier.
     interval : tuple of float
-        95 %, by the likelihood ratio, over all valleys; where it is open it ends at the edge of the
-        range.
+        95 % interval, by the likelihood ratio, over all local minima; an open interval ends at the
+        edge of the range.
     open_below, open_above : bool
         Whether the record excludes no value on that side.
     gain : float
-        Deviance that the structure saves by freeing the order; 0 if it was free.
+        Reduction of deviance by freeing the order; 0 if it was free.
     """
 
     order: Order
@@ -78,7 +78,7 @@ class LikelihoodProfile:
 
     @classmethod
     def unwalked(cls, candidate: Candidate, order: Order) -> LikelihoodProfile:
-        """Stand for an order that nothing could tell: one value, and no limit to either side.
+        """Return the profile of an order that nothing determines: one value without limits.
 
         Parameters
         ----------
@@ -90,29 +90,29 @@ class LikelihoodProfile:
 
     @property
     def walked(self) -> bool:
-        """Whether any other value was looked at."""
+        """Return whether another value was computed."""
         return len(self.values) > 1
 
     @property
     def relative_width(self) -> float:
-        """Part of the range that the interval spans."""
+        """Return the fraction of the range that the interval spans."""
         return (self.interval[1] - self.interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])
 
     @property
     def identifiable(self) -> bool:
-        """Whether the record says anything of use about this order."""
+        """Return whether the record determines this order to a useful precision."""
         narrow = self.relative_width <= WIDEST_SHARE and not (self.open_below or self.open_above)
         return narrow and len(self.local_minima) < 2
 
     @property
     def admits_one(self) -> bool:
-        """Whether the integer order 1 lies in the interval."""
+        """Return whether the interval holds the integer order 1."""
         return self.interval[0] <= 1 <= self.interval[1]
 
 
 @dataclass(frozen=True, slots=True)
 class Profiled:
-    """A profile, and where its valleys are.
+    """Profile with the plants at its local minima.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class Profiled:
     structure : Structure
         With the order free.
     plants : tuple of Plant
-        At the bottoms of the valleys, the lowest first.
+        Plants at the local minima, the lowest first.
     cost : float
         The lowest sum of squares.
     """
@@ -134,20 +134,12 @@ class Profiled:
 def profile(
     candidate_set: CandidateSet, candidate: Candidate, order: Order, *, elsewhere: bool = True
 ) -> Profiled:
-    """Walk away from the minimum both ways until the record excludes what lies beyond.
+    """Walk from the minimum in both directions until the record excludes the values beyond.
 
-    Each refit starts on the tangent of the last, and each step goes to where the deviance, were it
-    a parabola, would reach the next level. Where much of the range is admitted, the rest of it is
-    looked over for another valley, which is then walked as well.
-
-    Parameters
-    ----------
-    field : CandidateSet
-    candidate : Candidate
-        In whose structure the order is freed, if it is not free.
-    order : str
-    elsewhere : bool
-        Whether there may be another valley.
+    The order is freed in the structure of `candidate`, if it is not free. Each refit starts on the
+    tangent of the last, and each step goes to the value at which a parabolic deviance would reach
+    the next level. If much of the range is admitted and `elsewhere` is set, the remaining range is
+    searched for another local minimum, and a walk starts there as well.
     """
     walk = Walk(candidate_set, candidate, order)
     walk.both_ways()
@@ -188,26 +180,14 @@ def profiled(
 ) -> tuple[CandidateSet, LikelihoodProfile, LikelihoodProfile]:
     """Profile alpha and lambda in the freest structure.
 
-    What a walk finds lower than the candidates are, or in another valley, is where all of them
-    start once more, so that the fit selected and the profile tell of one minimum.
-
-    Parameters
-    ----------
-    field : CandidateSet
-    settled : collection of str
-        Orders of which no other valley need be looked for.
-    walk : bool
-        Whether the orders can be told at all.
-
-    Returns
-    -------
-    field : CandidateSet
-        With the candidates ranked again.
-    alpha, lambda_ : Profile
+    If a walk finds a lower cost than the candidates, or another local minimum, all candidates start
+    there once more, so that the selected fit and the profile agree. `settled` holds the orders that
+    need no search for another local minimum, and `walk` states whether the orders are determined.
+    Returns the ranked candidates and both profiles.
     """
     for round_ in range(1, _ROUNDS + 1):
         freest = candidate_set.freest
-        # The order of a damping that does not show could be anything: no walk would tell more.
+        # The order of an insignificant damping is undetermined: a walk would not help.
         walks = {
             order: profile(candidate_set, freest, order, elsewhere=order not in settled)
             for order in _ORDERS
@@ -230,7 +210,7 @@ def profiled(
 
 
 def _news(candidate_set: CandidateSet, found: Profiled) -> bool:
-    """Whether a candidate may be elsewhere than its lowest minimum."""
+    """Return whether a candidate may have a lower minimum elsewhere."""
     if len(found.plants) > 1:
         return True
     free = set(found.structure.free)
@@ -261,17 +241,18 @@ _NARROW: Final = 1.1
 _SHARPENINGS: Final = 2
 
 _DOUBTFUL_FRACTION: Final = 0.025
-"""Share of the range 0 to 2 within the 95 % limit from which there may be another valley."""
+"""Fraction of the range 0 to 2 within the 95 % limit from which there may be another local
+minimum."""
 
 _GRID: Final = 0.2
 _TRIAL_EVALUATIONS: Final = 8
-"""Spacing of the orders at which it is looked for, and evaluations at each."""
+"""Spacing of the orders in that search, and evaluations at each."""
 
 
 def with_order(structure: Structure, order: Order) -> Structure:
-    """Take a structure's damping with one order free.
+    """Return a structure with one order of its damping free.
 
-    Damping that the structure lacks comes in, its coefficient free.
+    A missing damping is added, with a free coefficient.
     """
     coefficient = COEFFICIENT_OF[order]
     fixed = {name: at for name, at in structure.fixed.items() if name not in (coefficient, order)}
@@ -280,7 +261,7 @@ def with_order(structure: Structure, order: Order) -> Structure:
 
 
 class Walk:
-    """Refits with one order held, and what they cost."""
+    """Refits with one order held, and their costs."""
 
     def __init__(self, candidate_set: CandidateSet, candidate: Candidate, order: Order) -> None:
         self.order = order
@@ -296,31 +277,30 @@ class Walk:
         self._stand_at(first)
 
     def _stand_at(self, bottom: Refit) -> None:
-        """Walk from a minimum with the order free."""
+        """Start the walk from a minimum with the order free."""
         self._first = bottom
         self._centre = float(bottom.x[self._index])
         self._store_lower(self._centre, bottom)
 
     def plant(self, value: float) -> Plant:
-        """Everything that was fitted at a value that was looked at."""
+        """Return the fitted plant at a computed value."""
         return self._at[value].plant
 
     def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Values in order, shape (n,), and their deviances above the lowest."""
+        """Return the values in order, shape (n,), and their deviances above the lowest."""
         values = np.array(sorted(self.costs))
         costs = np.array([self.costs[value] for value in values])
         return values, self._values * np.log(costs / costs.min())
 
     def both_ways(self) -> None:
-        """Walk from where it stands."""
+        """Walk in both directions from the current minimum."""
         for sign in (-1.0, 1.0):
             self._outwards(sign)
 
     def from_candidates(self) -> None:
-        """Walk from where special cases lie that are as good, and outside of what is admitted.
+        """Walk from equally good special cases outside of the admitted interval.
 
-        The order is fixed there, mostly to 1. A ridge over which no refit leads may part them from
-        the minimum.
+        Their order is fixed, mostly to 1. A barrier may separate them from the minimum.
         """
         coefficient, free = COEFFICIENT_OF[self.order], set(self.structure.free)
         for candidate in self._field.candidates:
@@ -335,7 +315,7 @@ class Walk:
                 self.both_ways()
 
     def elsewhere(self) -> None:
-        """Look for another valley, if much of the range is admitted, and walk it."""
+        """Search for another local minimum if much of the range is admitted, and walk from it."""
         (low, high), open_below, open_above = admitted(*self.curve())
         wide = high - low > _DOUBTFUL_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
         orders = gaps(list(self.costs), ORDER_RANGE, _GRID)
@@ -361,12 +341,12 @@ class Walk:
                 self.both_ways()
 
     def _store_lower(self, value: float, found: Refit) -> None:
-        """Keep the lower of two refits at one value."""
+        """Store the lower of two refits at one value."""
         if found.cost < self.costs.get(value, math.inf):
             self.costs[value], self._at[value] = found.cost, found
 
     def _outwards(self, sign: float) -> None:
-        """Cross the threshold, go on for a little of the curve, and sharpen the crossing."""
+        """Cross the threshold, continue a little, and refine the crossing."""
         low, high = ORDER_RANGE
         here, distance, root = self._centre, self._spread(), 0.0
         inside, outside = here, None
@@ -383,7 +363,7 @@ class Walk:
         for _ in range(_SHARPENINGS if outside is not None else 0):
             assert outside is not None
             if abs(inside - self._centre) >= abs(outside - self._centre):
-                break  # there is a ridge between
+                break  # there is a barrier between
             below, above = self._root(inside), self._root(outside)
             if above - below < _NARROW:
                 break
@@ -394,7 +374,7 @@ class Walk:
                 outside = middle
 
     def _spread(self) -> float:
-        """Give the standard deviation of the order, or what stands for it."""
+        """Return the standard deviation of the order, or a substitute."""
         (scaled, scale), index = self._first.equations.scaled_hessian(), self._index
         inverse = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))
         variance = inverse[index, index] / scale[index] ** 2
@@ -402,12 +382,12 @@ class Walk:
         return min(max(std, 1e-4), 0.25)
 
     def _root(self, value: float) -> float:
-        """Root of the deviance at a value."""
+        """Return the root of the deviance at a value."""
         lowest = self.costs[self._centre]
         return math.sqrt(max(self._values * math.log(self.costs[value] / lowest), 0.0))
 
     def _hold(self, value: float, near: Refit) -> float:
-        """Fit all else with the order at `value`; give the root of the deviance."""
+        """Fit all other parameters with the order at `value`; return the root of the deviance."""
         hold, most = (self.order,), self.costs[self._centre] * math.exp(FAR_BEHIND / self._values)
         found = self._descend(
             self._tangent(value, near),
@@ -428,7 +408,7 @@ class Walk:
     def _lower(
         self, found: Refit, other: Refit, value: float, hopeless: tuple[int, float] | None = None
     ) -> Refit:
-        """Descend from another refit with only the order moved; give the lower of the two."""
+        """Descend from another refit with only the order changed; return the lower of the two."""
         start = other.x.copy()
         start[self._index] = value
         again = self._descend(start, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless)
@@ -436,7 +416,7 @@ class Walk:
 
     @cached_property
     def _without_damping(self) -> Refit:
-        """Fit without the damping whose order is walked along: what it costs at any order."""
+        """Fit without the damping of this order: the cost at any value of the order."""
         coefficient = COEFFICIENT_OF[self.order]
         start = self._first.x.copy()
         index = self._unknowns.names.index(coefficient)
@@ -451,7 +431,7 @@ class Walk:
         hold: tuple[str, ...] = (),
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
-        """Fit from a vector of unknowns, some of them held where they start."""
+        """Fit from a vector of unknowns, some of them held at their start."""
         candidate_set = self._field
         return Refit.descend(
             candidate_set.comparison,
@@ -466,7 +446,7 @@ class Walk:
         )
 
     def _tangent(self, value: float, near: Refit) -> NDArray[np.float64]:
-        """Where all else would be with the order at `value`, to first order, shape (k,)."""
+        """Return the first-order estimate of the other unknowns with the order at `value`, (k,)."""
         x, index = near.x.copy(), self._index
         scaled, scale = near.equations.scaled_hessian()
         lower, upper = self._unknowns.bounds
@@ -478,25 +458,20 @@ class Walk:
         return x
 
 
-# Limits and valleys of a profile
+# Limits and local minima of a profile
 
 CHI_SQUARE_95: Final = 3.841458820694124
 """Deviance that the true value exceeds once in twenty records (one degree of freedom)."""
 
 MIN_BARRIER: Final = 0.5
-"""Deviance by which a ridge must rise over the higher of two valleys to part them: far more than
-the refits' tolerance."""
+"""Deviance by which a barrier must exceed the higher of two local minima to separate them: far more
+than the tolerance of the refits."""
 
 
 def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple[float, ...]:
-    """Bottoms of the valleys that the 95 % limit admits, the lowest first.
+    """Return the local minima within the 95 % limit, the lowest first.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Increasing.
-    deviance : ndarray, shape (n,)
-        Above the lowest.
+    `values`, shape (n,), increase; `deviance`, shape (n,), is above the lowest.
     """
     padded = np.concatenate([[np.inf], deviance, [np.inf]])
     lows = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] < padded[2:]))
@@ -512,7 +487,7 @@ def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> 
 def admitted(
     values: NDArray[np.float64], deviance: NDArray[np.float64]
 ) -> tuple[tuple[float, float], bool, bool]:
-    """Find the ends of all that the 95 % limit admits, ridges between valleys included.
+    """Return the interval of all values within the 95 % limit, barriers included.
 
     Returns
     -------
@@ -528,14 +503,10 @@ def admitted(
 
 
 def crossing(inside: float, outside: float, below: float, above: float) -> float:
-    """Where the limit is crossed between two values; the root of a deviance is all but linear.
+    """Return the value at which the limit is crossed; the root of a deviance is almost linear.
 
-    Parameters
-    ----------
-    inside, outside : float
-        Values on either side of the limit.
-    below, above : float
-        Their deviances.
+    `inside` and `outside` are values on either side of the limit, `below` and `above` their
+    deviances.
     """
     low, high = math.sqrt(max(below, 0.0)), math.sqrt(max(above, 0.0))
     fraction = (math.sqrt(CHI_SQUARE_95) - low) / (high - low)
@@ -543,14 +514,14 @@ def crossing(inside: float, outside: float, below: float, above: float) -> float
 
 
 def gaps(known: list[float], span: tuple[float, float], spacing: float) -> list[float]:
-    """Values within a span, equally spaced, that lie outside of all that is known."""
+    """Return equally spaced values within a span that lie outside of all known ones."""
     grid = np.arange(span[0] + spacing / 2, span[1], spacing).tolist()
     low, high = min(known), max(known)
     return [value for value in grid if value < low - spacing / 4 or value > high + spacing / 4]
 
 
 def dips(curve: dict[float, float]) -> list[float]:
-    """Places on a coarse curve that are lower than both neighbours, the ends included."""
+    """Return the values on a coarse curve that are lower than both neighbours, ends included."""
     values = sorted(curve)
     heights = [math.inf, *(curve[value] for value in values), math.inf]
     return [

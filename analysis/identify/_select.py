@@ -78,25 +78,25 @@ _MODES_TO_TEST: Final = 2
 _TILTED: Final = "the axis is tilted, and fits to the whole record are of one that is plumb"
 _CLIPPED: Final = "the torque is clipped"
 INTEGER: Final = STRUCTURES["III"]
-"""Both dampings of order 1. It is fitted from everywhere: what a record does not tell of orders has
-no valleys there, and no damping that is a stiffness or an inertia in truth."""
+"""Both dampings of order 1. It is fitted from every start: it has no local minima by undetermined
+orders, and no damping that is in fact a stiffness or an inertia."""
 
 _MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
 _NOT_SEARCHED: Final = frozenset({"sign", "unit", "clipping", "stop"})
-"""What makes a search for knocks idle. Settings at an edge may be a loud knock's doing."""
+"""Findings that make a search for impacts useless. A large impact may drive settings to an edge."""
 _OF_CHANNELS: Final = _MISREAD_KINDS | {"clipping", "stop"}
-"""All that is said where the record contradicts its file."""
+"""Findings that are reported if the record contradicts its file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """A verdict with what it rests on.
+    """Verdict on a record, with the fits that it rests on.
 
     Attributes
     ----------
     verdict : Verdict
     headline : Headline
-        The numbers to be told first, with flags.
+        Reported numbers, with flags.
     candidates : tuple of Candidate
         All fits, the lowest BIC first.
     analysis : RecordAnalysis
@@ -110,12 +110,12 @@ class Selection:
 
     @property
     def fit(self) -> RecordFit:
-        """The fit that the headline's numbers are of."""
+        """Return the fit behind the numbers of the headline."""
         return self.headline.fit
 
     @property
     def settled(self) -> frozenset[Order]:
-        """Orders that the record determines: it admits a single minimum along each."""
+        """Return the orders that the record determines: a single minimum along each."""
         orders = (self.verdict.alpha, self.verdict.lambda_)
         return frozenset(each.order for each in orders if each.profile.identifiable)
 
@@ -127,14 +127,14 @@ def select(
     band_hz: tuple[float, float] = BAND_HZ,
     earlier: Selection | None = None,
 ) -> Selection:
-    """Report what a record supports: modes first, orders where the beam earns them.
+    """Select the model that a record supports, and report its parameters.
 
-    The modal model is fitted to what remains of hum, knocks and gaps, and the modes are its own. If
-    it leaves nothing but noise, the antenna is linear and constant. Otherwise drag, forces that are
-    not linear, changes along the record and knocks are looked for. A uniform beam is tested against
-    the modal constants; orders, coefficients and stiffness are estimated from these with the
-    tolerance of the geometry that the measurement states. All structures are also fitted to the
-    record, on an exactly uniform beam: their values are a condition.
+    The modal model is fitted to the record without hum, impacts and gaps; the reported modes are
+    its modes. If its residual is noise, the antenna is linear and constant. Otherwise drag,
+    nonlinear forces, changes along the record and impacts are tested. A uniform beam is tested
+    against the modal constants; orders, coefficients and stiffness are estimated from these with
+    the tolerance of the geometry that the measurement states. All structures are also fitted to the
+    record on an exactly uniform beam: their values are conditional estimates.
 
     Parameters
     ----------
@@ -143,8 +143,9 @@ def select(
         Settings that stay as the file states them.
     band_hz : tuple of float
     earlier : Selection, optional
-        That of an earlier part of the record. All candidates start from its own where the first of
-        them explains all of it, in a third of the time; of several minima one may be missed.
+        Selection of an earlier part of the record. If its first candidate explains the whole
+        record, all candidates start from the earlier ones, in a third of the time; one of several
+        minima may be missed.
 
     Raises
     ------
@@ -162,17 +163,17 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True)
 class _Assessment(Generic[_T]):
-    """What is said of a record, and what it rests on.
+    """Result on a record, with the candidates that it rests on.
 
     Attributes
     ----------
     result : _T
-    field : CandidateSet
-        Led by the candidate that the numbers are of.
+    candidate_set : CandidateSet
+        Set led by the candidate of the reported numbers.
     explained : bool
-        Whether that leaves nothing but noise.
+        Whether its residual is noise only.
     kinds : collection of str
-        Kinds of what was found.
+        Kinds of the findings.
     """
 
     result: _T
@@ -184,7 +185,7 @@ class _Assessment(Generic[_T]):
 def _with_knocks(
     measurement: Measurement, assess: Callable[[Measurement], _Assessment[_T]]
 ) -> _Assessment[_T]:
-    """Judge a record; where all leaves more than noise, with the knocks that explain it."""
+    """Assess a record; if its residual is more than noise, with the impacts that explain it."""
     assessment = assess(measurement)
     for _ in range(MOST_KNOCKS):
         if assessment.explained or not _NOT_SEARCHED.isdisjoint(assessment.kinds):
@@ -209,7 +210,7 @@ def _selected(
     band_hz: tuple[float, float],
     earlier: Selection | None,
 ) -> _Assessment[Selection]:
-    """Choose the structure with what is known to have struck the beam."""
+    """Select the structure with the known impacts."""
     before = earlier.candidates if earlier else ()
     again = CandidateSet.from_earlier(before, measurement, fixed, band_hz) if before else None
     linear = again or CandidateSet.of(measurement, fixed, band_hz)
@@ -245,7 +246,7 @@ def _selected(
     visible = _visible(candidate_set, modal)
     test = _uniform_beam_test(measurement, modal)
     refused = test is not None and test.status == "refused"
-    # Another valley that a part of the record excludes, all of it does as well.
+    # The whole record excludes every local minimum that a part of it excludes.
     settled = earlier.settled if earlier and again else ()
     walk = not_reported_reason(candidate_set, visible) is None and not refused
     candidate_set, *profiles = profiled(candidate_set, settled, walk=walk)
@@ -319,13 +320,9 @@ def _selected(
 def _modal(
     candidate_set: CandidateSet, further: NDArray[np.complex128] | None = None
 ) -> ModalFit | None:
-    """Fit the modal model to what a set of candidates was fitted to; None if no mode shows.
+    """Fit the modal model to the data of a candidate set; return None if no mode is visible.
 
-    Parameters
-    ----------
-    field : CandidateSet
-    further : ndarray of complex, shape (c, K), optional
-        Spectra of unknown size beside the candidates' own.
+    `further`, shape (c, K), are spectra of unknown size in addition to those of the candidates.
     """
     if candidate_set.misread:
         return None
@@ -343,7 +340,7 @@ def _modal(
 
 
 def _visible(candidate_set: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
-    """Numbers of the modes that a record shows."""
+    """Return the numbers of the modes that a record shows."""
     if modal is None:
         return visible_modes(candidate_set.comparison, candidate_set.noise, candidate_set.best.fit)
     return modal.visible
@@ -357,19 +354,10 @@ def _with_modes(
     doubt: str | None,
     mode_doubt: str | None,
 ) -> Headline:
-    """Put the modal model in front of a headline, and parameters with the stated tolerance.
+    """Add the modal model to a headline of a uniform beam, and apply the stated tolerance.
 
-    Parameters
-    ----------
-    exact : Headline
-        That of an exactly uniform beam.
-    measurement : Measurement
-    modal : ModalFit or None
-        None keeps `exact`.
-    test : UniformBeamTest or None
-        None with it.
-    doubt, mode_doubt : str or None
-        Why no number, or no mode, is to be believed.
+    Return `exact` if there is no modal model. `doubt` and `mode_doubt` are the reasons against
+    every number and against every mode.
     """
     if modal is None or test is None:
         return exact
@@ -384,7 +372,7 @@ def _with_modes(
 
 
 def _uniform_beam_test(measurement: Measurement, modal: ModalFit | None) -> UniformBeamTest | None:
-    """Test whether the beam that the file states predicts the modes, but for its parameters."""
+    """Test whether a uniform beam with free parameters predicts the modes."""
     if modal is None:
         return None
     return uniform_beam_test(modal, measurement.nominal, measurement.axis_tilt_deg)
@@ -393,9 +381,9 @@ def _uniform_beam_test(measurement: Measurement, modal: ModalFit | None) -> Unif
 def _explanation(
     measurement: Measurement, candidate_set: CandidateSet, modal: ModalFit, test: UniformBeamTest
 ) -> tuple[Finding, ...]:
-    """Name simple causes that would explain what a uniform beam does not.
+    """Name simple causes of the deviations from a uniform beam.
 
-    Two modes leave no degree of freedom to test one.
+    Two modes leave no degree of freedom for this test.
     """
     if len(modal.visible) <= _MODES_TO_TEST:
         return ()
@@ -407,7 +395,7 @@ def _explanation(
 def _settings(
     candidate_set: CandidateSet, result: Headline, kinds: Collection[str]
 ) -> tuple[Finding, ...]:
-    """Find what the file states otherwise, where at least two modes show and nothing is absurd."""
+    """Find settings that differ from the file, if at least two modes show and nothing is absurd."""
     if "implausible" in kinds or len(result.visible_modes) < _MODES_TO_TEST:
         return ()
     return tuple(of_settings(candidate_set, result))
@@ -416,7 +404,7 @@ def _settings(
 def _linear_and_constant(
     candidate_set: CandidateSet, modal: ModalFit, band_hz: tuple[float, float]
 ) -> bool:
-    """Whether the modal model leaves nothing but noise: nothing else need be looked for."""
+    """Return whether the residual of the modal model is noise: then no other effect is tested."""
     _, _, multiples = _tests(candidate_set, modal, band_hz)
     return modal.explained and not any(each.present for each in multiples)
 
@@ -424,15 +412,10 @@ def _linear_and_constant(
 def _with_effects(
     linear: CandidateSet, *, again: bool
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[TemporalChange, ...]]:
-    """Look for what no linear constant antenna does.
+    """Test for nonlinear and time-varying effects.
 
-    Returns
-    -------
-    field : CandidateSet
-        With what explains the record best.
-    forces : tuple of NonlinearForce
-    changes : tuple of Change
-        Along the record.
+    Return the set with the best explanation, its nonlinear forces, and its changes along the
+    record.
     """
     candidate_set = linear if again else with_evident_drag(linear)
     if candidate_set is linear:
@@ -449,7 +432,7 @@ def _with_effects(
     candidate_set, changes = along_time(candidate_set.with_orders_free())
     one_sweep = linear.comparison.measurement.one_sweep
     if not one_sweep and (forces or candidate_set.drag is not None):
-        # What changes along the record may have looked like an amplitude, which does so as well.
+        # A change along the record may have been mistaken for a dependence on the amplitude.
         other, other_changes = along_time(linear.with_orders_free(), rival_bic=candidate_set.bic)
         if other_changes and other.bic < candidate_set.bic:
             return other, (), other_changes
@@ -461,10 +444,10 @@ def freest_alone(
 ) -> tuple[Headline, tuple[Finding, ...], RecordAnalysis]:
     """Fit the freest structure on a uniform beam, in a quarter of `select`'s time.
 
-    The modes are those of `select` where that selects such a beam with all orders free. Where it
-    selects anything else (drag, forces that are not linear), the residual shows it, and every
-    number carries a flag. Orders are not profiled: that one is not identifiable is told by
-    the modes that show and by the width of its interval.
+    The modes are those of `select` if that selects such a beam with all orders free. If it selects
+    another model (drag, nonlinear forces), the residual is not noise, and every number carries a
+    flag. Orders are not profiled: the visible modes and the width of the interval decide whether an
+    order is identifiable.
 
     Parameters
     ----------
@@ -475,9 +458,9 @@ def freest_alone(
     -------
     headline : Headline
     findings : tuple of Finding
-        What shows without a rival.
+        Findings that need no comparison of candidates.
     analysis : RecordAnalysis
-        That fit and one of `INTEGER`, the first first, with the noise.
+        That fit, then one of `INTEGER`, with the noise.
 
     Raises
     ------
@@ -490,7 +473,7 @@ def freest_alone(
 def _freest_alone(
     measurement: Measurement, band_hz: tuple[float, float]
 ) -> _Assessment[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
-    """Fit the freest structure alone with what is known to have struck the beam."""
+    """Fit the freest structure alone with the known impacts."""
     misread = tuple(wrong_scale(Comparison.of(measurement, band_hz)))
     additional = () if misread else (INTEGER,)
     candidate_set = replace(
@@ -531,14 +514,14 @@ def _freest_alone(
 
 
 def _unidentifiable_orders(candidate_set: CandidateSet, visible: tuple[int, ...]) -> dict[str, str]:
-    """Say by the fit alone which orders are not identifiable, and why."""
+    """Return the orders that are not identifiable by the fit alone, with reasons."""
     freest, *others = candidate_set.candidates
     reason = not_reported_reason(candidate_set, visible)
     found = {}
     for name in COEFFICIENT_OF.keys() & set(freest.structure.free):
         low, high = freest.fit.interval[name] or (-math.inf, math.inf)
         too_wide = high - low > WIDEST_SHARE * (ORDER_RANGE[1] - ORDER_RANGE[0])
-        # An interval that is too narrow for what lies between: a valley of its own.
+        # An interval that is too narrow for what lies between: a local minimum of its own.
         astray = not low <= 1 <= high and any(
             each.structure.fixed.get(name) == 1.0  # type: ignore[call-overload]
             and each.deviance - freest.deviance < NORMAL_95**2
@@ -550,16 +533,16 @@ def _unidentifiable_orders(candidate_set: CandidateSet, visible: tuple[int, ...]
 
 
 def _wrong_model_reason(kinds: Collection[str], *, explained: bool) -> str | None:
-    """Say why the model is not to be believed, by what was found; None: it may be."""
+    """Return why the findings refute the model; None if they do not."""
     if not _MISREAD_KINDS.isdisjoint(kinds):
         return MISREAD
     return UNEXPLAINED if "harmonics" in kinds or not explained else None
 
 
 def _doubt_reason(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> str | None:
-    """Say why no parameter is to be believed though all of the record is explained, or None.
+    """Return why no parameter is valid although the record is explained, or None.
 
-    The modes are what each was when it was passed.
+    The mode parameters are those at the time when the sweep passed each mode.
     """
     if established(changes, one_sweep=one_sweep):
         return None
@@ -575,18 +558,12 @@ def _with_doubts(
     *,
     explained: bool,
 ) -> tuple[Finding, ...]:
-    """Tell as facts only what is sure.
+    """Return all findings, with the doubtful ones marked as not established.
 
-    Parameters
-    ----------
-    beside, along : tuple of Finding
-        Beside the beam, and what changes along the record, which says itself how sure it is.
-    wrong, doubt : str or None
-        Why the model is not to be believed, and why no number of it.
-    flags : mapping of str to str
-        Reasons against single parameters, as the headline has them.
-    explained : bool
-        Whether harmonics are all that remains: then they are what they seem to be.
+    `from_model` are effects that were fitted with the beam, `along` the changes along the record,
+    which already state their certainty. `wrong` is the reason against the model, `doubt` the reason
+    against all numbers and `flags` those against single parameters. `explained` states that
+    harmonics are all that remains.
     """
 
     def qualified(each: Finding) -> Finding:
@@ -608,7 +585,7 @@ def _with_knocks_and_unexplained(
     white: Whiteness,
     related: InputRelation,
 ) -> tuple[Finding, ...]:
-    """Name knocks before all that was found, and after it what remains unexplained."""
+    """Add impacts before the other findings, and the unexplained residual after them."""
     explained = white.white and not related.related
     knocks = of_knocks(candidate_set.comparison.measurement.knocks, explained=explained)
     rest = () if explained else (unexplained(white, related, candidate_set.best.fit.modes),)
@@ -618,7 +595,7 @@ def _with_knocks_and_unexplained(
 def _tests(
     candidate_set: CandidateSet, modal: ModalFit | None, band_hz: tuple[float, float]
 ) -> tuple[Whiteness, InputRelation, tuple[Harmonic, ...]]:
-    """Test what the modal model leaves, or the first candidate where there is none."""
+    """Test the residual of the modal model, or of the first candidate if there is none."""
     comparison, counts = candidate_set.comparison, candidate_set.noise.counts
     residual = candidate_set.best.fit.residual if modal is None else modal.residual
     angle_rad = comparison.angle_rad[comparison.kept]

@@ -1,4 +1,4 @@
-"""Sentences of the verdict on one record, and which experiments would tell more."""
+"""Sentences of the verdict on one record, and experiments that would clarify it."""
 
 from __future__ import annotations
 
@@ -46,15 +46,10 @@ LOSSES: Final[Mapping[Order, str]] = {
 def of_headline(
     headline: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, alone: bool
 ) -> list[str]:
-    """Say what the modes show, what is known of the damping, and on which condition.
+    """Return sentences on the modes, the damping and the conditions of these numbers.
 
-    Parameters
-    ----------
-    told : Headline
-    orders : tuple of OrderVerdict
-        Alpha's and lambda's.
-    alone : bool
-        Whether nothing else explains the record as well.
+    `orders` are those of alpha and lambda; `alone` states that nothing else explains the record as
+    well.
     """
     if len(headline.visible_modes) < _SEVERAL:
         sentences = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
@@ -75,7 +70,7 @@ def of_headline(
 
 
 def uniformity(test: UniformBeamTest | None) -> list[str]:
-    """Say whether a uniform beam predicts the modal constants; nothing if that was not tested.
+    """Return the sentence on the test of a uniform beam; nothing if it was not tested.
 
     Parameters
     ----------
@@ -97,7 +92,7 @@ def uniformity(test: UniformBeamTest | None) -> list[str]:
 
 
 def _of_damping(headline: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -> list[str]:
-    """Say which damping there is, and which structures are excluded."""
+    """Return sentences on the damping and the excluded structures."""
     if headline.tolerant is not None:
         excluded = headline.with_status("excluded")
         return [f"Excluded by the losses: {_types(excluded)}."] if excluded else []
@@ -115,7 +110,7 @@ def _of_damping(headline: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -
 
 
 def slope(headline: Headline, verdict: OrderVerdict) -> str:
-    """Say what is known of one order as the slope of a loss over the modes in sight."""
+    """Return the sentence on one order: the slope of a loss over the visible modes."""
     estimate = headline.tolerant
     assert estimate is not None
     name, of = verdict.order, _OF[verdict.order]
@@ -136,7 +131,7 @@ def slope_of_loss(
     status: Status,
     reason: str | None,
 ) -> str:
-    """Say how a loss grows over the modes in sight, on which assumption, and whether as f.
+    """Return the sentence on the growth of a loss over the visible modes, with its conditions.
 
     Parameters
     ----------
@@ -147,11 +142,11 @@ def slope_of_loss(
     shown_hz : sequence of float
         Frequencies of the modes.
     estimate : TolerantEstimate
-        What the order is of.
+        Estimate that contains the order.
     status : str
         "compatible", "fractional" or "open".
     reason : str or None
-        Why the order is not established; None if it is.
+        Reason why the order is not established; None if it is.
     """
     std = (interval[1] - interval[0]) / (2 * NORMAL_95)
     written, low, high = to_uncertainty((value, *interval), std)
@@ -172,7 +167,7 @@ def slope_of_loss(
 
 
 def _if_exact(headline: Headline) -> list[str]:
-    """Say what an exactly uniform beam would give, where one predicts the modes."""
+    """Return sentences on the estimates for an exactly uniform beam that predicts the modes."""
     exact = headline.exact
     if exact is None:
         return []
@@ -187,7 +182,7 @@ def _if_exact(headline: Headline) -> list[str]:
 
 
 def order(verdict: OrderVerdict) -> str:
-    """Say what is known of one order on an exactly uniform beam."""
+    """Return the sentence on one order on an exactly uniform beam."""
     profile = verdict.profile
     low, high = profile.interval
     name, of = verdict.order, _OF[verdict.order]
@@ -214,12 +209,12 @@ def order(verdict: OrderVerdict) -> str:
 
 
 def _types(names: tuple[str, ...]) -> str:
-    """List structures."""
+    """Return a list of structures in words."""
     return f"type{'s' if len(names) > 1 else ''} {listed(sorted(names))}"
 
 
 def _condition(simpler: Simpler) -> str:
-    """Say what a simpler structure would give."""
+    """Return the sentence on the conditional estimate of a simpler structure."""
     taken = " and ".join(f"{name} = {value:g}" for name, value in simpler.fixed.items())
     numbers = [
         f"{name} = {_with_interval(simpler.parameters[name])}"
@@ -233,7 +228,7 @@ def _condition(simpler: Simpler) -> str:
 
 
 def _with_interval(quantity: Quantity) -> str:
-    """Write a number with its 95 % interval, to the digits that this gives a meaning."""
+    """Return a number with its 95 % interval, rounded to significant digits."""
     if quantity.interval_95 is None or not quantity.std:
         return f"{quantity.value:.4g}"
     low, high = quantity.interval_95
@@ -285,7 +280,7 @@ def experiments(
     found: tuple[Finding, ...],
     close: tuple[Candidate, ...],
 ) -> list[str]:
-    """Say what would tell more, beside the findings' remedies."""
+    """Return experiments that would clarify the verdict, in addition to the findings' remedies."""
     advice = []
     unknown = [o for o in orders if o.status == "not identifiable"]
     if unknown:
@@ -306,7 +301,7 @@ def experiments(
 
 
 def _for_two_modes(candidate_set: CandidateSet, visible: tuple[int, ...]) -> str:
-    """Say how both of the first two modes would show."""
+    """Return the experiment that would show both of the first two modes."""
     modes = {mode.number: mode.frequency_hz for mode in candidate_set.best.fit.modes}
     first_hz = modes.get(1, 0.0)
     at_hz = {1: first_hz, 2: modes.get(2, _SECOND * first_hz)}

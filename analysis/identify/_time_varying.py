@@ -1,22 +1,21 @@
 """Changes along the record (damping, stiffness, gain), clocks of different rates, and backlash.
 
-Columns of known shape and unknown size, as `analysis.identify._refit` takes them: what the torque
-would gain if damping, stiffness or gain rose in proportion to the time, and what a hub does that
-follows the shaft only once a gap is closed. In one sweep time and frequency go together, so a
-damping that drifts competes with an order of the damping, and a gain that drifts with a filter.
-Where torque and angle were sampled by clocks of different rates, the torque's delay changes along
-the record.
+The columns have a known shape and unknown size, as for `analysis.identify._refit`: the change of
+the torque if damping, stiffness or gain rise in proportion to time, and the effect of a hub that
+follows the shaft with backlash. In one sweep time and frequency go together, so a damping that
+drifts competes with an order of the damping, and a gain that drifts with a filter. Where torque and
+angle were sampled by clocks of different rates, the torque's delay changes along the record.
 
-A mode that rings for seconds remembers the damping and the stiffness that it had: at 0.4 % of
-stiffness in 22 s, one of 2.6 Hz is 0.03 rad out of phase with what its frequency of the moment
-would make of it. With ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``,
-``R = p / (c k⁴ + p)``, its place in space u (a angle, where it does not vibrate, with the part q
-that vibrates) and what changes as ``1 + e w(t)``, a stress D of stiffness or damping::
+A mode that rings for seconds depends on its damping and stiffness in the past: with 0.4 % of
+stiffness in 22 s, a mode of 2.6 Hz is 0.03 rad out of phase with a mode of its present frequency.
+With ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``, ``R = p / (c k⁴ + p)``, its
+position u (the rigid part a angle plus the vibration q) and a stress D of the stiffness or damping
+that changes as ``1 + e w(t)``::
 
     D = o k⁴ q + gamma s^lambda u,    q = -R a angle - e (c k⁴ + p)^-1 w D
 
-the torque gains ``e a EI (w gamma s^lambda u - R w D)``, where w multiplies in time what stands to
-its right; o is ``zeta s^alpha`` for a damping that changes, and c for the stiffness of a beam whose
+the torque gains ``e a EI (w gamma s^lambda u - R w D)``, where w multiplies the term to its right
+in time; o is ``zeta s^alpha`` for a damping that changes, and c for the stiffness of a beam whose
 mass stays. The second equation put into the first, again and again, gives D.
 """
 
@@ -59,8 +58,8 @@ _GAIN: Final = SURE**2 + 2 * math.log(20)
 """Deviance that a column must save: five of them are tried on four candidates."""
 
 _IN_SIGHT: Final = 0.75
-"""Share of a rival's lower BIC that a column has to promise. The first order foretells it to a
-tenth."""
+"""Fraction of a rival's lower BIC that a column has to reach by prediction. The first order
+predicts it to a tenth."""
 
 UNIT_PLAY_RAD: Final = 1e-4
 _CLOCK_UNIT: Final = 1e-5
@@ -74,16 +73,16 @@ _SETTLED: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class TemporalChange:
-    """One thing that changes along the record, or the backlash.
+    """Change of one property along the record, or the backlash.
 
     Attributes
     ----------
     what : str
     size, std : float
-        Change from the first sample to the last, relative; of clocks the relative difference of
+        Relative change from the first sample to the last; for clocks the relative difference of
         their rates; the backlash in rad.
     behind : float
-        BIC with it above the lowest without it.
+        BIC with it minus the lowest BIC without it.
     """
 
     what: What
@@ -93,33 +92,23 @@ class TemporalChange:
 
     @property
     def name(self) -> str:
-        """As sentences begin."""
+        """Return the name, as the beginning of a sentence."""
         return _NAMES[self.what]
 
     @property
     def certain(self) -> bool:
-        """Whether nothing else explains the record as well."""
+        """Return whether nothing else explains the record as well."""
         return self.behind < -STRONG
 
 
 def along_time(
     candidate_set: CandidateSet, rival_bic: float = math.inf
 ) -> tuple[CandidateSet, tuple[TemporalChange, ...]]:
-    """Find what changes along the record; refit all with it if nothing else explains it as well.
+    """Find changes along the record; refit all candidates with a certain one.
 
-    Parameters
-    ----------
-    field : CandidateSet
-    rival_bic : float
-        What else explains the record has this BIC (`CandidateSet.bic`): only what promises to come
-        near it is fitted.
-
-    Returns
-    -------
-    field : CandidateSet
-        The one given, unless something changes for certain.
-    changes : tuple of Change
-        What explains the record best of all, or as well as the best candidate.
+    Only columns that may come near `rival_bic`, the BIC of another explanation
+    (`CandidateSet.bic`), are fitted. Returns the candidates and the changes that explain the record
+    best or equally well.
     """
     if candidate_set.misread:
         return candidate_set, ()
@@ -152,12 +141,12 @@ def along_time(
 
 
 def _possible(change: TemporalChange) -> bool:
-    """Whether a size is one: backlash is positive, and nothing changes by more than itself."""
+    """Return whether a size is possible: backlash is positive, and no change exceeds 100 %."""
     return change.size > 0 if change.what == "play" else abs(change.size) < 1
 
 
 def _leads(candidate_set: CandidateSet) -> Iterator[Candidate]:
-    """Give the best candidate, and the simple ones that something may stand beside instead."""
+    """Return the best candidate, and simple ones that a change may explain instead."""
     yield candidate_set.best
     for candidate in candidate_set.candidates[1:]:
         if candidate.structure in _LEADS:
@@ -167,7 +156,7 @@ def _leads(candidate_set: CandidateSet) -> Iterator[Candidate]:
 def _promising(
     candidate_set: CandidateSet, lead: Candidate, lag: NDArray[np.float64], most_bic: float
 ) -> Iterator[tuple[What, float]]:
-    """Columns that to first order would make a candidate the best, with the BIC they promise."""
+    """Return the columns whose predicted BIC would make a candidate the best, with the BIC."""
     refit = candidate_set.refit(lead, 1)
     columns = _columns(candidate_set.comparison, lead.fit.plant, lag)
     saved = refit.saved_by(np.array(list(columns.values())))
@@ -182,7 +171,7 @@ def _promising(
 def _fitted(
     candidate_set: CandidateSet, lead: Candidate, what: What, lag: NDArray[np.float64]
 ) -> tuple[Refit, float]:
-    """Fit a candidate with one column beside it; give its BIC as well."""
+    """Fit a candidate with one additional column; return its BIC as well."""
     refit = candidate_set.refit(lead, 1)
     unknowns = refit.objective.unknowns
     size = 0.0
@@ -209,13 +198,13 @@ def _fitted(
 def _columns(
     comparison: Comparison, plant: Plant, lag: NDArray[np.float64]
 ) -> dict[What, NDArray[np.complex128]]:
-    """Spectra of the torque by a change of 1 from the first sample to the last, each of (K,)."""
+    """Return spectra of the torque by a change of 1 over the record, each of (K,)."""
     slopes = _slopes(comparison, plant)
     return {what: _column(comparison, plant, lag, what, 0.0, slopes) for what in _NAMES}
 
 
 def _slopes(comparison: Comparison, plant: Plant) -> dict[What, NDArray[np.float64]]:
-    """Torque per relative change of what may change in time, each of shape (samples,)."""
+    """Return the torque per relative change of each property, each of shape (samples,)."""
     _, (zeta, gamma, gain, ratio) = comparison.prediction.torque(plant, _GRADIENT)
     return {
         "damping": plant.damping.zeta * zeta + plant.damping.gamma * gamma,
@@ -232,9 +221,9 @@ def _column(
     size: float,
     slopes: Mapping[What, NDArray[np.float64]] | None = None,
 ) -> NDArray[np.complex128]:
-    """Column at a size that is perhaps not small, divided by it, shape (K,).
+    """Return the column at a finite size, divided by the size, shape (K,).
 
-    `slopes` are those of `_slopes`, where they are known already.
+    `slopes` are the results of `_slopes`, if known.
     """
     if what == "play":
         return comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
@@ -248,22 +237,10 @@ def _column(
 
 
 def _sampled_late(comparison: Comparison, plant: Plant, size: float) -> NDArray[np.float64]:
-    """Torque that a faster clock adds to the samples, over the difference of the rates.
+    """Return the torque by a faster clock per difference of the rates, shape (samples,).
 
     The torque with time stamp t is that of t plus the difference times the time since the middle of
-    the record, by its Taylor series.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    plant : Plant
-    size : float
-        Difference of the rates, in `_CLOCK_UNIT`.
-
-    Returns
-    -------
-    ndarray, shape (samples,)
-        For one unit.
+    the record, by its Taylor series. `size` is in `_CLOCK_UNIT`.
     """
     prediction, time_s = comparison.prediction, comparison.times_s()
     since_s = _CLOCK_UNIT * (time_s - time_s.mean())
@@ -279,12 +256,12 @@ def _sampled_late(comparison: Comparison, plant: Plant, size: float) -> NDArray[
 
 
 def play(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Spectrum of the torque by a backlash of `UNIT_PLAY_RAD`, shape (K,)."""
+    """Return the spectrum of the torque by a backlash of `UNIT_PLAY_RAD`, shape (K,)."""
     return _column(comparison, plant, _lag_of_play(comparison), "play", 0.0)
 
 
 def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
-    """Hub's angle less the shaft's with a backlash of `UNIT_PLAY_RAD`, at the decimated rate."""
+    """Return the angle of the hub less that of the shaft with backlash, at the decimated rate."""
     highest_hz = float(comparison.frequency_hz[-1])
     half, here, hub = UNIT_PLAY_RAD / 2, 0.0, []
     shaft = comparison.measurement.angle_from_rest(highest_hz)
@@ -307,7 +284,7 @@ _DECAY: Final = 9.0
 
 _ORDERS: Final = 12
 _SMALL: Final = 1e-4
-"""Orders of the size that are followed at most, and the share of the stress that counts."""
+"""Highest order of the size, and smallest fraction of the stress that is significant."""
 
 
 def remembered(
@@ -317,22 +294,11 @@ def remembered(
     what: Literal["damping", "stiffness"],
     size: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Torque by what changes, over its size, less what the derivative of the moment makes of it.
+    """Return the torque by the past of a change, per unit size, shape (samples,).
 
-    Parameters
-    ----------
-    comparison : Comparison
-    plant : Plant
-    change : ndarray, shape (samples,)
-        w at the samples kept; before and after as at its ends.
-    what : str
-        "stiffness": while the mass stays.
-    size : float
-        e.
-
-    Returns
-    -------
-    ndarray, shape (samples,)
+    This is the torque beyond the instantaneous derivative. `change`, shape (samples,), is w at the
+    retained samples, constant before and after. With `what` of "stiffness" the mass stays. `size`
+    is e.
     """
     n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
     length = fast_length(int(np.ceil(_PADDED * n)))
@@ -397,13 +363,14 @@ _KINDS: Final[dict[What, Kind]] = {
 
 
 def established(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> bool:
-    """Whether one change, and nothing else, explains the record.
+    """Return whether one change, and nothing else, explains the record.
 
-    What changes with time never is from one sweep: it may change with frequency. Backlash may be.
+    A change with time is never established by one sweep: it may depend on frequency instead.
+    Backlash may be established.
 
     Parameters
     ----------
-    changes : tuple of Change
+    changes : tuple of TemporalChange
     one_sweep : bool
         As `Measurement` has it.
     """
@@ -413,11 +380,11 @@ def established(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> bool
 
 
 def changing(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> Iterator[Finding]:
-    """Put in words what changes along the record.
+    """Yield findings on the changes along the record.
 
     Parameters
     ----------
-    changes : tuple of Change
+    changes : tuple of TemporalChange
     one_sweep : bool
         As `Measurement` has it.
     """

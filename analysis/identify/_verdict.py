@@ -1,4 +1,4 @@
-"""The verdict on one record: structure, orders, what is not known, and what would tell."""
+"""Verdict on one record: structure, orders, limits of the data, and clarifying experiments."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Status = Literal["compatible", "fractional", "open", "not identifiable", "absent
 
 STRONG: Final = 10.0
 """Difference of BIC from which the worse structure may be dismissed (Kass and Raftery, J. American
-Statistical Association 90 (1995) 773-795); below `EVEN` the data do not tell the two apart."""
+Statistical Association 90 (1995) 773-795); below `EVEN` the data do not distinguish the two."""
 
 EVEN: Final = 6.0
 
@@ -35,7 +35,7 @@ parameters that it lacks: chi-square's 0.1 %. A true one is excluded once in a t
 NOT_DETERMINED: Final = "the record does not determine the order"
 
 WITH_DRAG: Final = "air drag contributes to it, and its law is known to a few per cent only"
-"""Why external damping beside drag must not be taken for a property of the beam: of two records
+"""Why external damping with drag is not a property of the beam: of two records
 of one rig, one had lambda four standard deviations off, with a drag that fell with the speed."""
 
 
@@ -43,7 +43,7 @@ of one rig, one had lambda four standard deviations off, with a drag that fell w
 
 _MODES_FOR_AN_ORDER: Final = 2
 _MODES_FOR_ONE_DAMPING: Final = 3
-"""Modes from which on it shows that there is no second damping: two loss factors are explained by
+"""Number of modes that shows whether there is a second damping: two loss factors are explained by
 coefficient and order of one damping as well as by two dampings."""
 
 ANOTHER_DAMPING: Final = "from two modes it cannot be told whether there is another damping as well"
@@ -51,7 +51,7 @@ ANOTHER_DAMPING: Final = "from two modes it cannot be told whether there is anot
 
 @dataclass(frozen=True, slots=True)
 class OrderVerdict:
-    """One order of the damping.
+    """Verdict on one order of the damping.
 
     Attributes
     ----------
@@ -60,13 +60,14 @@ class OrderVerdict:
     status : str
         "compatible": the 95 % interval holds 1; "fractional": the record excludes 1; "open": 1 is
         doubtful but not excluded, or something else explains as much; "not identifiable": it could
-        be almost anything; "absent": such damping does not show, though three modes would show it.
+        be almost any value; "absent": such damping is insignificant, though three modes would show
+        it.
     value : float or None
-        The estimate with the order free, where the order is identifiable.
+        Estimate with the order free, if it is identifiable.
     interval : tuple of float or None
         Its 95 % interval, by the likelihood ratio.
     reason : str or None
-        Why the number is not a property of the beam; None if it is.
+        Reason why the number is not a property of the beam; None if it is one.
     profile : Profile
     """
 
@@ -85,17 +86,10 @@ def order_verdict(
     *,
     doubt: str | None,
 ) -> OrderVerdict:
-    """Judge one order.
+    """Assess one order in the freest structure.
 
-    Parameters
-    ----------
-    field : CandidateSet
-    profile : Profile
-        Profile of the order, in the freest structure on the beam selected.
-    visible : tuple of int
-        Modes that the record shows.
-    doubt : str or None
-        Why nothing that rests on that structure is to be believed; None: it may be.
+    `profile` is that of the order on the selected beam, `visible` the visible modes, and `doubt`
+    the reason against that structure; None if it is valid.
     """
     status, reason = _judged(candidate_set, profile, visible, doubt=doubt)
     known = status not in ("not identifiable", "absent")
@@ -110,26 +104,19 @@ def order_verdict(
 
 
 def not_reported_reason(candidate_set: CandidateSet, visible: tuple[int, ...]) -> str | None:
-    """Say why no order can be told from a record, whatever its likelihood says; None if it may.
-
-    Parameters
-    ----------
-    field : CandidateSet
-    visible : tuple of int
-        Modes that the record shows.
-    """
+    """Return why a record determines no order, whatever its likelihood; None if it may."""
     return too_few_modes(candidate_set.freest.structure, len(visible))
 
 
 def too_few_modes(structure: Structure, modes: int) -> str | None:
-    """Say why so many modes tell no order, whatever the likelihood says; None if they may.
+    """Return why so many modes determine no order, whatever the likelihood; None if they may.
 
     Parameters
     ----------
     structure : Structure
         The freest that the data support.
     modes : int
-        How many show.
+        Number of visible modes.
     """
     # The loss at one frequency is all that one mode shows; what may narrow an order then is how
     # exactly the beam is uniform.
@@ -141,7 +128,7 @@ def too_few_modes(structure: Structure, modes: int) -> str | None:
 
 
 def deviance_of_one(profile: LikelihoodProfile) -> float:
-    """Deviance of order 1 above the lowest; infinite where the walk along the order ended before.
+    """Return the deviance of order 1 above the lowest; infinite beyond the end of the walk.
 
     Parameters
     ----------
@@ -179,7 +166,7 @@ def _judged(
 
 @dataclass(frozen=True, slots=True)
 class CandidateRow:
-    """One line of the table of candidates.
+    """Row of the table of candidates.
 
     Attributes
     ----------
@@ -201,7 +188,7 @@ class CandidateRow:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What can be said of one record.
+    """Conclusions on one record.
 
     Attributes
     ----------
@@ -210,17 +197,17 @@ class Verdict:
     structure : str
         Structure of the lowest BIC: "I" to "VII".
     rivals : tuple of str
-        Structures that the data cannot tell from it.
+        Structures that the data do not distinguish from it.
     parameters : mapping of str to float
-        Those of the freest structure, as `RecordFit` names them, but for those that carry a flag.
+        Parameters of the freest structure without a flag, as `RecordFit` names them.
     adequate : bool
-        Whether what remains of that is noise.
+        Whether the residual of that structure is noise.
     alpha, lambda_ : OrderVerdict
     visible_modes : tuple of int
-        Modes that stand out of the noise.
+        Modes significantly above the noise.
     findings : tuple of Finding
-        What else is in the record.
-    table : tuple of Row
+        Other effects in the record.
+    table : tuple of CandidateRow
         All candidates, the lowest BIC first.
     whiteness : Whiteness
     input_relation : InputRelation
@@ -228,9 +215,9 @@ class Verdict:
     sentences : tuple of str
         The verdict in words, the most important first.
     experiments : tuple of str
-        What would tell more.
+        Experiments that would clarify the verdict.
     damping_with_amplitude : tuple of DampingAt
-        Damping in free vibration, where the air brakes the beam; else empty.
+        Damping in free vibration with air drag; else empty.
     """
 
     name: str
@@ -251,14 +238,14 @@ class Verdict:
     damping_with_amplitude: tuple[DampingAt, ...] = ()
 
     def as_json(self) -> dict[str, object]:
-        """As `json.dumps` takes it; what is not finite becomes null."""
+        """Return the verdict as `json.dumps` takes it; numbers that are not finite become null."""
         plain = _plain(dataclasses.asdict(self))
         assert isinstance(plain, dict)
         return plain
 
 
 def rivals(candidate_set: CandidateSet, within: float) -> tuple[Candidate, ...]:
-    """Candidates whose BIC is less than so much above that of the first, without the first."""
+    """Return the candidates whose BIC is within a limit above that of the first."""
     limit = candidate_set.best.bic + within
     return tuple(c for c in candidate_set.candidates[1:] if c.bic < limit)
 

@@ -153,7 +153,7 @@ class IdentifiedModel:
         """Parameters and covariance of the beam that the response is computed from.
 
         The beam that fits the record exactly where its covariance is stated: parameters with a
-        tolerance of the geometry do not place the resonances as exactly as they were measured.
+        tolerance of the geometry reproduce the resonances less exactly than they were measured.
         """
         exact = self.headline.get("exact_geometry")
         if isinstance(exact, dict) and isinstance(exact.get("parameters"), dict):
