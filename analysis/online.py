@@ -217,7 +217,7 @@ class OnlineFit:
         self._path = Path(name)
         self._blocks: list[NDArray[np.void]] = []
         self._count = 0
-        self._judged: Selection | None = None
+        self._last_selection: Selection | None = None
 
     def feed(self, samples: NDArray[np.void]) -> None:
         """Append the next samples.
@@ -310,9 +310,9 @@ class OnlineFit:
             measurement, band_hz = Measurement.of_record(record), record_band_hz(record)
             orders: tuple[OrderVerdict, ...] = ()
             if whole:
-                before = self._judged if from_last else None
+                before = self._last_selection if from_last else None
                 selection = select(measurement, band_hz=band_hz, earlier=before)
-                self._judged = selection
+                self._last_selection = selection
                 headline, analysis = selection.headline, selection.analysis
                 found = selection.verdict.findings
                 orders = (selection.verdict.alpha, selection.verdict.lambda_)

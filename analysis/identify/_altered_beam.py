@@ -7,8 +7,8 @@ Relative to the stiffness of the beam, mode k then solves ``D(s) = 0``::
 
 with numbers K (stiffness), C (of the clamp), M (mass), I (medium) and T (tension by gravity) that
 its shape gives, and the residue of the torque includes its arms about the motor axis. The plain
-beam has ``K = k⁴``, ``M = I = 1``, ``C = T = 0``. What damping changes in a shape is of the order
-of it times the alteration: it moves poles by the square, and the arms to first order.
+beam has ``K = k⁴``, ``M = I = 1``, ``C = T = 0``. The effect of damping on a shape is of the order
+of the damping times the alteration: it moves poles by the square, and the arms to first order.
 
 A local compliance adds to the flexibility, not to the stiffness: the moment
 along a clamped-free beam follows from its loads alone, so few modes suffice there.
@@ -129,8 +129,8 @@ class ModeTerms:
     mass_arm, lump_arm, medium_arm, tension_arm : ndarray, shape (n,)
         About the motor's axis, over the length; complex where the clamp has a loss.
     turn_by_medium, turn_by_internal : ndarray, shape (n,)
-        What ``gamma s^lambda`` and ``zeta s^alpha`` add to the arm of the mass, by their change of
-        the shape.
+        Contributions of ``gamma s^lambda`` and ``zeta s^alpha`` to the arm of the mass, by their
+        change of the shape.
     density_kg_per_m : float or None
     alteration : Alteration
     """

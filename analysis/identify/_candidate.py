@@ -24,7 +24,7 @@ class Candidate:
     structure : Structure
     fit : RecordFit
     columns : int
-        Parameters of what is not linear, in addition to those of the fit.
+        Number of nonlinear terms, in addition to the parameters of the fit.
     """
 
     structure: Structure

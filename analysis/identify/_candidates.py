@@ -145,7 +145,7 @@ class CandidateSet:
             return None
         candidate_set = cls._fitted(found, fixed, (replace(first, fit=found.fits[0]),))
         before = replace(candidate_set, candidates=tuple(earlier))
-        every = (before._brought_to(candidate_set, c, MANY) for c in others)
+        every = (before._refitted(candidate_set, c, MANY) for c in others)
         candidate_set = (
             candidate_set.ranked((*candidate_set.candidates, *every))
             ._without_leakage()
@@ -272,7 +272,7 @@ class CandidateSet:
             return self
         # The others from where they were: they have seen their best's noise only.
         others = (c for c in self.candidates if c is not self.best)
-        every = (self._brought_to(candidate_set, c, MANY) for c in others)
+        every = (self._refitted(candidate_set, c, MANY) for c in others)
         return candidate_set.ranked((*candidate_set.candidates, *every)).cross_checked()
 
     def _without_leakage(self) -> CandidateSet:
@@ -283,9 +283,9 @@ class CandidateSet:
     def under(self, noise: NoiseSpectrum) -> CandidateSet:
         """Fit again under a slightly different noise spectrum."""
         other = replace(self, noise=noise)
-        return other.ranked(self._brought_to(other, c, FEW) for c in self.candidates)
+        return other.ranked(self._refitted(other, c, FEW) for c in self.candidates)
 
-    def _brought_to(self, other: CandidateSet, c: Candidate, max_evaluations: int) -> Candidate:
+    def _refitted(self, other: CandidateSet, c: Candidate, max_evaluations: int) -> Candidate:
         """Fit a candidate in a slightly different set; only roughly if its BIC is far higher."""
         behind = c.bic - min(each.bic for each in self.candidates)
         return other.refit(c, max_evaluations if behind < FAR_BEHIND else _A_STEP).candidate()
@@ -303,7 +303,7 @@ class CandidateSet:
                 break
         return candidate_set
 
-    def tried_from(self, plant: Plant) -> CandidateSet:
+    def restarted_from(self, plant: Plant) -> CandidateSet:
         """Start each candidate from a plant that another search found."""
         return self.ranked(self._from_plant(c, plant) for c in self.candidates).cross_checked()
 

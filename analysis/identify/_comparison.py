@@ -84,7 +84,7 @@ class Comparison:
         Torque that was removed for it, at the retained samples and at the ticks without torque.
     drag : DragExpansion, optional
         Removed torque by drag, and its derivatives with respect to the beam.
-    struck : ndarray of complex, shape (k, K), or None
+    impact_spectra : ndarray of complex, shape (k, K), or None
         Spectra of the torque by impacts, of unknown sizes, in addition to the removed torque.
     last_poles_rad_s : list of complex
         Poles of the last plant; other plants that explain the record have similar ones.
@@ -108,7 +108,7 @@ class Comparison:
     incoherent_nm: NDArray[np.float64] | float = 0.0
     incoherent_at_unknown_nm: NDArray[np.float64] | float = 0.0
     drag: DragExpansion | None = None
-    struck: NDArray[np.complex128] | None = None
+    impact_spectra: NDArray[np.complex128] | None = None
     last_poles_rad_s: list[complex] = field(default_factory=list)
 
     @classmethod
@@ -187,9 +187,9 @@ class Comparison:
             if 0 < first_s < (samples - 1) / decimation.rate_hz
         )
         comparison = replace(comparison, later_decays=later)
-        return comparison._struck() if measurement.knocks else comparison
+        return comparison._without_impacts() if measurement.knocks else comparison
 
-    def _struck(self) -> Comparison:
+    def _without_impacts(self) -> Comparison:
         """Remove the impacts as estimated; their remainder is projected out."""
         rate_hz, knocks = self.decimation.rate_hz, self.measurement.knocks
         grid_s = self.times_s()
@@ -201,7 +201,9 @@ class Comparison:
             for time_s in (grid_s, unknown_s)
         )
         columns = np.concatenate([each.columns(grid_s, rate_hz) for each in knocks])
-        return replace(self, struck=self.spectrum(columns))._without(taken_nm, at_unknown_nm)
+        return replace(self, impact_spectra=self.spectrum(columns))._without(
+            taken_nm, at_unknown_nm
+        )
 
     def _without(
         self, torque_nm: NDArray[np.float64] | float, at_unknown_nm: NDArray[np.float64] | float
@@ -438,9 +440,9 @@ class Comparison:
         """
         hum = self.decays.hum([hum.frequency_hz for hum in self.hum])
         drift = _drift(self.samples)[None, self.bins]
-        struck = drift[:0] if self.struck is None else self.struck
+        impact_spectra = drift[:0] if self.impact_spectra is None else self.impact_spectra
         decays = [each.columns(poles) for each in (self.decays, *self.later_decays)]
-        return np.concatenate([*decays, hum, struck, drift])
+        return np.concatenate([*decays, hum, impact_spectra, drift])
 
     def decay_gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]

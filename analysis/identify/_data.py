@@ -149,7 +149,7 @@ class Measurement:
     Attributes
     ----------
     name : str
-        What messages call it: the file's path.
+        Name in messages: the path of the file.
     angle_rad, torque_nm : ndarray, shape (n,)
         Motor angle and coupling torque, one value per tick.
     rate_hz : float

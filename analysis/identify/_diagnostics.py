@@ -1,7 +1,7 @@
 """Diagnostics of a record: effects other than the beam of Eq. 25, by name and size.
 
 Settings at the edge of the search range or different from the file, disturbances of the torque,
-forces that are not linear, drag, a free decay at the start, and what remains unexplained.
+nonlinear forces, drag, a free decay at the start, and the unexplained residual.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from analysis.identify._channel_checks import clipping, drift_of_zero, stops
 from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
-from analysis.identify._residual_tests import SURE
+from analysis.identify._residual_tests import SIGNIFICANT_STD
 from analysis.statistics import NORMAL_95, chi_square_deviate
 from rigd.units import interval_text, to_uncertainty
 
@@ -111,7 +111,7 @@ def _difference(
     quantity, stated = headline.parameters.get(name), _stated(candidate_set, name)
     if quantity is None or quantity.flag or not quantity.std or quantity.interval_95 is None:
         return None
-    if abs(quantity.value - stated) < SURE * quantity.std:
+    if abs(quantity.value - stated) < SIGNIFICANT_STD * quantity.std:
         return None
     low, high = quantity.interval_95
     return quantity.value - stated, low - stated, high - stated
@@ -175,7 +175,7 @@ def _of_beam(candidate_set: CandidateSet, headline: Headline) -> Iterator[Findin
             sentence=(
                 f"{words} is {size} % {'higher' if relative > 0 else 'lower'} than the "
                 f"file states ({interval_text(interval, 100, '+')} %; 95 %)"
-                f"{_or_else(candidate_set, name)}."
+                f"{_equivalent_causes(candidate_set, name)}."
             ),
             value=relative,
             interval=(low, high),
@@ -184,7 +184,7 @@ def _of_beam(candidate_set: CandidateSet, headline: Headline) -> Iterator[Findin
         )
 
 
-def _or_else(candidate_set: CandidateSet, name: Setting) -> str:
+def _equivalent_causes(candidate_set: CandidateSet, name: Setting) -> str:
     """Return the end of the sentence that names other causes with the same effect on the torque."""
     if name == "bending_stiffness_n_m2":
         return ", or the torque's gain is"
@@ -194,7 +194,7 @@ def _or_else(candidate_set: CandidateSet, name: Setting) -> str:
     std = fit.std["bending_stiffness_n_m2"] or 0.0
     # A small mass at the tip moves all modes alike, and the torque by a quarter of that.
     missing = math.log(stiffness / beam.bending_stiffness_n_m2) + relative
-    if fit.plant.tip_mass_kg or relative <= 0 or abs(missing) > SURE * std / stiffness:
+    if fit.plant.tip_mass_kg or relative <= 0 or abs(missing) > SIGNIFICANT_STD * std / stiffness:
         return ""
     mass_g = 1e3 * relative * beam.density_kg_per_m * beam.length_m
     return f", or the beam carries {mass_g:.2g} g at its tip"
@@ -208,7 +208,10 @@ def _of_start(candidate_set: CandidateSet, headline: Headline) -> Iterator[Findi
     loudest = max(ringing.amplitude_nm)
     # A hum begins and ends with the record, and so resembles a decay.
     hum = max((line.amplitude_nm for line in candidate_set.noise.lines), default=0.0)
-    if loudest <= hum or chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) < SURE:
+    if (
+        loudest <= hum
+        or chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) < SIGNIFICANT_STD
+    ):
         return
     yield Finding(
         kind="ringing start",

@@ -66,10 +66,10 @@ _MANY: Final = 40
 _HOPELESS: Final = 50.0
 """Deviance above the structure with drag from which the descent of another ends early."""
 
-_SETTLED: Final = 2.0
+_CONVERGED: Final = 2.0
 _ROUGHLY: Final = 500.0
 """Predicted reduction of squares below which the drag is not recomputed: the step itself is taken,
-by all fits at this drag (`_all`).
+by all fits at this drag (`_fit_all`).
 
 The two numbers of a law and external damping can compensate each other along a flat direction.
 There each recomputation predicted a step of half a standard deviation in the same direction, for
@@ -180,18 +180,18 @@ def _with_drag(candidate_set: CandidateSet) -> CandidateSet:
     start = None if lead is None else _start(candidate_set, lead)
     if start is None:
         return candidate_set
-    settled = _settled(candidate_set, start, STRUCTURES[_LEAD], tolerance=_ROUGHLY)
-    if settled is None:
+    converged = _converged(candidate_set, start, STRUCTURES[_LEAD], tolerance=_ROUGHLY)
+    if converged is None:
         return candidate_set
     # Thence to the freest damping; without drag its fit may be that of no beam at all.
-    known, point = settled.objective.comparison, _DragPoint.of(settled)
+    known, point = converged.objective.comparison, _DragPoint.of(converged)
     for name in (_FREEST, _LEAD):
-        settled = _settled(candidate_set, point, STRUCTURES[name], known=known)
-        if settled is not None:
+        converged = _converged(candidate_set, point, STRUCTURES[name], known=known)
+        if converged is not None:
             break
     else:
         return candidate_set
-    found = _all(candidate_set, settled)
+    found = _fit_all(candidate_set, converged)
     assert found.drag is not None
     return found if found.drag.value_m > 0 and found.bic < candidate_set.bic else candidate_set
 
@@ -260,12 +260,12 @@ def _start(candidate_set: CandidateSet, lead: Candidate) -> _DragPoint | None:
     )
 
 
-def _settled(
+def _converged(
     candidate_set: CandidateSet,
     point: _DragPoint,
     structure: Structure,
     *,
-    tolerance: float = _SETTLED,
+    tolerance: float = _CONVERGED,
     known: Comparison | None = None,
 ) -> Refit | None:
     """Fit one structure with drag, from `point`; recompute the drag until the fit converges.
@@ -276,7 +276,7 @@ def _settled(
     unknowns = candidate_set.unknowns(structure)
     x = unknowns.vector(point.plant)
     law, noise, two = point.law, point.noise, point.two
-    comparison, roughly, saved = known, tolerance > _SETTLED, math.inf
+    comparison, roughly, saved = known, tolerance > _CONVERGED, math.inf
     for _ in range(_ROUNDS):
         if comparison is None:
             plant = unknowns.plant(x)
@@ -292,7 +292,7 @@ def _settled(
         descent = partial(Refit.descend, comparison, unknowns, noise=noise)
         at_first = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=1)
         here = at_first.further(_FEW)
-        if two or roughly or _known_to(here) > _ONE_NUMBER:
+        if two or roughly or _relative_std(here) > _ONE_NUMBER:
             before, saved = saved, at_first.cost - max(at_first.predicted_cost, here.cost)
             if saved < tolerance or before / 2 < saved < _IN_VAIN:
                 return at_first
@@ -307,7 +307,7 @@ def _settled(
     return None
 
 
-def _known_to(refit: Refit) -> float:
+def _relative_std(refit: Refit) -> float:
     """Return the relative standard deviation of a drag law of one number."""
     law, (_, std) = _law_at(refit), refit.amplitudes()
     return float(std[0]) / max(float(law.constant_m), float(np.finfo(float).tiny))
@@ -322,15 +322,15 @@ def _law_at(refit: Refit) -> DragLaw:
     return DragLaw(expansion.law.constant_m + step[0], slowing)
 
 
-def _all(candidate_set: CandidateSet, settled: Refit) -> CandidateSet:
+def _fit_all(candidate_set: CandidateSet, converged: Refit) -> CandidateSet:
     """Fit all structures with the drag of a converged fit, and estimate its size."""
     other = replace(
         candidate_set,
-        comparison=settled.objective.comparison,
-        columns=settled.columns,
-        noise=settled.noise_here(),
+        comparison=converged.objective.comparison,
+        columns=converged.columns,
+        noise=converged.noise_here(),
     )
-    least = other.descent(settled.objective.unknowns, settled.x, 1).cost
+    least = other.descent(converged.objective.unknowns, converged.x, 1).cost
     most = least * math.exp(_HOPELESS / candidate_set.best.values)
     begun = []
     for each in candidate_set.candidates:
@@ -338,7 +338,7 @@ def _all(candidate_set: CandidateSet, settled: Refit) -> CandidateSet:
         refit = Refit.descend(
             other.comparison,
             unknowns,
-            unknowns.vector(settled.plant),
+            unknowns.vector(converged.plant),
             other.noise,
             other.columns,
             max_evaluations=_FEW,

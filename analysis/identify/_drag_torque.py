@@ -8,19 +8,19 @@ k of `analysis.identify._predictor`, ``Z_i = p + c k_i⁴`` and ``b_i = ∫ x ph
     f = -rho_air/2 (C |v| v + S |v|^(1/3) v)
     torque added = sum_i L b_i F_i p / Z_i - ∫ x f dx
 
-The moment of the force is exact, the sum over the modes all that inertia makes of it. C is C_D d of
-a constant coefficient. S is the part of it that falls with the speed as in White's law for a
-cylinder, ``C_D = 1 + 10 Re^(-2/3)`` [1]_.
+The moment of the force is exact; the sum over the modes is the whole contribution of inertia. C is
+C_D d of a constant coefficient. S is the part of it that falls with the speed as in White's law for
+a cylinder, ``C_D = 1 + 10 Re^(-2/3)`` [1]_.
 
-What the motor's motion makes of the speeds is exact (by transforms over the whole record, as in
-`TorquePredictor`). What the drag makes of them is followed step by step, for drag halves a peak and
-no repeated substitution converges there. Of each mode the two poles, with their residues, are
-stepped; the force between the steps is the cubic through the last four of them. From the forces so
-found the torque again follows by transforms, exactly.
+The speeds by the motor's motion are exact (by transforms over the whole record, as in
+`TorquePredictor`). The effect of drag on them is computed in time steps, since drag halves a peak
+and repeated substitution does not converge there. The two poles of each mode, with their residues,
+are stepped; the force between the steps is the cubic through the last four of them. From the forces
+so found the torque again follows by transforms, exactly.
 
 This torque is not linear in the motion, so no response function gives it. In a fit it is computed
-at one beam and drag and taken out of the measured torque; what it changes by when beam or drag
-change is linear (`DragExpansion`) in
+at one beam and drag and removed from the measured torque; its change with beam or drag is linear
+(`DragExpansion`) in
 
 * the poles of the modes, on which the motion near a resonance depends,
 * the external damping ``gamma s^lambda`` at these poles, since it also drives the modes,

@@ -125,7 +125,7 @@ def fit_record(
             reference = renewed
             comparison = reference.objective.comparison
             searches = [search.on(comparison) for search in searches]
-        noise, descents = _under_its_noise(searches, closest, reference, descents)
+        noise, descents = _descend_with_noise(searches, closest, reference, descents)
         closest = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
         reference = descents[closest]
         if not _explains(reference, noise):
@@ -177,7 +177,7 @@ def refit_record(
     return RecordAnalysis.of([summary(here.objective, here.x, noise)], noise, comparison)
 
 
-def _under_its_noise(
+def _descend_with_noise(
     searches: list[StructureSearch], closest: int, reference: Descent, before: list[Descent]
 ) -> tuple[NoiseSpectrum, list[Descent]]:
     """Descend with all structures under the noise of the closest one's residual.
@@ -198,7 +198,7 @@ def _under_its_noise(
     for i, search in enumerate(searches):
         found = first if i == closest else None
         if found is None and before:
-            found = _still_behind(Descent(search.objective, before[i].x), noise, most)
+            found = _still_worse(Descent(search.objective, before[i].x), noise, most)
         if found is None:
             found = search.under(noise).to_minimum(noise, _TOLERANCE, (_PATIENCE, most))
         descents.append(found)
@@ -213,7 +213,7 @@ def _explains(closest: Descent, noise: NoiseSpectrum) -> bool:
     return whiteness(residual[counts], hz[counts]).all_but_white
 
 
-def _still_behind(before: Descent, noise: NoiseSpectrum, most: float) -> Descent | None:
+def _still_worse(before: Descent, noise: NoiseSpectrum, most: float) -> Descent | None:
     """Return the descent of a structure that stays above a cost; None if it does not."""
     if before.cost(noise) <= most:
         return None

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rigd.session import Validity
 
 
-class JudgedOrder(Protocol):
+class OrderResult(Protocol):
     """Result on one order, from one record or from a campaign."""
 
     @property
@@ -33,7 +33,7 @@ class JudgedOrder(Protocol):
 def headline_json(
     file: str | None,
     estimates: Numbers,
-    orders: Iterable[JudgedOrder],
+    orders: Iterable[OrderResult],
     findings: Iterable[Finding],
     validity: Validity,
 ) -> dict[str, Any]:

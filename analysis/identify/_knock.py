@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _FREEST: Final = STRUCTURES["VI"]
 
-MOST_KNOCKS: Final = 3
+MAX_KNOCKS: Final = 3
 """Limit of impacts in one record."""
 
 _WINDOWS_S: Final = (0.08, 0.5)
@@ -108,7 +108,7 @@ def knocks_in(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator
     One half of the record then holds no impact, or only its free decay at the start. So the search
     also uses the residual of fits to either half. With `obvious` it is limited to obvious impacts.
     """
-    if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MOST_KNOCKS:
+    if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_KNOCKS:
         return
     first = knock_in(candidate_set)
     if first is not None and first.obvious:
@@ -143,7 +143,7 @@ def _knock_in(refit: Refit) -> DetectedImpact | None:
         extent = _extent(cleaned, first, last)
         if extent is None:
             return None
-        found = _judged(cleaned, *extent)
+        found = _sized(cleaned, *extent)
         if found.explained_fraction < _WORTH:
             return None
         if extent[0] > first:
@@ -340,7 +340,7 @@ def _extent(refit: Refit, first: int, last: int) -> tuple[int, int] | None:
     return (begins, ends) if sure and rings > _RINGS * float(alone.sum()) else None
 
 
-def _judged(refit: Refit, first: int, last: int) -> DetectedImpact:
+def _sized(refit: Refit, first: int, last: int) -> DetectedImpact:
     """Return an impact with its size and the fraction that it explains."""
     comparison = refit.objective.comparison
     knock = _knock(refit, first, last)

@@ -59,7 +59,7 @@ _NEAREST_BINS: Final = 24
 the frequency, and bins beyond."""
 
 _NOISE_PASSES: Final = 3
-_SETTLED: Final = 0.02
+_CONVERGED: Final = 0.02
 """Change of the noise's mean logarithm below which it is not estimated again."""
 
 _MOST_FURTHER: Final = 2
@@ -184,7 +184,7 @@ def fit_modes(
         tuple(number for number, _, _ in inside),
         np.array([[math.log(2 * math.pi * hz), 2 * ratio] for _, hz, ratio in inside]).ravel(),
     )
-    return search.without_unexcited_modes().settled().with_further_resonances().fit()
+    return search.without_unexcited_modes().converged().with_further_resonances().fit()
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +214,7 @@ class _ModalSearch:
         )
         return replace(self, x=found.x)
 
-    def settled(self) -> _ModalSearch:
+    def converged(self) -> _ModalSearch:
         """Alternate descents with estimates of noise and unknown torque until they converge."""
         search = self
         for _ in range(_NOISE_PASSES):
@@ -231,7 +231,7 @@ class _ModalSearch:
             search = replace(
                 search, comparison=comparison, noise=replace(search.noise, power=power)
             )
-            if change < _SETTLED and comparison.measurement.torque_known.all():
+            if change < _CONVERGED and comparison.measurement.torque_known.all():
                 break
         return search.descended()
 
@@ -259,7 +259,7 @@ class _ModalSearch:
             start = [math.log(2 * math.pi * related.at_hz), 0.02]
             more = replace(
                 search, numbers=(*search.numbers, 0), x=np.concatenate([search.x, start])
-            ).settled()
+            ).converged()
             at = replace(search, noise=more.noise, comparison=more.comparison).descended()
             if at.cost() - more.cost() < _EVIDENCE or more.last_overlaps():
                 break

@@ -29,7 +29,7 @@ from analysis.identify._candidates import INTEGER_INTERNAL
 from analysis.identify._data import fast_length
 from analysis.identify._predictor import torque_channel
 from analysis.identify._refit import Refit
-from analysis.identify._residual_tests import SURE
+from analysis.identify._residual_tests import SIGNIFICANT_STD
 from analysis.identify._verdict import STRONG
 from rigd.beam import clamped_free_eigenvalues, participation
 
@@ -161,8 +161,8 @@ class ModalForces:
 
 _MOST_TERMS: Final = 2
 _ROUNDS: Final = 6
-_SETTLED: Final = 0.005
-_GAIN: Final = SURE**2 + 2 * math.log(30)
+_SIZE_TOLERANCE: Final = 0.005
+_GAIN: Final = SIGNIFICANT_STD**2 + 2 * math.log(30)
 """Deviance reduction that a term needs: three forces on three modes are tested in three rounds."""
 
 _HINT: Final = 6.0
@@ -206,7 +206,7 @@ def nonlinear_forces(
     """
     best = candidate_set.best
     here = candidate_set.refit(best)
-    if _gain(best, here.cost, _most_wanted(candidate_set, here, modes, [])[1]) < _HINT:
+    if _gain(best, here.cost, _best_term(candidate_set, here, modes, [])[1]) < _HINT:
         return candidate_set, ()
     for lead in _leads(candidate_set):
         found, forces = _added(candidate_set, lead, modes)
@@ -232,7 +232,7 @@ def _added(
     best = candidate_set.best
     here = candidate_set.refit(lead)
     while len(terms) < _MOST_TERMS:
-        term, cost = _most_wanted(candidate_set, here, modes, terms)
+        term, cost = _best_term(candidate_set, here, modes, terms)
         behind = _gain(best, cost, best.fit.cost)
         if term is None or _gain(best, here.cost, cost) < _GAIN or behind > _HOPELESS:
             break
@@ -253,7 +253,7 @@ def _gain(candidate: Candidate, before: float, after: float) -> float:
     return candidate.values * math.log(before / after)
 
 
-def _most_wanted(
+def _best_term(
     candidate_set: CandidateSet, refit: Refit, modes: tuple[int, ...], taken: list[Term]
 ) -> tuple[Term | None, float]:
     """Return the term with the largest first-order reduction, and the cost with it."""
@@ -294,7 +294,7 @@ def _with_terms(
         )
         before = sizes
         sizes, std = (values[len(candidate_set.columns) :] for values in refit.amplitudes())
-        if np.all(np.abs(sizes - before) < np.maximum(0.3 * std, _SETTLED * np.abs(sizes))):
+        if np.all(np.abs(sizes - before) < np.maximum(0.3 * std, _SIZE_TOLERANCE * np.abs(sizes))):
             break
     return refit, sizes, std
 
@@ -303,6 +303,6 @@ def _explain(without: CandidateSet, within: CandidateSet) -> bool:
     """Return whether the forces explain the residual of the linear beam, or at least half of it."""
     power = np.abs(without.best.fit.residual) ** 2
     before = without.best.fit.cost - without.best.fit.degrees_of_freedom
-    chance = SURE * math.sqrt(2 * power.size * 2)
+    chance = SIGNIFICANT_STD * math.sqrt(2 * power.size * 2)
     after = within.best.fit.cost - within.best.fit.degrees_of_freedom
     return after < max(_EXPLAINED * before, chance)

@@ -234,7 +234,7 @@ class Unknowns:
     def estimates_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Differentiate the free parameters by `x`, shape (k, k): [parameter, unknown].
 
-        Those of `LOGARITHMIC` count as logarithms.
+        `LOGARITHMIC` parameters count as logarithms.
         """
         derivative: NDArray[np.float64] = self._values(x)[1]
         return derivative

@@ -1,4 +1,4 @@
-"""Parameters that the predicted torque depends on: beam, damping, settings and what is stated."""
+"""Parameters of the predicted torque: beam, damping, settings and stated values."""
 
 from __future__ import annotations
 

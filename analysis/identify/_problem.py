@@ -217,11 +217,11 @@ class Objective:
                 max_evaluations=max_evaluations,
                 hopeless=hopeless,
             )
-            settled = objective is self or np.abs(found.x - x).max() < _CONVERGED
+            converged = objective is self or np.abs(found.x - x).max() < _CONVERGED
             x = found.x
             # A descent that did not converge does not converge with new fills either.
             given_up = hopeless is not None and found.equations.cost > hopeless[1]
-            if settled or given_up or found.evaluations >= max_evaluations:
+            if converged or given_up or found.evaluations >= max_evaluations:
                 break
         return objective, found
 

@@ -176,20 +176,20 @@ _ROUNDS: Final = 3
 
 
 def profiled(
-    candidate_set: CandidateSet, settled: Collection[Order] = (), *, walk: bool = True
+    candidate_set: CandidateSet, determined: Collection[Order] = (), *, walk: bool = True
 ) -> tuple[CandidateSet, LikelihoodProfile, LikelihoodProfile]:
     """Profile alpha and lambda in the freest structure.
 
     If a walk finds a lower cost than the candidates, or another local minimum, all candidates start
-    there once more, so that the selected fit and the profile agree. `settled` holds the orders that
-    need no search for another local minimum, and `walk` states whether the orders are determined.
+    there once more, so that the selected fit and the profile agree. Orders in `determined` need no
+    search for another local minimum, and `walk` states whether the orders can be determined.
     Returns the ranked candidates and both profiles.
     """
     for round_ in range(1, _ROUNDS + 1):
         freest = candidate_set.freest
         # The order of an insignificant damping is undetermined: a walk would not help.
         walks = {
-            order: profile(candidate_set, freest, order, elsewhere=order not in settled)
+            order: profile(candidate_set, freest, order, elsewhere=order not in determined)
             for order in _ORDERS
             if walk and freest.structure.has(order)
         }
@@ -197,9 +197,9 @@ def profiled(
         if round_ == _ROUNDS:
             break
         for found in walks.values():
-            if _news(candidate_set, found):
+            if _may_improve(candidate_set, found):
                 for plant in found.plants:
-                    candidate_set = candidate_set.tried_from(plant)
+                    candidate_set = candidate_set.restarted_from(plant)
         if [candidate.fit.cost for candidate in candidate_set.candidates] == before:
             break
     of_alpha, of_lambda = (
@@ -209,7 +209,7 @@ def profiled(
     return candidate_set, of_alpha, of_lambda
 
 
-def _news(candidate_set: CandidateSet, found: Profiled) -> bool:
+def _may_improve(candidate_set: CandidateSet, found: Profiled) -> bool:
     """Return whether a candidate may have a lower minimum elsewhere."""
     if len(found.plants) > 1:
         return True
@@ -274,9 +274,9 @@ class Walk:
         )
         self.costs: dict[float, float] = {}
         self._at: dict[float, Refit] = {}
-        self._stand_at(first)
+        self._start_at(first)
 
-    def _stand_at(self, bottom: Refit) -> None:
+    def _start_at(self, bottom: Refit) -> None:
         """Start the walk from a minimum with the order free."""
         self._first = bottom
         self._centre = float(bottom.x[self._index])
@@ -311,7 +311,7 @@ class Walk:
             behind = self._values * math.log(candidate.fit.cost / min(self.costs.values()))
             if behind < CHI_SQUARE_95 and not low <= candidate.fit.parameters[self.order] <= high:
                 start = self._unknowns.vector(candidate.fit.plant)
-                self._stand_at(self._descend(start, _MAX_EVALUATIONS, hold=(self.order,)))
+                self._start_at(self._descend(start, _MAX_EVALUATIONS, hold=(self.order,)))
                 self.both_ways()
 
     def elsewhere(self) -> None:
@@ -337,7 +337,7 @@ class Walk:
             here = self._values * math.log(bottom.cost / min(self.costs.values()))
             known = float(np.interp(at, values, deviance, math.inf, math.inf))
             if here < min(CHI_SQUARE_95, known - MIN_BARRIER):
-                self._stand_at(bottom)
+                self._start_at(bottom)
                 self.both_ways()
 
     def _store_lower(self, value: float, found: Refit) -> None:

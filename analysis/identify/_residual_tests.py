@@ -1,8 +1,8 @@
 """Residual tests: whiteness, coherence with the input, harmonics of the sweep.
 
-Chance is ruled out at one level throughout (`SURE`). The cumulative periodogram of a white residual
-is a straight line but for a Kolmogorov statistic (Bartlett's test). A residual that is coherent
-with the angle is linear dynamics that the model lacks.
+Chance is ruled out at one level throughout (`SIGNIFICANT_STD`). The cumulative periodogram of a
+white residual is a straight line but for a Kolmogorov statistic (Bartlett's test). A residual that
+is coherent with the angle is linear dynamics that the model lacks.
 
 A linear beam responds at the drive frequency, and rings at frequencies that the sweep has passed. A
 response at twice or three times the drive frequency is nonlinear. This test needs no model.
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
 
 # Chance
 
-SURE: Final = 5.0
+SIGNIFICANT_STD: Final = 5.0
 """Standard deviations from which chance is ruled out: 3 in 10 million for all tests together."""
 
 
 def largest_of(count: int) -> float:
-    """Return the threshold for the largest of `count` values: `SURE`² / 2 plus ln count."""
-    return SURE**2 / 2 + math.log(max(count, 1))
+    """Return the limit of half the square of a deviate, for the largest of `count` values."""
+    return SIGNIFICANT_STD**2 / 2 + math.log(max(count, 1))
 
 
 # Whiteness, and coherence with the input
 
 _LEVEL: Final = 1e-6
-"""Probability of chance: what `SURE` means for the other tests."""
+"""Probability of chance: what `SIGNIFICANT_STD` means for the other tests."""
 
 _DOUBTFUL: Final = 0.01
 """The same where a false alarm costs only computing time."""
@@ -172,7 +172,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
             loudest = deviate
             edges = (float(frequency_hz[i]), float(frequency_hz[i + width - 1]))
             ratio = float(total[i]) / (2 * width)
-        loud |= deviate > SURE + 0.5 and float(total[i]) / (2 * width) > _LOUD
+        loud |= deviate > SIGNIFICANT_STD + 0.5 and float(total[i]) / (2 * width) > _LOUD
     return Whiteness(
         distance=distance,
         band=KOLMOGOROV_95 / math.sqrt(count),
@@ -239,7 +239,9 @@ def input_relation(
         deviate=deviate,
         correlation=float(correlation[at]),
         lag_s=float(at_s[at]),
-        related=bool(local or deviate > SURE or correlation[at] ** 2 / 2 > largest_of(tried)),
+        related=bool(
+            local or deviate > SIGNIFICANT_STD or correlation[at] ** 2 / 2 > largest_of(tried)
+        ),
     )
 
 
@@ -322,7 +324,8 @@ def harmonics(
                 deviate=deviate,
                 drive_hz=float(drive_hz[inside][largest]),
                 present=bool(
-                    deviate > SURE or chi_square[largest] / 2 > largest_of(chi_square.size)
+                    deviate > SIGNIFICANT_STD
+                    or chi_square[largest] / 2 > largest_of(chi_square.size)
                 ),
             )
         )

@@ -25,7 +25,7 @@ from analysis.identify._explanations import finding as explanation_finding
 from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
 from analysis.identify._headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
-from analysis.identify._knock import MOST_KNOCKS, knocks_in, of_knocks, with_knock
+from analysis.identify._knock import MAX_KNOCKS, knocks_in, of_knocks, with_knock
 from analysis.identify._modal_fit import fit_modes
 from analysis.identify._modal_headline import tolerant_order, with_modal_model
 from analysis.identify._nonlinear import nonlinear_forces
@@ -114,7 +114,7 @@ class Selection:
         return self.headline.fit
 
     @property
-    def settled(self) -> frozenset[Order]:
+    def determined(self) -> frozenset[Order]:
         """Return the orders that the record determines: a single minimum along each."""
         orders = (self.verdict.alpha, self.verdict.lambda_)
         return frozenset(each.order for each in orders if each.profile.identifiable)
@@ -187,7 +187,7 @@ def _with_knocks(
 ) -> _Assessment[_T]:
     """Assess a record; if its residual is more than noise, with the impacts that explain it."""
     assessment = assess(measurement)
-    for _ in range(MOST_KNOCKS):
+    for _ in range(MAX_KNOCKS):
         if assessment.explained or not _NOT_SEARCHED.isdisjoint(assessment.kinds):
             break
         better = None
@@ -221,9 +221,9 @@ def _selected(
     plain = modal is not None and _linear_and_constant(linear, modal, band_hz)
     if not (plain or measurement.knocks):
         for knock in knocks_in(linear, obvious=True):
-            struck = _selected(with_knock(measurement, knock), fixed, band_hz, None)
-            if struck.explained:
-                return struck
+            with_impact = _selected(with_knock(measurement, knock), fixed, band_hz, None)
+            if with_impact.explained:
+                return with_impact
     if modal is not None:
         small = small_effect(linear.comparison, modal, modal.plant_like(linear.likeliest.plant))
     alone = modal if small is None else _modal(linear, small.column[None])
@@ -247,9 +247,9 @@ def _selected(
     test = _uniform_beam_test(measurement, modal)
     refused = test is not None and test.status == "refused"
     # The whole record excludes every local minimum that a part of it excludes.
-    settled = earlier.settled if earlier and again else ()
+    determined = earlier.determined if earlier and again else ()
     walk = not_reported_reason(candidate_set, visible) is None and not refused
-    candidate_set, *profiles = profiled(candidate_set, settled, walk=walk)
+    candidate_set, *profiles = profiled(candidate_set, determined, walk=walk)
     leading = candidate_set.led_by(candidate_set.freest)
     white, related, multiples = _tests(leading, modal, band_hz)
     explained = white.white and not related.related

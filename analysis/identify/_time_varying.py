@@ -31,7 +31,7 @@ from analysis.identify._data import fast_length
 from analysis.identify._finding import Finding
 from analysis.identify._predictor import ResponseGrid, eigenvalues, torque_channel
 from analysis.identify._refit import MANY, Refit
-from analysis.identify._residual_tests import SURE
+from analysis.identify._residual_tests import SIGNIFICANT_STD
 from analysis.identify._verdict import STRONG
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
@@ -54,7 +54,7 @@ What = Literal["damping", "stiffness", "gain", "clock", "play"]
 
 _LEADS: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
 _GRADIENT: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness")
-_GAIN: Final = SURE**2 + 2 * math.log(20)
+_GAIN: Final = SIGNIFICANT_STD**2 + 2 * math.log(20)
 """Deviance that a column must save: five of them are tried on four candidates."""
 
 _IN_SIGHT: Final = 0.75
@@ -68,7 +68,7 @@ _TERMS: Final = 16
 """Terms of a Taylor series in time: enough for three radians."""
 
 _ROUNDS: Final = 8
-_SETTLED: Final = 0.01
+_CONVERGED: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,8 +188,8 @@ def _fitted(
             max_evaluations=MANY,
         )
         moved, size = size, float(refit.amplitudes()[0][-1])
-        settled = abs(size - moved) < _SETTLED * abs(size)
-        if settled and abs(lead.values * math.log(before / refit.cost)) < 1:
+        converged = abs(size - moved) < _CONVERGED * abs(size)
+        if converged and abs(lead.values * math.log(before / refit.cost)) < 1:
             break
     deviance = lead.values * math.log(refit.cost / lead.values)
     return refit, deviance + (lead.parameters + 1) * math.log(lead.values)
@@ -232,7 +232,7 @@ def _column(
     ramp = np.linspace(-0.5, 0.5, comparison.samples)
     change = ramp * (slopes or _slopes(comparison, plant))[what]
     if what != "gain":
-        change += remembered(comparison, plant, ramp, what, size)
+        change += memory_torque(comparison, plant, ramp, what, size)
     return comparison.spectrum(change)
 
 
@@ -287,7 +287,7 @@ _SMALL: Final = 1e-4
 """Highest order of the size, and smallest fraction of the stress that is significant."""
 
 
-def remembered(
+def memory_torque(
     comparison: Comparison,
     plant: Plant,
     change: NDArray[np.float64],

@@ -91,7 +91,7 @@ def order_verdict(
     `profile` is that of the order on the selected beam, `visible` the visible modes, and `doubt`
     the reason against that structure; None if it is valid.
     """
-    status, reason = _judged(candidate_set, profile, visible, doubt=doubt)
+    status, reason = _status(candidate_set, profile, visible, doubt=doubt)
     known = status not in ("not identifiable", "absent")
     return OrderVerdict(
         order=profile.order,
@@ -137,7 +137,7 @@ def deviance_of_one(profile: LikelihoodProfile) -> float:
     return float(np.interp(1.0, profile.values, profile.deviance, left=np.inf, right=np.inf))
 
 
-def _judged(
+def _status(
     candidate_set: CandidateSet,
     profile: LikelihoodProfile,
     visible: tuple[int, ...],

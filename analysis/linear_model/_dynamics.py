@@ -39,12 +39,12 @@ _BUTTERWORTH: Final = 2**0.5
 
 
 class LinearModelError(UserError, ValueError):
-    """A model cannot be realised; the message names the cause and the remedy."""
+    """The model cannot be realised; the message names the cause and the remedy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dynamics:
-    """What is realised: a response from motor angle to coupling torque and its poles.
+    """Response from motor angle to coupling torque, with its poles, to be realised.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Dynamics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertain:
-    """Dynamics that depend on parameters of which values and covariance are known.
+    """Dynamics as a function of parameters with known values and covariance.
 
     Attributes
     ----------

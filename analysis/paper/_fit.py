@@ -16,7 +16,7 @@ type VI:
 * errors that are independent from bin to bin: within 20 % of the scatter of repeated fits;
 * errors shared by the nine neighbours that zero padding makes alike: half of that scatter, since
   a resonance is then narrower than one error and the fit absorbs most of it;
-* Welch's estimate of a chirp: leakage, not noise, is what remains, and the standard deviations
+* Welch's estimate of a chirp: leakage, not noise, dominates, and the standard deviations
   are 3 to 50 times the scatter between sessions. The bias itself is 1 to 7 times as large as
   they are, and 4 to 20 times if the structure is wrong.
 

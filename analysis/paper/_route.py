@@ -388,7 +388,7 @@ def analyse(
             )
         except (FitError, WeightingError) as error:
             raise SettingsError(f"{record.path}: {error}") from error
-        models.extend(_judged(fit, record.beam, response, beam_on_tool, peaks) for fit in fits)
+        models.extend(_evaluated(fit, record.beam, response, beam_on_tool, peaks) for fit in fits)
         on_step(f"type {name}")
     return WelchAnalysis(
         record=record,
@@ -417,7 +417,7 @@ def _check_excited(record: Record) -> None:
         )
 
 
-def _judged(
+def _evaluated(
     fit: FrfFit,
     beam: Beam,
     measured: FrequencyResponse,

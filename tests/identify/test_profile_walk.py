@@ -30,7 +30,7 @@ class DoubleWell(Walk):
         self.order, self.structure = "lambda", None
         self._values, self._index = COUNT, 0
         self.costs, self._at = {}, {}
-        self._stand_at(self._descend(np.array([start]), 1))
+        self._start_at(self._descend(np.array([start]), 1))
 
     def _descend(self, start, max_evaluations, *, hold=(), hopeless=None):
         order = float(start[0])
