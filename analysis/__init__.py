@@ -1,7 +1,7 @@
 """Offline analyser of session files: frequency response and fractional damping models.
 
-For scripts and notebooks, `load`, `frf`, `fit`, `select` and `campaign` of `analysis.api` are here
-too.
+It also offers `load`, `frf`, `fit`, `select` and `campaign` of `analysis.api` for scripts and
+notebooks.
 """
 
 from typing import TYPE_CHECKING

@@ -41,7 +41,7 @@ def load(path: Path | str) -> Record:
     SessionError
         The file cannot be read.
     RecordError
-        It can, but not be analysed.
+        The file can be read, but not analysed.
 
     Examples
     --------
@@ -62,8 +62,8 @@ def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyRespo
     ----------
     record : Record
     settings : WelchSettings, optional
-        Estimator, segments and band; by default the paper's, as far as the record's rate holds
-        it.
+        Estimator, segments and band; by default those of the reference paper, limited by the
+        record's rate.
 
     Returns
     -------
@@ -128,17 +128,17 @@ def fit(
     ----------
     record : Record
     types : sequence of str, optional
-        Names from "I" to "VII"; by default all seven, with "welch" the paper's six.
+        Names from "I" to "VII"; by default all seven, with "welch" the six of the reference paper.
     method : {"record", "welch"}
-        Output error on the whole record, or the paper's fit to Welch's estimate.
+        Output error on the whole record, or the reference paper's fit to Welch's estimate.
     fixed : iterable of str
         With "record" only: settings of beam and rig that stay at the file's values, of
         `analysis.identify.SETTINGS`.
     weightings : sequence of str, optional
         With "welch" only: "const", "omega", "omega^K"; by default the first two.
     band_hz : tuple of float, optional
-        First and last frequency; by default 0 to 50 Hz, with "welch" the paper's band, either up
-        to 0.4 of the record's rate.
+        First and last frequency; by default 0 to 50 Hz, with "welch" the reference paper's band,
+        either up to 0.4 of the record's rate.
 
     Returns
     -------
@@ -197,7 +197,7 @@ def select(
     fixed: Iterable[Setting] = (),
     band_hz: tuple[float, float] | None = None,
 ) -> Selection:
-    """Fit every structure to a record, and say which one its data support.
+    """Fit every structure to a record, and select the one that its data support.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def select(
     Returns
     -------
     Selection
-        The fit to be believed, the verdict in words, and all candidates.
+        Selected fit, verdict in words, and all candidates.
 
     Raises
     ------
@@ -239,7 +239,7 @@ def campaign(
     paths : iterable of Path or str
         Session files.
     settings : WelchSettings, optional
-        Settings of the Welch fits; by default the paper's.
+        Settings of the Welch fits; by default those of the reference paper.
     types : sequence of str, optional
         Structures fitted to the whole records; by default all seven.
     fixed : sequence of str

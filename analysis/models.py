@@ -1,11 +1,11 @@
 """Damping structures, their parametrization, and the settings with which they are fitted.
 
 A structure says which damping parameters are fitted and which stay fixed. Types I to VI have the
-fixed values of the paper's Table 2. Type VII is the one its conclusions point to: internal damping
-of integer order (alpha = 1) with external damping of fractional order.
+fixed values of Table 2 of the reference paper. Type VII follows from its conclusions: internal
+damping of integer order (alpha = 1) with external damping of fractional order.
 
-A coefficient and its order are all but interchangeable near the frequencies where they act:
-fitting ``zeta`` and ``alpha`` themselves means descending a curved valley (their correlation is
+A coefficient and its order are almost interchangeable near the frequencies where they act: a fit of
+``zeta`` and ``alpha`` themselves descends along a curved flat direction (their correlation is
 -0.99). So the unknowns of a fit to a frequency response (`DampingUnknowns`) are the logarithm of
 the damping's size at one frequency, and the order:
 
@@ -73,7 +73,7 @@ SI unit."""
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """One choice of free and fixed damping parameters.
+    """Choice of free and fixed damping parameters.
 
     Attributes
     ----------
@@ -99,16 +99,16 @@ class Structure:
 
     @property
     def internal(self) -> bool:
-        """Whether the structure has internal damping (of the material)."""
+        """Return whether the structure has internal damping (of the material)."""
         return "zeta" in self.free
 
     @property
     def external(self) -> bool:
-        """Whether the structure has external damping (of the environment)."""
+        """Return whether the structure has external damping (of the environment)."""
         return "gamma" in self.free
 
     def has(self, name: str) -> bool:
-        """Whether a parameter means anything in the structure: of a beam or a rig any does.
+        """Return whether a parameter has a meaning in the structure (always for beam and rig).
 
         Parameters
         ----------
@@ -157,10 +157,10 @@ STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
 
 
 class FrequencyResponseModel:
-    """Measured torque per motor angle, ``G(j omega) + J_tool (j omega)²``, on one frequency grid.
+    """Model of torque per motor angle, ``G(j omega) + J_tool (j omega)²``, on a frequency grid.
 
-    The torque sensor sits under the clamp, so what it measures includes the tool inertia; it
-    is added to the model, and never taken from the data.
+    The torque sensor is under the clamp, so its signal includes the tool inertia. This inertia is
+    added to the model, and never subtracted from the data.
 
     Parameters
     ----------
@@ -191,13 +191,13 @@ class FrequencyResponseModel:
         self._tool = tool_inertia_kg_m2 * s * s
 
     def evaluate(self, damping: Damping) -> NDArray[np.complex128]:
-        """Response in N·m/rad, shape (n,)."""
+        """Return the response in N·m/rad, shape (n,)."""
         return self._grid.evaluate(self.beam, damping) + self._tool
 
     def evaluate_with_gradient(
         self, damping: Damping, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Response, shape (n,), and its derivatives by the parameters `wrt`, shape (k, n).
+        """Return the response, shape (n,), and its derivatives by the parameters `wrt`, (k, n).
 
         Parameters
         ----------
@@ -220,11 +220,11 @@ _LARGEST_POWER = 10
 
 
 class WeightingError(ValueError):
-    """A weighting that does not exist, or that is not positive and finite where it is used."""
+    """The weighting does not exist, or is not positive and finite where it is used."""
 
 
 def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[np.float64]:
-    """Weights ``W_p = p(omega_p) / sum_i p(omega_i)`` on an evenly spaced grid (A5).
+    """Return weights ``W_p = p(omega_p) / sum_i p(omega_i)`` on an evenly spaced grid (A5).
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[n
 
 
 def weighting_name(weighting: Weighting) -> str:
-    """Return what a weighting is called in results: its name, or its function's.
+    """Return the name of a weighting in results: its own, or that of its function.
 
     Raises
     ------
@@ -316,7 +316,7 @@ def _exponent(weighting: str) -> float:
 RECORD_BAND_HZ: Final = (0.0, 50.0)
 """Band of the whole-record fits, where the record's rate holds it."""
 
-LARGEST_SHARE_OF_RATE: Final = 0.4
+LARGEST_FRACTION_OF_RATE: Final = 0.4
 """Highest frequency that is fitted, over the sampling rate: filters need room up to half of it."""
 
 PAPER_BAND_HZ: Final = (0.5875, 50.0)
@@ -361,7 +361,7 @@ def estimate_text(estimator: Estimator, segmentation: Segmentation, segments: in
 
 @dataclass(frozen=True, slots=True)
 class WelchSettings:
-    """How the frequency response is estimated and what is fitted to it.
+    """Settings of the frequency response estimate and of the fits to it.
 
     Attributes
     ----------
@@ -369,8 +369,8 @@ class WelchSettings:
         "iv" is Hiv, with the reference as instrument; "fft" is the ratio of two
         transforms of the whole record.
     segment_length, overlap, nfft : int, optional
-        In samples; None takes the paper's durations at the record's rate, or with a segment given
-        15 % of it as overlap and a transform no shorter than it.
+        In samples. None selects the durations of the reference paper at the record's rate; with a
+        given segment, 15 % of it as overlap and a transform no shorter than it.
     band_hz : tuple of float
         First and last frequency fitted, both included.
     types : tuple of str
@@ -389,12 +389,14 @@ class WelchSettings:
 
     @property
     def are_usual(self) -> bool:
-        """Whether estimator and segments are the paper's, not chosen for one record."""
+        """Return whether estimator and segments are those of the reference paper."""
         chosen = self.segment_length or self.overlap or self.nfft
         return self.estimator == "h1" and not chosen
 
     def segmentation(self, rate_hz: float) -> Segmentation:
-        """Fill in what was left open: the paper's durations, in samples at this rate.
+        """Return the segmentation in samples at a rate.
+
+        The durations of the reference paper are the defaults.
 
         Examples
         --------
@@ -439,7 +441,7 @@ class DampingUnknowns:
 
     @classmethod
     def of(cls, structure: Structure, beam: Beam) -> DampingUnknowns:
-        """Take the beam's own modes as the frequencies at which damping is measured.
+        """Return the unknowns with the beam's own modes as reference frequencies of the damping.
 
         Parameters
         ----------
@@ -458,7 +460,7 @@ class DampingUnknowns:
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper bounds, shape (k,)."""
+        """Return lower and upper bounds, shape (k,)."""
         ranges = [
             ORDER_RANGE if name in ("alpha", "lambda") else tuple(map(math.log, SIZE_RANGE))
             for name in self.structure.free
@@ -466,7 +468,7 @@ class DampingUnknowns:
         return np.array([low for low, _ in ranges]), np.array([high for _, high in ranges])
 
     def parameters(self, x: NDArray[np.float64]) -> dict[Parameter, float]:
-        """All four damping parameters at `x`."""
+        """Return all four damping parameters at `x`."""
         free: dict[Parameter, float] = dict(zip(self.structure.free, map(float, x), strict=True))
         every = {**self.structure.fixed, **free}
         if self.structure.internal:
@@ -478,13 +480,13 @@ class DampingUnknowns:
         return every
 
     def damping(self, x: NDArray[np.float64]) -> Damping:
-        """Damping at `x`."""
+        """Return the damping at `x`."""
         return self.structure.damping(self.parameters(x))
 
     def derivative_of_parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Differentiate the free parameters by the unknowns, shape (k, k): [parameter, unknown].
 
-        An order moves its coefficient too, since the size stays.
+        An order changes its coefficient too, since the size is constant.
         """
         parameters = self.parameters(x)
         row = {name: i for i, name in enumerate(self.structure.free)}

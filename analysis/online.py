@@ -1,10 +1,9 @@
 """Online fit: the estimate of a session that still runs, from the samples recorded so far.
 
-`OnlineFit` is fed with samples and fits as often as it is asked, by the very functions of
-`analyze`, so that the last estimate of a session is that of its file. As a program,
-``python -m analysis.online``, it takes the samples on standard input, as `rigd.session.online_fit`
-writes them, and answers on standard output, one line of JSON per estimate
-(docs/online_fit.md).
+`OnlineFit` receives samples and fits them on request, by the functions of `analyze`, so that the
+last estimate of a session equals that of its file. As a program, ``python -m analysis.online``, it
+takes the samples on standard input, as `rigd.session.online_fit` writes them, and answers on
+standard output, one line of JSON per estimate (docs/online_fit.md).
 """
 
 from __future__ import annotations
@@ -45,8 +44,8 @@ if TYPE_CHECKING:
 
 _NOISE_POINTS: Final = 40
 _NICE: Final = 5
-"""Niceness of the program while somebody waits for its answers: behind the rig's own processes, a
-third of a processor beside another program."""
+"""Niceness of the program while its estimates are awaited: below the rig's own processes, a third
+of a processor in competition with another program."""
 
 _NEED_NO_MODE: Final = frozenset({"sign", "unit", "clipping", "stop", "hum", "sensor drift"})
 """Kinds of findings that do not rest on a fitted beam."""
@@ -54,25 +53,25 @@ _NEED_NO_MODE: Final = frozenset({"sign", "unit", "clipping", "stop", "hum", "se
 
 @dataclass(frozen=True, slots=True)
 class OnlineEstimate:
-    """What the samples up to a tick tell.
+    """Estimate from the samples up to a tick.
 
     Attributes
     ----------
     tick : int
-        First tick that was left out.
+        First tick that was excluded.
     duration_s : float
         Length of the record used.
     whole : bool
-        Whether every structure was tried, as `analysis.select` does; otherwise the freest alone,
-        under the same tests of what it leaves.
+        Whether every structure was tested, as `analysis.select` does; otherwise the freest alone,
+        with the same tests of its residual.
     took_s : float
-        Time that it took.
+        Computing time.
     headline : Headline or None
         The numbers, with flags; None if there was no fit.
     orders : tuple of OrderVerdict
-        Judgement of alpha and lambda; empty unless `whole`.
+        Verdicts on alpha and lambda; empty unless `whole`.
     findings : tuple of Finding
-        Effects beside the beam, and what makes the numbers doubtful.
+        Effects in addition to the beam, and reasons against the numbers.
     analysis : RecordAnalysis or None
         The fits with the noise.
     warnings : tuple of str
@@ -97,53 +96,53 @@ class OnlineEstimate:
 
     @property
     def doubt(self) -> str | None:
-        """Why no number is to be believed; None if some are."""
-        told = self.headline
-        if told is None:
+        """Return the reason against all numbers; None if some are valid."""
+        headline = self.headline
+        if headline is None:
             return self.problem
         numbers = [
-            *told.parameters.values(),
-            *(each for mode in told.modes for each in (mode.frequency_hz, mode.damping_ratio)),
+            *headline.parameters.values(),
+            *(each for mode in headline.modes for each in (mode.frequency_hz, mode.damping_ratio)),
         ]
         flags = [each.flag for each in numbers]
         return None if None in flags else flags[0]
 
     @property
     def predicting(self) -> RecordFit | None:
-        """The fit to predict the next excitation's answer with; None if there was no fit.
+        """Return the fit for predictions of the next excitation; None if there was no fit.
 
-        It has both dampings. One that does not show, or whose order is not identifiable and which
-        may thus be a stiffness or an inertia in truth, has order 1.
+        It has both dampings. An insignificant damping, or one without an identifiable order (which
+        may be a stiffness or an inertia), has order 1.
         """
         from analysis.identify import INTEGER
         from analysis.models import COEFFICIENT_OF
 
-        told, analysis = self.headline, self.analysis
-        if told is None or analysis is None:
+        headline, analysis = self.headline, self.analysis
+        if headline is None or analysis is None:
             return None
-        fit = told.with_both
-        untold = {name for name in COEFFICIENT_OF if name in told.flags}
-        if not untold or fit is not told.fit:
+        fit = headline.with_both
+        flagged = {name for name in COEFFICIENT_OF if name in headline.flags}
+        if not flagged or fit is not headline.fit:
             return fit
         return next((each for each in analysis.fits if each.structure is INTEGER), fit)
 
     @property
     def plant(self) -> Plant | None:
-        """That of `predicting`, its modes where the record shows them; None if there was no fit.
+        """Return the plant of `predicting` with the measured modes; None if there was no fit.
 
-        Where a uniform beam does not predict the modal constants, each mode has a stiffness of its
+        If a uniform beam does not predict the modal constants, each mode has a stiffness of its
         own.
         """
-        told, fit = self.headline, self.predicting
-        if told is None or fit is None:
+        headline, fit = self.headline, self.predicting
+        if headline is None or fit is None:
             return None
-        test = told.uniform_beam
-        if told.modal is None or test is None or test.status == "passed":
+        test = headline.uniform_beam
+        if headline.modal is None or test is None or test.status == "passed":
             return fit.plant
-        return told.modal.plant_like(fit.plant)
+        return headline.modal.plant_like(fit.plant)
 
     def as_json(self) -> dict[str, Any]:
-        """As `json.dumps` takes it (docs/online_fit.md)."""
+        """Return the estimate as `json.dumps` takes it (docs/online_fit.md)."""
         from analysis.identify import headline_json
         from analysis.results import finite
 
@@ -158,9 +157,9 @@ class OnlineEstimate:
             "findings": [each.sentence for each in self.findings],
             "modes": [],
         }
-        told, fit, plant = self.headline, self.predicting, self.plant
-        if told and fit and plant and self.analysis:
-            content |= headline_json(None, told, self.orders, self.findings, self.validity)
+        headline, fit, plant = self.headline, self.predicting, self.plant
+        if headline and fit and plant and self.analysis:
+            content |= headline_json(None, headline, self.orders, self.findings, self.validity)
             content |= {
                 "predicting": fit.structure.name,
                 "plant": asdict(plant),
@@ -172,7 +171,7 @@ class OnlineEstimate:
 
 
 def _noise(analysis: RecordAnalysis) -> dict[str, Any]:
-    """Thin out the spectrum of the noise."""
+    """Return the noise spectrum on fewer points."""
     import numpy as np
 
     hz = analysis.frequency_hz
@@ -182,16 +181,16 @@ def _noise(analysis: RecordAnalysis) -> dict[str, Any]:
 
 
 class OnlineFit:
-    """Fit of a session as far as it has been recorded.
+    """Fit of the recorded part of a running session.
 
     Parameters
     ----------
     metadata : mapping of str to str
         The record ``session`` of its file (docs/session_format.md): rate, beam, delays.
     segments : mapping of str to (int, int), optional
-        Name → first tick and end (exclusive), as planned.
+        Planned segments: name → first tick and end (exclusive).
     name : str
-        What messages call it.
+        Name in messages.
 
     Examples
     --------
@@ -218,10 +217,10 @@ class OnlineFit:
         self._path = Path(name)
         self._blocks: list[NDArray[np.void]] = []
         self._count = 0
-        self._judged: Selection | None = None
+        self._last_selection: Selection | None = None
 
     def feed(self, samples: NDArray[np.void]) -> None:
-        """Take the next samples.
+        """Append the next samples.
 
         Parameters
         ----------
@@ -231,22 +230,24 @@ class OnlineFit:
         from analysis.record import MAX_SAMPLES, RECORD_FIELDS
 
         if self._count <= MAX_SAMPLES:  # one more than that, and `record` says that it is too long
-            kept = samples[list(RECORD_FIELDS)]
-            self._blocks.append(kept.astype([(name, kept.dtype[name]) for name in RECORD_FIELDS]))
+            fields = samples[list(RECORD_FIELDS)]
+            self._blocks.append(
+                fields.astype([(name, fields.dtype[name]) for name in RECORD_FIELDS])
+            )
             self._count += len(samples)
 
     def record(self, up_to_tick: int | None = None) -> Record:
-        """Return the record so far, as `analysis.load` would of a file with these samples.
+        """Return the record so far, as `analysis.load` returns it for a file with these samples.
 
         Parameters
         ----------
         up_to_tick : int, optional
-            Samples from this tick on are left out.
+            Samples from this tick on are excluded.
 
         Raises
         ------
         SessionError, RecordError
-            There is none, or it cannot be analysed.
+            There is no record, or it cannot be analysed.
         """
         import numpy as np
 
@@ -278,22 +279,22 @@ class OnlineFit:
     def estimate(
         self, up_to_tick: int | None = None, *, whole: bool = False, from_last: bool = False
     ) -> OnlineEstimate:
-        """Fit what has been recorded.
+        """Return the estimate from the samples recorded so far.
 
         Parameters
         ----------
         up_to_tick : int, optional
-            Samples from this tick on are left out.
+            Samples from this tick on are excluded.
         whole : bool
-            Try every structure, as `analysis.select` does, in four times the time.
+            Test every structure, as `analysis.select` does, in four times the time.
         from_last : bool
-            Such an estimate may start from what the last one found, where that explains these
-            samples too: in a third of the time, but of several minima it may miss one.
+            Allow such an estimate to start from the last one, if that explains these samples too.
+            This takes a third of the time, but may miss one of several minima.
 
         Returns
         -------
         OnlineEstimate
-            Where nothing can be fitted, one that says why.
+            Estimate, or the reason why nothing can be fitted.
         """
         from analysis.identify import Measurement, MeasurementError, freest_alone, select
         from analysis.record import RecordError
@@ -309,29 +310,29 @@ class OnlineFit:
             measurement, band_hz = Measurement.of_record(record), record_band_hz(record)
             orders: tuple[OrderVerdict, ...] = ()
             if whole:
-                before = self._judged if from_last else None
+                before = self._last_selection if from_last else None
                 selection = select(measurement, band_hz=band_hz, earlier=before)
-                self._judged = selection
-                told, analysis = selection.headline, selection.analysis
+                self._last_selection = selection
+                headline, analysis = selection.headline, selection.analysis
                 found = selection.verdict.findings
                 orders = (selection.verdict.alpha, selection.verdict.lambda_)
             else:
-                told, found, analysis = freest_alone(measurement, band_hz)
+                headline, found, analysis = freest_alone(measurement, band_hz)
         except (SessionError, RecordError, ArithmeticError, ValueError) as error:
-            # A running session is told, and goes on; later samples may do.
+            # A running session gets the reason, and goes on; later samples may suffice.
             foreseen = isinstance(error, SessionError | RecordError | MeasurementError)
             problem = f"The record so far cannot be fitted ({error!r})."
             problem = str(error).removeprefix(f"{self._path}: ") if foreseen else problem
             took_s = time.monotonic() - began_s
             return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
-        shows = bool(told.visible_modes)
-        plant = told.fit.plant
+        shows = bool(headline.visible_modes)
+        plant = headline.fit.plant
         return OnlineEstimate(
             tick=tick,
             duration_s=duration_s,
             whole=whole,
             took_s=time.monotonic() - began_s,
-            headline=told if shows else None,
+            headline=headline if shows else None,
             orders=orders if shows else (),
             findings=found
             if shows
@@ -349,13 +350,13 @@ class OnlineFit:
 
 
 def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateRequest]) -> None:
-    """Answer to what comes, until it ends.
+    """Answer requests until the stream ends.
 
     Parameters
     ----------
     start : StreamStart
     frames : iterator
-        As `rigd.session.read_frames` gives them.
+        Frames from `rigd.session.read_frames`.
 
     Raises
     ------
@@ -367,7 +368,7 @@ def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateReques
     came = queue.SimpleQueue()
 
     def read() -> None:
-        # Beside the fit, so that the sender never waits for it.
+        # In another thread than the fit, so that the sender never waits for it.
         end = None
         try:
             for frame in frames:
@@ -411,7 +412,7 @@ def _answer(fit: OnlineFit, request: EstimateRequest) -> None:
 
 
 def main() -> None:
-    """Answer on standard output to the stream on standard input."""
+    """Answer the stream on standard input on standard output."""
     # Ctrl-C stops the session safely; this ends with the stream.
     ignore()
     parser = argparse.ArgumentParser(prog="python -m analysis.online", description=__doc__)

@@ -1,14 +1,14 @@
 """Minimum of a sum of squares within bounds: damped Gauss-Newton steps on the normal equations.
 
-For problems of a few unknowns and thousands of residuals, where forming the normal equations is
-cheap and a general solver's overhead (and its import, longer than all the fits of a session) is
-not. Steps are damped after Nielsen [1]_.
+For problems of a few unknowns and thousands of residuals the normal equations are cheap. The
+overhead of a general solver is not: its import takes longer than all fits of a session. Steps are
+damped after Nielsen [1]_.
 
 The Hessian of a sum of squares is ``J'J`` and a second part: the residuals times their own second
-derivatives. Gauss-Newton and Levenberg-Marquardt leave the second part out. Where the residual
-stays large, because the model cannot follow the data, they creep: each step shortens the way that
-remains by the same share. Here the second part is learned from how the gradient changes from step
-to step (NL2SOL [2]_), and used when it would have foretold the last step better.
+derivatives. Gauss-Newton and Levenberg-Marquardt leave the second part out. If the residual stays
+large, because the model does not fit the data, they converge slowly: each step reduces the
+remaining distance by the same fraction. Here the second part is estimated from the change of the
+gradient from step to step (NL2SOL [2]_), and used if it would have predicted the last step better.
 
 References
 ----------
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """A sum of squares at one point, with what a Gauss-Newton step needs.
+    """Sum of squares at one point, with gradient and Hessian of a Gauss-Newton step.
 
     Attributes
     ----------
@@ -52,14 +52,14 @@ class NormalEquations:
     hessian: NDArray[np.float64]
 
     def scaled_hessian(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Hessian with ones on its diagonal, and the root of its own diagonal, shape (k,)."""
+        """Return the Hessian scaled to a unit diagonal, and the root of its diagonal, (k,)."""
         scale = np.sqrt(np.maximum(np.diag(self.hessian), np.finfo(float).tiny))
         return self.hessian / np.outer(scale, scale), scale
 
     def held(
         self, x: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Whether the cost pushes an unknown against a bound that it rests on, shape (k,).
+        """Return which unknowns the cost pushes against a bound that they are at, shape (k,).
 
         Parameters
         ----------
@@ -73,16 +73,16 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """Where a descent ended.
+    """End point of a descent.
 
     Attributes
     ----------
     x : ndarray, shape (k,)
     equations : NormalEquations
-        There.
+        Equations at `x`.
     evaluations : int
     second_part : ndarray, shape (k, k)
-        What it learned of half the Hessian beyond Gauss-Newton's.
+        Estimated half of the Hessian beyond Gauss-Newton.
     """
 
     x: NDArray[np.float64]
@@ -92,42 +92,42 @@ class Minimum:
 
     @property
     def cost(self) -> float:
-        """Sum of squares there."""
+        """Return the sum of squares."""
         return self.equations.cost
 
 
 class Region(Protocol):
-    """Bounds of the unknowns, shape (k,), and the way of a step within them."""
+    """Bounds of the unknowns, shape (k,), and the path of a step within them."""
 
     @property
     def lower(self) -> NDArray[np.float64]:
-        """Least values."""
+        """Return the lower bounds."""
 
     @property
     def upper(self) -> NDArray[np.float64]:
-        """Largest values."""
+        """Return the upper bounds."""
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and largest step from `x` in each unknown, shape (k,)."""
+        """Return the least and largest step from `x` in each unknown, shape (k,)."""
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Point within the bounds that a step leads to, shape (k,).
+        """Return the point within the bounds that a step leads to, shape (k,).
 
         Parameters
         ----------
         x : ndarray, shape (k,)
             Point within the bounds.
         step : ndarray, shape (k,)
-            Step that is asked for.
+            Requested step.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Bounds between which steps go straight: an unknown that one would push through rests there.
+    """Bounds with straight steps: an unknown that a step would push beyond stays at its bound.
 
-    To make the best of it with the other unknowns within the same step, as `_step` does within
-    limits, brings no gain here: the fits to a frequency response take 7 % more evaluations with it.
+    An optimum of the other unknowns within the same step, as `_step` computes it within limits, has
+    no advantage here: the fits to a frequency response take 7 % more evaluations with it.
     """
 
     lower: NDArray[np.float64]
@@ -136,18 +136,18 @@ class Box:
     """Largest values, shape (k,)."""
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and largest step: any, cut off by `end`."""
+        """Return the least and largest step: unlimited, since `end` clips it."""
         return np.full(x.size, -np.inf), np.full(x.size, np.inf)
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Go straight, to the bounds at most.
+        """Return the end of a straight step, clipped to the bounds.
 
         Parameters
         ----------
         x : ndarray, shape (k,)
             Point within the bounds.
         step : ndarray, shape (k,)
-            Step that is asked for.
+            Requested step.
         """
         return np.clip(x + step, self.lower, self.upper)
 
@@ -157,7 +157,7 @@ class Box:
 _FIRST_DAMPING: Final = 1e-3
 _LARGEST_DAMPING: Final = 1e16
 _LEAST_RELIEF: Final = 0.1
-"""Share of the damping that a step which kept its promise leaves."""
+"""Factor of the damping after a step with the predicted reduction."""
 
 _SHORTEST_STEP: Final = 1e-13
 _FLOOR: Final = 1e-14
@@ -183,18 +183,18 @@ def descend(
     start : ndarray, shape (k,)
         Unknowns scaled so that a change of 1 is large.
     region : Region
-        Where steps lead, and the bounds; a `Box` if nothing is known but these.
+        Bounds and path of steps; a `Box` for bounds alone.
     relative_tolerance : float
-        Stop when a step promises less than this fraction of the cost, or is too short to be told
-        from rounding.
+        Stop when the predicted reduction by a step is less than this fraction of the cost, or the
+        step is too short to be distinguished from rounding.
     max_evaluations : int
         Most evaluations of `problem`, after which the best point so far is returned.
     second_part : ndarray, shape (k, k), optional
-        As a descent on nearly the same problem has learned it; used from the first step on. With
-        that of few points of a frequency response, fits to all take 39 evaluations in place of 57.
+        Estimate by a descent on a similar problem, used from the first step on. With that of few
+        points of a frequency response, fits to all take 39 evaluations instead of 57.
     hopeless : tuple of int and float, optional
-        Number of evaluations after which a descent ends whose cost is still above a value, and that
-        value: there are better explanations of the data, and nobody asks for this minimum.
+        Number of evaluations, and a cost: a descent that is still above this cost then ends, since
+        there are better explanations of the data.
     """
     x = np.clip(start, region.lower, region.upper)
     here = problem(x)
@@ -218,11 +218,11 @@ def descend(
         if step is None:
             break
         trial = region.end(x, step)
-        step = trial - x  # cut off or bent: what is promised is promised of this
-        promised = -float(step @ (2 * here.gradient + model @ step))
+        step = trial - x  # clipped or bent: the prediction is for this step
+        predicted = -float(step @ (2 * here.gradient + model @ step))
         if float(np.abs(step).max()) < _SHORTEST_STEP * (1 + float(np.abs(x).max())):
             break
-        if 0 <= promised < relative_tolerance * here.cost and damping < 1:
+        if 0 <= predicted < relative_tolerance * here.cost and damping < 1:
             break
         there = problem(trial)
         evaluations += 1
@@ -232,7 +232,7 @@ def descend(
             bend = float(step @ second @ step)
             uses_second = abs(gained - (foretold - bend)) <= abs(gained - foretold)
             second = _learned(second, step, here, there)
-            quality = gained / promised if promised > 0 else 0.0
+            quality = gained / predicted if predicted > 0 else 0.0
             damping *= max(_LEAST_RELIEF, 1 - (2 * quality - 1) ** 3)
             growth = 2.0
             x, here = trial, there
@@ -253,9 +253,9 @@ def _step(
     damping: float,
     limits: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64] | None:
-    """Lowest point of the model within the limits, shape (k,); None if the model is not convex.
+    """Return the lowest point of the model within the limits, (k,); None if it is not convex.
 
-    What would go beyond its limit stays there, and the others make the best of it.
+    An unknown that would exceed its limit stays there, and the others are optimised.
     """
     least, most = limits
     step = np.zeros(free.size)
@@ -285,7 +285,7 @@ def _learned(
     here: NormalEquations,
     there: NormalEquations,
 ) -> NDArray[np.float64]:
-    """Second part of the Hessian after a step, by the symmetric secant update of NL2SOL, (k, k)."""
+    """Return the second part of the Hessian after a step, by the secant update of NL2SOL."""
     change = there.gradient - here.gradient
     along = float(change @ step)
     if along <= 0:
@@ -294,8 +294,8 @@ def _learned(
     turned = second @ step
     size = abs(float(step @ turned))
     if size > 0:  # what was learned farther up may be too large here
-        share = min(1.0, abs(float(step @ bend)) / size)
-        second, turned = share * second, share * turned
+        overlap = min(1.0, abs(float(step @ bend)) / size)
+        second, turned = overlap * second, overlap * turned
     miss = bend - turned
     both = np.outer(miss, change)
     return (
@@ -309,14 +309,14 @@ def _learned(
 
 _Value = TypeVar("_Value")
 
-_KEPT: Final = 2
+_STORED: Final = 2
 """The last step of a descent may have been taken back."""
 
 
 class Recent(Generic[_Value]):
-    """Values at the last two points, for an objective that is asked for them again.
+    """Values at the last two points, cached for repeated evaluation.
 
-    Covariances are asked for where a descent ended, and the next one begins there.
+    Covariances are evaluated at the end of a descent, and the next descent begins there.
     """
 
     __slots__ = ("_values",)
@@ -327,18 +327,18 @@ class Recent(Generic[_Value]):
     def at(
         self, x: NDArray[np.float64], compute: Callable[[NDArray[np.float64]], _Value]
     ) -> _Value:
-        """Value at `x`, computed if it is not one of the last.
+        """Return the value at `x`, computed unless it is one of the last.
 
         Parameters
         ----------
         x : ndarray, shape (k,)
             Point.
         compute : callable
-            Gives the value at a point.
+            Function that returns the value at a point.
         """
         key = x.tobytes()
         if key not in self._values:
-            if len(self._values) == _KEPT:
+            if len(self._values) == _STORED:
                 del self._values[next(iter(self._values))]
             self._values[key] = compute(x)
         return self._values[key]

@@ -1,8 +1,8 @@
-"""Quick look at one session: its modes, the coherence, what is flagged, against the last session.
+"""Quick look at one session: modes, coherence and flags, compared with the last session.
 
-As a program, ``python -m analysis.quick_look FILE``, it writes the look beside the session file, as
-``STEM.look.json``, and prints its text. `rigd run` and the daemon start it after each session, at
-a low priority. The report of `analyze` says more and takes longer.
+As a program, ``python -m analysis.quick_look FILE``, it writes the quick look into the folder of
+the session file, as ``STEM.look.json``, and prints its text. `rigd run` and the daemon start it
+after each session, at a low priority. The report of `analyze` is more complete and takes longer.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _JUDGED_S: Final = 300.0
 1 kHz, the freest structure alone 4 ms."""
 
 _NEAR: Final = 0.1
-"""Distance of two such bands, relative to their frequency, below which they are told as one."""
+"""Distance of two such bands, relative to their frequency, below which they are reported as one."""
 
 _HAMMING_BINS: Final = 1.30
 """Width of a Hamming window's main lobe at half its power, in bins of the segment."""
@@ -53,26 +53,26 @@ _HAMMING_BINS: Final = 1.30
 _QUANTITIES: Final = ("frequency_hz", "damping_ratio")
 
 _NICE: Final = 10
-"""Niceness of the program: a tenth of what an ordinary one gets beside it."""
+"""Niceness of the program: a tenth of the processor time of an ordinary one."""
 
 
 class LookError(ValueError):
-    """A look cannot be made or written; the message says why, and what to do."""
+    """A quick look cannot be made or written; the message states cause and remedy."""
 
 
-# The look
+# The quick look
 
 
 def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
-    """Look at a session.
+    """Return the quick look at a session.
 
     Parameters
     ----------
     path : Path
         Session file.
     last : Path, optional
-        Session to compare with, by its look; by default the last one of the same specimen among
-        the looks beside the file.
+        Session to compare with, by its quick look; by default the last one of the same specimen in
+        the folder of the file.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
     Raises
     ------
     rigd.session.SessionError, LookError
-        There is no session file, or no look of `last`.
+        There is no session file, or no quick look of `last`.
     """
     from analysis.record import RecordError, load_record
     from analysis.results import finite
@@ -104,14 +104,16 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         session_id = about.get("id", path.stem)
         start_utc_ns = _whole_number(about.get("start_utc_ns", ""))
         flags += record.warnings
-        told, validity, more = _headline(record)
-        modes = [] if told is None else [_mode(each) for each in told.modes]
+        headline, validity, more = _headline(record)
+        modes = [] if headline is None else [_mode(each) for each in headline.modes]
         flags += more
         response, coherence, more = _response(record)
         flags += more
-        if told is not None and response is not None:
-            model = _model(told, record, response["frequency_hz"])
-    before = _look_of(last) if last is not None else _last_look(path, specimen, start_utc_ns)
+        if headline is not None and response is not None:
+            model = _model(headline, record, response["frequency_hz"])
+    before = (
+        _quick_look_of(last) if last is not None else _last_quick_look(path, specimen, start_utc_ns)
+    )
     if before is not None and any(mode["shown"] for mode in modes):
         compared = _against(modes, before)
     document = {
@@ -136,38 +138,38 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
 
 
 def _headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:
-    """Fit the record; return the numbers, None without any, their validity, and the sentences."""
+    """Fit the record; return its numbers (or None), their validity, and sentences."""
     from analysis.identify import Measurement, MeasurementError, freest_alone
     from analysis.results import whole_record
     from analysis.suited import record_band_hz
     from analysis.validity import record_validity, stated_validity
 
-    said = []
+    sentences = []
     length_s = record.time_s.size / record.rate_hz
-    told: Headline
+    headline: Headline
     found: tuple[Finding, ...]
     try:
         if length_s <= _JUDGED_S:
             whole = whole_record(record)
-            told, found, validity = whole.headline, whole.verdict.findings, whole.validity
+            headline, found, validity = whole.headline, whole.verdict.findings, whole.validity
         else:
-            told, found, _ = freest_alone(Measurement.of_record(record), record_band_hz(record))
-            model = told.fit.plant.beam, told.fit.plant.damping
+            headline, found, _ = freest_alone(Measurement.of_record(record), record_band_hz(record))
+            model = headline.fit.plant.beam, headline.fit.plant.damping
             validity = record_validity(record.metadata, record.angle_rad, record.rate_hz, model)
-            said.append(
-                f"The record is long ({length_s:.0f} s): type {told.name} alone was fitted; "
+            sentences.append(
+                f"The record is long ({length_s:.0f} s): type {headline.name} alone was fitted; "
                 "non-uniform beams, air drag, nonlinear forces and changes along the record were "
                 "not tried. analyze tries them."
             )
     except MeasurementError as error:
         no_modes = f"No modes: {_without_name(str(error), record.path)}"
         return None, stated_validity(record.metadata), [no_modes]
-    if told.uniform_beam is not None:
-        validity = replace(validity, uniform_beam=told.uniform_beam.summary)
-    said += [each.sentence for each in found]
-    if not told.modes:
-        said.append("No modes: none lies in the excited band.")
-    return told, validity, said
+    if headline.uniform_beam is not None:
+        validity = replace(validity, uniform_beam=headline.uniform_beam.summary)
+    sentences += [each.sentence for each in found]
+    if not headline.modes:
+        sentences.append("No modes: none lies in the excited band.")
+    return headline, validity, sentences
 
 
 def _mode(mode: Mode) -> dict[str, Any]:
@@ -181,11 +183,11 @@ def _mode(mode: Mode) -> dict[str, Any]:
     }
 
 
-def _model(told: Headline, record: Record, shown_hz: Sequence[float]) -> dict[str, Any] | None:
-    """Return the response of the model shown first with its 95 % band, where it was excited.
+def _model(headline: Headline, record: Record, shown_hz: Sequence[float]) -> dict[str, Any] | None:
+    """Return the response of the first model with its 95 % band, where it was excited.
 
-    None if it does not explain the record, or depends on the amplitude, as with drag: there is no
-    band for it then.
+    Return None if the model does not explain the record or depends on the amplitude, as with drag:
+    there is no band then.
     """
     import numpy as np
 
@@ -193,37 +195,37 @@ def _model(told: Headline, record: Record, shown_hz: Sequence[float]) -> dict[st
     from analysis.report.bands import dense_grid
     from rigd.view.frequency_charts import response_thinning
 
-    if not told.explained or told.drag_speed_m_s is not None or len(shown_hz) == 0:
+    if not headline.explained or headline.drag_speed_m_s is not None or len(shown_hz) == 0:
         return None
-    shown = ShownModel.of(told, record)
+    shown = ShownModel.of(headline, record)
     peaks_hz = [mode.frequency_hz for mode in shown.modes]
     band = shown.band(dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
     magnitude, limits = np.abs(band.response), band.magnitude_limits()
-    kept = response_thinning(band.frequency_hz).extremes(magnitude)
+    selected = response_thinning(band.frequency_hz).extremes(magnitude)
     return {
-        "frequency_hz": _rounded(band.frequency_hz[kept]),
-        "magnitude": _rounded(magnitude[kept]),
-        "magnitude_low_95": _rounded(limits[0][kept]),
-        "magnitude_high_95": _rounded(limits[1][kept]),
-        "phase_rad": _rounded(np.angle(band.response[kept])),
+        "frequency_hz": _rounded(band.frequency_hz[selected]),
+        "magnitude": _rounded(magnitude[selected]),
+        "magnitude_low_95": _rounded(limits[0][selected]),
+        "magnitude_high_95": _rounded(limits[1][selected]),
+        "phase_rad": _rounded(np.angle(band.response[selected])),
     }
 
 
 def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], list[str]]:
-    """Estimate response and coherence as the live view does, where the reference has excited it."""
+    """Estimate response and coherence like the live view, where the reference has excited it."""
     import numpy as np
 
-    from analysis.models import LARGEST_SHARE_OF_RATE
+    from analysis.models import LARGEST_FRACTION_OF_RATE
     from analysis.suited import against_welch
     from rigd.spectral import SpectralError, segmentation_of
     from rigd.view.frequency_charts import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_thinning
 
-    last_hz = min(LAST_HZ, LARGEST_SHARE_OF_RATE * record.rate_hz)
+    last_hz = min(LAST_HZ, LARGEST_FRACTION_OF_RATE * record.rate_hz)
     segments = segmentation_of(record.first_sweep_samples, record.rate_hz)
     resolution_hz = _HAMMING_BINS * record.rate_hz / segments.segment_length
     try:
         estimate = _estimate(record, segments, last_hz)
-        # Of steps, multisines and narrow sweeps it would tell of the segments, not of the rig.
+        # For steps, multisines and narrow sweeps it would show the segments, not the rig.
         coherence = None
         if estimate is not None and against_welch(record, (FIRST_HZ, last_hz)) is None:
             coherence, segments = _coherence(record, estimate, segments, last_hz)
@@ -236,12 +238,12 @@ def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], li
     )
     shown = estimate.excited & (found.frequency_hz >= FIRST_HZ) & np.isfinite(found.response)
     hz, values = found.frequency_hz[shown], found.response[shown]
-    kept = response_thinning(hz).extremes(np.abs(values))
+    selected = response_thinning(hz).extremes(np.abs(values))
     response = {
-        "frequency_hz": _rounded(hz[kept]),
-        "magnitude": _rounded(np.abs(values[kept])),
-        "phase_rad": _rounded(np.angle(values[kept])),
-        "coherence": None if coherence is None else _rounded(coherence[shown][kept]),
+        "frequency_hz": _rounded(hz[selected]),
+        "magnitude": _rounded(np.abs(values[selected])),
+        "phase_rad": _rounded(np.angle(values[selected])),
+        "coherence": None if coherence is None else _rounded(coherence[shown][selected]),
         "resolution_hz": round(resolution_hz, 4),
     }
     if coherence is None or hz.size == 0:
@@ -273,7 +275,7 @@ def _estimate(record: Record, segments: Segmentation, last_hz: float) -> Running
 def _coherence(
     record: Record, estimate: RunningEstimate, segments: Segmentation, last_hz: float
 ) -> tuple[Real | None, Segmentation]:
-    """Return the coherence, and the segments that it is of: of a single one there is none."""
+    """Return the coherence and its segments; a single segment has no coherence."""
     from rigd.spectral import PAPER_OVERLAP_FRACTION, PAPER_SEGMENTS, segment_lengths
 
     if estimate.response.coherence is None:
@@ -289,9 +291,9 @@ def _coherence(
 def _bands(
     frequency_hz: Real, low: NDArray[np.bool_], resolved_hz: float
 ) -> Iterator[tuple[float, float]]:
-    """Join bins to bands: what is nearer than a tenth of its frequency is one band.
+    """Join bins to bands: bins nearer than a tenth of their frequency form one band.
 
-    A band narrower than segments resolve is left out.
+    A band narrower than the resolution of the segments is omitted.
     """
     import numpy as np
 
@@ -309,7 +311,7 @@ def _no_coherence() -> dict[str, Any]:
 # Against the last session
 
 
-def _look_of(last: Path) -> dict[str, Any]:
+def _quick_look_of(last: Path) -> dict[str, Any]:
     look = read_look(look_path(last))
     if look is None:
         raise LookError(
@@ -319,8 +321,8 @@ def _look_of(last: Path) -> dict[str, Any]:
     return look
 
 
-def _last_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
-    """Find the last session of a specimen before a time, by the looks beside its file."""
+def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
+    """Return the last quick look of a specimen before a time, from the folder of the file."""
     found = last_look(
         path.parent,
         specimen,
@@ -375,7 +377,7 @@ def _against(modes: list[dict[str, Any]], before: Mapping[str, Any]) -> dict[str
 
 
 def _text(document: Mapping[str, Any]) -> Iterator[str]:
-    """Say it in a few lines for a terminal."""
+    """Return the quick look in a few lines for a terminal."""
     from rigd.view.frequency_charts import LOW_COHERENCE
 
     specimen = f" ({document['specimen']})" if document["specimen"] else ""
@@ -408,7 +410,7 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _rounded(values: Real) -> list[float]:
-    """Six digits: more than an estimate has."""
+    """Round to six digits: more than the accuracy of an estimate."""
     return [float(f"{value:.6g}") for value in values]
 
 
@@ -424,14 +426,14 @@ def _without_name(sentence: str, path: Path) -> str:
 
 
 def write_look(document: Mapping[str, Any], path: Path) -> Path:
-    """Write a look beside its session file, whole or not at all.
+    """Write a quick look to the folder of its session file, whole or not at all.
 
-    An older look at the same session is replaced; one that was made later stays.
+    An older quick look of the same session is replaced; one that was made later stays.
 
     Parameters
     ----------
     document : mapping
-        As `look_at` gives it.
+        Result of `look_at`.
     path : Path
         Session file.
 
@@ -443,44 +445,44 @@ def write_look(document: Mapping[str, Any], path: Path) -> Path:
     Raises
     ------
     LookError
-        It cannot be written, or something else has its name.
+        It cannot be written, or another file has its name.
     """
-    place = look_path(path)
-    there = read_look(place)
+    target = look_path(path)
+    there = read_look(target)
     if there is not None and there["made_utc_ns"] > document["made_utc_ns"]:
-        return place
-    new = place.with_name(f".{place.name}.{os.getpid()}")
+        return target
+    new = target.with_name(f".{target.name}.{os.getpid()}")
     try:
-        if there is None and place.exists() and place.stat().st_size > 0:
-            raise LookError(f"{place} is not a quick look of this version; move it away.")
+        if there is None and target.exists() and target.stat().st_size > 0:
+            raise LookError(f"{target} is not a quick look of this version; move it away.")
         new.write_text(json.dumps(document, allow_nan=False), "utf-8")
-        new.replace(place)
+        new.replace(target)
     except OSError as error:
-        raise LookError(f"{place} cannot be written ({error.strerror}).") from None
+        raise LookError(f"{target} cannot be written ({error.strerror}).") from None
     finally:
         with suppress(OSError):
             new.unlink(missing_ok=True)
-    return place
+    return target
 
 
 # The program
 
 
 def main() -> None:
-    """Look at the session that the command line names."""
+    """Write the quick look of the session on the command line."""
     raise_on(signal.SIGINT)
     parser = argparse.ArgumentParser(prog="python -m analysis.quick_look", description=__doc__)
     parser.add_argument("file", type=Path, metavar="FILE", help="Session file.")
     parser.add_argument(
         "--last", type=Path, metavar="FILE", help="Session to compare with (default: the last one)."
     )
-    asked = begin_background(parser)
+    arguments = begin_background(parser)
     # Not as the last of all programs: no session runs meanwhile, and others may never pause.
     with suppress(OSError):
         os.nice(_NICE)
     try:
-        document = look_at(asked.file, asked.last)
-        write_look(document, asked.file)
+        document = look_at(arguments.file, arguments.last)
+        write_look(document, arguments.file)
     except (SessionError, LookError) as error:
         sys.exit(f"Error: {error}")
     except KeyboardInterrupt:

@@ -1,7 +1,7 @@
-"""A session file as arrays on a uniform time grid, with what is known of their faults.
+"""Session file as arrays on a uniform time grid, with its known faults.
 
 The estimators want uniform samples; a session may have missed ticks, held (stale) values or a
-sweep that was cut short. What is done about each is decided here, bounded, counted and reported.
+sweep that was cut short. This module decides on their treatment, limits it, counts and reports it.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ _CONSEQUENCES: tuple[tuple[str, str], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Gaps:
-    """What of the record was filled by linear interpolation.
+    """Counts of the samples that were filled by linear interpolation.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class Record:
     time_s
         (n,) scheduled time of each tick since the session's start.
     reference_rad, angle_rad
-        (n,) angle asked for and angle measured at the output shaft.
+        (n,) requested angle, and angle measured at the output shaft.
     torque_nm
         (n,) coupling torque, positive when the motor pushes the beam.
     angle_known, torque_known
@@ -122,7 +122,7 @@ class Record:
     rate_hz
         Ticks per second.
     beam
-        The specimen as the file states it.
+        Specimen in the file.
     angle_delay_s, torque_delay_s
         Age of either value at its time stamp.
     tool_inertia_kg_m2
@@ -146,11 +146,11 @@ class Record:
     rest_angle_rad
         Angle held before the sweep, None if the file has no segment ``rest``.
     gaps
-        What was interpolated.
+        Counts of interpolated samples.
     flags
         Count of flagged samples in the sweep, by the flag's meaning, only those that occur.
     warnings
-        Sentences an analyst should read beside the results.
+        Warnings for the analyst, in sentences.
     metadata
         Metadata `session` of the file, as strings.
     outcome
@@ -185,17 +185,17 @@ class Record:
 
     @property
     def sweep_samples(self) -> int:
-        """Number of samples in the sweep."""
+        """Return the number of samples in the sweep."""
         return int(self.sweep.stop - self.sweep.start)
 
     @property
     def first_sweep(self) -> slice:
-        """Range of samples that Welch's method uses: the way there, or all of a single sweep."""
+        """Return the range for Welch's method: the sweep there, or all of a single sweep."""
         return self.sweep if self.there is None else self.there
 
     @property
     def first_sweep_samples(self) -> int:
-        """Number of samples in the first sweep."""
+        """Return the number of samples in the first sweep."""
         return int(self.first_sweep.stop - self.first_sweep.start)
 
 
@@ -203,9 +203,9 @@ def load_record(path: Path) -> Record:
     """Read a session file and put it on a uniform time grid.
 
     Missing ticks, and values flagged as stale, are replaced by linear interpolation between their
-    fresh neighbours, up to `MAX_UNKNOWN_SHARE` of the sweep and `MAX_GAP_S` at a time; the counts
-    are in the result, and masks that say which they are. Without segments the whole record is the
-    sweep, and a sweep that was stopped is cut to what was recorded.
+    fresh neighbours, up to `MAX_UNKNOWN_SHARE` of the sweep and `MAX_GAP_S` at a time. The result
+    has their counts and masks. Without segments the whole record is the sweep; a sweep that was
+    stopped ends with the recorded samples.
 
     Parameters
     ----------
@@ -215,9 +215,9 @@ def load_record(path: Path) -> Record:
     Raises
     ------
     rigd.session.SessionError
-        The file is missing, unreadable, foreign, or lacks a required key.
+        The file is missing, unreadable, of another format, or lacks a required key.
     RecordError
-        It was read, but its samples cannot be analysed.
+        The file was read, but its samples cannot be analysed.
 
     Examples
     --------
@@ -236,7 +236,7 @@ def record_of(session: Session) -> Record:
     Parameters
     ----------
     session
-        As read from a file, or as recorded so far; of the samples `RECORD_FIELDS` are needed.
+        Session from a file, or recorded so far; its samples need `RECORD_FIELDS`.
 
     Raises
     ------
@@ -315,7 +315,7 @@ def record_of(session: Session) -> Record:
 
 
 def _sweep(session: Session, first_tick: int, length: int) -> tuple[slice, int]:
-    """Find the samples of the sweep, and how many of its ticks were not recorded."""
+    """Return the samples of the sweep, and the number of its ticks without a sample."""
     if "sweep" not in session.segments:
         return slice(0, length), 0
     first, end = session.segments["sweep"]
@@ -331,14 +331,14 @@ def _sweep(session: Session, first_tick: int, length: int) -> tuple[slice, int]:
 
 
 def _there(session: Session, first_tick: int, sweep: slice) -> slice | None:
-    """Find the samples of the first of two sweeps; None if there is one."""
+    """Return the samples of the first of two sweeps; None if there is one."""
     first, end = session.segments.get("there", (0, 0))
     start, stop = max(first - first_tick, sweep.start), min(end - first_tick, sweep.stop)
     return slice(start, stop) if stop > start else None
 
 
 def _rest_angle(session: Session, ticks: NDArray[np.int64]) -> float | None:
-    """Median of the angle over the segment ``rest``, None without one."""
+    """Return the median of the angle over the segment ``rest``, None without one."""
     first, end = session.segments.get("rest", (0, 0))
     at_rest = (ticks >= first) & (ticks < end)
     return float(np.median(session.samples["angle_rad"][at_rest])) if at_rest.any() else None
@@ -352,7 +352,7 @@ def _flag_counts(status: NDArray[np.uint32]) -> dict[str, int]:
 def _filled(
     values: NDArray[np.float64], index: NDArray[np.int64], unknown: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Values on the whole grid, those unknown by linear interpolation (held at the ends)."""
+    """Return values on the whole grid, unknown ones interpolated linearly (held at the ends)."""
     full = np.zeros(len(unknown))
     full[index] = values
     if unknown.any() and not unknown.all():

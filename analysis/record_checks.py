@@ -1,9 +1,9 @@
-"""Checks of a session before it is analysed: values that its file states, and samples.
+"""Checks of a session before its analysis: values that its file states, and samples.
 
-A unit mistaken for another, or a file from somewhere else, is told here by its key; no estimator
-could say so half as well, and some would overflow. Of the samples, what cannot be analysed is
-refused: an empty or endless span, a clock that contradicts the rate, values that are not finite, a
-dead sensor, gaps too long to be interpolated.
+These checks report a wrong unit, or a file of another program, by its key, more clearly than an
+estimator could; some would overflow. Samples that cannot be analysed raise an error: an empty or
+endless span, a clock that contradicts the rate, values that are not finite, a dead sensor, gaps too
+long to be interpolated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class RecordError(ValueError):
-    """A session that was read but cannot be analysed; the message names file, cause and remedy."""
+    """The session was read but cannot be analysed; the message states file, cause and remedy."""
 
 
 # Values that the file states
@@ -51,7 +51,7 @@ _LEAST_PERIODS: Final = 0.1
 
 
 def stated_rate_hz(session: Session) -> float:
-    """Rate of the ticks in Hz.
+    """Return the rate of the ticks in Hz.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def stated_rate_hz(session: Session) -> float:
 
 
 def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
-    """Specimen, of which the record can show the first mode.
+    """Return the specimen, if the record is long enough for its first mode.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
 
 
 def first_mode_hz(beam: Beam) -> float:
-    """Frequency of the first mode of an undamped beam with locked hub.
+    """Return the frequency of the first mode of an undamped beam with locked hub.
 
     Parameters
     ----------
@@ -116,12 +116,12 @@ def first_mode_hz(beam: Beam) -> float:
 
 
 def stated_tool_inertia_kg_m2(session: Session) -> float:
-    """Inertia between torque sensor and beam, 0 if the file has none.
+    """Return the inertia between torque sensor and beam, 0 if the file has none.
 
     Raises
     ------
     RecordError
-        It is negative, or that of a vehicle.
+        It is negative, or implausibly large.
     """
     key = "tool_inertia_kg_m2"
     inertia_kg_m2 = session.number(key, 0.0)
@@ -133,18 +133,18 @@ def stated_tool_inertia_kg_m2(session: Session) -> float:
 
 
 def stated_tip_mass_kg(session: Session) -> float | None:
-    """Point mass at the beam's tip, None if the file states none.
+    """Return the point mass at the beam's tip, None if the file states none.
 
     Raises
     ------
     RecordError
-        It is negative, or that of a vehicle.
+        It is negative, or implausibly large.
     """
     return _stated_between(session, "tip_mass_kg", 0.0, MAX_TIP_MASS_KG)
 
 
 def stated_axis_tilt_deg(session: Session) -> float | None:
-    """Inclination of the plane of motion along the beam at rest, None if the file states none.
+    """Return the inclination of the plane of motion at rest, None if the file states none.
 
     Positive where the tip is lower than the motor's axis.
 
@@ -166,7 +166,7 @@ def _stated_between(session: Session, key: str, low: float, high: float) -> floa
 
 
 def stated_delay_s(session: Session, key: str) -> float:
-    """Age of a channel's values at their time stamps in s, 0 if the file has none.
+    """Return the age of a channel's values at their time stamps in s, 0 if not stated.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def stated_delay_s(session: Session, key: str) -> float:
     Raises
     ------
     RecordError
-        It is longer than any device's.
+        It is longer than that of any device.
     """
     delay_s = session.number(key, 0.0)
     if abs(delay_s) > _MAX_DELAY_S:
@@ -187,7 +187,7 @@ def stated_delay_s(session: Session, key: str) -> float:
 
 
 def stated_torque_filter_s(session: Session) -> tuple[float, float]:
-    """Time constants of the torque channel's low-pass filter of first and of second order.
+    """Return the time constants of the torque channel's first- and second-order filter.
 
     ``1 / (2 pi torque_filter_hz)`` for the order stated (`torque_filter_order`, 1 without it), 0
     for the other; both 0 if the file states no filter.
@@ -208,19 +208,19 @@ def stated_torque_filter_s(session: Session) -> tuple[float, float]:
 
 
 SCALES: Final = ("torque_scale", "length", "density")
-"""What no session shows, and its file may state the uncertainty of."""
+"""Quantities that no session determines; the file may state their uncertainty."""
 
 UNCERTAIN: Final = (*SCALES, "tip_mass")
-"""All values of a file whose uncertainty it may state."""
+"""All values whose uncertainty a file may state."""
 
 
 def stated_uncertainty(session: Session) -> dict[str, float]:
-    """Relative standard uncertainties of `UNCERTAIN` values that the file states, by their names.
+    """Return the stated relative standard uncertainties of `UNCERTAIN` values, by their names.
 
     Raises
     ------
     RecordError
-        One is negative, or so large that the value would not be known at all.
+        One is negative, or so large that the value would be unknown.
     """
     stated = {}
     for name in UNCERTAIN:
@@ -235,9 +235,9 @@ def stated_uncertainty(session: Session) -> dict[str, float]:
 
 
 def stated_uniformity(session: Session) -> float:
-    """Relative standard deviation of each mode's frequency from that of a uniform beam.
+    """Return the relative standard deviation of mode frequencies from a uniform beam.
 
-    0.001, that of an antenna made with care, if the file states none.
+    0.001, typical of a carefully made antenna, if the file states none.
 
     Raises
     ------
@@ -262,7 +262,7 @@ def _wrong(session: Session, key: str, value: float, rule: str) -> RecordError:
 # Samples
 
 MAX_UNKNOWN_SHARE = 0.05
-"""Largest share of angle or torque that may be missing or flagged: one limit for import, loading
+"""Largest fraction of angle or torque that may be missing or flagged: one limit for import, loading
 and estimation. Whole-record fits stand so much of it (within their own uncertainty at 4.5 %)."""
 
 MAX_GAP_S = 0.1
@@ -283,7 +283,7 @@ MAX_CLOCK_ERROR = 1e-3
 
 
 def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
-    """Refuse a span of ticks that is all but empty, or too long.
+    """Raise if a span of ticks is almost empty, or too long.
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
     Raises
     ------
     RecordError
-        It is.
+        The span is unusable.
     """
     span = int(ticks[-1] - ticks[0]) + 1
     if span > MAX_SPAN * len(ticks):
@@ -314,7 +314,7 @@ def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
 def check_clock(
     path: Path, ticks: NDArray[np.int64], t_ns: NDArray[np.int64], rate_hz: float
 ) -> None:
-    """Refuse time stamps that run backwards or contradict the rate.
+    """Raise if time stamps run backwards or contradict the rate.
 
     Parameters
     ----------
@@ -330,17 +330,17 @@ def check_clock(
     Raises
     ------
     RecordError
-        They do.
+        They are unusable.
     """
     if len(ticks) < 2:
         return
     # Compared, not subtracted: a difference of what a file states may overflow.
     back = np.flatnonzero(t_ns[1:] <= t_ns[:-1])
     if back.size:
-        place = int(back[0])
+        index = int(back[0])
         raise RecordError(
-            f"{path}: the time stamp t_ns goes from {t_ns[place]} ns at tick {ticks[place]} to "
-            f"{t_ns[place + 1]} ns at tick {ticks[place + 1]}, but time must go forward; it does "
+            f"{path}: the time stamp t_ns goes from {t_ns[index]} ns at tick {ticks[index]} to "
+            f"{t_ns[index + 1]} ns at tick {ticks[index + 1]}, but time must go forward; it does "
             f"not at {back.size} of {len(ticks)} samples. Correct the program that wrote the file."
         )
     elapsed_ns = max(int(t_ns[-1]) - int(t_ns[0]), 1)
@@ -355,7 +355,7 @@ def check_clock(
 def check_finite(
     path: Path, field: str, values: NDArray[np.float64], ticks: NDArray[np.int64]
 ) -> None:
-    """Refuse values that are not finite, or that no rig has.
+    """Raise if values are not finite, or implausible for any rig.
 
     Parameters
     ----------
@@ -371,7 +371,7 @@ def check_finite(
     Raises
     ------
     RecordError
-        There are some.
+        There are such values.
     """
     large = np.flatnonzero(np.abs(values) > MAX_VALUE)
     bad = np.flatnonzero(~np.isfinite(values))
@@ -389,7 +389,7 @@ def check_finite(
 
 
 def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
-    """Refuse a torque that is one and the same throughout: noise alone would move it.
+    """Raise if the torque is constant throughout: noise alone would change it.
 
     Parameters
     ----------
@@ -401,7 +401,7 @@ def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
     Raises
     ------
     RecordError
-        It is.
+        It is constant.
     """
     if torque_nm.size > 1 and np.ptp(torque_nm) == 0.0:
         raise RecordError(
@@ -413,13 +413,13 @@ def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
 def check_fillable(
     path: Path, channel: str, unknown: NDArray[np.bool_], first_tick: int, rate_hz: float
 ) -> None:
-    """Refuse a channel of the sweep of which too much, or too much at once, would be filled in.
+    """Raise if too much of a channel in the sweep, in total or at once, would be interpolated.
 
     Parameters
     ----------
     path : Path
     channel : str
-        What messages call it.
+        Name in messages.
     unknown : ndarray of bool, shape (n,)
         Samples of the sweep without a new value.
     first_tick : int
@@ -439,7 +439,7 @@ def check_fillable(
 
 
 def too_much_unknown(what: str, unknown: int, of: int) -> str | None:
-    """Say that more than `MAX_UNKNOWN_SHARE` of a channel is unknown; None if it is not.
+    """Return the message that more than `MAX_UNKNOWN_SHARE` of a channel is unknown, or None.
 
     Parameters
     ----------
@@ -458,7 +458,7 @@ def too_much_unknown(what: str, unknown: int, of: int) -> str | None:
 
 
 def longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
-    """Length and start of the longest run of True, (0, 0) without any.
+    """Return length and start of the longest run of True, (0, 0) without any.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Results of one record, as computing hands them to all that shows them: text, page, files.
+"""Results of one record, for all outputs: text, page, files.
 
 `record_result` makes a `RecordResult` from a session file. A campaign retains the parts of each
 that it needs (`analysis.campaigns.SessionAnalysis`) and combines them in an
@@ -37,22 +37,22 @@ _ORDERS: Final = frozenset({"alpha", "lambda"})
 FigureFormat = Literal["png", "svg", "pdf"]
 FIGURE_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg", "pdf")
 DEFAULT_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg")
-"""Formats of the figures unless asked for: PDF takes as long as PNG and SVG together."""
+"""Default formats of the figures: PDF takes as long as PNG and SVG together."""
 
 
 @dataclass(frozen=True, slots=True)
 class Routes:
-    """What is done with a record: Welch's fits, by these settings, and those of the whole record.
+    """Selection of analyses of a record: Welch's fits, and those of the whole record.
 
     Attributes
     ----------
     settings : WelchSettings
     paper, whole_record : bool
-        Which of the two.
+        Selected analyses.
     fixed : tuple of str
         Settings of rig and specimen that stay at the file's values.
     band_hz : tuple of float or None
-        Band of both; None takes what suits the record.
+        Band of both; None selects the largest suitable band.
     figures : tuple of str
         Formats of the report's figures.
     uniformity : float or None
@@ -71,7 +71,7 @@ class Routes:
 
 @dataclass(frozen=True, slots=True)
 class WholeRecord:
-    """What the whole record gave: all structures fitted to it, and which of them it supports.
+    """Results of the whole record: all structures fitted, and the selected one.
 
     Attributes
     ----------
@@ -100,30 +100,30 @@ class WholeRecord:
 
     @property
     def analysis(self) -> RecordAnalysis:
-        """The fits with the noise, the lines and the bins that are theirs."""
+        """Return the fits with their noise, lines and bins."""
         return self.selection.analysis
 
     @property
     def fits(self) -> Mapping[str, RecordFit]:
-        """Fits by the name that tables call them, the lowest BIC first."""
+        """Return the fits by their names in tables, the lowest BIC first."""
         return {each.name: each.fit for each in self.selection.candidates}
 
     @property
     def delta_bic(self) -> Mapping[str, float]:
-        """BIC above the lowest by the name of the fit."""
+        """Return the BIC above the lowest by the name of the fit."""
         best, *_ = self.selection.candidates
         return {each.name: each.bic - best.bic for each in self.selection.candidates}
 
     @property
     def headline(self) -> Headline:
-        """The numbers that are told first; its fit is one of `fits`."""
+        """Return the reported numbers; their fit is one of `fits`."""
         return self.selection.headline
 
     @property
     def verdict(self) -> Verdict:
-        """What can be told from the data and what cannot, in the operator's words.
+        """Return the verdict in sentences for the operator.
 
-        Its second sentence is on the validity of the numbers.
+        Its second sentence states the validity of the numbers.
         """
         verdict = self.selection.verdict
         first, others = verdict.sentences[:1], verdict.sentences[1:]
@@ -131,29 +131,29 @@ class WholeRecord:
 
     @property
     def orders(self) -> tuple[OrderVerdict, OrderVerdict]:
-        """What is known of each order."""
+        """Return the verdicts on both orders."""
         return self.verdict.alpha, self.verdict.lambda_
 
     @property
     def fit(self) -> RecordFit:
-        """The fit that the headline's numbers are of."""
+        """Return the fit behind the numbers of the headline."""
         return self.headline.fit
 
     @property
     def visible_modes(self) -> tuple[int, ...]:
-        """Numbers of its modes that the record shows."""
+        """Return the numbers of the modes that the record shows."""
         return self.headline.visible_modes
 
     @property
     def withheld(self) -> frozenset[str]:
-        """Orders of that fit whose numbers carry a flag."""
+        """Return the orders of that fit whose numbers carry a flag."""
         return frozenset(_ORDERS & self.headline.flags.keys())
 
     @property
     def combined(self) -> dict[str, Quantity]:
-        """The headline's parameters that a scale acts on whose uncertainty the file states.
+        """Return the headline's parameters that depend on a scale of stated uncertainty.
 
-        With standard uncertainties and intervals that include it.
+        Their standard uncertainties and intervals include that of the scale.
         """
         from analysis.identify import scales_absorbed, with_scales
 
@@ -162,7 +162,7 @@ class WholeRecord:
         return with_scales(self.headline.parameters, self.record.uncertainty)
 
     def headline_json(self) -> dict[str, Any]:
-        """Write the headline as the JSON document has it."""
+        """Return the headline as the content of the JSON document."""
         from analysis.identify import headline_json
         from analysis.record_checks import SCALES
 
@@ -191,7 +191,7 @@ class WholeRecord:
 
     @property
     def unsupported(self) -> frozenset[str]:
-        """Orders flagged on an exactly uniform beam, or of absent damping."""
+        """Return the orders with a flag on an exactly uniform beam, or of absent damping."""
         exact = (self.headline.exact or self.headline).parameters
         flagged = {name for name in _ORDERS & exact.keys() if exact[name].flag is not None}
         return frozenset(flagged | {each.order for each in self.orders if each.value is None})
@@ -199,7 +199,7 @@ class WholeRecord:
 
 @dataclass(frozen=True, slots=True)
 class RecordResult:
-    """One record with everything that was found in it.
+    """Results of all analyses of one record.
 
     Attributes
     ----------
@@ -207,7 +207,7 @@ class RecordResult:
     whole : WholeRecord or None
         Fits to the whole record; None if they were not run.
     welch : WelchAnalysis or None
-        Fits to Welch's estimate, as in the paper; None if they were not run.
+        Fits to Welch's estimate, as in the reference paper; None if they were not run.
     validity : Validity
         How exact the linear model is for the record.
     """
@@ -229,17 +229,17 @@ class RecordResult:
 
     @property
     def name(self) -> str:
-        """What titles call the record."""
+        """Return the name of the record for titles."""
         return self.record.path.name
 
     @property
     def unsupported(self) -> frozenset[str]:
-        """Orders that the whole record does not support; none are known without its fits."""
+        """Return the orders that the whole record does not support; none without its fits."""
         return frozenset() if self.whole is None else self.whole.unsupported
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What an analyst should read beside the results."""
+        """Return the warnings for the analyst."""
         return self.record.warnings if self.welch is None else self.welch.warnings
 
 
@@ -260,7 +260,7 @@ def whole_record(
     fixed : tuple of str
         Settings that stay at the file's values.
     band_hz : tuple of float, optional
-        By default what suits the record.
+        By default the largest suitable band.
 
     Raises
     ------
@@ -291,14 +291,14 @@ def record_result(
     on_step : callable, optional
         Called with a few words after each step.
     warn : callable, optional
-        Called with a sentence on what was left out.
+        Called with a sentence on an omitted analysis.
 
     Raises
     ------
     SessionError, RecordError
         The file cannot be read, or holds no record that can be analysed.
     EstimateError, MeasurementError
-        No route suits the record, or the settings do not.
+        No analysis suits the record, or the settings do not.
     """
     from analysis.identify import MeasurementError
     from analysis.record import load_record
@@ -331,7 +331,7 @@ def record_result(
 
 
 def with_uniformity(record: Record, uniformity: float | None) -> Record:
-    """Replace the uniformity of a record by a stated one; None leaves the file's.
+    """Return a record with a stated uniformity; None retains that of the file.
 
     Parameters
     ----------
@@ -346,9 +346,9 @@ def _with_warnings(record: Record, more: tuple[str, ...]) -> Record:
 
 
 def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
-    """Copy a JSON value with null for numbers that are not finite and plain numbers for numpy's.
+    """Return a copy of a JSON value with null for non-finite numbers, and without numpy types.
 
-    Keys lose the underscore by which an attribute is told from a word of Python (``lambda_``).
+    Keys lose the underscore that distinguishes an attribute from a Python keyword (``lambda_``).
     """
     from numpy import generic
 

@@ -1,7 +1,7 @@
-"""p-values and quantiles of the distributions that the analyzer decides by; the fit in per cent.
+"""p-values and quantiles of the analyzer's test distributions; the fit in per cent.
 
-From `scipy.special`, not `scipy.stats`, which takes four times as long to import; and only when
-one is asked for, since a command that prints its help needs none.
+They use `scipy.special`, since `scipy.stats` takes four times as long to import. It is imported on
+first use, since a command that prints its help needs none.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SMALLEST: Final = 1e-290
 
 
 def chi_square_p_value(value: ArrayLike, degrees_of_freedom: float) -> NDArray[np.float64]:
-    """Probability that a chi-square is at least `value`, of the shape of `value`.
+    """Return the probability that a chi-square is at least `value`, of the shape of `value`.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ def chi_square_p_value(value: ArrayLike, degrees_of_freedom: float) -> NDArray[n
 
 
 def chi_square_deviate(value: float, degrees_of_freedom: float) -> float:
-    """Turn a chi-square into the standard normal deviate that is exceeded as rarely.
+    """Return the standard normal deviate with the tail probability of a chi-square.
 
-    It is finite however far `value` is out, also where the probability underflows.
+    It is finite for any `value`, also where the probability underflows.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def chi_square_deviate(value: float, degrees_of_freedom: float) -> float:
 
 
 def kolmogorov_p_value(statistic: float) -> float:
-    """Probability that the Kolmogorov statistic, times the root of the count, is at least that.
+    """Return the p-value of the Kolmogorov statistic times the root of the count.
 
     Examples
     --------
@@ -94,12 +94,12 @@ def kolmogorov_p_value(statistic: float) -> float:
 
 
 def student_t_quantile(level: float, degrees_of_freedom: float) -> float:
-    """Two-sided point of Student's t: within ± it a share `level` lies.
+    """Return the two-sided quantile of Student's t: ± it holds a fraction `level`.
 
     Parameters
     ----------
     level : float
-        Share, 0 to 1.
+        Fraction, 0 to 1.
     degrees_of_freedom : float
         Above 0.
 
@@ -115,10 +115,10 @@ def student_t_quantile(level: float, degrees_of_freedom: float) -> float:
 
 
 def nrmse_percent(residual: NDArray[Any], measured: NDArray[Any]) -> float:
-    """Fit as ``compare`` of MATLAB's System Identification Toolbox has it, in %.
+    """Return the fit in %, as ``compare`` of MATLAB's System Identification Toolbox defines it.
 
-    ``100 (1 - |residual| / |measured - its mean|)``: 100 for a model that leaves nothing, 0 for one
-    that is no better than the mean, below 0 for one that is worse.
+    ``100 (1 - |residual| / |measured - its mean|)``: 100 for a perfect model, 0 for one that is no
+    better than the mean, below 0 for one that is worse.
 
     Parameters
     ----------

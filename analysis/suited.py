@@ -1,4 +1,4 @@
-"""What of an analysis suits a record: the band of the fits, and whether Welch's fits do at all."""
+"""Applicability of the analyses to a record: band of the fits, and use of Welch's method."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.models import (
-    LARGEST_SHARE_OF_RATE,
+    LARGEST_FRACTION_OF_RATE,
     PAPER_BAND_HZ,
     RECORD_BAND_HZ,
     WelchSettings,
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Band = tuple[float, float]
 
 LEFT_OUT: Final = "Welch fits left out: "
-"""Begin of the sentence that says why there are none."""
+"""Beginning of the sentence with the reason why there are none."""
 
 _NO_SWEEP: Final = {
     "step": "a step excites all frequencies at one moment, which averaging over segments loses",
@@ -44,87 +44,91 @@ _TWO_SWEEPS: Final = (
 )
 
 _WHOLE: Final = 0.99
-"""Share of the planned sweep from which it counts as complete: ticks may be missing at its end."""
+"""Fraction of the planned sweep from which it counts as complete: ticks may be missing at its
+end."""
 
 
-def record_band_hz(record: Record, asked_hz: Band | None = None) -> Band:
-    """Band of the whole-record fits: the one asked for, or as much of the usual one as there is.
+def record_band_hz(record: Record, requested_hz: Band | None = None) -> Band:
+    """Return the band of the whole-record fits: the requested one, or the usual one.
+
+    The usual band is limited by the record's rate.
 
     Parameters
     ----------
     record : Record
-    asked_hz : tuple of float, optional
-        In Hz; used as it is.
+    requested_hz : tuple of float, optional
+        Requested band in Hz; used unchanged.
     """
-    return asked_hz or _within(RECORD_BAND_HZ, record.rate_hz)
+    return requested_hz or _within(RECORD_BAND_HZ, record.rate_hz)
 
 
-def check_record_band(record: Record, asked_hz: Band | None) -> None:
-    """Refuse a band that the record's rate does not hold.
+def check_record_band(record: Record, requested_hz: Band | None) -> None:
+    """Raise if the record's rate does not support a band.
 
     Parameters
     ----------
     record : Record
-    asked_hz : tuple of float or None
-        In Hz.
+    requested_hz : tuple of float or None
+        Requested band, in Hz.
 
     Raises
     ------
     SettingsError
-        It ends too high.
+        The band ends too high.
     """
     from analysis.paper import SettingsError
 
-    limit_hz = LARGEST_SHARE_OF_RATE * record.rate_hz
-    if asked_hz is not None and asked_hz[1] > limit_hz:
+    limit_hz = LARGEST_FRACTION_OF_RATE * record.rate_hz
+    if requested_hz is not None and requested_hz[1] > limit_hz:
         raise SettingsError(
-            f"{record.path}: the band reaches {asked_hz[1]:g} Hz, but whole-record fits end at "
-            f"{limit_hz:g} Hz, {LARGEST_SHARE_OF_RATE:g} of the rate of {record.rate_hz:g} Hz; "
+            f"{record.path}: the band reaches {requested_hz[1]:g} Hz, but whole-record fits end at "
+            f"{limit_hz:g} Hz, {LARGEST_FRACTION_OF_RATE:g} of the rate of {record.rate_hz:g} Hz; "
             "lower --band."
         )
 
 
 def welch_settings(
-    record: Record, settings: WelchSettings, asked_hz: Band | None = None
+    record: Record, settings: WelchSettings, requested_hz: Band | None = None
 ) -> WelchSettings:
-    """Choose the band of the Welch fits: the one asked for, or what there is of the paper's.
+    """Return the settings of the Welch fits with the requested band or the default one.
 
-    A band in the settings that is not the paper's was asked for, too. A band from 0 Hz begins at
-    the first frequency above it, since a constant tells nothing.
+    The default is the band of the reference paper; another band in the settings is a requested one,
+    too. A band from 0 Hz begins at the first frequency above it, since a constant has no
+    information.
 
     Parameters
     ----------
     record : Record
     settings : WelchSettings
-    asked_hz : tuple of float, optional
-        In Hz.
+    requested_hz : tuple of float, optional
+        Requested band, in Hz.
     """
-    if asked_hz is None and settings.band_hz != PAPER_BAND_HZ:
-        asked_hz = settings.band_hz
-    first_hz, last_hz = asked_hz or _within(PAPER_BAND_HZ, record.rate_hz)
+    if requested_hz is None and settings.band_hz != PAPER_BAND_HZ:
+        requested_hz = settings.band_hz
+    first_hz, last_hz = requested_hz or _within(PAPER_BAND_HZ, record.rate_hz)
     if first_hz == 0.0:
         first_hz = record.rate_hz / settings.segmentation(record.rate_hz).nfft
     return replace(settings, band_hz=(first_hz, last_hz))
 
 
-def remarks(record: Record, asked_hz: Band | None = None) -> tuple[str, ...]:
-    """Sentences on what was made to suit the record.
+def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]:
+    """Return sentences on the adaptations of the analysis to the record.
 
     Parameters
     ----------
     record : Record
-    asked_hz : tuple of float, optional
-        Band that was asked for, in Hz.
+    requested_hz : tuple of float, optional
+        Requested band, in Hz.
     """
-    said = (_TOUCH,) if record.metadata.get("excitation") == "touch" else ()
+    sentences = (_TOUCH,) if record.metadata.get("excitation") == "touch" else ()
     if record.there is not None:
-        said = (*said, _TWO_SWEEPS)
-    _, last_hz = record_band_hz(record, asked_hz)
-    if asked_hz is not None or last_hz == RECORD_BAND_HZ[1]:
-        return said
+        sentences = (*sentences, _TWO_SWEEPS)
+    _, last_hz = record_band_hz(record, requested_hz)
+    if requested_hz is not None or last_hz == RECORD_BAND_HZ[1]:
+        return sentences
     return (
-        *said,
-        f"Fits end at {last_hz:g} Hz, {LARGEST_SHARE_OF_RATE:g} of the record's rate of "
+        *sentences,
+        f"Fits end at {last_hz:g} Hz, {LARGEST_FRACTION_OF_RATE:g} of the record's rate of "
         f"{record.rate_hz:g} Hz, instead of {RECORD_BAND_HZ[1]:g} Hz.",
     )
 
@@ -132,43 +136,43 @@ def remarks(record: Record, asked_hz: Band | None = None) -> tuple[str, ...]:
 def welch_analysis(
     record: Record,
     settings: WelchSettings,
-    asked_hz: Band | None = None,
+    requested_hz: Band | None = None,
     *,
     optional: bool,
     on_step: Callable[[str], None] = lambda _done: None,
 ) -> tuple[WelchAnalysis | None, str | None]:
-    """Run Welch's fits where they suit a record.
+    """Run Welch's fits if they suit the record.
 
     Parameters
     ----------
     record : Record
     settings : WelchSettings
-    asked_hz : tuple of float, optional
-        Band that was asked for, in Hz.
+    requested_hz : tuple of float, optional
+        Requested band, in Hz.
     optional : bool
-        Whether the record is analysed without them, too. Even so, segments or an estimator that
-        were chosen for it are not dropped in silence.
+        Whether the record is analysed without them, too. Even then segments or an estimator that
+        were chosen for it are not ignored silently.
     on_step : callable, optional
-        As of `analysis.paper._route.analyse`.
+        Callback of `analysis.paper._route.analyse`.
 
     Returns
     -------
     analysis : WelchAnalysis or None
     left_out : str or None
-        Sentence that says why there is none.
+        Sentence with the reason why there is none.
 
     Raises
     ------
     EstimateError
-        They were to be run, and cannot be.
+        The fits were requested, and cannot be run.
     """
     from analysis.paper import EstimateError, SettingsError, analyse
 
     optional = optional and settings.are_usual
-    reason = against_welch(record, asked_hz) if optional else None
+    reason = against_welch(record, requested_hz) if optional else None
     if reason is None:
         try:
-            return analyse(record, welch_settings(record, settings, asked_hz), on_step), None
+            return analyse(record, welch_settings(record, settings, requested_hz), on_step), None
         except EstimateError as error:
             if not optional or isinstance(error, SettingsError):
                 raise
@@ -176,14 +180,14 @@ def welch_analysis(
     return None, f"{LEFT_OUT}{reason}."
 
 
-def against_welch(record: Record, asked_hz: Band | None = None) -> str | None:
-    """Say why Welch's method does not suit a record, as the end of a sentence; None if it may.
+def against_welch(record: Record, requested_hz: Band | None = None) -> str | None:
+    """Return why Welch's method does not suit a record, as the end of a sentence, or None.
 
     Parameters
     ----------
     record : Record
-    asked_hz : tuple of float, optional
-        Band that was asked for, in Hz.
+    requested_hz : tuple of float, optional
+        Requested band, in Hz.
     """
     kind = record.metadata.get("excitation", "")
     if kind in _NO_SWEEP:
@@ -193,7 +197,7 @@ def against_welch(record: Record, asked_hz: Band | None = None) -> str | None:
         return f"{_NO_SWEEP[kind]} ({option} makes them nevertheless)"
     planned_s = _number(record, "duration_s")
     swept_s = record.first_sweep_samples / record.rate_hz
-    if asked_hz is not None or planned_s is None or swept_s >= _WHOLE * planned_s:
+    if requested_hz is not None or planned_s is None or swept_s >= _WHOLE * planned_s:
         return None
     reached_hz = _reached_hz(record, swept_s / planned_s)
     first_hz, last_hz = _within(PAPER_BAND_HZ, record.rate_hz)
@@ -205,12 +209,12 @@ def against_welch(record: Record, asked_hz: Band | None = None) -> str | None:
     )
 
 
-def _reached_hz(record: Record, share: float) -> float | None:
-    """Frequency that an upward sweep had reached after a share of its duration."""
+def _reached_hz(record: Record, fraction: float) -> float | None:
+    """Return the frequency that an upward sweep reaches after a fraction of its duration."""
     start_hz, stop_hz = _number(record, "start_hz"), _number(record, "stop_hz")
     if start_hz is None or stop_hz is None or stop_hz <= start_hz:
         return None
-    return start_hz + share * (stop_hz - start_hz)
+    return start_hz + fraction * (stop_hz - start_hz)
 
 
 def _number(record: Record, key: str) -> float | None:
@@ -221,7 +225,7 @@ def _number(record: Record, key: str) -> float | None:
 
 
 def _within(band_hz: Band, rate_hz: float) -> Band:
-    """As much of a band as a rate holds; all of it where nothing would be left."""
+    """Return a band limited by a rate; the whole band if nothing remained."""
     first_hz, last_hz = band_hz
-    limit_hz = min(last_hz, LARGEST_SHARE_OF_RATE * rate_hz)
+    limit_hz = min(last_hz, LARGEST_FRACTION_OF_RATE * rate_hz)
     return (first_hz, limit_hz) if first_hz < limit_hz else band_hz

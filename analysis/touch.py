@@ -1,8 +1,8 @@
-"""Touches of a recorded session: where, when and how hard its antenna met something.
+"""Touches of a recorded session: position, time and force of contacts of the antenna.
 
-What the control loop has detected is marked in the samples. Where nothing is marked, the loop's own
-test is run over the record: a session that was no search may have met something as well. Each touch
-is then estimated as it is during a session (`rigd.touch`).
+Detections of the control loop are marked in the samples. Without marks, the loop's own test runs
+over the record: a session that was no search may have had contacts as well. Each touch is then
+estimated as during a session (`rigd.touch`).
 """
 
 from __future__ import annotations
@@ -63,29 +63,29 @@ if TYPE_CHECKING:
 
 _LEAST_BEFORE_S: Final = 0.3
 _LEAST_AFTER_S: Final = 0.02
-"""Record around a detection without which nothing can be estimated."""
+"""Least record around a detection for an estimate."""
 _LEAST_REST_S: Final = 0.5
-"""Beginning by which the test judges the noise, where the file states no longer rest."""
+"""Beginning from which the test estimates the noise, if the file states no longer rest."""
 _QUIET_S: Final = 0.5
-"""After so long without a detection the next one is another touch: the beam bounces."""
+"""Time without a detection after which the next one is another touch: the beam bounces."""
 _MOST_OF_TICK: Final = 0.99
-"""Filters of more than a hundred records a tick are not told from that."""
+"""Filters of more than a hundred records a tick are treated as that."""
 _MOST_FOUND: Final = 20
-"""More touches than that in a record that was no search: it is the model that does not fit."""
+"""With more touches in a record that was no search the model does not fit."""
 _MOST_OF_MODEL: Final = 5.0
-"""Sum of squared residuals per degree of freedom from which on the model is in doubt."""
+"""Sum of squared residuals per degree of freedom from which the model is doubtful."""
 _LEAST_NOISE: Final = 1e-9
 _LEAST_QUIET: Final = 100
-"""Samples that the vibration before a touch is fitted to."""
+"""Number of samples for the fit of the vibration before a touch."""
 _POINTS: Final = 41
-"""Along the antenna."""
+"""Number of points along the antenna."""
 _DESCRIPTIONS: Final = ("specimen.toml", "profile.toml")
-"""Attachments that tell the damping; the first that does counts."""
+"""Attachments with the damping; the first one that has it is used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """One touch of a session.
+    """Touch of a session with its estimate.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Touch:
     start_s
         Time of the estimate's record in the session.
     estimate
-        None, as what follows, if there is too little of the record around it.
+        Estimate; None, like the following ones, if the record around it is too short.
     antenna_m
         The bent antenna at the touch, seen from above with the motor's axis in (0, 0), shape
         (points, 2).
@@ -121,7 +121,7 @@ class Touch:
     ends_m: Real | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as a document of JSON types."""
+        """Return the touch as a document of JSON types."""
         estimate = self.estimate
         point = None if self.point_m is None else self.point_m.tolist()
         return {
@@ -145,15 +145,15 @@ class TouchedSession:
     touches
         In the order of time.
     found
-        Who detected them: ``loop``, during the session; ``record``, this analysis.
+        Source of the detections: ``loop``, during the session; ``record``, this analysis.
     model
-        The beam that they are estimated with.
+        Beam of the estimates.
     rate_hz
         Ticks a second.
     has_shear
-        The file tells the base shear.
+        Whether the file has the base shear.
     warnings
-        What should be known of the result, in sentences.
+        Remarks on the result, in sentences.
     validity
         How exact the linear model is for the session.
     """
@@ -169,7 +169,7 @@ class TouchedSession:
 
 
 class TouchAnalysis:
-    """Finds and estimates touches; what it prepares for one model serves several sessions.
+    """Detection and estimates of touches; one model serves several sessions.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ class TouchAnalysis:
     def session(
         self, path: Path, on_step: Callable[[str], None] = lambda _: None
     ) -> TouchedSession:
-        """Find and estimate the touches of a session.
+        """Return the touches of a session.
 
         Parameters
         ----------
@@ -300,7 +300,7 @@ class TouchAnalysis:
 
 @dataclass(frozen=True, slots=True)
 class _Prepared:
-    """What serves all touches of one model."""
+    """Prepared data for all touches of one model."""
 
     estimator: TouchEstimator
     free: FreeBeam
@@ -323,7 +323,7 @@ def _checked_rate_hz(session: Session) -> float:
 
 
 def _model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
-    """Return the identified model, or the one that the file's attachments state."""
+    """Return the identified model, or the one in the file's attachments."""
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
     stated: dict[str, Any] = {
@@ -344,7 +344,7 @@ def _model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
 
 
 def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
-    """Return the sensor's low-pass filter, and the one that makes samples of its records."""
+    """Return the sensor's low-pass filter, and the one that forms samples of its records."""
     order, constant_s = max(enumerate(stated_torque_filter_s(session), start=1), key=itemgetter(1))
     corner_hz = 1 / (2 * pi * constant_s) if constant_s else 0.0
     kind = session.metadata.get("sensor_filter", "")
@@ -352,15 +352,15 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
         return SensorFilter(corner_hz, order)
     delay_s = session.number("sensor_filter_delay_s", 0.0)
     # A mean of n records of a tick is (n - 1) / 2n of a tick old, the triangle twice as much.
-    share = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(kind, inf)
-    if not 0.0 <= share < _MOST_OF_TICK:
+    fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(kind, inf)
+    if not 0.0 <= fraction < _MOST_OF_TICK:
         raise RecordError(
             f"{session.path}: sensor_filter is {kind[:100]!r} with sensor_filter_delay_s = "
             f"{delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} s) "
             f"or a triangle (shorter than a period); correct the file's metadata."
         )
-    records = round(1 / (1 - share))
-    spacing_s = share / rate_hz / max(records - 1, 1)
+    records = round(1 / (1 - fraction))
+    spacing_s = fraction / rate_hz / max(records - 1, 1)
     return SensorFilter.of_records(corner_hz, order, kind, records, spacing_s)
 
 
@@ -391,8 +391,8 @@ def _detections(
     Returns
     -------
     list of tuple
-        For each touch the tick at which it is noticed, and the one from which the beam was free
-        before it.
+        For each touch the tick of the detection, and the tick from which the beam was free before
+        it.
     """
     samples = session.samples
     ticks = samples["tick"].astype(np.int64)
@@ -442,7 +442,7 @@ def _noise(values: Real) -> float:
 
 
 def _angle_noise(angle_rad: Real, resting: NDArray[np.bool_]) -> float:
-    """Noise of the angle: as it scatters at rest, or that of its resolution."""
+    """Return the noise of the angle: its scatter at rest, or that of its resolution."""
     steps = np.abs(np.diff(angle_rad))
     steps = steps[steps > _LEAST_NOISE]
     resolution_rad = float(steps.min()) if steps.size else 0.0
@@ -479,14 +479,14 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def _deflection_m(free: FreeBeam, record: TouchRecord, time_s: float) -> Real:
-    """Return where the beam was at a time, if it was free until then, relative to its root's line.
+    """Return the beam's deflection at a time relative to its root line, if it was free.
 
     Parameters
     ----------
     free
-        For the points along the beam, of which the first is at the axis.
+        Free motion at the points along the beam; the first is at the axis.
     record
-        Its vibration is what fits the samples before the time.
+        Record; the vibration is fitted to its samples before the time.
     time_s
         From the record's beginning.
     """

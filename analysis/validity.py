@@ -1,8 +1,8 @@
 """Validity of a record: the largest slope of the antenna's tip, and the linear model's error there.
 
-The plan of a session predicts the slope, and its file states it
-(``predicted_peak_tip_slope_rad``). For a file that does not, it is computed from the measured angle
-with the beam and damping that were estimated from the record.
+The plan of a session predicts the slope, and its file states it (``predicted_peak_tip_slope_rad``).
+If the file does not state it, it is computed from the measured angle with the beam and damping that
+were estimated from the record.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _KEY: Final = "predicted_peak_tip_slope_rad"
 
 
 def stated_validity(metadata: Mapping[str, str]) -> Validity:
-    """Return the validity that a file states; unknown if it states none.
+    """Return the stated validity of a file; unknown if it states none.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def record_validity(
     rate_hz: float,
     *models: tuple[Beam, Damping],
 ) -> Validity:
-    """Return the validity of a record: as its file states it, else from the measured angle.
+    """Return the validity of a record: the stated one, else from the measured angle.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def record_validity(
 
 
 def worst(validities: Iterable[Validity]) -> Validity:
-    """Return the validity of several records together: unknown if that of one is.
+    """Return the joint validity of several records: unknown if one is unknown.
 
     Parameters
     ----------

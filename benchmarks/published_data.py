@@ -20,7 +20,7 @@ import numpy as np
 from analysis.identify import Measurement
 from analysis.identify._comparison import Comparison
 from analysis.identify._modal_fit import fit_modes
-from analysis.identify._noise import Noise
+from analysis.identify._noise import NoiseSpectrum
 from rigd.beam import Beam
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ def fit_record(
     comparison = Comparison.of(measurement, band_hz)
     torque = comparison.spectrum(comparison.torque_nm[comparison.kept])
     power = np.full(torque.size, np.mean(np.abs(torque) ** 2))
-    white = Noise(power, np.ones(torque.size, dtype=bool), ())
+    white = NoiseSpectrum(power, np.ones(torque.size, dtype=bool), ())
     starts = [(number, hz, 0.005) for number, hz in enumerate(starts_hz, start=1)]
     found = fit_modes(comparison, white, starts)
     if found is None:

@@ -42,8 +42,8 @@ from ._predictor import Prediction as Prediction
 from ._predictor import ResponseGrid as ResponseGrid
 from ._problem import Objective as Objective
 from ._profile_likelihood import WIDEST_SHARE as WIDEST_SHARE
+from ._profile_likelihood import LikelihoodProfile as LikelihoodProfile
 from ._profile_likelihood import Order as Order
-from ._profile_likelihood import Profile as Profile
 from ._residual_tests import Harmonic as Harmonic
 from ._residual_tests import InputRelation as InputRelation
 from ._residual_tests import Whiteness as Whiteness
@@ -73,7 +73,7 @@ from ._uniform_beam import tolerant_estimate as tolerant_estimate
 from ._uniform_beam import uniform_beam_test as uniform_beam_test
 from ._verdict import EVEN as EVEN
 from ._verdict import STRONG as STRONG
+from ._verdict import CandidateRow as CandidateRow
 from ._verdict import OrderVerdict as OrderVerdict
-from ._verdict import Row as Row
 from ._verdict import Verdict as Verdict
 from ._verdict import too_few_modes as too_few_modes

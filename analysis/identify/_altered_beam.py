@@ -6,11 +6,11 @@ Relative to the stiffness of the beam, mode k then solves ``D(s) = 0``::
     D = c K + (1 + j eta) C + rho/EI s² M + gamma s^lambda I + rho/EI g T,    c = 1 + zeta s^alpha
 
 with numbers K (stiffness), C (of the clamp), M (mass), I (medium) and T (tension by gravity) that
-its shape gives, and the residue of the torque has its arms about the motor axis beside them. Of the
-plain beam they are ``K = k⁴``, ``M = I = 1``, ``C = T = 0``. What damping changes in a shape is of
-the order of it times the alteration: it moves poles by the square, and the arms to first order.
+its shape gives, and the residue of the torque includes its arms about the motor axis. The plain
+beam has ``K = k⁴``, ``M = I = 1``, ``C = T = 0``. The effect of damping on a shape is of the order
+of the damping times the alteration: it moves poles by the square, and the arms to first order.
 
-What bends easier at one place has its part in the flexibility, not in the stiffness: the moment
+A local compliance adds to the flexibility, not to the stiffness: the moment
 along a clamped-free beam follows from its loads alone, so few modes suffice there.
 """
 
@@ -50,7 +50,7 @@ Profile = Literal["taper", "outer half", "wave"]
 
 @dataclass(frozen=True, slots=True)
 class Alteration:
-    """What a rig has beside a plain uniform beam on a rigid clamp.
+    """Deviations of a rig from a plain uniform beam on a rigid clamp.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Alteration:
 
     @classmethod
     def stated(cls, nominal: Plant, tilt_deg: float | None = None) -> Alteration:
-        """Take what the file states: the mass at the tip and the inclination.
+        """Return the alterations that the file states: the mass at the tip and the inclination.
 
         Parameters
         ----------
@@ -101,13 +101,13 @@ class Alteration:
         )
 
     def same_shapes(self, other: Alteration) -> bool:
-        """Whether another alteration changes the shapes in the same way."""
+        """Return whether another alteration changes the mode shapes in the same way."""
         return self == replace(
             other, relaxation=self.relaxation, sensor=self.sensor, lag_s=self.lag_s
         )
 
     def channel(self, s: NDArray[np.complex128]) -> NDArray[np.complex128] | float:
-        """Return what the lags in the torque's channel make of a torque."""
+        """Return the factor by which the lags of the torque channel multiply a torque."""
         time_s, over_quality = self.sensor
         through: NDArray[np.complex128] | float = 1.0
         if time_s:
@@ -118,7 +118,7 @@ class Alteration:
 
 @dataclass(frozen=True, slots=True)
 class ModeTerms:
-    """Numbers of some modes of an altered beam, each of shape (n,); see the module.
+    """Galerkin coefficients of some modes of an altered beam, each of shape (n,); see the module.
 
     Attributes
     ----------
@@ -129,8 +129,8 @@ class ModeTerms:
     mass_arm, lump_arm, medium_arm, tension_arm : ndarray, shape (n,)
         About the motor's axis, over the length; complex where the clamp has a loss.
     turn_by_medium, turn_by_internal : ndarray, shape (n,)
-        What ``gamma s^lambda`` and ``zeta s^alpha`` add to the arm of the mass, by their change of
-        the shape.
+        Contributions of ``gamma s^lambda`` and ``zeta s^alpha`` to the arm of the mass, by their
+        change of the shape.
     density_kg_per_m : float or None
     alteration : Alteration
     """
@@ -152,7 +152,7 @@ class ModeTerms:
 
 @dataclass(frozen=True, slots=True)
 class _Basis:
-    """First modes of the uniform beam at nodes of a quadrature over it, and integrals of them."""
+    """First modes of the uniform beam at the nodes of a quadrature, and their integrals."""
 
     z: NDArray[np.float64]
     x: NDArray[np.float64]
@@ -167,12 +167,12 @@ class _Basis:
     def weighted(
         self, rows: NDArray[np.float64], profile: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Integrals of products of rows, weighted by a profile, shape (N, N)."""
+        """Return integrals of products of rows, weighted by a profile, shape (N, N)."""
         found: NDArray[np.float64] = (rows * (self.weights * profile)) @ rows.T
         return found
 
     def deviation(self, parts: Sequence[tuple[Profile, float]]) -> NDArray[np.float64]:
-        """Relative deviation at the nodes."""
+        """Return the relative deviation at the nodes."""
         total = np.zeros(self.x.size)
         for profile, size in parts:
             total += size * _PROFILES[profile](self.x)
@@ -187,19 +187,19 @@ _PROFILES: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[np.float6
 
 
 def _at(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shapes of the basis at some places, (N, …)."""
+    """Return the basis shapes at positions along the beam, (N, …)."""
     return np.array([mode_shape(number, x) for number in range(1, _BASIS + 1)])
 
 
 @lru_cache(maxsize=32)
 def _at_lump(position: float) -> NDArray[np.float64]:
-    """Shapes of the basis at one place, (N,); not to be written to."""
+    """Return the basis shapes at one position, (N,); the array is read-only."""
     return _at(np.array(position))
 
 
 @lru_cache(maxsize=1)
 def _basis() -> _Basis:
-    """Compute the basis, once."""
+    """Return the basis; it is computed once."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES_OF_HALF)
     x = np.concatenate([0.25 * (nodes + 1), 0.25 * (nodes + 3)])
     weights = np.tile(weights / 4, 2)
@@ -222,17 +222,9 @@ def _basis() -> _Basis:
 
 @lru_cache(maxsize=16)
 def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> ModeTerms:
-    """Compute the numbers of some modes.
-
-    Parameters
-    ----------
-    alteration : Alteration
-    beam : Beam
-        Uniform one that is altered.
-    modes : tuple of int
-    """
+    """Return the Galerkin coefficients of some modes of a beam that is altered."""
     basis = _basis()
-    length, places = beam.length_m, np.array(modes) - 1
+    length, indices = beam.length_m, np.array(modes) - 1
     count = len(alteration.lumps)
 
     def padded(array: NDArray[np.float64], value: float = 0.0) -> NDArray[np.float64]:
@@ -249,17 +241,20 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     mass_arm = padded(basis.arms + basis.shapes @ (basis.weights * heavier * basis.x))
     lump, lump_arm = np.zeros_like(mass), np.zeros_like(mass_arm)
     tension, tension_arm = padded(basis.tension), padded(basis.arms_of_tension)
-    for place, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS):
-        share, shape = mass_kg / (beam.density_kg_per_m * length), padded(_at_lump(position).copy())
+    for index, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS):
+        fraction, shape = (
+            mass_kg / (beam.density_kg_per_m * length),
+            padded(_at_lump(position).copy()),
+        )
         # All modes beyond the basis give way to a lump as one spring, and move as one mode.
         beyond = position**3 / 3 - float(np.sum((shape[:_BASIS] / basis.z**2) ** 2))
-        shape[place] = math.sqrt(max(beyond, 0.0)) * _NEXT**2
-        lump += share * np.outer(shape, shape)
-        lump_arm += share * position * shape
+        shape[index] = math.sqrt(max(beyond, 0.0)) * _NEXT**2
+        lump += fraction * np.outer(shape, shape)
+        lump_arm += fraction * position * shape
         if alteration.gravity_m_s2:
-            inside = np.where(basis.x < position, share, 0.0)
+            inside = np.where(basis.x < position, fraction, 0.0)
             tension = tension + padded(basis.weighted(basis.slopes, inside))
-            tension_arm = tension_arm + share * shape
+            tension_arm = tension_arm + fraction * shape
     # Flexibility to loads of the basis' shapes: of the beam, of the clamp
     moments = basis.curvatures / basis.z[:, None] ** 4
     softer = 1 / (1 + basis.deviation(alteration.stiffness))
@@ -273,7 +268,7 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     inverse, vectors = np.linalg.eigh(lower @ (mass + lump) @ lower.T)
     inverse, vectors = inverse[::-1], vectors[:, ::-1]
     every = lower.T @ vectors / np.sqrt(inverse)  # of modal mass 1
-    shapes: Terms = every[:, places]
+    shapes: Terms = every[:, indices]
     if alteration.clamp_loss:
         turns = turns / (1 + 1j * alteration.clamp_loss)
         elastic = np.linalg.inv(bends + turns)
@@ -281,11 +276,11 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     loads = elastic @ shapes
     size = np.sum(shapes * shapes, axis=0)
     # What the losses change in the shapes, to first order, turns the residues a little.
-    apart = 1 / inverse[places] - 1 / inverse[:, None]
-    apart[places, np.arange(places.size)] = np.inf
+    separation = 1 / inverse[indices] - 1 / inverse[:, None]
+    separation[indices, np.arange(indices.size)] = np.inf
     arms = (mass_arm + lump_arm) @ every
-    medium = arms @ ((every.T @ shapes) / apart)
-    internal = arms @ (((elastic @ every).T @ bends @ loads) / apart)
+    medium = arms @ ((every.T @ shapes) / separation)
+    internal = arms @ (((elastic @ every).T @ bends @ loads) / separation)
 
     def of_shapes(matrix: NDArray[np.float64]) -> Terms:
         found: Terms = np.sum(shapes * (matrix @ shapes), axis=0) / size
@@ -313,7 +308,7 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
 def _complex_shapes(
     elastic: Terms, mass: NDArray[np.float64], shapes: Terms
 ) -> NDArray[np.complex128]:
-    """Shapes with a lossy clamp, (N, n), by inverse iteration from those without the loss."""
+    """Return the shapes with a lossy clamp, (N, n), by inverse iteration from the lossless ones."""
     found = shapes.astype(np.complex128)
     for mode in found.T:
         for _ in range(_ITERATIONS):

@@ -17,14 +17,14 @@ FAR_BEHIND: Final = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One structure on a uniform beam, fitted.
+    """Fit of one structure on a uniform beam.
 
     Attributes
     ----------
     structure : Structure
     fit : RecordFit
     columns : int
-        Parameters of what is not linear, in addition to those of the fit.
+        Number of nonlinear terms, in addition to the parameters of the fit.
     """
 
     structure: Structure
@@ -33,32 +33,35 @@ class Candidate:
 
     @property
     def parameters(self) -> int:
-        """Number of free parameters; the free decay's amplitudes, common to all, do not count."""
+        """Return the number of free parameters, without the amplitudes of the free decay.
+
+        These amplitudes are common to all candidates.
+        """
         return len(self.fit.interval) + self.columns
 
     @property
     def values(self) -> int:
-        """Number of real values compared."""
+        """Return the number of real values compared."""
         fit = self.fit
         decays = fit.ringing.degrees_of_freedom
         return fit.degrees_of_freedom + len(fit.interval) + decays + self.columns
 
     @property
     def deviance(self) -> float:
-        """``-2 ln`` likelihood but for a constant: noise of known shape and free level."""
+        """Return ``-2 ln`` likelihood up to a constant, for noise of known shape and free level."""
         return self.values * math.log(self.fit.cost / self.values)
 
     @property
     def bic(self) -> float:
-        """Schwarz, Annals of Statistics 6 (1978) 461-464."""
+        """Return the BIC (Schwarz, Annals of Statistics 6 (1978) 461-464)."""
         return self.deviance + self.parameters * math.log(self.values)
 
     @property
     def aic(self) -> float:
-        """Akaike, IEEE Trans. Automatic Control 19 (1974) 716-723."""
+        """Return Akaike's criterion (IEEE Trans. Automatic Control 19 (1974) 716-723)."""
         return self.deviance + 2 * self.parameters
 
     @property
     def name(self) -> str:
-        """As tables call it."""
+        """Return the name that tables show."""
         return self.structure.name

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from analysis.identify._data import Measurement
     from analysis.identify._drag import DragEstimate
     from analysis.identify._finding import Finding
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._result import RecordAnalysis, RecordFit
     from analysis.models import Structure
@@ -42,7 +42,7 @@ _DISMISSED: Final = 10.0
 again."""
 
 _SHOWS: Final = 4.0
-"""Deviance that a damping must save to stay in the freest structure: one that saves less moves no
+"""Deviance reduction that a damping needs to stay in the freest structure: with less it moves no
 other parameter by more than two standard deviations, and only makes them uncertain."""
 
 _CERTAIN: Final = 5.0
@@ -61,27 +61,27 @@ _NEARLY: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class CandidateSet:
-    """All candidates on one record, and what it takes to fit again.
+    """All candidates on one record, with the data that another fit needs.
 
     Attributes
     ----------
     comparison : Comparison
     noise : Noise
-        The one under which all were fitted.
+        Noise under which all of them were fitted.
     free : tuple of str
         Settings that are free.
     candidates : tuple of Candidate
         The lowest BIC first.
     columns : ndarray of complex, shape (c, K)
-        What all were allowed beside the linear beam.
+        Spectra that all of them include in addition to the linear beam.
     drag : DragEstimate, optional
-        Drag of the air, if the record calls for it; it is then in all candidates.
+        Air drag, if the record shows it; all candidates then include it.
     misread : tuple of Finding
-        A wrong sign or unit, which makes every number wrong; empty where there is none.
+        Findings of a wrong sign or unit, which invalidates every number; usually empty.
     """
 
     comparison: Comparison
-    noise: Noise
+    noise: NoiseSpectrum
     free: tuple[Setting, ...]
     candidates: tuple[Candidate, ...]
     columns: NDArray[np.complex128]
@@ -95,7 +95,7 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet:
-        """Fit every structure on a uniform beam; the freest alone where a sign or a unit is wrong.
+        """Fit every structure on a uniform beam; only the freest one if a sign or unit is wrong.
 
         Raises
         ------
@@ -105,8 +105,8 @@ class CandidateSet:
         if misread := tuple(wrong_scale(Comparison.of(measurement, band_hz))):
             # No beam explains such a record: one structure shows what remains as well as all.
             return replace(cls.of_freest(measurement, fixed, band_hz), misread=misread)
-        field = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
-        return field._without_leakage()
+        candidate_set = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
+        return candidate_set._without_leakage()
 
     @classmethod
     def from_earlier(
@@ -116,7 +116,7 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet | None:
-        """Fit what was fitted to an earlier part of the record, each from where it was.
+        """Fit the candidates of an earlier part of the record again, each from its last estimate.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ class CandidateSet:
         Returns
         -------
         CandidateSet or None
-            None if the first leaves more than noise now: a search has to find out why.
+            None if the residual of the first exceeds the noise: then a search is needed.
 
         Raises
         ------
@@ -143,11 +143,15 @@ class CandidateSet:
         found = refit_record(measurement, unknowns, first.fit.plant, band_hz=band_hz)
         if found is None:
             return None
-        field = cls._fitted(found, fixed, (replace(first, fit=found.fits[0]),))
-        before = replace(field, candidates=tuple(earlier))
-        every = (before._brought_to(field, c, MANY) for c in others)
-        field = field.ranked((*field.candidates, *every))._without_leakage().cross_checked()
-        return field._renewed()
+        candidate_set = cls._fitted(found, fixed, (replace(first, fit=found.fits[0]),))
+        before = replace(candidate_set, candidates=tuple(earlier))
+        every = (before._refitted(candidate_set, c, MANY) for c in others)
+        candidate_set = (
+            candidate_set.ranked((*candidate_set.candidates, *every))
+            ._without_leakage()
+            .cross_checked()
+        )
+        return candidate_set._renewed()
 
     @classmethod
     def of_freest(
@@ -155,30 +159,30 @@ class CandidateSet:
         measurement: Measurement,
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
-        beside: tuple[Structure, ...] = (),
+        additional: tuple[Structure, ...] = (),
     ) -> CandidateSet:
-        """Fit the structure with every order free, on a uniform beam, and few others beside it.
+        """Fit the structure with every order free, and some additional ones, on a uniform beam.
 
         Raises
         ------
         MeasurementError
             The record cannot be used.
         """
-        structures = (_FREEST, *beside)
+        structures = (_FREEST, *additional)
         return cls._uniform(
             fit_record(measurement, structures, fixed=fixed, band_hz=band_hz), fixed
         )
 
     @classmethod
     def _uniform(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> CandidateSet:
-        """Take over what was fitted with a uniform beam."""
+        """Return the candidates of fits to a uniform beam."""
         return cls._fitted(uniform, fixed, (Candidate(fit.structure, fit) for fit in uniform.fits))
 
     @classmethod
     def _fitted(
         cls, analysis: RecordAnalysis, fixed: tuple[Setting, ...], candidates: Iterable[Candidate]
     ) -> CandidateSet:
-        """Take over what was fitted, as candidates."""
+        """Return a set with given fits as its candidates."""
         comparison = analysis.comparison
         return cls(
             comparison=comparison,
@@ -190,16 +194,16 @@ class CandidateSet:
 
     @property
     def best(self) -> Candidate:
-        """The first: the lowest BIC, unless the field is led by another (`led_by`)."""
+        """Return the first candidate: the lowest BIC, unless `led_by` put another first."""
         return self.candidates[0]
 
     @property
     def freest(self) -> Candidate:
-        """The freest structure that the record supports; a damping that does not show is left out.
+        """Return the freest structure that the record supports, without insignificant dampings.
 
-        All orders are free, so its intervals hold whichever simpler structure is the true one;
-        those of the lowest BIC hold only if that is. The best where no structure was fitted with
-        its orders free.
+        All orders are free, so its intervals are valid whichever simpler structure is the true one.
+        The intervals of the lowest BIC are valid only if that structure is true. If no structure
+        was fitted with free orders, this is the best one.
         """
         alike = {c.structure.name: c for c in self.candidates}
         freest = alike.get(_FREEST.name)
@@ -210,32 +214,32 @@ class CandidateSet:
         return least if least.deviance - freest.deviance < _SHOWS else freest
 
     def led_by(self, candidate: Candidate) -> CandidateSet:
-        """Put one candidate first: the one whose numbers are told."""
+        """Return the set with one candidate first: the one whose numbers are reported."""
         others = (c for c in self.candidates if c is not candidate)
         return replace(self, candidates=(candidate, *others))
 
     @property
     def likeliest(self) -> RecordFit:
-        """The lowest sum of squares, however many parameters it took."""
+        """Return the candidate with the lowest sum of squares, whatever its parameters."""
         return min((candidate.fit for candidate in self.candidates), key=lambda fit: fit.cost)
 
     @property
     def bic(self) -> float:
-        """The lowest, comparable between fields whose noise has been estimated again."""
+        """Return the lowest BIC; it is comparable between sets with different noise."""
         return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
 
     def unknowns(self, structure: Structure) -> Unknowns:
-        """Search space of a structure on this record."""
+        """Return the search space of a structure on this record."""
         return Unknowns.of(structure, self.comparison.measurement.nominal, self.free)
 
     def refit(self, candidate: Candidate, max_evaluations: int = MANY) -> Refit:
-        """Descend from where a candidate is."""
+        """Descend from the estimate of a candidate."""
         return self.descent_from(candidate.fit.plant, candidate.structure, max_evaluations)
 
     def descent_from(
         self, plant: Plant, structure: Structure, max_evaluations: int = MANY
     ) -> Refit:
-        """Descend from a plant, with a structure."""
+        """Descend from a plant with a structure."""
         unknowns = self.unknowns(structure)
         return self.descent(unknowns, unknowns.vector(plant), max_evaluations)
 
@@ -253,63 +257,64 @@ class CandidateSet:
         )
 
     def _renewed(self) -> CandidateSet:
-        """Tell anew, with the best beam, what followed the reference; `self` if that is settled."""
-        field = self
+        """Re-estimate the angle that follows the reference; `self` after convergence."""
+        candidate_set = self
         for _ in range(RENEWALS):
-            best = field.best
-            comparison = field.comparison.renewed(best.fit.plant, field.noise)
-            if comparison is field.comparison:
+            best = candidate_set.best
+            comparison = candidate_set.comparison.renewed(best.fit.plant, candidate_set.noise)
+            if comparison is candidate_set.comparison:
                 break
-            alone = replace(field, comparison=comparison, candidates=(best,))
+            alone = replace(candidate_set, comparison=comparison, candidates=(best,))
             noise = alone.refit(best, FEW).noise_here()
             alone = replace(alone, noise=noise)
-            field = replace(alone, candidates=(alone.refit(best, FEW).candidate(),))
-        if field is self:
+            candidate_set = replace(alone, candidates=(alone.refit(best, FEW).candidate(),))
+        if candidate_set is self:
             return self
         # The others from where they were: they have seen their best's noise only.
         others = (c for c in self.candidates if c is not self.best)
-        every = (self._brought_to(field, c, MANY) for c in others)
-        return field.ranked((*field.candidates, *every)).cross_checked()
+        every = (self._refitted(candidate_set, c, MANY) for c in others)
+        return candidate_set.ranked((*candidate_set.candidates, *every)).cross_checked()
 
     def _without_leakage(self) -> CandidateSet:
-        """Leave out the bins that a disturbance beyond the band leaks into."""
+        """Exclude the bins that a disturbance beyond the band leaks into."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
         return self.under(noise) if noise is not self.noise else self
 
-    def under(self, noise: Noise) -> CandidateSet:
-        """Fit again under a noise that differs a little."""
+    def under(self, noise: NoiseSpectrum) -> CandidateSet:
+        """Fit again under a slightly different noise spectrum."""
         other = replace(self, noise=noise)
-        return other.ranked(self._brought_to(other, c, FEW) for c in self.candidates)
+        return other.ranked(self._refitted(other, c, FEW) for c in self.candidates)
 
-    def _brought_to(self, other: CandidateSet, c: Candidate, max_evaluations: int) -> Candidate:
-        """Fit a candidate in a set that differs a little; roughly where it is far behind."""
+    def _refitted(self, other: CandidateSet, c: Candidate, max_evaluations: int) -> Candidate:
+        """Fit a candidate in a slightly different set; only roughly if its BIC is far higher."""
         behind = c.bic - min(each.bic for each in self.candidates)
         return other.refit(c, max_evaluations if behind < FAR_BEHIND else _A_STEP).candidate()
 
     def cross_checked(self) -> CandidateSet:
-        """Start each from where the best is: over a flat valley a search may miss what is there."""
-        field = self
+        """Start each candidate from the best one: a search may miss a flat minimum."""
+        candidate_set = self
         for _ in range(_CROSS_CHECKS):
-            best = field.best
-            field = field.ranked(
-                c if c is best else field._from_plant(c, best.fit.plant) for c in field.candidates
+            best = candidate_set.best
+            candidate_set = candidate_set.ranked(
+                c if c is best else candidate_set._from_plant(c, best.fit.plant)
+                for c in candidate_set.candidates
             )
-            if field.best is best:
+            if candidate_set.best is best:
                 break
-        return field
+        return candidate_set
 
-    def tried_from(self, plant: Plant) -> CandidateSet:
-        """Start each from a plant that a search has found."""
+    def restarted_from(self, plant: Plant) -> CandidateSet:
+        """Start each candidate from a plant that another search found."""
         return self.ranked(self._from_plant(c, plant) for c in self.candidates).cross_checked()
 
     def _from_plant(self, candidate: Candidate, plant: Plant) -> Candidate:
-        """Fit a candidate from another's plant, where that has no other kind of damping."""
+        """Fit a candidate from the plant of another, unless that has other dampings."""
         structure, damping = candidate.structure, plant.damping
         if (damping.zeta and not structure.internal) or (damping.gamma and not structure.external):
             return candidate
         outlook = self.descent_from(plant, structure, 1)
         least = candidate.fit.cost * (1 - MISSED)
-        if outlook.promised_cost > least:
+        if outlook.predicted_cost > least:
             return candidate
         first = outlook.further(FEW)
         if first.cost > candidate.fit.cost * (1 + _NEARLY):
@@ -318,35 +323,35 @@ class CandidateSet:
         return candidate if found.cost > least else found.candidate()
 
     def with_special_cases(self) -> CandidateSet:
-        """Fit special cases of the freest structure from where that is, if they may be better.
+        """Fit special cases of the freest structure from its estimate, if they may be better.
 
-        An internal damping whose order is near 2 is an inertia, with a minimum of its own, which
-        the search for the freest may take for the lowest: from an order of 1 there is none. A
-        damping that does not show is left out, as of the freest of all structures (`freest`).
+        An internal damping whose order is near 2 is an inertia. It has a minimum of its own, and
+        the search for the freest structure may take it for the lowest; from an order of 1 this
+        minimum does not exist. An insignificant damping is left out, as in `freest`.
         """
         fit = next(each.fit for each in self.candidates if each.structure is _FREEST)
         low, high = fit.interval["alpha"] or (math.inf, -math.inf)
         doubtful = [_INTEGER] if not low <= 1 <= high else []
         doubtful += _may_lack_one(fit)
         found = (self.descent_from(fit.plant, structure).candidate() for structure in doubtful)
-        field = self.ranked((*self.candidates, *found)).cross_checked()
-        return field.led_by(field.freest)
+        candidate_set = self.ranked((*self.candidates, *found)).cross_checked()
+        return candidate_set.led_by(candidate_set.freest)
 
     def with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
-        """Fit a candidate with the damping that it lacks, so that its modes count that as unknown.
+        """Fit a candidate with the damping that it lacks, for the uncertainty of its modes.
 
-        A damping that does not show may be there, and a mode's damping ratio is that of both: where
-        the mode was excited for no longer than it rings, this is most of its uncertainty. So the
-        other damping is estimated beside, with order 1. One whose order rests on the edge of its
-        range is an inertia or a stiffness, and counts as absent, too.
+        An insignificant damping may still exist, and the damping ratio of a mode is the sum of
+        both. If the mode was excited for less time than it rings, this dominates its uncertainty.
+        So the other damping is estimated as well, with order 1. A damping whose order is at the
+        edge of its range is an inertia or a stiffness, and counts as absent, too.
 
         Returns
         -------
         fit : RecordFit
-            The candidate's own if it lacks none.
+            The fit of the candidate itself if it lacks none.
         bounded : bool
-            Whether the other damping would have to be negative: it is one standard deviation of it
-            then, and the fit no minimum.
+            Whether the other damping would have to be negative. It is then one standard
+            deviation, and the fit is not a minimum.
         """
         structure, own = candidate.structure, candidate.fit
         absent = [
@@ -362,23 +367,23 @@ class CandidateSet:
         free = tuple(name for name in PARAMETERS if name not in fixed)
         both = replace(structure, free=free, fixed=fixed)
         unknowns = self.unknowns(both)
-        place = unknowns.names.index(coefficient)
+        index = unknowns.names.index(coefficient)
         little = self.descent(unknowns, unknowns.vector(own.plant), 1)
-        growth = 1 + float(little.promised_step[place])  # linear in the loss, not in its logarithm
+        growth = 1 + float(little.predicted_step[index])  # linear in the loss, not in its logarithm
         if growth > 1:
             start = little.x.copy()
-            start[place] += math.log(growth)
+            start[index] += math.log(growth)
             found = self.descent(unknowns, start, MANY)
-            if found.x[place] > little.x[place]:
+            if found.x[index] > little.x[index]:
                 return found.fit(), False
         scaled, scale = little.equations.scaled_hessian()
-        spread = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))[place, place] ** 0.5
+        spread = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))[index, index] ** 0.5
         x = little.x.copy()
-        x[place] += max(math.log(spread / scale[place]), 0.0)
+        x[index] += max(math.log(spread / scale[index]), 0.0)
         return self.descent(unknowns, x, 1).fit(), True
 
     def with_orders_free(self) -> CandidateSet:
-        """Free the orders too, if that was not done."""
+        """Fit the structures with free orders, unless they have been fitted."""
         best = self.best
         alike = {c.structure.name: c.fit for c in self.candidates}
         found: list[Refit] = []
@@ -401,32 +406,32 @@ class CandidateSet:
         return freed.under(min(found, key=lambda refit: refit.cost).noise_here())
 
     def with_effect(self, columns: NDArray[np.complex128]) -> CandidateSet:
-        """Fit all with spectra of unknown size, under the noise that the best then leaves."""
+        """Fit all with spectra of unknown size, under the noise estimated from the new residual."""
         every = np.concatenate([self.columns, columns])
         best = replace(self, columns=every).refit(self.best)
         return self.with_columns(every, best.noise_here())
 
-    def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> CandidateSet:
-        """Fit all again, with what is not linear in addition to the beam."""
+    def with_columns(self, columns: NDArray[np.complex128], noise: NoiseSpectrum) -> CandidateSet:
+        """Fit all again with columns of nonlinear effects in addition to the beam."""
         other = replace(self, columns=columns, noise=noise)
         return other.ranked(other.refit(c).candidate() for c in self.candidates).cross_checked()
 
     def ranked(self, candidates: Iterable[Candidate]) -> CandidateSet:
-        """Hold these candidates, the lowest BIC first."""
+        """Return the set with these candidates, the lowest BIC first."""
         return replace(self, candidates=_ranked(candidates))
 
     def all_but_white(self, fit: RecordFit) -> bool:
-        """Whether chance may have shaped what a fit leaves, once in a hundred records at least."""
+        """Return whether chance exceeds the residual of a fit in one record of 100."""
         counts = self.noise.counts
         return whiteness(fit.residual[counts], self.comparison.frequency_hz[counts]).all_but_white
 
 
 def _may_lack_one(fit: RecordFit) -> list[Structure]:
-    """Structures without one of the dampings, where a fit does not show it beyond doubt."""
-    beside = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
+    """Return the structures without one of the dampings that is not clearly significant."""
+    additional = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
     return [
         structure
-        for structure, other in beside
+        for structure, other in additional
         if other is None or other.value < _CERTAIN * other.std
     ]
 

@@ -25,7 +25,7 @@ RELAXATION: Final = "relaxation"
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """A kind of cause, with one or two unknowns of its own.
+    """Physical cause of deviating modes, with one or two unknowns of its own.
 
     Attributes
     ----------
@@ -33,15 +33,15 @@ class Cause:
     starts : sequence of tuple of float
         Unknowns from which searches begin.
     lower, upper : tuple of float
-        What is plausible; nothing that rests on an outer bound counts.
+        Plausible range; a result at an outer bound is discarded.
     altered : callable
-        Alteration by unknowns, from what is stated and the beam.
+        Function of the stated alteration, the unknowns and the beam that returns an alteration.
     described : callable
-        Size, unit and words, from unknowns and the beam found.
+        Function of the unknowns and the fitted beam that returns size, unit and words.
     plant : callable, optional
-        Rig with it, from unknowns and the rig with the beam found.
+        Function of the unknowns and the fitted plant that returns the plant with this cause.
     special : tuple of str
-        Names of causes that are special cases of this one.
+        Names of causes that this one includes as special cases.
     """
 
     name: str
@@ -64,8 +64,8 @@ def _tilt(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
     return own[0], "deg", words
 
 
-def _mass_kg(share: float, beam: Beam) -> float:
-    return share * beam.density_kg_per_m * beam.length_m
+def _mass_kg(fraction: float, beam: Beam) -> float:
+    return fraction * beam.density_kg_per_m * beam.length_m
 
 
 def _with_tip_mass(stated: Alteration, own: Sequence[float], beam: Beam) -> Alteration:
@@ -116,13 +116,13 @@ def _second_corner(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
 
 
 def _with_filter(own: Sequence[float], plant: Plant) -> Plant | None:
-    """Rig with a filter of first order; None if the file states another, for it has one."""
+    """Return the plant with a first-order filter; None if the file already states a filter."""
     stated = plant.filter_time_constant_s
     return None if stated else replace(plant, filter_time_constant_s=1e-3 * own[0])
 
 
 def _with_second_filter(own: Sequence[float], plant: Plant) -> Plant | None:
-    """Rig with a filter of second order; None if the file states another, for it has one."""
+    """Return the plant with a second-order filter; None if the file already states a filter."""
     stated = plant.second_order_filter_time_constant_s
     return None if stated else replace(plant, second_order_filter_time_constant_s=1e-3 * own[0])
 
@@ -146,7 +146,7 @@ def _relaxation(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
 
 
 def _digits(value: float) -> str:
-    """Two digits: no interval is known."""
+    """Round to two digits: the interval is not known."""
     return f"{value:.2g}" if abs(value) < 100 else f"{float(f'{value:.2g}'):.0f}"
 
 
@@ -176,7 +176,7 @@ CAUSES: Final = (
         lambda own, plant: replace(plant, tip_mass_kg=_mass_kg(own[0], plant.beam)),
     ),
     Cause(
-        "lump", tuple((0.05 * place, 0.01) for place in range(3, 20, 2)),
+        "lump", tuple((0.05 * index, 0.01) for index in range(3, 20, 2)),
         (0.02, 0.0), (0.99, 0.5), _with_lump, _lump, special=("tip mass",),
     ),
     _uneven_mass("taper", "a mass per length that changes by {} from root to tip"),

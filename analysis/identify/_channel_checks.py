@@ -1,7 +1,8 @@
 """Checks of the recorded channels: clipping, stopped motor, wrong sign or unit, sensor drift.
 
-Sign and unit are judged by the median, over the band, of torque over angle against the beam that
-the file states; it depends neither on where the modes are exactly, nor on how they are damped.
+Sign and unit are checked by the ratio of torque and angle to the response of the beam that the
+file states, as a median over the band. The median depends neither on the exact mode frequencies
+nor on the damping.
 """
 
 from __future__ import annotations
@@ -26,21 +27,21 @@ if TYPE_CHECKING:
 # Clipping and stops
 
 _FEWEST_FLAT: Final = 4
-"""Known values next to another at the very extreme: noise does not repeat its largest."""
+"""Number of adjacent values at the extreme: noise does not repeat its largest value."""
 
 _STILL_S: Final = 0.5
 _STILL: Final = 0.02
-"""Least stand-still worth a word, and motion then, over what was asked for."""
+"""Shortest standstill that is reported, and the motion during it relative to the reference."""
 
 
 def clipping(measurement: Measurement) -> Iterator[Finding]:
-    """Find a torque that stays at its extreme values."""
+    """Yield a finding if the torque stays at its extreme values."""
     torque, known = measurement.torque_nm, measurement.torque_known
     flat = []
     for limit in (torque[known].max(), torque[known].min()):
         at = known & (torque == limit)
-        beside = at & (np.roll(at, 1) | np.roll(at, -1))
-        if limit != 0 and np.count_nonzero(beside) >= _FEWEST_FLAT:
+        repeated = at & (np.roll(at, 1) | np.roll(at, -1))
+        if limit != 0 and np.count_nonzero(repeated) >= _FEWEST_FLAT:
             flat.append((float(limit), int(np.count_nonzero(at))))
     if not flat:
         return
@@ -59,17 +60,17 @@ def clipping(measurement: Measurement) -> Iterator[Finding]:
 
 
 def stops(measurement: Measurement) -> Iterator[Finding]:
-    """Detect a motor at rest although the reference moves."""
-    asked = measurement.reference_rad
-    if asked is None:
+    """Yield a finding if the motor is at rest although the reference moves."""
+    reference_rad = measurement.reference_rad
+    if reference_rad is None:
         return
     length = max(round(_STILL_S * measurement.rate_hz), 2)
-    blocks = asked.size // length
+    blocks = reference_rad.size // length
     if blocks == 0:
         return
     moved, wanted = (
         np.ptp(values[: blocks * length].reshape(blocks, length), axis=1)
-        for values in (measurement.angle_rad, asked)
+        for values in (measurement.angle_rad, reference_rad)
     )
     still = (wanted > np.median(wanted)) & (moved < _STILL * wanted)
     if not still.any():
@@ -90,7 +91,7 @@ def stops(measurement: Measurement) -> Iterator[Finding]:
 # Sign and unit
 
 _LOSS_S: Final = 1e-4
-"""Internal damping of order 1, in s: of some per cent, for want of a better."""
+"""Assumed internal damping of order 1, in s: some per cent."""
 
 _DRIVEN: Final = 1e-3
 """Power of the angle over its largest from which a frequency counts."""
@@ -116,16 +117,16 @@ _BEYOND: Final = math.log(5.0)
 
 
 def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
-    """Find a reversed sign, or a factor between units, in torque over angle."""
+    """Yield a finding if torque over angle has the wrong sign or a wrong unit."""
     angle = comparison.spectrum(comparison.angle_rad[comparison.kept])
     torque = comparison.spectrum(comparison.torque_nm[comparison.kept])
     power = np.abs(angle) ** 2
     driven = power > _DRIVEN * power.max()
     beam = comparison.measurement.nominal.beam
     expected = transfer(2j * np.pi * comparison.frequency_hz[driven], beam, Damping(zeta=_LOSS_S))
-    share = torque[driven] / (angle[driven] * expected)
-    size = np.abs(share)
-    cosine = float(np.median(share.real / np.maximum(size, np.finfo(float).tiny)))
+    torque_ratio = torque[driven] / (angle[driven] * expected)
+    size = np.abs(torque_ratio)
+    cosine = float(np.median(torque_ratio.real / np.maximum(size, np.finfo(float).tiny)))
     if abs(cosine) < _ALIGNED:
         return
     if cosine < 0:
@@ -170,17 +171,17 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
 
 _PARTS: Final = 16
 _BEYOND_CHANCE: Final = 10.0
-"""Scatter of the means over what noise alone makes of them."""
+"""Scatter of the means relative to the scatter that noise alone causes."""
 
 
-def drift_of_zero(field: CandidateSet) -> float:
-    """Range of the means over parts of the record in N·m; 0 if noise alone may make it."""
-    comparison = field.comparison
-    torque, _ = comparison.prediction.torque(field.best.fit.plant)
+def drift_of_zero(candidate_set: CandidateSet) -> float:
+    """Return the range of the means over parts of the record in N·m; 0 if noise explains it."""
+    comparison = candidate_set.comparison
+    torque, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
     left = comparison.torque_nm[comparison.kept] - torque
     length = left.size // _PARTS
     means = left[: _PARTS * length].reshape(_PARTS, length).mean(axis=1)
     # White noise as loud as that of the band's upper half.
-    upper = field.noise.power[field.noise.power.size // 2 :]
+    upper = candidate_set.noise.power[candidate_set.noise.power.size // 2 :]
     chance = math.sqrt(float(np.median(upper)) / comparison.samples / length)
     return float(np.ptp(means)) if float(means.std()) > _BEYOND_CHANCE * chance else 0.0

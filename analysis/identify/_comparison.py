@@ -1,6 +1,6 @@
-"""Comparison of one record in one band with any plant: what of it counts, and what is taken out.
+"""Comparison of one record in one band with any plant: compared samples and removed parts.
 
-What of the motor's angle counts as input is told by `analysis.identify._instrument`.
+`analysis.identify._instrument` selects the part of the motor angle that is used as input.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from analysis.identify._free_decay import (
 )
 from analysis.identify._instrument import following
 from analysis.identify._predictor import Prediction
-from analysis.models import LARGEST_SHARE_OF_RATE
+from analysis.models import LARGEST_FRACTION_OF_RATE
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -34,31 +34,31 @@ if TYPE_CHECKING:
     from analysis.identify._free_decay import Pole
     from analysis.identify._hum import Hum
     from analysis.identify._modal_model import ModalModel
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
 
 _FEWEST_BINS: Final = 50
 _LARGEST_CHANGE: Final = 0.1
-"""Whitened squares that another plant's share of the rest may add before it is taken out anew."""
+"""Whitened squares that a change of the removed torque may add before it is computed again."""
 
 _FEEDBACKS: Final = 3
-"""Times that what rings is predicted from the angle that follows, and the other way round."""
+"""Iterations between the ringing torque and the part of the angle that follows the reference."""
 
 _LARGEST_REST: Final = 0.3
-"""Share of the angle's power that may be apart from the reference. With more it was not this
-reference that the motor followed."""
+"""Largest fraction of the angle's power that may be incoherent with the reference. With more the
+motor followed another reference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One record in one band, ready to be compared with any plant.
+    """Data of one record in one band, to be compared with any plant.
 
     Attributes
     ----------
     measurement : Measurement
         Record at its full rate.
     angle_rad, torque_nm : ndarray, shape (m,)
-        Both channels in the band at the decimated rate; unknown torque filled by what is expected.
+        Both channels in the band at the decimated rate; unknown torque is filled by the prediction.
     decimation : Decimation
     kept : slice
         Samples that are compared.
@@ -67,27 +67,27 @@ class Comparison:
         Bins of the residual's transform that lie in the band.
     frequency_hz : ndarray, shape (K,)
     visible_modes : int
-        Modes of the nominal beam within the band, whose free decay is projected out.
+        Number of modes of the nominal beam in the band; their free decay is projected out.
     decays : DecaySpectra
-        Spectra of what rings at the beginning.
+        Spectra of the free decay at the beginning.
     later_decays : tuple of LaterDecaySpectra
-        Spectra of what rings after each gap of the angle that is too long to be interpolated.
-    apart_nm : ndarray, shape (samples,)
-        Torque that was taken out because it followed no reference, at the samples kept.
-    apart_at_unknown_nm : ndarray, shape (u,)
-        The same at the ticks whose torque is unknown.
+        Spectra of the free decay after each gap of the angle that is too long to interpolate.
+    removed_nm : ndarray, shape (samples,)
+        Torque by impacts and drag that was removed, at the retained samples.
+    removed_at_unknown_nm : ndarray, shape (u,)
+        The same at the ticks with unknown torque.
     hum : tuple of Hum
-        What was taken out besides, as well as it was known; the rest of it is projected out.
-    rest_rad : ndarray, shape (m,), or float
-        Angle that followed no reference, 0 where all of it counts.
-    rest_nm, rest_at_unknown_nm : ndarray or float
-        Torque that was taken out for it, at the samples kept and at the ticks without torque.
+        Hum that was removed, as estimated; its remainder is projected out.
+    incoherent_rad : ndarray, shape (m,), or float
+        Part of the angle that is incoherent with the reference; 0 if all of the angle is used.
+    incoherent_nm, incoherent_at_unknown_nm : ndarray or float
+        Torque that was removed for it, at the retained samples and at the ticks without torque.
     drag : DragExpansion, optional
-        The torque by drag that was taken out, and what it changes by with the beam.
-    struck : ndarray of complex, shape (k, K), or None
-        Spectra of the torque by knocks, of unknown sizes: beside what was taken out.
+        Removed torque by drag, and its derivatives with respect to the beam.
+    impact_spectra : ndarray of complex, shape (k, K), or None
+        Spectra of the torque by impacts, of unknown sizes, in addition to the removed torque.
     last_poles_rad_s : list of complex
-        Where the last plant had its poles: all that explain a record have them close by.
+        Poles of the last plant; other plants that explain the record have similar ones.
     """
 
     measurement: Measurement
@@ -101,21 +101,21 @@ class Comparison:
     visible_modes: int
     decays: DecaySpectra
     later_decays: tuple[LaterDecaySpectra, ...] = ()
-    apart_nm: NDArray[np.float64] | float = 0.0
-    apart_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    removed_nm: NDArray[np.float64] | float = 0.0
+    removed_at_unknown_nm: NDArray[np.float64] | float = 0.0
     hum: tuple[Hum, ...] = ()
-    rest_rad: NDArray[np.float64] | float = 0.0
-    rest_nm: NDArray[np.float64] | float = 0.0
-    rest_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    incoherent_rad: NDArray[np.float64] | float = 0.0
+    incoherent_nm: NDArray[np.float64] | float = 0.0
+    incoherent_at_unknown_nm: NDArray[np.float64] | float = 0.0
     drag: DragExpansion | None = None
-    struck: NDArray[np.complex128] | None = None
+    impact_spectra: NDArray[np.complex128] | None = None
     last_poles_rad_s: list[complex] = field(default_factory=list)
 
     @classmethod
     def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
-        """Bring a measurement into the band.
+        """Return a measurement reduced to a band.
 
-        The mean of the residual is never compared: it is the torque sensor's zero.
+        The mean of the residual is never compared: it is the zero of the torque sensor.
 
         Parameters
         ----------
@@ -130,11 +130,11 @@ class Comparison:
             The record cannot be used, or is too short for the band.
         """
         lowest_hz, highest_hz = band_hz
-        limit_hz = LARGEST_SHARE_OF_RATE * measurement.rate_hz
+        limit_hz = LARGEST_FRACTION_OF_RATE * measurement.rate_hz
         if not 0 <= lowest_hz < highest_hz <= limit_hz:
             raise MeasurementError(
                 f"{measurement.name}: the band {lowest_hz:g}-{highest_hz:g} Hz is empty, negative "
-                f"or beyond {LARGEST_SHARE_OF_RATE:g} of the sampling rate ({limit_hz:g} Hz); "
+                f"or beyond {LARGEST_FRACTION_OF_RATE:g} of the sampling rate ({limit_hz:g} Hz); "
                 "choose another --band."
             )
         measurement.check(highest_hz)
@@ -187,13 +187,13 @@ class Comparison:
             if 0 < first_s < (samples - 1) / decimation.rate_hz
         )
         comparison = replace(comparison, later_decays=later)
-        return comparison._struck() if measurement.knocks else comparison
+        return comparison._without_impacts() if measurement.knocks else comparison
 
-    def _struck(self) -> Comparison:
-        """Take out the knocks as well as they are known; the rest of them is projected out."""
+    def _without_impacts(self) -> Comparison:
+        """Remove the impacts as estimated; their remainder is projected out."""
         rate_hz, knocks = self.decimation.rate_hz, self.measurement.knocks
         grid_s = self.times_s()
-        ticks = self._places(~self.measurement.torque_known)
+        ticks = self._decimated_indices(~self.measurement.torque_known)
         reach_s = self.decimation.reach / rate_hz
         unknown_s = ticks / self.measurement.rate_hz - reach_s
         taken_nm, at_unknown_nm = (
@@ -201,37 +201,39 @@ class Comparison:
             for time_s in (grid_s, unknown_s)
         )
         columns = np.concatenate([each.columns(grid_s, rate_hz) for each in knocks])
-        return replace(self, struck=self.spectrum(columns))._without(taken_nm, at_unknown_nm)
+        return replace(self, impact_spectra=self.spectrum(columns))._without(
+            taken_nm, at_unknown_nm
+        )
 
     def _without(
         self, torque_nm: NDArray[np.float64] | float, at_unknown_nm: NDArray[np.float64] | float
     ) -> Comparison:
-        """Take out torque: at the samples kept, and at the ticks whose torque is unknown."""
+        """Remove torque at the retained samples and at the ticks with unknown torque."""
         left_nm = self.torque_nm.copy()
         left_nm[self.kept] -= torque_nm
         return replace(
             self,
             torque_nm=left_nm,
-            apart_nm=self.apart_nm + torque_nm,
-            apart_at_unknown_nm=self.apart_at_unknown_nm + at_unknown_nm,
+            removed_nm=self.removed_nm + torque_nm,
+            removed_at_unknown_nm=self.removed_at_unknown_nm + at_unknown_nm,
         )
 
     def times_s(self) -> NDArray[np.float64]:
-        """Instants of the samples compared since the record's first tick, shape (samples,)."""
+        """Return the times of the compared samples since the first tick, (samples,)."""
         return self.first_s + np.arange(self.samples) / self.decimation.rate_hz
 
     @property
     def first_s(self) -> float:
-        """Instant of the first of them."""
+        """Return the time of the first compared sample."""
         return float(self.kept.start - self.decimation.reach) / self.decimation.rate_hz
 
     @property
     def samples(self) -> int:
-        """Number of samples compared."""
+        """Return the number of compared samples."""
         return int(self.kept.stop - self.kept.start)
 
     def poles(self, plant: Plant, wrt: Sequence[str] = ()) -> tuple[Pole, ...]:
-        """Poles of a plant whose free decay is projected out, as `mode_poles` gives them.
+        """Return the poles of a plant whose free decay is projected out, as `mode_poles` does.
 
         Parameters
         ----------
@@ -244,19 +246,19 @@ class Comparison:
         return found
 
     def spectrum(self, values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Transform of samples kept, shape (..., samples), in the band: (..., K)."""
+        """Transform retained samples, shape (..., samples), to the band: (..., K)."""
         return np.fft.rfft(values)[..., self.bins]
 
     def in_time(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Turn a spectrum in the band, shape (K,), into the samples kept, shape (samples,)."""
+        """Transform a spectrum in the band, shape (K,), to the retained samples."""
         every = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
         every[self.bins] = spectrum
         return np.fft.irfft(every, self.samples)
 
-    def followed_rad(self) -> NDArray[np.float64]:
-        """Part of the angle that is coherent with the reference, shape (m,).
+    def coherent_rad(self) -> NDArray[np.float64]:
+        """Return the part of the angle that is coherent with the reference, shape (m,).
 
-        All of it without a reference, or with one that does not explain it.
+        This is the whole angle if there is no reference, or if the reference does not explain it.
         """
         if self.measurement.reference_rad is None:
             return self.angle_rad
@@ -271,7 +273,7 @@ class Comparison:
     def _followed(
         self, moved_rad: NDArray[np.float64], torque_nm: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Part of an angle that follows the reference, and a torque if one is given, shape (m,)."""
+        """Return the part of an angle that follows the reference and, optionally, a torque."""
         reference_rad = self.measurement.reference_rad
         assert reference_rad is not None
         # Later samples fall to 0 with the filter's end, behind everything that is compared.
@@ -285,23 +287,25 @@ class Comparison:
 
     @property
     def _recorded(self) -> int:
-        """Decimated samples up to the record's end."""
+        """Return the slice of decimated samples up to the end of the record."""
         return int(self.decimation.inside(self.measurement.angle_rad.size).stop)
 
     def following_reference(self, plant: Plant | ModalModel) -> Comparison:
-        """Use the part of the angle coherent with the reference as input, and take out the rest.
+        """Use the part of the angle coherent with the reference as input (instrumental variable).
+
+        The torque by the remaining part of the angle is removed.
 
         Parameters
         ----------
         plant : Plant
-            As found so far. Its error adds to the noise and makes no bias.
+            Current estimate. Its error increases the noise and causes no bias.
 
         Returns
         -------
         Comparison
-            `self` if all of the angle counts as such: see `followed_rad`.
+            `self` if all of the angle is coherent: see `coherent_rad`.
         """
-        followed = self.followed_rad()
+        followed = self.coherent_rad()
         if followed is self.angle_rad:
             return self
         return self._split(self.angle_rad, followed, plant)
@@ -312,53 +316,50 @@ class Comparison:
         followed: NDArray[np.float64],
         plant: Plant | ModalModel,
     ) -> Comparison:
-        """Use a part of the angle as input, and take out what a plant makes of the rest."""
+        """Use a part of the angle as input, and remove the torque of a plant by the other part."""
         return replace(
             self,
             angle_rad=followed,
             prediction=self.prediction.of_other(followed),
-            rest_rad=moved_rad - followed,
-        ).with_rest_of(plant)
+            incoherent_rad=moved_rad - followed,
+        ).with_incoherent_part_of(plant)
 
-    def with_rest_of(self, plant: Plant | ModalModel) -> Comparison:
-        """Take out what a plant makes of the angle that followed no reference, in place of before.
-
-        Parameters
-        ----------
-        plant : Plant
-        """
-        if not isinstance(self.rest_rad, np.ndarray):
+    def with_incoherent_part_of(self, plant: Plant | ModalModel) -> Comparison:
+        """Replace the removed torque of the incoherent angle by the prediction of a plant."""
+        if not isinstance(self.incoherent_rad, np.ndarray):
             return self
-        rest = self.prediction.of_other(self.rest_rad)
-        rest_nm = rest.torque(plant)[0]
+        rest = self.prediction.of_other(self.incoherent_rad)
+        incoherent_nm = rest.torque(plant)[0]
         at_unknown_nm = rest.torque_between(
-            plant, self.decimation.factor, self._places(~self.measurement.torque_known)
+            plant, self.decimation.factor, self._decimated_indices(~self.measurement.torque_known)
         )[0]
-        told = replace(self, rest_nm=rest_nm, rest_at_unknown_nm=at_unknown_nm)
-        return told._without(rest_nm - self.rest_nm, at_unknown_nm - self.rest_at_unknown_nm)
+        updated = replace(self, incoherent_nm=incoherent_nm, incoherent_at_unknown_nm=at_unknown_nm)
+        return updated._without(
+            incoherent_nm - self.incoherent_nm, at_unknown_nm - self.incoherent_at_unknown_nm
+        )
 
-    def renewed(self, plant: Plant | ModalModel, noise: Noise) -> Comparison:
-        """Tell anew what followed the reference, with a plant better than the one before.
+    def renewed(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
+        """Re-estimate the part of the angle that follows the reference, with a better plant.
 
         Parameters
         ----------
         plant : Plant
-            As fitted to this comparison.
+            Plant fitted to this comparison.
         noise : Noise
 
         Returns
         -------
         Comparison
-            `self` if the torque of what followed no reference is the same with either plant, but
-            for what moves a parameter by a third of its standard deviation at most.
+            `self` if the new torque of the incoherent part would move no parameter by more than
+            a third of its standard deviation.
         """
-        other = self.with_rest_of(plant)
+        other = self.with_incoherent_part_of(plant)
         if other is self:
             return self
-        change = self.spectrum(other.rest_nm - np.asarray(self.rest_nm)) * noise.weight
+        change = self.spectrum(other.incoherent_nm - np.asarray(self.incoherent_nm)) * noise.weight
         if np.vdot(change, change).real <= _LARGEST_CHANGE:
             return self
-        moved_rad, followed = self.angle_rad + self.rest_rad, self.angle_rad
+        moved_rad, followed = self.angle_rad + self.incoherent_rad, self.angle_rad
         felt = Prediction(followed, self.decimation.rate_hz, slice(0, self._recorded))
         # What rings moves the motor, which makes it ring otherwise.
         for _ in range(_FEEDBACKS):
@@ -367,13 +368,13 @@ class Comparison:
 
     @property
     def hum_nm(self) -> NDArray[np.float64] | float:
-        """Hum that was taken out, at the samples kept."""
+        """Return the removed hum at the retained samples."""
         return self._hum_at(np.arange(self.samples) / self.decimation.rate_hz)
 
     def without_hum(self, hum: tuple[Hum, ...]) -> Comparison:
-        """Take out hum, in place of what was taken out before."""
+        """Remove hum, and restore the hum that was removed before."""
         other = replace(self, hum=hum)
-        ticks = self._places(~self.measurement.torque_known)
+        ticks = self._decimated_indices(~self.measurement.torque_known)
         first_s = self.kept.start / self.decimation.rate_hz
         time_s = ticks / self.measurement.rate_hz - first_s
         return other._without(
@@ -381,28 +382,28 @@ class Comparison:
         )
 
     def with_drag(self, plant: Plant, law: DragLaw) -> Comparison:
-        """Take the torque by drag out, and tell what it changes by.
+        """Remove the torque by drag, and store its derivatives.
 
         Parameters
         ----------
         plant : Plant
-            The beam whose drag it is.
+            Beam on which the drag acts.
         law : DragLaw
 
         Raises
         ------
         DragError
-            The drag is too large to be followed.
+            The drag is too large for the time steps.
         """
         # All that moves is braked, whether or not it followed a reference.
-        moved_rad = self.angle_rad + self.rest_rad
+        moved_rad = self.angle_rad + self.incoherent_rad
         response = DragResponse(moved_rad, self.decimation.rate_hz, plant)
         found = response.torque(law, range(1, self.visible_modes + 1))
 
         def band(values: NDArray[np.float64]) -> NDArray[np.complex128]:
             return self.spectrum(values[..., self.kept])
 
-        unknown = self._places(~self.measurement.torque_known)
+        unknown = self._decimated_indices(~self.measurement.torque_known)
         between = np.fft.irfft(
             self.decimation.factor * np.fft.rfft(found.torque_nm),
             self.decimation.factor * found.torque_nm.size,
@@ -410,8 +411,8 @@ class Comparison:
         return replace(
             self,
             torque_nm=self.torque_nm - found.torque_nm,
-            apart_nm=self.apart_nm + found.torque_nm[self.kept],
-            apart_at_unknown_nm=self.apart_at_unknown_nm + between[unknown],
+            removed_nm=self.removed_nm + found.torque_nm[self.kept],
+            removed_at_unknown_nm=self.removed_at_unknown_nm + between[unknown],
             drag=DragExpansion(
                 plant=plant,
                 law=law,
@@ -431,17 +432,17 @@ class Comparison:
         return sum((hum.torque(time_s) for hum in self.hum), start=0.0)
 
     def nuisance(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Spectra of terms of unknown amplitude, shape (m, K).
+        """Return spectra of terms of unknown amplitude, shape (m, K).
 
-        Free decays, from the beginning on and from each long gap on, hum, knocks, and last a zero
-        of the torque sensor that drifts in proportion to time: the jump from the record's end to
-        its beginning would leak into all bins.
+        These are the free decays from the beginning and from each long gap, hum, impacts, and last
+        a linear drift of the torque sensor's zero. Without it the jump from the end of the record
+        to its beginning would leak into all bins.
         """
         hum = self.decays.hum([hum.frequency_hz for hum in self.hum])
         drift = _drift(self.samples)[None, self.bins]
-        struck = drift[:0] if self.struck is None else self.struck
+        impact_spectra = drift[:0] if self.impact_spectra is None else self.impact_spectra
         decays = [each.columns(poles) for each in (self.decays, *self.later_decays)]
-        return np.concatenate([*decays, hum, struck, drift])
+        return np.concatenate([*decays, hum, impact_spectra, drift])
 
     def decay_gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
@@ -464,25 +465,26 @@ class Comparison:
         return total
 
     def filled(self, plant: Plant | ModalModel) -> Comparison:
-        """Put what `plant` predicts where the torque is unknown, so that it does not count there.
+        """Fill unknown torque with the prediction of `plant`, so that it adds no residual.
 
-        The squares that remain have their minimum where that of the known samples is, once the
-        fit has settled.
+        After convergence the remaining squares have the same minimum as those of the known samples.
         """
         known = self.measurement.torque_known
         if known.all():
             return self
         torque = self.measurement.torque_nm.copy()
         torque[~known] = (
-            self.apart_at_unknown_nm
-            + self.prediction.torque_between(plant, self.decimation.factor, self._places(~known))[0]
+            self.removed_at_unknown_nm
+            + self.prediction.torque_between(
+                plant, self.decimation.factor, self._decimated_indices(~known)
+            )[0]
         )
         torque_nm = self.decimation.apply(torque)
-        torque_nm[self.kept] -= self.apart_nm
+        torque_nm[self.kept] -= self.removed_nm
         return replace(self, torque_nm=torque_nm)
 
     def lost_gradient(self, plant: Plant, wrt: tuple[str, ...]) -> NDArray[np.complex128]:
-        """Compute what unknown torques would have given to the gradient's spectra, (k, K).
+        """Return the contribution of the unknown torques to the gradient's spectra, (k, K).
 
         Parameters
         ----------
@@ -495,7 +497,7 @@ class Comparison:
         lost = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
         if unknown.any():
             _, gradient = self.prediction.torque_between(
-                plant, self.decimation.factor, self._places(unknown), wrt
+                plant, self.decimation.factor, self._decimated_indices(unknown), wrt
             )
             for row, values in zip(lost, gradient, strict=True):
                 only = np.zeros(unknown.size)
@@ -503,17 +505,14 @@ class Comparison:
                 row[:] = self.spectrum(self.decimation.apply(only)[self.kept])
         return lost
 
-    def _places(self, ticks: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Ticks counted from the first decimated sample on."""
+    def _decimated_indices(self, ticks: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Return the indices of ticks at full rate, counted from the first decimated sample."""
         return np.flatnonzero(ticks) + self.decimation.reach * self.decimation.factor
 
 
 @lru_cache(maxsize=2)
 def _drift(samples: int) -> NDArray[np.complex128]:
-    """Transform of a drift of 1 over all samples, kept: every evaluation needs it.
-
-    Not to be written to.
-    """
+    """Return the transform of a drift of 1 over all samples; it is cached and read-only."""
     drift: NDArray[np.complex128] = np.fft.rfft(np.linspace(-0.5, 0.5, samples))
     drift.flags.writeable = False
     return drift

@@ -1,10 +1,10 @@
-"""Measured angle and torque as an estimator takes them: gaps interpolated, decimated to the band.
+"""Measured angle and torque for the estimators: gaps interpolated, decimated to the band.
 
 A missing angle is interpolated, since the convolution with the response needs one at every tick; a
-missing torque is not compared. After a longer gap of the angle the beam may ring by what the motor
-did in it, and that is estimated as the free decay at a record's beginning is. Decimation is by a
-linear-phase FIR filter (Kaiser window), so that all of the band is kept and neither channel is
-delayed against the other.
+missing torque is not compared. After a longer gap of the angle the beam may ring from the motor's
+motion in the gap. This ringing is estimated like the free decay at the beginning of a record.
+Decimation is by a linear-phase FIR filter (Kaiser window), so that the whole band is retained and
+neither channel is delayed against the other.
 
 References
 ----------
@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 _SAME_INSTANT_S: Final = 1e-7
 
 MAX_ANGLE_GAP_PERIODS: Final = 0.4
-"""Longest gap of the angle that is told by its neighbours, in periods of the band's upper end."""
+"""Longest gap of the angle that is interpolated, in periods of the band's upper end."""
 
 MOST_LONG_GAPS: Final = 8
-"""Longer ones in one record: after each of them every mode has an unknown amplitude and phase."""
+"""Limit of longer gaps: after each of them every mode has an unknown amplitude and phase."""
 
 _FILTERS_FORGET: Final = 5.0
 """Time constants after which a filter has forgotten what was before."""
@@ -56,19 +56,19 @@ class MeasurementError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Knock:
-    """A knock on the beam: any torque for as long as it lasts, and from its beginning free decays.
+class RecordedImpact:
+    """Impact on the beam: any torque while it lasts, and free decays from its beginning.
 
     Attributes
     ----------
     first_s, last_s : float
         Its first instant, and the first one after it, since the record's first tick.
     resolution_s : float
-        By how much the first may be off.
+        Uncertainty of the first instant.
     poles_rad_s : tuple of complex
-        Poles of the modes that rang on: of a conjugate pair the upper, or a real one.
+        Poles of the ringing modes: the upper one of a conjugate pair, or a real one.
     sizes : tuple of float
-        Size of each column (`columns`), as well as it is known.
+        Estimated size of each column (`columns`).
     largest_nm : float
         Largest torque within a second.
     """
@@ -81,7 +81,7 @@ class Knock:
     largest_nm: float = 0.0
 
     def decays(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Decays of all modes, and the same times the time since the knock, shape (d, n).
+        """Return the decays of all modes, then the decays times the time since the impact.
 
         Parameters
         ----------
@@ -99,7 +99,7 @@ class Knock:
         return np.array(rows).reshape(len(rows), time_s.size)
 
     def columns(self, time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
-        """Torque by each unknown size: decays, then single samples for as long as it lasts.
+        """Return the torque per unknown size: decays, then single samples of the contact.
 
         Parameters
         ----------
@@ -114,22 +114,22 @@ class Knock:
         """
         half_s = 0.5 / rate_hz
         touched = (time_s > self.first_s - half_s) & (time_s < self.last_s - half_s)
-        places = np.flatnonzero(touched)
-        single = np.zeros((places.size, time_s.size))
-        single[np.arange(places.size), places] = 1.0
+        indices = np.flatnonzero(touched)
+        single = np.zeros((indices.size, time_s.size))
+        single[np.arange(indices.size), indices] = 1.0
         return np.concatenate([self.decays(time_s), single])
 
     def torque(
         self, time_s: NDArray[np.float64], grid_s: NDArray[np.float64], rate_hz: float
     ) -> NDArray[np.float64]:
-        """Torque at some instants as well as it is known, shape (n,).
+        """Return the estimated torque at some times, shape (n,).
 
         Parameters
         ----------
         time_s : ndarray, shape (n,)
             Since the record's first tick.
         grid_s : ndarray, shape (m,)
-            Instants of the samples that `sizes` belongs to.
+            Instants of the samples to which `sizes` refers.
         rate_hz : float
             Their rate.
         """
@@ -144,34 +144,34 @@ class Knock:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """Angle and torque of one session, with what the file states of rig and specimen.
+    """Angle and torque of one session, with the stated data of rig and specimen.
 
     Attributes
     ----------
     name : str
-        What messages call it: the file's path.
+        Name in messages: the path of the file.
     angle_rad, torque_nm : ndarray, shape (n,)
         Motor angle and coupling torque, one value per tick.
     rate_hz : float
         Ticks per second.
     beam : Beam
-        As the file states it: where the search for density and stiffness starts.
+        Beam in the file: the start of the search for density and stiffness.
     angle_known, torque_known : ndarray of bool, shape (n,)
         False where a tick was missed or its value is flagged (held, saturated). Such a torque is
         not compared; such an angle is bridged, since the convolution needs one.
     rest_angle_rad : float or None
         Angle at which the beam rested before the record, None if not known: then the first angle.
     delay_s : float
-        By how much the torque is older than the angle at one time stamp, as the file states it.
+        Age of the torque relative to the angle at one time stamp, as the file states it.
     tool_inertia_kg_m2 : float
         Inertia between torque sensor and beam, as the file states it.
     filter_time_constant_s, second_order_filter_time_constant_s : float
         Low-pass filter of the torque's channel, as the file states it: see `Plant`.
     reference_rad : ndarray, shape (n,), or None
-        Angle that a controller was asked for, if one held the motor: what of the angle does not
-        follow it is taken to be the noise's doing.
-    knocks : tuple of Knock
-        What is known to have struck the beam. Their sizes stay free.
+        Reference of the motor's controller, if there was one: the part of the angle that does
+        not follow it is attributed to the noise.
+    knocks : tuple of RecordedImpact
+                    Known impacts on the beam. Their sizes stay free.
     uniformity : float
         Relative standard deviation of each mode's frequency from that of a uniform beam.
     tip_mass_kg : float or None
@@ -180,8 +180,8 @@ class Measurement:
         Inclination of the plane of motion along the beam at rest as the file states it, positive
         where the tip is lower than the motor's axis; None if it was not measured.
     one_sweep : bool
-        Whether the motor passed each frequency once, in their order: then what changes with time
-        cannot be told from what changes with frequency.
+        Whether the motor passed each frequency once, in their order: changes with time and with
+        frequency are then not distinguishable.
     """
 
     name: str
@@ -197,7 +197,7 @@ class Measurement:
     reference_rad: NDArray[np.float64] | None = None
     filter_time_constant_s: float = 0.0
     second_order_filter_time_constant_s: float = 0.0
-    knocks: tuple[Knock, ...] = ()
+    knocks: tuple[RecordedImpact, ...] = ()
     uniformity: float = 1e-3
     tip_mass_kg: float | None = None
     axis_tilt_deg: float | None = None
@@ -205,7 +205,7 @@ class Measurement:
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
-        """Take over a record that was read from a session file.
+        """Return the measurement of a record that was read from a session file.
 
         Raises
         ------
@@ -239,13 +239,13 @@ class Measurement:
         )
 
     def check(self, highest_hz: float) -> None:
-        """Refuse what cannot be used in a band that ends at `highest_hz`.
+        """Raise if the measurement cannot be used in a band that ends at `highest_hz`.
 
         Raises
         ------
         MeasurementError
-            Shapes differ, values are not finite, too much is unknown or in one piece, or the angle
-            never moves.
+            Shapes differ, values are not finite, too many values are unknown in total or in one
+            gap, or the angle never moves.
         """
         n = len(self.angle_rad)
         for other in (self.torque_nm, self.angle_known, self.torque_known):
@@ -296,7 +296,9 @@ class Measurement:
             )
 
     def long_gaps(self, highest_hz: float) -> tuple[tuple[int, int], ...]:
-        """Gaps of the angle too long to be told by their neighbours: what moved in them may ring.
+        """Return the gaps of the angle that are too long to interpolate.
+
+        The beam may ring after them.
 
         Parameters
         ----------
@@ -306,10 +308,10 @@ class Measurement:
         Returns
         -------
         tuple of (int, int)
-            First tick of each, and the first after it of which the torque's channel, which is
-            late, has forgotten it.
+            First tick of each gap, and the first tick after it at which the filters of the torque
+            channel have settled.
         """
-        told = MAX_ANGLE_GAP_PERIODS / highest_hz * self.rate_hz
+        longest = MAX_ANGLE_GAP_PERIODS / highest_hz * self.rate_hz
         late_s = abs(self.delay_s) + _FILTERS_FORGET * (
             self.filter_time_constant_s + self.second_order_filter_time_constant_s
         )
@@ -317,11 +319,11 @@ class Measurement:
         return tuple(
             (int(start), min(int(end) + late, len(self.angle_rad)))
             for start, end in zip(*_runs(~self.angle_known), strict=True)
-            if end - start > told
+            if end - start > longest
         )
 
     def without_torque_in(self, gaps: Iterable[tuple[int, int]]) -> Measurement:
-        """Take the torque for unknown in some gaps, each from a first tick to one after its last.
+        """Mark the torque as unknown in gaps, each from a first tick to one after its last.
 
         Parameters
         ----------
@@ -334,7 +336,7 @@ class Measurement:
 
     @property
     def nominal(self) -> Plant:
-        """Rig and specimen as the file states them, without damping."""
+        """Return rig and specimen as the file states them, without damping."""
         return Plant(
             beam=self.beam,
             damping=Damping(),
@@ -346,12 +348,12 @@ class Measurement:
         )
 
     @property
-    def torque_share(self) -> float:
-        """Share of the torque that is known."""
+    def known_torque_fraction(self) -> float:
+        """Return the fraction of the samples whose torque is known."""
         return float(np.mean(self.torque_known))
 
     def angle_from_rest(self, highest_hz: float) -> NDArray[np.float64]:
-        """Angle relative to where the beam rested, shape (n,), unknown values bridged."""
+        """Return the angle relative to rest, shape (n,), with unknown values interpolated."""
         angle = bridged(self.angle_rad, self.angle_known, highest_hz / self.rate_hz)
         origin = angle[0] if self.rest_angle_rad is None else self.rest_angle_rad
         return angle - origin
@@ -376,7 +378,7 @@ def bridged(
     Parameters
     ----------
     values : ndarray, shape (n,)
-        What stands at unknown places is ignored.
+        Unknown values are ignored.
     known : ndarray of bool, shape (n,)
     highest : float
         Highest frequency, in cycles per sample.
@@ -401,17 +403,17 @@ def bridged(
 
 @lru_cache(maxsize=64)
 def _weights(neighbours: tuple[int, ...], length: int, highest: float) -> NDArray[np.float64]:
-    """Weights of the neighbours in each of `length` values from place 0 on."""
-    places = np.array(neighbours)
-    among = np.sinc(2 * highest * np.subtract.outer(places, places))
-    among += _NOISE_POWER * np.eye(places.size)
-    across = np.sinc(2 * highest * np.subtract.outer(np.arange(length), places))
+    """Return the weights of the neighbours in each of `length` values from index 0 on."""
+    indices = np.array(neighbours)
+    among = np.sinc(2 * highest * np.subtract.outer(indices, indices))
+    among += _NOISE_POWER * np.eye(indices.size)
+    across = np.sinc(2 * highest * np.subtract.outer(np.arange(length), indices))
     weights: NDArray[np.float64] = np.linalg.solve(among, across.T).T
     return weights
 
 
 def _runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First places of the runs of True, and those after their last."""
+    """Return the first indices of the runs of True, and the indices after their last."""
     edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
 
@@ -425,19 +427,19 @@ _RATE_OVER_BAND: Final = 2.4
 
 @dataclass(frozen=True, slots=True)
 class Decimation:
-    """A linear-phase low-pass filter, centred, and the samples that are kept after it.
+    """Linear-phase low-pass filter, centred, followed by downsampling.
 
-    Our own, since `scipy.signal`, which has `kaiserord`, `firwin` and `oaconvolve`, takes 0.64 s of
-    processor time to import when all else is there: a tenth of what a session of 76 s takes.
+    It does not use `scipy.signal` (`kaiserord`, `firwin` and `oaconvolve`), whose import takes 0.64
+    s of processor time: a tenth of the analysis of a session of 76 s.
 
     Attributes
     ----------
     factor : int
-        One sample in so many is kept.
+        One sample in `factor` is retained.
     kernel : ndarray, shape (2 reach factor + 1,)
         The filter: passes `highest_hz`, and 100 dB less from half the new rate on.
     reach : int
-        Samples of the new rate to either side that the filter sees.
+        Half length of the filter, in samples of the new rate.
     rate_hz : float
         The new rate.
     """
@@ -449,14 +451,14 @@ class Decimation:
 
     @classmethod
     def to_band(cls, rate_hz: float, highest_hz: float) -> Decimation:
-        """Choose the lowest rate that holds 0 to `highest_hz`, which is at most 0.4 `rate_hz`.
+        """Return the decimation to the lowest rate that holds the band from 0 to `highest_hz`.
 
         Parameters
         ----------
         rate_hz : float
             Rate of the record.
         highest_hz : float
-            Highest frequency that is kept.
+            Highest frequency that is retained, at most 0.4 `rate_hz`.
         """
         factor = max(int(rate_hz / (_RATE_OVER_BAND * highest_hz)), 1)
         new_rate_hz = rate_hz / factor
@@ -472,7 +474,7 @@ class Decimation:
         return cls(factor, kernel / kernel.sum(), reach, new_rate_hz)
 
     def apply(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Filter and thin out.
+        """Filter and downsample.
 
         Parameters
         ----------
@@ -490,15 +492,15 @@ class Decimation:
         return np.fft.irfft(spectrum, padded)[: length : self.factor].copy()
 
     def inside(self, ticks: int) -> slice:
-        """Select samples of `apply` for which the filter saw nothing but the record's `ticks`."""
+        """Return the slice of samples of `apply` that depend on the record's `ticks` only."""
         return slice(2 * self.reach, (ticks - 1) // self.factor + 1)
 
 
 def fast_length(at_least: int) -> int:
-    """Least number not below `at_least` (1 or more) whose prime factors are at most 11.
+    """Return the least number not below `at_least` (1 or more) with prime factors up to 11.
 
-    A transform of real values is a fifth faster with factors up to 5 (``real=True``), which no fit
-    shows in its time; but the grid of the Laplace variable follows the length (`Prediction`), and
+    A transform of real values is a fifth faster with factors up to 5 (``real=True``), which makes
+    no fit faster. The grid of the Laplace variable depends on the length (`TorquePredictor`), and
     with it the last digits of every estimate.
 
     Examples
@@ -513,7 +515,7 @@ def fast_length(at_least: int) -> int:
 
 
 def fast_length_below(at_most: int) -> int:
-    """Largest number not above `at_most` (1 or more) whose prime factors are at most 11."""
+    """Return the largest number not above `at_most` (1 or more) with prime factors up to 11."""
     from scipy.fft import prev_fast_len
 
     return int(prev_fast_len(at_most))

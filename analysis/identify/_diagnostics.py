@@ -1,7 +1,7 @@
 """Diagnostics of a record: effects other than the beam of Eq. 25, by name and size.
 
-Settings at the edge of what is searched or not as the file states them, disturbances of the torque,
-forces that are not linear, drag, a free decay at the start, and what remains unexplained.
+Settings at the edge of the search range or different from the file, disturbances of the torque,
+nonlinear forces, drag, a free decay at the start, and the unexplained residual.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from analysis.identify._channel_checks import clipping, drift_of_zero, stops
 from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
-from analysis.identify._residual_tests import SURE
+from analysis.identify._residual_tests import SIGNIFICANT_STD
 from analysis.statistics import NORMAL_95, chi_square_deviate
 from rigd.units import interval_text, to_uncertainty
 
@@ -28,46 +28,46 @@ if TYPE_CHECKING:
 
 
 def findings(
-    field: CandidateSet,
+    candidate_set: CandidateSet,
     forces: tuple[NonlinearForce, ...],
     multiples: tuple[Harmonic, ...],
 ) -> tuple[Finding, ...]:
-    """Name what is there: of a record with a wrong sign or unit, only what needs no model.
+    """Return the findings; for a record with a wrong sign or unit, only those without a model.
 
     Parameters
     ----------
-    field : CandidateSet
+    candidate_set : CandidateSet
     forces : tuple of NonlinearForce
-        Those the record calls for.
+        Significant forces.
     multiples : tuple of Harmonic
-        What the residual holds at multiples of the sweep's frequency.
+        Residual at multiples of the sweep's frequency.
     """
-    measurement = field.comparison.measurement
-    seen = (*field.misread, *clipping(measurement), *stops(measurement))
-    if field.misread:
+    measurement = candidate_set.comparison.measurement
+    seen = (*candidate_set.misread, *clipping(measurement), *stops(measurement))
+    if candidate_set.misread:
         return seen
     found = (
         *seen,
-        *_hum(field),
-        *_air(field),
+        *_hum(candidate_set),
+        *_air(candidate_set),
         *map(_force, forces),
         *_harmonics(multiples),
     )
-    return (*found, *at_edges(field))
+    return (*found, *at_edges(candidate_set))
 
 
 # Settings at an edge, or not as the file states them
 
 _DELAY_OFF_S: Final = 1e-4
-"""Delay worth a word: backlash of a few tenths of a milliradian passes for a shorter one."""
+"""Smallest reported delay: backlash of a few tenths of a milliradian passes for a shorter one."""
 
 _BEAM_OFF: Final = 0.003
-"""Deviation of stiffness or density, relative to the file's, worth a word."""
+"""Deviation of stiffness or density, relative to the file, that is reported."""
 
 
-def at_edges(field: CandidateSet) -> Iterator[Finding]:
-    """Find settings that the search took as far as it goes; no rig is so far from its file."""
-    fit = field.best.fit
+def at_edges(candidate_set: CandidateSet) -> Iterator[Finding]:
+    """Yield settings at the edge of the search range, which no real rig reaches."""
+    fit = candidate_set.best.fit
     for name, words, factor, unit in (
         ("delay_s", "The delay between the channels", 1e3, "ms"),
         ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)", 1, "s²/m⁴"),
@@ -91,44 +91,40 @@ def at_edges(field: CandidateSet) -> Iterator[Finding]:
             )
 
 
-def of_settings(field: CandidateSet, told: Headline) -> Iterator[Finding]:
-    """Find what of delay, inertia, beam and start is not as the file states it.
+def of_settings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
+    """Yield delay, inertia, beam data and initial ringing that differ from the file.
 
-    Parameters
-    ----------
-    field : CandidateSet
-    told : Headline
-        Numbers with flags: what carries one is no finding.
+    Parameters with a flag in `headline` are no finding.
     """
-    yield from _of_instruments(field, told)
-    yield from _of_beam(field, told)
-    yield from _of_start(field, told)
+    yield from _of_instruments(candidate_set, headline)
+    yield from _of_beam(candidate_set, headline)
+    yield from _of_start(candidate_set, headline)
 
 
 def _difference(
-    field: CandidateSet, told: Headline, name: Setting
+    candidate_set: CandidateSet, headline: Headline, name: Setting
 ) -> tuple[float, float, float] | None:
-    """By how much a setting differs from what the file states, with the ends of its interval.
+    """Return the difference of a setting from the file, with the ends of its interval.
 
-    None where it does not beyond chance, or where its value carries a flag.
+    Return None if chance explains the difference, or if the value carries a flag.
     """
-    quantity, stated = told.parameters.get(name), _stated(field, name)
+    quantity, stated = headline.parameters.get(name), _stated(candidate_set, name)
     if quantity is None or quantity.flag or not quantity.std or quantity.interval_95 is None:
         return None
-    if abs(quantity.value - stated) < SURE * quantity.std:
+    if abs(quantity.value - stated) < SIGNIFICANT_STD * quantity.std:
         return None
     low, high = quantity.interval_95
     return quantity.value - stated, low - stated, high - stated
 
 
-def _of_instruments(field: CandidateSet, told: Headline) -> Iterator[Finding]:
-    """Find a delay and an inertia that the file does not state."""
-    off = _difference(field, told, "delay_s")
+def _of_instruments(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
+    """Yield a delay and an inertia that the file does not state."""
+    off = _difference(candidate_set, headline, "delay_s")
     if off is not None and abs(off[0]) > _DELAY_OFF_S:
         value, *interval = off
         low, high = interval
         (size,) = to_uncertainty((abs(value),), (high - low) / 2, 1e3)
-        delay_s = told.parameters["delay_s"].value
+        delay_s = headline.parameters["delay_s"].value
         yield Finding(
             kind="delay",
             sentence=(
@@ -142,7 +138,7 @@ def _of_instruments(field: CandidateSet, told: Headline) -> Iterator[Finding]:
             remedy=f"Declare the delay between the channels as {1e3 * delay_s:.3f} ms.",
             parameters=("delay_s",),
         )
-    if off := _difference(field, told, "tool_inertia_kg_m2"):
+    if off := _difference(candidate_set, headline, "tool_inertia_kg_m2"):
         value, *interval = off
         low, high = interval
         (size,) = to_uncertainty((value,), (high - low) / 2, 1e6)
@@ -160,59 +156,62 @@ def _of_instruments(field: CandidateSet, told: Headline) -> Iterator[Finding]:
         )
 
 
-def _of_beam(field: CandidateSet, told: Headline) -> Iterator[Finding]:
-    """Find density and stiffness that are not the file's."""
+def _of_beam(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
+    """Yield density and stiffness that differ from the file."""
     beam: tuple[tuple[Setting, str], ...] = (
         ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)"),
         ("bending_stiffness_n_m2", "The bending stiffness (EI)"),
     )
     for name, words in beam:
-        stated = _stated(field, name)
-        off = _difference(field, told, name)
+        stated = _stated(candidate_set, name)
+        off = _difference(candidate_set, headline, name)
         if off is None or abs(off[0]) < _BEAM_OFF * stated:
             continue
-        share, *interval = (part / stated for part in off)
+        relative, *interval = (part / stated for part in off)
         low, high = interval
-        (size,) = to_uncertainty((abs(share),), (high - low) / 2, 100)
+        (size,) = to_uncertainty((abs(relative),), (high - low) / 2, 100)
         yield Finding(
             kind="beam data",
             sentence=(
-                f"{words} is {size} % {'higher' if share > 0 else 'lower'} than the "
+                f"{words} is {size} % {'higher' if relative > 0 else 'lower'} than the "
                 f"file states ({interval_text(interval, 100, '+')} %; 95 %)"
-                f"{_or_else(field, name)}."
+                f"{_equivalent_causes(candidate_set, name)}."
             ),
-            value=share,
+            value=relative,
             interval=(low, high),
             remedy="Weigh and measure the link again, or take the value found.",
             parameters=(name,),
         )
 
 
-def _or_else(field: CandidateSet, name: Setting) -> str:
-    """Name what does to the torque just what such a deviation does; the sentence's end."""
+def _equivalent_causes(candidate_set: CandidateSet, name: Setting) -> str:
+    """Return the end of the sentence that names other causes with the same effect on the torque."""
     if name == "bending_stiffness_n_m2":
         return ", or the torque's gain is"
-    fit, beam = field.best.fit, field.comparison.measurement.beam
-    share = math.log(fit.plant.beam.density_over_stiffness / beam.density_over_stiffness) / 4
+    fit, beam = candidate_set.best.fit, candidate_set.comparison.measurement.beam
+    relative = math.log(fit.plant.beam.density_over_stiffness / beam.density_over_stiffness) / 4
     stiffness = fit.plant.beam.bending_stiffness_n_m2
     std = fit.std["bending_stiffness_n_m2"] or 0.0
     # A small mass at the tip moves all modes alike, and the torque by a quarter of that.
-    missing = math.log(stiffness / beam.bending_stiffness_n_m2) + share
-    if fit.plant.tip_mass_kg or share <= 0 or abs(missing) > SURE * std / stiffness:
+    missing = math.log(stiffness / beam.bending_stiffness_n_m2) + relative
+    if fit.plant.tip_mass_kg or relative <= 0 or abs(missing) > SIGNIFICANT_STD * std / stiffness:
         return ""
-    mass_g = 1e3 * share * beam.density_kg_per_m * beam.length_m
+    mass_g = 1e3 * relative * beam.density_kg_per_m * beam.length_m
     return f", or the beam carries {mass_g:.2g} g at its tip"
 
 
-def _of_start(field: CandidateSet, told: Headline) -> Iterator[Finding]:
-    """Say that the beam rang when the record began, where the modal model shows it."""
-    ringing = None if told.modal is None else told.modal.ringing
+def _of_start(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
+    """Yield a finding if the modal model shows that the beam rang at the beginning."""
+    ringing = None if headline.modal is None else headline.modal.ringing
     if ringing is None or not ringing.degrees_of_freedom:
         return
     loudest = max(ringing.amplitude_nm)
-    # A hum begins and ends with the record, which looks a little like a decay.
-    hum = max((line.amplitude_nm for line in field.noise.lines), default=0.0)
-    if loudest <= hum or chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) < SURE:
+    # A hum begins and ends with the record, and so resembles a decay.
+    hum = max((line.amplitude_nm for line in candidate_set.noise.lines), default=0.0)
+    if (
+        loudest <= hum
+        or chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) < SIGNIFICANT_STD
+    ):
         return
     yield Finding(
         kind="ringing start",
@@ -226,9 +225,9 @@ def _of_start(field: CandidateSet, told: Headline) -> Iterator[Finding]:
     )
 
 
-def _stated(field: CandidateSet, name: Setting) -> float:
-    """Give the value of a setting in the file."""
-    measurement = field.comparison.measurement
+def _stated(candidate_set: CandidateSet, name: Setting) -> float:
+    """Return the value of a setting in the file."""
+    measurement = candidate_set.comparison.measurement
     return {
         "density_over_stiffness": measurement.beam.density_over_stiffness,
         "bending_stiffness_n_m2": measurement.beam.bending_stiffness_n_m2,
@@ -250,7 +249,7 @@ _SAME_TURN: Final = 0.5
 
 
 def mains(frequency_hz: float) -> str:
-    """Name the mains if that may be the source, else nothing."""
+    """Return the name of the mains if it may be the source, else an empty string."""
     for base in (50, 60):
         for n in range(1, 9):
             if abs(frequency_hz - n * base) < _MAINS_WANDER * n * base:
@@ -261,7 +260,7 @@ def mains(frequency_hz: float) -> str:
 def unexplained(
     white: Whiteness, related: InputRelation, modes: tuple[ModeEstimate, ...]
 ) -> Finding:
-    """Describe what remains and has no name."""
+    """Return the finding that describes the unexplained residual."""
     low, high = white.loudest_hz
     at_mode = [mode.number for mode in modes if low <= mode.frequency_hz <= high]
     if related.related:
@@ -309,14 +308,14 @@ def unexplained(
     )
 
 
-def _hum(field: CandidateSet) -> Iterator[Finding]:
-    comparison = field.comparison
+def _hum(candidate_set: CandidateSet) -> Iterator[Finding]:
+    comparison = candidate_set.comparison
     duration_s = comparison.samples / comparison.decimation.rate_hz
-    drift_nm = drift_of_zero(field)
+    drift_nm = drift_of_zero(candidate_set)
     if drift_nm > 0:
         yield _drift(drift_nm)
     period_s = repeats_after_s(comparison)
-    for line in field.noise.lines:
+    for line in candidate_set.noise.lines:
         if line.frequency_hz * duration_s < _FEWEST_PERIODS:
             continue
         near = mains(line.frequency_hz)
@@ -357,8 +356,8 @@ def _drift(size_nm: float) -> Finding:
     )
 
 
-def _air(field: CandidateSet) -> Iterator[Finding]:
-    drag = field.drag
+def _air(candidate_set: CandidateSet) -> Iterator[Finding]:
+    drag = candidate_set.drag
     if drag is None:
         return
     low, high = drag.interval_95_m

@@ -1,8 +1,8 @@
 """Air drag on the beam: whether it is there, how large C_D d is, and the damping by amplitude.
 
-Drag along the whole beam is one number, or two where the coefficient falls with the speed. Left
-out, it passes for a fractional order, a delay, modes of their own stiffness and another density:
-it damps each mode by as much as the mode is fast at the time.
+Drag along the whole beam is one number, or two where the coefficient falls with the speed. Without
+it a fit finds a fractional order, a delay, deviating mode frequencies and another density
+instead: drag damps each mode in proportion to its speed.
 
 In free vibration of one mode, the tip moving by ``A sin(omega t)``, a force per metre
 ``rho_air/2 C v^p`` takes from each cycle as much as linear damping of the ratio::
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
     from analysis.models import Structure
 
@@ -43,43 +43,43 @@ if TYPE_CHECKING:
 # Search for drag
 
 _SCORED: Final = ("III", "VI", "VII")
-"""Structures beside which drag is looked for: those that have either damping."""
+"""Structures with which drag is tested: those that have either damping."""
 
 _EVIDENT: Final = 100.0
 _ALL_BUT_NOISE: Final = 0.8
-"""Squares, and share of what a uniform beam leaves unexplained, that a small drag saves where it is
-evident. In records of all that rigs may have else (`benchmarks/wrong_models.py`) the column saves
-less than a third, or asks for air that pushes; with drag it saves all and more, since part of what
-drag leaves counts as noise."""
+"""Squares, and fraction of the unexplained squares, by which a small drag reduces the cost where it
+is evident. In records with other defects of a rig (`benchmarks/wrong_models.py`) the column
+removes less than a third, or its size is negative. With drag it removes more than all, since a
+part of the residual by drag counts as noise."""
 
 _PROMISE: Final = 6.0
-"""Deviance by which the first order may fail to foresee what drag saves."""
+"""Error of the deviance reduction that the first order predicts."""
 
 _ROUNDS: Final = 15
 _FEW: Final = 12
 """Evaluations of a descent before the drag is recomputed."""
 
-_A_LOOK: Final = 4
+_EARLY_EVALUATIONS: Final = 4
 """Evaluations that show whether a structure is hopeless."""
 
 _MANY: Final = 40
 _HOPELESS: Final = 50.0
-"""Deviance behind the structure with drag from which another is not followed to its minimum."""
+"""Deviance above the structure with drag from which the descent of another ends early."""
 
-_SETTLED: Final = 2.0
+_CONVERGED: Final = 2.0
 _ROUGHLY: Final = 500.0
-"""Squares that another step may save where the drag need not be recomputed: the step is taken
-all the same, by all that is fitted at this drag (`_all`).
+"""Predicted reduction of squares below which the drag is not recomputed: the step itself is taken,
+by all fits at this drag (`_fit_all`).
 
-The two numbers of a law and external damping can make up for each other along a flat valley. There
-the recomputed drag promised a step of half a standard deviation, always the same way, for ten
-rounds and more: it led away from the truth, and each round cost a second.
+The two numbers of a law and external damping can compensate each other along a flat direction.
+There each recomputation predicted a step of half a standard deviation in the same direction, for
+ten rounds and more: away from the true value, at a second a round.
 """
 
 _IN_VAIN: Final = 20.0
-"""Squares that a step may save and yet be the last, if the one before saved no more than twice as
-much. Where external damping has vanished, or is an inertia, each step along its order promises what
-the recomputed drag does not keep.
+"""Reduction of squares with which a step may be the last, if the step before reduced them by no
+more than twice as much. Where external damping has vanished, or is an inertia, each step along its
+order predicts a reduction that the recomputed drag does not confirm.
 """
 
 _LEAD: Final = "III"
@@ -94,12 +94,12 @@ has two numbers, whether or not the second differs from nought, or its interval 
 """
 
 _SLOWEST: Final = 0.02
-"""Least speed that tells anything, relative to the highest."""
+"""Lowest speed with any information, relative to the highest."""
 
 
 @dataclass(frozen=True, slots=True)
 class DragEstimate:
-    """Drag of the air as found.
+    """Estimate of the air drag.
 
     Attributes
     ----------
@@ -109,8 +109,8 @@ class DragEstimate:
     interval_95_m : tuple of float
         Not below 0.
     speed_m_s : float
-        The speed at which it is known best; where the record tells no more than a mean, the one
-        that counts most in it.
+        The speed at which it is known best; if the record determines only a mean, the speed with
+        the largest weight.
     law : DragLaw
         For all speeds.
     covariance : tuple of tuple of float
@@ -126,10 +126,10 @@ class DragEstimate:
 
 
 def with_evident_drag(uniform: CandidateSet) -> CandidateSet:
-    """Refit with the air's drag, where that is the explanation before any other has been tried.
+    """Refit with air drag if it is evident before any other explanation has been tested.
 
-    To first order it saves all that a uniform beam leaves unexplained, which nothing else does that
-    a rig may have; with it, nothing but noise is left.
+    To first order it explains the whole residual of a uniform beam, which no other defect of a rig
+    does. With drag only noise remains.
 
     Parameters
     ----------
@@ -148,22 +148,22 @@ def with_evident_drag(uniform: CandidateSet) -> CandidateSet:
 
 
 def _is_evident(uniform: CandidateSet) -> bool:
-    """Whether a small drag beside the freest structure would explain what that leaves."""
+    """Return whether a small drag with the freest structure would explain its residual."""
     freest = next(c for c in uniform.candidates if c.structure.name == _FREEST)
     refit = uniform.refit(freest, 1)
     size, saved = _first_amplitude(refit)
     return size > 0 and saved > max(_EVIDENT, _ALL_BUT_NOISE * (refit.cost - refit.expected_cost))
 
 
-def with_air_drag(field: CandidateSet) -> CandidateSet:
-    """Refit all candidates with the air's drag, if that explains the record better.
+def with_air_drag(candidate_set: CandidateSet) -> CandidateSet:
+    """Refit all candidates with air drag, if that explains the record better.
 
-    To first order a column of known shape tells what drag could save beside each of a few
-    structures. Only if one of them could then be the best of all is anything fitted.
+    To first order a column of known shape predicts by how much drag reduces the cost of each of a
+    few structures. Drag is fitted only if one of them could then be the best of all.
 
     Parameters
     ----------
-    field : CandidateSet
+    candidate_set : CandidateSet
         Without drag.
 
     Returns
@@ -171,55 +171,55 @@ def with_air_drag(field: CandidateSet) -> CandidateSet:
     CandidateSet
         The one given, if there is no drag; else with `drag`, the lowest BIC first.
     """
-    return _with_drag(field) if _promising(field) else field
+    return _with_drag(candidate_set) if _promising(candidate_set) else candidate_set
 
 
-def _with_drag(field: CandidateSet) -> CandidateSet:
-    """Fit all structures with drag; the set given if that is no better."""
-    lead = next((c for c in field.candidates if c.structure.name == _LEAD), None)
-    start = None if lead is None else _start(field, lead)
+def _with_drag(candidate_set: CandidateSet) -> CandidateSet:
+    """Fit all structures with drag; return the given set if that is no better."""
+    lead = next((c for c in candidate_set.candidates if c.structure.name == _LEAD), None)
+    start = None if lead is None else _start(candidate_set, lead)
     if start is None:
-        return field
-    settled = _settled(field, start, STRUCTURES[_LEAD], tolerance=_ROUGHLY)
-    if settled is None:
-        return field
+        return candidate_set
+    converged = _converged(candidate_set, start, STRUCTURES[_LEAD], tolerance=_ROUGHLY)
+    if converged is None:
+        return candidate_set
     # Thence to the freest damping; without drag its fit may be that of no beam at all.
-    known, point = settled.objective.comparison, _Point.of(settled)
+    known, point = converged.objective.comparison, _DragPoint.of(converged)
     for name in (_FREEST, _LEAD):
-        settled = _settled(field, point, STRUCTURES[name], known=known)
-        if settled is not None:
+        converged = _converged(candidate_set, point, STRUCTURES[name], known=known)
+        if converged is not None:
             break
     else:
-        return field
-    found = _all(field, settled)
+        return candidate_set
+    found = _fit_all(candidate_set, converged)
     assert found.drag is not None
-    return found if found.drag.value_m > 0 and found.bic < field.bic else field
+    return found if found.drag.value_m > 0 and found.bic < candidate_set.bic else candidate_set
 
 
 @dataclass(frozen=True, slots=True)
-class _Point:
-    """Where a search with drag stands."""
+class _DragPoint:
+    """State of a search with drag."""
 
     plant: Plant
     structure: Structure
     law: DragLaw
-    noise: Noise
+    noise: NoiseSpectrum
     two: bool = False
 
     @classmethod
-    def of(cls, refit: Refit) -> _Point:
+    def of(cls, refit: Refit) -> _DragPoint:
         structure = refit.objective.unknowns.structure
         two = len(refit.columns) > 1
         return cls(refit.plant, structure, _law_at(refit), refit.noise, two)
 
 
-def _promising(field: CandidateSet) -> bool:
-    """Whether some structure with drag could be better than the best without."""
-    best = field.best
-    for candidate in field.candidates:
+def _promising(candidate_set: CandidateSet) -> bool:
+    """Return whether some structure with drag could be better than the best without."""
+    best = candidate_set.best
+    for candidate in candidate_set.candidates:
         if candidate is not best and candidate.structure.name not in _SCORED:
             continue
-        refit = field.refit(candidate, 1)
+        refit = candidate_set.refit(candidate, 1)
         size, saved = _first_amplitude(refit)
         before = refit.cost
         cost = max(before - saved, 1e-3 * before)
@@ -230,15 +230,17 @@ def _promising(field: CandidateSet) -> bool:
 
 
 def small_drag(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Spectrum of a small drag's torque, over C_D d, shape (1, K)."""
-    moved_rad = comparison.angle_rad + comparison.rest_rad
+    """Return the spectrum of the torque by a small drag over C_D d, shape (1, K)."""
+    moved_rad = comparison.angle_rad + comparison.incoherent_rad
     response = DragResponse(moved_rad, comparison.decimation.rate_hz, plant)
     return comparison.spectrum(response.first_order()[None, comparison.kept])
 
 
 def _first_amplitude(refit: Refit) -> tuple[float, float]:
-    """Size of a small drag beside a fit without it, all else free, and the squares it saves."""
-    (column,), residual = refit.beside(small_drag(refit.objective.comparison, refit.plant))
+    """Return the size of a small drag added to a fit, all else free, and the cost reduction."""
+    (column,), residual = refit.unexplained_columns(
+        small_drag(refit.objective.comparison, refit.plant)
+    )
     square = float(np.vdot(column, column).real)
     if square <= 0:
         return 0.0, 0.0
@@ -246,51 +248,43 @@ def _first_amplitude(refit: Refit) -> tuple[float, float]:
     return -along / square, along**2 / square
 
 
-def _start(field: CandidateSet, lead: Candidate) -> _Point | None:
-    """Fit with the first order of the drag; None if the air would have to push."""
-    column = small_drag(field.comparison, lead.fit.plant)
-    refit = replace(field, columns=column).refit(lead, _FEW)
+def _start(candidate_set: CandidateSet, lead: Candidate) -> _DragPoint | None:
+    """Fit with the first order of the drag; return None if the drag would be negative."""
+    column = small_drag(candidate_set.comparison, lead.fit.plant)
+    refit = replace(candidate_set, columns=column).refit(lead, _FEW)
     size = float(refit.amplitudes()[0][0])
-    return _Point(refit.plant, lead.structure, DragLaw(size), field.noise) if size > 0 else None
+    return (
+        _DragPoint(refit.plant, lead.structure, DragLaw(size), candidate_set.noise)
+        if size > 0
+        else None
+    )
 
 
-def _settled(
-    field: CandidateSet,
-    point: _Point,
+def _converged(
+    candidate_set: CandidateSet,
+    point: _DragPoint,
     structure: Structure,
     *,
-    tolerance: float = _SETTLED,
+    tolerance: float = _CONVERGED,
     known: Comparison | None = None,
 ) -> Refit | None:
-    """Fit one structure with drag.
+    """Fit one structure with drag, from `point`; recompute the drag until the fit converges.
 
-    Parameters
-    ----------
-    field : CandidateSet
-        Without drag.
-    point : _Point
-        Where to start.
-    structure : Structure
-    tolerance : float
-        Squares that a further step may still save.
-    known : Comparison, optional
-        With the drag at that start.
-
-    Returns
-    -------
-    Refit or None
-        None if the air would have to push, the drag cannot be followed, or nothing settles.
+    `tolerance` is the largest reduction of squares by a further step, `known` the comparison with
+    the drag of the start. Return None if the drag is negative, unstable or does not converge.
     """
-    unknowns = field.unknowns(structure)
+    unknowns = candidate_set.unknowns(structure)
     x = unknowns.vector(point.plant)
     law, noise, two = point.law, point.noise, point.two
-    comparison, roughly, saved = known, tolerance > _SETTLED, math.inf
+    comparison, roughly, saved = known, tolerance > _CONVERGED, math.inf
     for _ in range(_ROUNDS):
         if comparison is None:
             plant = unknowns.plant(x)
             # Without drag the beam seemed to be another, and so what the rest of the angle did.
             try:
-                comparison = field.comparison.with_rest_of(plant).with_drag(plant, law)
+                comparison = candidate_set.comparison.with_incoherent_part_of(plant).with_drag(
+                    plant, law
+                )
             except DragError:
                 return None
         drag = comparison.drag
@@ -298,8 +292,8 @@ def _settled(
         descent = partial(Refit.descend, comparison, unknowns, noise=noise)
         at_first = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=1)
         here = at_first.further(_FEW)
-        if two or roughly or _known_to(here) > _ONE_NUMBER:
-            before, saved = saved, at_first.cost - max(at_first.promised_cost, here.cost)
+        if two or roughly or _relative_std(here) > _ONE_NUMBER:
+            before, saved = saved, at_first.cost - max(at_first.predicted_cost, here.cost)
             if saved < tolerance or before / 2 < saved < _IN_VAIN:
                 return at_first
         else:
@@ -313,14 +307,14 @@ def _settled(
     return None
 
 
-def _known_to(refit: Refit) -> float:
-    """Relative deviation of the drag, of one number."""
+def _relative_std(refit: Refit) -> float:
+    """Return the relative standard deviation of a drag law of one number."""
     law, (_, std) = _law_at(refit), refit.amplitudes()
     return float(std[0]) / max(float(law.constant_m), float(np.finfo(float).tiny))
 
 
 def _law_at(refit: Refit) -> DragLaw:
-    """Drag at a minimum: where it was computed, and the step from there."""
+    """Return the drag law at a minimum: the law of the last computation plus the step."""
     expansion = refit.objective.comparison.drag
     assert expansion is not None
     step = refit.amplitudes()[0].tolist()
@@ -328,42 +322,42 @@ def _law_at(refit: Refit) -> DragLaw:
     return DragLaw(expansion.law.constant_m + step[0], slowing)
 
 
-def _all(field: CandidateSet, settled: Refit) -> CandidateSet:
-    """Fit all structures with the drag that one has settled on, and estimate its size."""
+def _fit_all(candidate_set: CandidateSet, converged: Refit) -> CandidateSet:
+    """Fit all structures with the drag of a converged fit, and estimate its size."""
     other = replace(
-        field,
-        comparison=settled.objective.comparison,
-        columns=settled.columns,
-        noise=settled.noise_here(),
+        candidate_set,
+        comparison=converged.objective.comparison,
+        columns=converged.columns,
+        noise=converged.noise_here(),
     )
-    least = other.descent(settled.objective.unknowns, settled.x, 1).cost
-    most = least * math.exp(_HOPELESS / field.best.values)
+    least = other.descent(converged.objective.unknowns, converged.x, 1).cost
+    most = least * math.exp(_HOPELESS / candidate_set.best.values)
     begun = []
-    for each in field.candidates:
+    for each in candidate_set.candidates:
         unknowns = other.unknowns(each.structure)
         refit = Refit.descend(
             other.comparison,
             unknowns,
-            unknowns.vector(settled.plant),
+            unknowns.vector(converged.plant),
             other.noise,
             other.columns,
             max_evaluations=_FEW,
             relative_tolerance=MISSED,
-            hopeless=(_A_LOOK, most),
+            hopeless=(_EARLY_EVALUATIONS, most),
         )
         begun.append((refit.candidate(), refit))
     candidates = [
-        refit.further(_MANY).candidate() if refit.promised_cost < most else candidate
+        refit.further(_MANY).candidate() if refit.predicted_cost < most else candidate
         for candidate, refit in begun
     ]
     found = other.ranked(candidates).cross_checked()
     return replace(found, drag=_estimate(found))
 
 
-def _estimate(field: CandidateSet) -> DragEstimate:
-    """Drag with its deviation, beside all the damping that the best beam may have."""
-    freest = max(field.candidates, key=lambda c: (len(c.structure.free), -c.bic))
-    refit = field.refit(freest)
+def _estimate(candidate_set: CandidateSet) -> DragEstimate:
+    """Return the drag with its standard deviation, with all possible damping of the best beam."""
+    freest = max(candidate_set.candidates, key=lambda c: (len(c.structure.free), -c.bic))
+    refit = candidate_set.refit(freest)
     law, covariance = _law_at(refit), refit.amplitude_covariance()[1]
     covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom
     expansion = refit.objective.comparison.drag
@@ -400,15 +394,15 @@ _POINTS: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class DampingAt:
-    """Damping ratio of a mode that vibrates freely.
+    """Damping ratio of a mode in free vibration at one amplitude.
 
     Attributes
     ----------
     mode : int
     tip_amplitude_m : float
     damping_ratio, std : float
-        That of the beam and that of the air, whose uncertainties are added as if they were
-        independent: one makes up for the other, so that the sum is known better than that.
+        Sum of the ratios of beam and air. Their uncertainties are added as if independent;
+        they are anticorrelated, so this is an upper limit.
     """
 
     mode: int
@@ -417,20 +411,20 @@ class DampingAt:
     std: float
 
 
-def damping_with_amplitude(field: CandidateSet) -> tuple[DampingAt, ...]:
-    """Damping of the first modes that show at several amplitudes; nothing without drag."""
-    drag = field.drag
+def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAt, ...]:
+    """Return the damping of the first visible modes at several amplitudes; empty without drag."""
+    drag = candidate_set.drag
     if drag is None:
         return ()
-    fit = field.best.fit
+    fit = candidate_set.best.fit
     numbers = np.array([drag.law.constant_m, drag.law.slowing])[: len(drag.covariance)]
     covariance = np.array(drag.covariance)
     found = []
     for mode in fit.modes:
         if mode.number not in _MODES or mode.frequency_hz <= 0:
             continue
-        for share in _DEFLECTIONS:
-            amplitude = share * fit.plant.beam.length_m
+        for fraction in _DEFLECTIONS:
+            amplitude = fraction * fit.plant.beam.length_m
             slopes = by_law(
                 mode.number,
                 2 * math.pi * mode.frequency_hz,
@@ -452,7 +446,7 @@ def damping_with_amplitude(field: CandidateSet) -> tuple[DampingAt, ...]:
 def by_law(
     mode: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
 ) -> NDArray[np.float64]:
-    """Damping ratio by the air over the two numbers of a `DragLaw`, shape (2,)."""
+    """Return the damping ratio by the air per number of a `DragLaw`, shape (2,)."""
     node, weight = np.polynomial.legendre.leggauss(_POINTS)
     shape = np.abs(mode_shape(mode, 0.5 * (node + 1)) / mode_shape(mode, 1.0))
     speed = tip_amplitude_m * omega_rad_s

@@ -8,19 +8,19 @@ k of `analysis.identify._predictor`, ``Z_i = p + c k_i⁴`` and ``b_i = ∫ x ph
     f = -rho_air/2 (C |v| v + S |v|^(1/3) v)
     torque added = sum_i L b_i F_i p / Z_i - ∫ x f dx
 
-The moment of the force is exact, the sum over the modes all that inertia makes of it. C is C_D d of
-a constant coefficient. S is the part of it that falls with the speed as in White's law for a
-cylinder, ``C_D = 1 + 10 Re^(-2/3)`` [1]_.
+The moment of the force is exact; the sum over the modes is the whole contribution of inertia. C is
+C_D d of a constant coefficient. S is the part of it that falls with the speed as in White's law for
+a cylinder, ``C_D = 1 + 10 Re^(-2/3)`` [1]_.
 
-What the motor's motion makes of the speeds is exact (by transforms over the whole record, as in
-`Prediction`). What the drag makes of them is followed step by step, for drag halves a peak and no
-repeated substitution converges there. Of each mode the two poles, with their residues, are stepped;
-the force between the steps is the cubic through the last four of them. From the forces so found
-the torque again follows by transforms, exactly.
+The speeds by the motor's motion are exact (by transforms over the whole record, as in
+`TorquePredictor`). The effect of drag on them is computed in time steps, since drag halves a peak
+and repeated substitution does not converge there. The two poles of each mode, with their residues,
+are stepped; the force between the steps is the cubic through the last four of them. From the forces
+so found the torque again follows by transforms, exactly.
 
 This torque is not linear in the motion, so no response function gives it. In a fit it is computed
-at one beam and drag and taken out of the measured torque; what it changes by when beam or drag
-change is linear (`DragExpansion`) in
+at one beam and drag and removed from the measured torque; its change with beam or drag is linear
+(`DragExpansion`) in
 
 * the poles of the modes, on which the motion near a resonance depends,
 * the external damping ``gamma s^lambda`` at these poles, since it also drives the modes,
@@ -73,7 +73,7 @@ _OVERSAMPLING: Final = 3
 
 _PADDED: Final = 1.1
 _DECAY: Final = 6.6
-"""As in `Prediction`."""
+"""As in `TorquePredictor`."""
 
 _PAST: Final = 3
 """Forces before the present one that the polynomial passes."""
@@ -95,26 +95,26 @@ _SLOWING: Final = 1 / 3
 
 
 class DragError(ArithmeticError):
-    """So much drag on so light a beam cannot be followed from sample to sample."""
+    """Drag is too large, or the beam too light, to be simulated from sample to sample."""
 
 
 @dataclass(frozen=True, slots=True)
 class DragLaw:
-    """Drag per metre and speed squared.
+    """Law of the drag per metre and speed squared.
 
     Attributes
     ----------
     constant_m : float
         C_D d that does not depend on the speed.
     slowing : float
-        S, in m (m/s)^(2/3): by how much C_D d is more at 1 m/s.
+        S, in m (m/s)^(2/3): additional C_D d at 1 m/s.
     """
 
     constant_m: float
     slowing: float = 0.0
 
     def at(self, speed_m_s: float) -> float:
-        """C_D d in m at a speed."""
+        """Return C_D d in m at a speed."""
         return float(self.constant_m + self.slowing * speed_m_s ** (_SLOWING - 1))
 
 
@@ -151,14 +151,14 @@ class DragTorque:
 
     @property
     def by_ln_density(self) -> Real:
-        """By the logarithm of the mass per length, the poles and the drag held."""
+        """Return the derivative by the logarithm of the mass per length, poles and drag held."""
         numbers = np.array([self.law.constant_m, self.law.slowing])
         own: Real = self.torque_nm - numbers @ self.by_law
         return own
 
 
 class DragResponse:
-    """What drag does to one beam that follows one angle.
+    """Torque by drag on one beam that follows one angle.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ class DragResponse:
     Attributes
     ----------
     s : ndarray of complex, shape (bins,)
-        Where its transforms are told: a line beside the imaginary axis, in rad/s.
+        Points of its transforms: a line parallel to the imaginary axis, in rad/s.
     """
 
     def __init__(self, angle_rad: Real, rate_hz: float, plant: Plant) -> None:
@@ -199,17 +199,17 @@ class DragResponse:
         self._pairs = _pole_pairs(k * beam.length_m**4, plant)
 
     def first_order(self) -> Real:
-        """Torque by a small drag, over C_D d, shape (m,)."""
+        """Return the torque by a small drag over C_D d, shape (m,)."""
         return self._torque(self._modal(_force(self._linear_speed(), DragLaw(1.0))))
 
     def torque(self, law: DragLaw, modes: Sequence[int] = ()) -> DragTorque:
-        """Torque by drag, with its derivatives.
+        """Return the torque by drag, with its derivatives.
 
         Parameters
         ----------
         law : DragLaw
         modes : sequence of int
-            By whose poles the torque is to be differentiated.
+            Modes by whose poles the torque is differentiated.
 
         Raises
         ------
@@ -232,8 +232,8 @@ class DragResponse:
         carried = self._leverage[:, None] * self._follow * spectra[:-1]
         for mode in modes:
             pole = self._pairs[mode - 1][0]
-            share, mirror = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
-            for change in (share + mirror, 1j * (share - mirror)):
+            term, mirror = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
+            for change in (term + mirror, 1j * (term - mirror)):
                 sources.append((mode - 1, self._fine(moved[mode - 1] * change)))
                 direct.append(self.in_time(carried[mode - 1] * change))
         for mode in _LOWEST:
@@ -258,13 +258,13 @@ class DragResponse:
 
     @property
     def poles(self) -> Complex:
-        """Upper pole of each mode, shape (MODES,)."""
+        """Return the upper pole of each mode, shape (MODES,)."""
         upper: Complex = self._pairs[:, 0]
         return upper
 
     @property
     def _leverage(self) -> Real:
-        """Leverage of the modes, L b_i, shape (MODES,)."""
+        """Return the leverage of the modes, L b_i, shape (MODES,)."""
         return self.plant.beam.length_m * self._grid.leverage_m
 
     def _mean_speed(self, speed: Real) -> float:
@@ -274,16 +274,16 @@ class DragResponse:
         return power / total if total > 0 else 0.0
 
     def _linear_speed(self) -> Real:
-        """Speeds at the points without drag, shape (3 m, POINTS)."""
+        """Return the speeds at the points without drag, shape (3 m, POINTS)."""
         speed = np.outer(self._fine(self._turning), self._grid.x_m)
         for shape, driven in zip(self._grid.shapes, self._driven, strict=True):
             speed += np.outer(self._fine(driven), shape)
         return speed
 
     def _brake(self, speed: Real, law: DragLaw) -> None:
-        """Turn the speeds without drag into those with it, in place."""
-        told, by_state, by_force = self._stepping()
-        step = np.concatenate([self._grid.shapes.T @ told, by_state])
+        """Replace the speeds without drag by those with drag, in the same array."""
+        output, by_state, by_force = self._stepping()
+        step = np.concatenate([self._grid.shapes.T @ output, by_state])
         of_force = by_force @ self._grid.to_modes
         state, force, magnitude = np.zeros(len(by_state)), *np.zeros((2, POINTS))
         out = np.zeros(len(step))
@@ -307,20 +307,14 @@ class DragResponse:
             add(state, later, state)
 
     def _perturbed(self, speed: Real, law: DragLaw, sources: list[tuple[int, Real]]) -> list[Real]:
-        """Change the forces, as `_modal` has them, by a mode's speed and by the law.
+        """Return the first-order change of the modal forces by a mode's speed and by the law.
 
-        To first order the points are not needed for that: what the speed of one mode does to the
-        force on another is one number at each step.
-
-        Parameters
-        ----------
-        speed : ndarray, shape (3 m, POINTS)
-            With drag.
-        sources : list of (int, ndarray of shape (3 m,))
-            Which mode (from 0) moves faster, and by how much.
+        To first order the points are not needed: the effect of the speed of one mode on the force
+        on another is one number at each step. `speed`, shape (3 m, POINTS), is with drag; `sources`
+        holds for each mode (from 0) that moves faster the additional speed, shape (3 m,).
         """
-        told, by_state, by_force = self._stepping()
-        step = np.concatenate([told, by_state])
+        output, by_state, by_force = self._stepping()
+        step = np.concatenate([output, by_state])
         of_force = np.hstack([by_force, np.zeros((len(by_force), 1))])  # none of the moment
         runs, weights = len(sources) + 2, self._to_root
         coupling = (weights[:, None] * self._grid.shapes).reshape(-1, POINTS).T
@@ -349,14 +343,14 @@ class DragResponse:
         return list(np.ascontiguousarray(changed.transpose(2, 1, 0)))
 
     def _stepping(self) -> tuple[Real, Real, Real]:
-        """Matrices of a step: modes' speeds and next state, by the state; by the new force.
+        """Return the matrices of a time step: modal speeds and next state by state, and by force.
 
         The state holds two numbers a mode, then the modes' forces of the last three steps.
         """
         n, step_s = MODES, 1 / (_OVERSAMPLING * self._rate_hz)
         states = 2 * n + _PAST * n
         by_state, by_force = np.zeros((states, states)), np.zeros((states, n))
-        told = np.zeros((n, states))
+        output = np.zeros((n, states))
         z_prime = self._slopes()
         for i, (pair, slope) in enumerate(zip(self._pairs, z_prime, strict=True)):
             rows = slice(2 * i, 2 * i + 2)
@@ -367,16 +361,16 @@ class DragResponse:
                 a, b = decay[0].real, decay[0].imag
                 by_state[rows, rows] = [[a, -b], [b, a]]
                 parts = np.array([inputs[0].real, inputs[0].imag])
-                told[i, rows] = 2 * gain[0].real, -2 * gain[0].imag
+                output[i, rows] = 2 * gain[0].real, -2 * gain[0].imag
             elif np.isnan(pair[0]):
                 continue
             else:
                 by_state[rows, rows] = np.diag(decay.real)
                 parts = inputs.real
-                told[i, rows] = gain.real
+                output[i, rows] = gain.real
             by_force[rows, i] = parts[:, 0]
             by_state[rows, 2 * n + i :: n] = parts[:, 1:]
-        # The forces move on by one place.
+        # The forces move on by one step.
         by_force[2 * n : 3 * n] = np.eye(n)
         by_state[3 * n :, 2 * n : -n] = np.eye((_PAST - 1) * n)
         # For the speed the new force is not known yet: it is foreseen from the last three.
@@ -384,10 +378,10 @@ class DragResponse:
         for back, factor in enumerate((3.0, -3.0, 1.0)):
             columns = slice((2 + back) * n, (3 + back) * n)
             foreseen[:, columns] += factor * by_force[: 2 * n]
-        return told[:, : 2 * n] @ foreseen, by_state, by_force
+        return output[:, : 2 * n] @ foreseen, by_state, by_force
 
     def _slopes(self) -> Complex:
-        """Slope of Z at the poles, shape (MODES, 2)."""
+        """Return the slope of Z at the poles, shape (MODES, 2)."""
         s, damping = self._pairs, self.plant.damping
         ratio = self.plant.beam.density_over_stiffness
         log_s = np.log(s)
@@ -401,22 +395,22 @@ class DragResponse:
 
     @property
     def _to_root(self) -> Real:
-        """From the points to the modes and, last, to the moment: (MODES + 1, POINTS)."""
+        """Return the matrix from points to modes and, last, the moment: (MODES + 1, POINTS)."""
         return np.vstack([self._grid.to_modes, self._grid.to_moment])
 
     def _modal(self, force: Real) -> Real:
-        """Force on each mode and, last, its moment: (MODES + 1, 3 m), of (3 m, POINTS)."""
+        """Return the force on each mode and, last, its moment, from (3 m, POINTS)."""
         modal: Real = self._to_root @ force.T
         return modal
 
     def _spectra(self, forces: Real) -> Complex:
-        """Transform what `_modal` gives, shape (MODES + 1, bins)."""
+        """Transform the result of `_modal`, shape (MODES + 1, bins)."""
         every = np.fft.rfft(forces / self._growth, _OVERSAMPLING * self._length)
         spectra: Complex = every[:, : self.s.size] / _OVERSAMPLING
         return spectra
 
     def _response(self, spectra: Complex) -> Complex:
-        """Torque's transform, without the delay, by forces on modes and their moment."""
+        """Return the transform of the torque by modal forces and moment, without the delay."""
         torque: Complex = self._leverage @ (self._follow * spectra[:-1]) - spectra[-1]
         return torque
 
@@ -424,7 +418,7 @@ class DragResponse:
         return self.in_time(self._response(self._spectra(forces)))
 
     def in_time(self, torque: Complex) -> Real:
-        """Values (..., m) of a torque, as its channel shows it, at the samples of the angle.
+        """Return the values (..., m) of a torque after its channel, at the samples of the angle.
 
         Parameters
         ----------
@@ -436,23 +430,23 @@ class DragResponse:
         return values
 
     def modal_torque(self, mode: int) -> Complex:
-        """Part of one mode, from 1, in the linear torque, without the delay, shape (bins,).
+        """Return the part of one mode, from 1, in the linear torque, without delay, shape (bins,).
 
-        The mode's poles are in all of it, and in nothing else of the torque.
+        This part contains all dependence of the torque on the poles of the mode.
         """
-        share = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode - 1]
-        torque: Complex = share * self._inertial * self._driven[mode - 1] / self.s
+        term = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode - 1]
+        torque: Complex = term * self._inertial * self._driven[mode - 1] / self.s
         return torque
 
     def _fine(self, spectrum: Complex) -> Real:
-        """Values (..., 3 m) over the record at the multiple of the rate."""
+        """Return the values (..., 3 m) over the record at the multiple of the rate."""
         fine = np.fft.irfft(_OVERSAMPLING * spectrum, _OVERSAMPLING * self._length)
         values: Real = fine[..., : self._growth.size] * self._growth
         return values
 
 
 def _force(speed: Real, law: DragLaw) -> Real:
-    """Force per metre in N/m."""
+    """Return the force per metre in N/m."""
     magnitude = np.abs(speed)
     per_speed = law.constant_m * magnitude
     if law.slowing:
@@ -462,23 +456,23 @@ def _force(speed: Real, law: DragLaw) -> Real:
 
 
 def _pole_pairs(k_of_length: Real, plant: Plant) -> Complex:
-    """Poles of the modes, shape (MODES, 2), of which ``(k L)^4`` is given."""
+    """Return the poles of the modes, shape (MODES, 2), whose ``(k L)^4`` is given."""
     pairs = poles_for_eigenvalues(k_of_length**0.25, plant.beam, plant.damping)
     return pairs.astype(np.complex128)
 
 
 def _polynomial_inputs(pole: Complex, step_s: float) -> Complex:
-    """Integrate ``z' = p z + F`` over forces at the end of a step and before: (poles, 1 + _PAST).
+    """Integrate ``z' = p z + F`` over the forces at the steps: (poles, 1 + _PAST).
 
     Between the instants the force is the polynomial through all of them.
     """
     node, weight = np.polynomial.legendre.leggauss(_QUADRATURE)
     at = 0.5 * (node + 1)
-    places = 1.0 - np.arange(1 + _PAST)
+    nodes = 1.0 - np.arange(1 + _PAST)
     lagrange = np.array(
         [
-            np.prod([(at - other) / (own - other) for other in places if other != own], axis=0)
-            for own in places
+            np.prod([(at - other) / (own - other) for other in nodes if other != own], axis=0)
+            for own in nodes
         ]
     )
     growth = np.exp(pole[:, None] * (step_s * (1 - at)))
@@ -493,17 +487,17 @@ _OF_EXTERNAL: Final = ("gamma", "lambda")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DragExpansion:
-    """Changes of the torque by drag around one beam and drag, as spectra in the band.
+    """Derivatives of the torque by drag at one beam and drag, as spectra in the band.
 
     Attributes
     ----------
     plant : Plant
     law : DragLaw
-        At these the torque was taken out of the record.
+        Beam and law for which the torque was removed from the record.
     response : DragResponse
-        What drag does to that beam.
+        Response of that beam to drag.
     band : callable
-        Spectrum in the band of samples of the angle's times.
+        Function that returns the spectrum in the band of samples at the times of the angle.
     by_pole : dict of int to ndarray of complex, shape (2, K)
         For each mode: by the real and the imaginary part of its upper pole.
     by_external : ndarray of complex, shape (2, 2, K)
@@ -527,10 +521,10 @@ class DragExpansion:
     speed_m_s: float
     top_speed_m_s: float
 
-    def beside(
+    def change_to(
         self, plant: Plant, poles: Sequence[Pole], names: Sequence[str], chain: Real
     ) -> tuple[Complex, Complex]:
-        """Spectrum (K,) of what another beam changes, and its derivatives by the unknowns (k, K).
+        """Return the change of the spectrum (K,) for another beam, and its derivatives (k, K).
 
         Parameters
         ----------
@@ -575,10 +569,11 @@ class DragExpansion:
         return change, jacobian
 
     def _external(self, plant: Plant) -> list[Real]:
-        """External damping of another beam less that of this one, as it drives the lowest modes.
+        """Return the external damping of another beam less that of this one, for the lowest modes.
 
-        At the pole of each, where it counts: with another order ``gamma s^lambda`` is not linear in
-        gamma and lambda, and where little external damping shows a fit may come by any order.
+        The difference is taken at the pole of each mode: with another order ``gamma s^lambda`` is
+        not linear in gamma and lambda, and a fit with insignificant external damping may reach any
+        order.
 
         Returns
         -------
@@ -600,9 +595,9 @@ class DragExpansion:
         return found
 
     def _remainder(self, mode: int, here: complex, there: complex) -> tuple[Complex, Complex]:
-        """Linear torque of a mode beyond the first order in its pole, (K,), and its slopes, (2, K).
+        """Return a mode's linear torque beyond first order in its pole, and its slopes.
 
-        The slopes are by the real and the imaginary part.
+        The torque has the shape (K,), and the slopes by the real and the imaginary part (2, K).
         """
         s, torque = self.response.s, self.response.modal_torque(mode)
         apart = there - here
@@ -618,6 +613,6 @@ class DragExpansion:
 
 
 def _part(chain: Real, names: Sequence[str], wanted: Sequence[str]) -> Real:
-    """Rows of some parameters, shape (len(wanted), k); nought of one that is not there."""
+    """Return the rows of some parameters, shape (len(wanted), k); zero for a missing one."""
     none = np.zeros(chain.shape[1])
     return np.array([chain[names.index(name)] if name in names else none for name in wanted])

@@ -1,4 +1,4 @@
-"""Simple causes that would explain modes which no plain uniform beam has: named, and never facts.
+"""Simple causes of modes that deviate from a uniform beam; they are hypotheses, not facts.
 
 Each is fitted to the modal constants with the seven parameters of the beam, at exact geometry. A
 dozen constants admit several causes, so none of those that explain them is established.
@@ -50,10 +50,10 @@ _RISE: Final = 10.0
 
 _HALVINGS: Final = 3
 _CLOSE: Final = 0.02
-"""Share of chi-square, or of 1, that a step must promise."""
+"""Least predicted reduction of chi-square in a step, relative to chi-square or 1."""
 
 _RELUCTANCE: Final = 1e-3
-"""Keeps an unknown without effect where it is; one determined is moved all the same."""
+"""Regularization: an unknown without effect stays, a determined one moves all the same."""
 
 _NEAR: Final = 6.0
 """Chi-square above the best from which a cause is not named unless its p-value is `_GOOD`."""
@@ -64,21 +64,21 @@ _MOST_NAMED: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class CauseFit:
-    """One cause, fitted to the modal constants, that would explain the modes.
+    """Fit of one cause to the modal constants.
 
     Attributes
     ----------
     name : str
         Kind of cause.
     words : str
-        The same with its size, as sentences take it.
+        Cause and size in words, for sentences.
     size : float
         In `unit`.
     unit : str
     chi_square, p_value : float
-        Misfit of the modal constants with it, and how rarely chance makes it larger.
+        Misfit of the modal constants with it, and the probability of a larger one by chance.
     plant : Plant or None
-        Rig with it, where a `Plant` has such a thing.
+        Plant with this cause, if a `Plant` can represent it.
     """
 
     name: str
@@ -90,7 +90,7 @@ class CauseFit:
     plant: Plant | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """As `json.dumps` takes it."""
+        """Return the fit as `json.dumps` takes it."""
         return {
             "name": self.name,
             "size": self.size,
@@ -103,7 +103,7 @@ class CauseFit:
 def explanations(
     fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
 ) -> tuple[CauseFit, ...]:
-    """Find causes that explain the modes, each alone; the best first.
+    """Return the causes that explain the modes, each alone; the best first.
 
     Parameters
     ----------
@@ -146,12 +146,12 @@ def explanations(
 def _explained(
     problem: ConstantsProblem, cause: Cause, bases: Sequence[NDArray[np.float64]]
 ) -> CauseFit | None:
-    """Fit one cause; None if it is not to be tested, explains nothing or is not plausible."""
+    """Fit one cause; return None if it is not tested, explains nothing or is not plausible."""
     count = problem.lower.size
     freedom = problem.compared - count - len(cause.lower)
     if freedom <= 0:
         return None
-    begun = [(*_Search(problem, cause, x).begun(), x) for x in bases]
+    begun = [(*_CauseSearch(problem, cause, x).begun(), x) for x in bases]
     for _, start, x in sorted(begun, key=lambda each: each[0]):
         cost, y = _fitted(problem, cause, x, start, freedom)
         p_value = float(chi_square_p_value(cost, freedom))
@@ -184,16 +184,16 @@ def _fitted(
     y: NDArray[np.float64],
     freedom: int,
 ) -> tuple[float, NDArray[np.float64]]:
-    """Descend from y, first with a tolerance; chi-square and unknowns."""
+    """Descend from y, first with a tolerance; return chi-square and unknowns."""
     cost = math.inf
     for tolerance in _TOLERANCES:
-        cost, y = _Search(problem, cause, x, tolerance).descended(y)
+        cost, y = _CauseSearch(problem, cause, x, tolerance).descended(y)
         if cost > _HOPELESS * freedom:
             break
     return cost, y
 
 
-class _Search:
+class _CauseSearch:
     """Search for beam and cause, with one tolerance.
 
     Parameters
@@ -201,9 +201,9 @@ class _Search:
     problem : ConstantsProblem
     cause : Cause
     x : ndarray, shape (7,)
-        Unknowns of the beam without it. A damping that is none in them stays so.
+        Unknowns of the beam without the cause. An absent damping stays absent.
     tolerance : float
-        Standard deviation of every constant, beside what the record leaves uncertain.
+        Standard deviation of every constant, in addition to the uncertainty of the record.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class _Search:
         self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def begun(self) -> tuple[float, NDArray[np.float64]]:
-        """Best point a step of the beam's unknowns away from a start of the cause."""
+        """Return the best point one step of the beam's unknowns away from a start of the cause."""
         x, rows = self._x, None
         low, high = (ends[: x.size] - x for ends in (self._lower, self._upper))
         found = []
@@ -239,10 +239,10 @@ class _Search:
         return min(found, key=lambda pair: pair[0])
 
     def descended(self, y: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Take Gauss-Newton steps; the least chi-square, and its unknowns.
+        """Take Gauss-Newton steps; return the least chi-square and its unknowns.
 
-        Whole ones as a rule, also where chi-square rises a little: along a curved valley it does,
-        and then falls the more.
+        Steps are not shortened as a rule, also where chi-square rises a little: along a curved flat
+        direction it rises first and then falls further.
         """
         scale, least, best = self._scale, math.inf, y
         for _ in range(_MANY):
@@ -250,13 +250,13 @@ class _Search:
             cost = float(deviation @ deviation)
             if cost < least:
                 least, best = cost, y
-            step, promised = _step(
+            step, predicted = _step(
                 deviation,
                 rows * scale[:, None],
                 (self._lower - y) / scale,
                 (self._upper - y) / scale,
             )
-            if cost - promised < _CLOSE * max(cost, 1.0):
+            if cost - predicted < _CLOSE * max(cost, 1.0):
                 break
             step = step * scale * min(1.0, _LONGEST / float(np.abs(step).max()))
             for _ in range(_HALVINGS):
@@ -274,11 +274,11 @@ class _Search:
         if altered.same_shapes(Alteration()):
             return replace(self._plain, alteration=altered)
         terms = mode_terms(altered, beam, self._problem.modes)
-        # A cause's mass is a share of the beam's: while that is varied, shapes stay as they are.
+        # The mass of a cause is a fraction of the beam's: shapes stay the same while that varies.
         return terms if self._problem.stated.lumps else replace(terms, density_kg_per_m=None)
 
     def _whitened(self, x: NDArray[np.float64], terms: ModeTerms) -> NDArray[np.float64]:
-        """Deviations of beams, (m, 7), with one cause: (m, 4 n)."""
+        """Return the deviations of beams, (m, 7), with one cause: (m, 4 n)."""
         off = self._problem.differences(x, terms)
         found: NDArray[np.float64] = np.nan_to_num(off @ self._whitener.T, nan=1e6)
         return found
@@ -288,14 +288,14 @@ class _Search:
         return found
 
     def _slopes(self, y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Deviations, and their derivatives by the beam's unknowns."""
+        """Return the deviations and their derivatives by the beam's unknowns."""
         count = self._x.size
         steps = np.concatenate([np.zeros((1, count)), _STEP * np.eye(count)])
         every = self._whitened(y[:count] + steps, self._terms(y))
         return every[0], (every[1:] - every[0]) / _STEP
 
     def _jacobian(self, y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Deviations, and their derivatives by all unknowns."""
+        """Return the deviations and their derivatives by all unknowns."""
         deviation, rows = self._slopes(y)
         steps = _STEP * np.diag(self._scale)[self._x.size :]
         own_rows = [(self._deviations(y + step) - deviation) / step.sum() for step in steps]
@@ -308,10 +308,10 @@ def _step(
     low: NDArray[np.float64],
     high: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Gauss-Newton step within limits, and the chi-square that it promises.
+    """Return the Gauss-Newton step within limits, and the chi-square that it predicts.
 
-    By least squares of the deviations themselves: frequencies are known a thousand times better
-    than residues, and normal equations would square that.
+    The deviations themselves are solved by least squares: frequencies are known a thousand times
+    better than residues, and normal equations would square that.
     """
     step, moving = np.zeros(len(rows)), np.arange(len(rows))
     while moving.size:
@@ -333,12 +333,12 @@ def _step(
 
 
 def finding(test: UniformBeamTest, found: Sequence[CauseFit], step: Step | None = None) -> Finding:
-    """Put in words what would explain the modes.
+    """Return the finding that names the causes of the modes.
 
     Parameters
     ----------
     test : UniformBeamTest
-        That refused the plain uniform beam.
+        Test that refused the plain uniform beam.
     found : sequence of CauseFit
         As `explanations` gives them.
     step : Step, optional

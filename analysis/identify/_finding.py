@@ -1,4 +1,4 @@
-"""Finding: an effect in a record other than the beam of Eq. 25."""
+"""Finding: an effect in a record in addition to the linear beam."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ Kind = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing found.
+    """One effect found in a record.
 
     Attributes
     ----------
     kind : str
     sentence : str
-        As the report says it.
+        Sentence for the report.
     value : float or None
         Its size, in `unit`.
     interval : tuple of float or None
         95 %.
     unit : str
     remedy : str
-        What to do, or which experiment tells more; may be empty.
+        Action, or experiment that would clarify the cause; may be empty.
     parameters : tuple of str
-        Fitted parameters that it is about: it is no fact where one of them is flagged.
+        Fitted parameters that it rests on: it is not established if one of them is flagged.
     """
 
     kind: Kind
@@ -83,18 +83,18 @@ _INTERVAL: Final = re.compile(r" \((?:[^()]*; 95 %|± [^()]*)\)")
 
 
 def doubted(finding: Finding, because: str) -> Finding:
-    """Tell as no fact what was found beside a model that is not to be believed.
+    """Return a finding as not established, for a reason.
 
     Parameters
     ----------
     finding : Finding
     because : str
-        Why it is not.
+        Reason why it is not established.
 
     Returns
     -------
     Finding
-        Without interval; as it was if it does not rest on the model (`SEEN`).
+        Finding without interval; unchanged if it does not rest on the model (`SEEN`).
 
     Examples
     --------

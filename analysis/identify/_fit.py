@@ -15,7 +15,7 @@ from analysis.identify._plant import SETTINGS, free_settings
 from analysis.identify._problem import Objective
 from analysis.identify._residual_tests import whiteness
 from analysis.identify._result import RecordAnalysis, RecordFit
-from analysis.identify._search import CoarseResponse, Descent, Search
+from analysis.identify._search import CoarseResponse, Descent, StructureSearch
 from analysis.identify._uncertainty import (
     covariance_of_unknowns,
     interval_from_zero,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._data import Measurement
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._problem import Projected
     from analysis.models import Structure
@@ -44,10 +44,10 @@ _BEFORE_LINES: Final = 1e-4
 """The same while noise and lines are still to be found: a standard deviation."""
 
 _PATIENCE: Final = 20
-"""Evaluations after which a structure far behind the closest one is left where it is: it creeps
-along a valley that damping of the wrong kind makes."""
+"""Evaluations after which a structure far behind the closest one is left where it is: it
+converges slowly along a flat direction that damping of the wrong kind causes."""
 
-_A_LOOK: Final = 4
+_EARLY_EVALUATIONS: Final = 4
 """The same for one that was far behind before."""
 
 _REPEATS: Final = 3
@@ -63,19 +63,19 @@ def fit_record(
 ) -> RecordAnalysis:
     """Fit structures to a whole record in the band.
 
-    The torque is predicted from the measured angle (`Prediction`); the squares of what the
-    measurement differs by, whitened with the spectrum of the noise found in it, are minimised over
-    the damping and over density over stiffness, stiffness, delay and tool inertia. For noise in
-    the torque alone that is the maximum-likelihood estimate, whatever the excitation. Where a
-    controller held the motor to a reference, the part coherent with that is used as input
-    (`analysis.identify._instrument`): the noise then moves the motor as well.
+    The torque is predicted from the measured angle (`Prediction`); the squared residual, whitened
+    with the estimated noise spectrum, is minimised over the damping and over density over
+    stiffness, stiffness, delay and tool inertia. For noise in the torque alone that is the
+    maximum-likelihood estimate, whatever the excitation. Where a controller held the motor to a
+    reference, the part coherent with that is used as input (`analysis.identify._instrument`): the
+    noise then moves the motor as well.
 
     Parameters
     ----------
     measurement : Measurement
     structures : iterable of Structure
-        They share one noise spectrum, that of the one closest to the coarse response, so that
-        their costs compare.
+        All use one noise spectrum, that of the one closest to the coarse response, so that their
+        costs are comparable.
     fixed : iterable of str
         Settings (`SETTINGS`) that stay at the values the file states.
     band_hz : tuple of float
@@ -97,7 +97,7 @@ def fit_record(
     nominal = measurement.nominal
     coarse = CoarseResponse(comparison)
     searches = [
-        Search.of(Objective(comparison, unknowns), coarse)
+        StructureSearch.of(Objective(comparison, unknowns), coarse)
         for unknowns in (Unknowns.of(structure, nominal, free) for structure in structures)
     ]
     closest = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
@@ -113,7 +113,8 @@ def fit_record(
         comparison = reference.objective.comparison
         coarse = CoarseResponse(comparison)
         searches = [
-            Search.of(Objective(comparison, search.unknowns), coarse) for search in searches
+            StructureSearch.of(Objective(comparison, search.unknowns), coarse)
+            for search in searches
         ]
     # What was apart from the reference may hide the beam, or stand for noise. The closest structure
     # shows that before all others are fitted, and the closest of all once they are.
@@ -124,11 +125,11 @@ def fit_record(
             reference = renewed
             comparison = reference.objective.comparison
             searches = [search.on(comparison) for search in searches]
-        noise, descents = _under_its_noise(searches, closest, reference, descents)
+        noise, descents = _descend_with_noise(searches, closest, reference, descents)
         closest = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
         reference = descents[closest]
         if not _explains(reference, noise):
-            break  # what none of these explains is not told apart any better by them
+            break  # none of these explains it, so a further pass does not distinguish them better
         renewed = reference.renewed(noise, _BEFORE_LINES)
         if renewed is reference:
             break
@@ -155,7 +156,7 @@ def refit_record(
     Returns
     -------
     RecordAnalysis or None
-        None where that leaves more than noise, or a hum: then a search is needed.
+        None if the residual is more than noise, or a hum: then a search is needed.
 
     Raises
     ------
@@ -176,24 +177,17 @@ def refit_record(
     return RecordAnalysis.of([summary(here.objective, here.x, noise)], noise, comparison)
 
 
-def _under_its_noise(
-    searches: list[Search], closest: int, reference: Descent, before: list[Descent]
-) -> tuple[Noise, list[Descent]]:
-    """Descend with all structures under the noise that the closest one leaves.
+def _descend_with_noise(
+    searches: list[StructureSearch], closest: int, reference: Descent, before: list[Descent]
+) -> tuple[NoiseSpectrum, list[Descent]]:
+    """Descend with all structures under the noise of the closest one's residual.
 
-    Parameters
-    ----------
-    searches : list of Search
-        One for each structure.
-    closest : int
-        Place of the closest structure.
-    reference : Descent
-        Where that is.
-    before : list of Descent
-        Where all were before it was told anew what follows the reference; empty the first time.
-        One that stays far behind from there is not searched for again.
+    `searches` holds one search for each structure; `closest` is the index of the closest one, and
+    `reference` its descent. `before` holds the descents before the part that follows the reference
+    was re-estimated, and is empty the first time: a structure far behind then is not searched for
+    again.
     """
-    # Lines are looked for once, in what a fit to every bin leaves.
+    # Lines are searched for once, in the residual of a fit to every bin.
     noise = reference.noise(with_lines=True)
     hum = reference.objective.comparison.hum
     noise = replace(noise, lines=(*noise.lines, *(each.line for each in hum)))
@@ -204,31 +198,31 @@ def _under_its_noise(
     for i, search in enumerate(searches):
         found = first if i == closest else None
         if found is None and before:
-            found = _still_behind(Descent(search.objective, before[i].x), noise, most)
+            found = _still_worse(Descent(search.objective, before[i].x), noise, most)
         if found is None:
             found = search.under(noise).to_minimum(noise, _TOLERANCE, (_PATIENCE, most))
         descents.append(found)
     return noise, descents
 
 
-def _explains(closest: Descent, noise: Noise) -> bool:
-    """Whether chance may have shaped what a structure leaves."""
+def _explains(closest: Descent, noise: NoiseSpectrum) -> bool:
+    """Return whether chance explains the residual of a structure."""
     objective, counts = closest.objective, noise.counts
     residual = objective.project(objective.linearise(closest.x), noise.weight).residual
     hz = objective.comparison.frequency_hz
     return whiteness(residual[counts], hz[counts]).all_but_white
 
 
-def _still_behind(before: Descent, noise: Noise, most: float) -> Descent | None:
-    """Look whether a structure stays above a cost from where it was; None if it does not."""
+def _still_worse(before: Descent, noise: NoiseSpectrum, most: float) -> Descent | None:
+    """Return the descent of a structure that stays above a cost; None if it does not."""
     if before.cost(noise) <= most:
         return None
-    found = before.to_minimum(noise, _TOLERANCE, (_A_LOOK, most))
+    found = before.to_minimum(noise, _TOLERANCE, (_EARLY_EVALUATIONS, most))
     return found if found.cost(noise) > most else None
 
 
 def _followed_again(clean: Descent, whole: Comparison) -> Descent:
-    """Recompute the part that follows no reference: the first was biased by a disturbance."""
+    """Recompute the incoherent part: the first estimate was biased by a disturbance."""
     hum, unknowns = clean.objective.comparison.hum, clean.objective.unknowns
     for _ in range(_REPEATS):
         comparison = whole.following_reference(clean.plant).without_hum(hum)
@@ -241,8 +235,8 @@ def _followed_again(clean: Descent, whole: Comparison) -> Descent:
 # Result at a minimum
 
 
-def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> RecordFit:
-    """Parameters, uncertainty, modes and residual at a minimum.
+def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) -> RecordFit:
+    """Return parameters, uncertainty, modes and residual at a minimum.
 
     Parameters
     ----------
@@ -256,7 +250,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> Recor
     at = objective.linearise(x)
     projected = objective.project(at, noise.weight)
     # Where a torque is unknown the residual is nought and adds nothing to the sum.
-    compared = round(2 * np.sum(noise.counts) * comparison.measurement.torque_share)
+    compared = round(2 * np.sum(noise.counts) * comparison.measurement.known_torque_fraction)
     freedom = compared - x.size - projected.amplitudes.size
     scatter = projected.cost / freedom
     lower, upper = unknowns.bounds
@@ -269,11 +263,11 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> Recor
     std, intervals = dict(of.std), dict(of.interval)
     tool = "tool_inertia_kg_m2"
     if tool in names and held[names.index(tool)]:
-        place = names.index(tool)
-        free = held & (np.arange(held.size) != place)
+        index = names.index(tool)
+        free = held & (np.arange(held.size) != index)
         every, _ = covariance_of_unknowns(jacobian, scatter, free)
         chain = unknowns.estimates_by_unknowns(x)
-        std[tool] = float(chain[place, place] * every[place, place] ** 0.5)
+        std[tool] = float(chain[index, index] * every[index, index] ** 0.5)
     spread = std.get(tool)
     if tool in names and spread:
         intervals[tool] = interval_from_zero(values[tool], spread)
@@ -301,9 +295,9 @@ def _compared_jacobian(
     objective: Objective,
     x: NDArray[np.float64],
     projected: Projected,
-    noise: Noise,
+    noise: NoiseSpectrum,
 ) -> NDArray[np.complex128]:
-    """Jacobian of the torques that are known, shape (k, K)."""
+    """Return the Jacobian of the known torques, shape (k, K)."""
     comparison, unknowns = objective.comparison, objective.unknowns
     if comparison.measurement.torque_known.all():
         return projected.jacobian

@@ -1,9 +1,8 @@
 """Free decay of the beam's modes: its poles, how they move, and its spectrum over a record.
 
-A beam that already rings when the record begins adds to the torque a sum of decays whose amplitudes
-nobody knows but whose poles are the model's own. So does one that was moved while nobody looked: in
-a gap of the measured angle. Their spectra over the samples compared are geometric sums, in closed
-form.
+A beam that already rings when the record begins adds a sum of decays to the torque. Their
+amplitudes are unknown, and their poles are those of the model. The same holds after a gap of the
+measured angle. The spectra over the compared samples are geometric sums, in closed form.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _HARDLY: Final = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Pole:
-    """One pole of one mode: of a conjugate pair the upper, or a real one.
+    """One pole of one mode: the upper one of a conjugate pair, or a real one.
 
     Attributes
     ----------
@@ -37,7 +36,7 @@ class Pole:
         From 1.
     at_rad_s : complex
     derivative : ndarray of complex, shape (k,)
-        By the parameters asked for.
+        Derivatives by the requested parameters.
     """
 
     mode: int
@@ -46,35 +45,35 @@ class Pole:
 
     @property
     def oscillates(self) -> bool:
-        """Whether the decay is an oscillation: two columns, else one."""
+        """Return whether the decay is an oscillation, with two columns instead of one."""
         return self.at_rad_s.imag != 0
 
 
 def decay_columns(poles: Sequence[Pole]) -> int:
-    """Count the spectra of the decays of some poles: two of each that oscillates."""
+    """Count the decay spectra of some poles: two for each that oscillates."""
     return sum(1 + pole.oscillates for pole in poles)
 
 
 def mode_poles(
     plant: Plant, count: int, wrt: Sequence[str], near_rad_s: Sequence[complex] = ()
 ) -> tuple[Pole, ...]:
-    """Poles of the first `count` modes with their derivatives, without modes that have none.
+    """Return the poles of the first `count` modes with derivatives; some modes may have none.
 
     Parameters
     ----------
     plant : Plant
     count : int
     wrt : sequence of str
-        Names that `ResponseGrid` knows; some do not move a pole.
+        Names of `ResponseGrid`; some do not affect a pole.
     near_rad_s : sequence of complex, optional
-        Where the poles are expected, if all of them are; in the order of the modes.
+        Approximate poles in the order of the modes, if all are known.
     """
     near = np.array(near_rad_s) if len(near_rad_s) == count > 0 else None
     if plant.tip_mass_kg or plant.root_compliance_rad_per_nm:
         return _loaded_poles(plant, count, wrt, near)
     z = eigenvalues(count).copy()
-    for place, offset in enumerate(plant.stiffness_offsets[: count - 1], start=1):
-        z[place] *= (1 + offset) ** 0.25
+    for index, offset in enumerate(plant.stiffness_offsets[: count - 1], start=1):
+        z[index] *= (1 + offset) ** 0.25
     found = []
     for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, near)):
         if np.isnan(pair[0]):
@@ -89,7 +88,7 @@ def mode_poles(
 def _loaded_poles(
     plant: Plant, count: int, wrt: Sequence[str], near: NDArray[np.complex128] | None
 ) -> tuple[Pole, ...]:
-    """Compute the same with a tip mass or an elastic clamp, on a uniform beam."""
+    """Return the same poles with a tip mass or an elastic clamp, on a uniform beam."""
     loaded = LoadedBeam(
         plant.beam, plant.damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm
     )
@@ -125,7 +124,7 @@ class DecaySpectra:
         self._turn = np.exp(-1j * omega_rad_s * self._period_s)
 
     def columns(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Spectra of ``Re exp(p t)`` and, if it oscillates, ``Im exp(p t)``: shape (m, K)."""
+        """Return spectra of ``Re exp(p t)`` and, if it oscillates, ``Im exp(p t)``: (m, K)."""
         return self._spectra(poles, self._sum)
 
     def gradient(
@@ -133,29 +132,30 @@ class DecaySpectra:
     ) -> NDArray[np.complex128]:
         """Differentiate ``amplitudes @ columns(poles)`` through the poles, shape (k, K)."""
         turned = []
-        place = 0
+        index = 0
         for pole in poles:
             if pole.oscillates:
                 # t exp(p t) times the pole's motion, seen along the two amplitudes.
-                moved = complex(amplitudes[place], -amplitudes[place + 1]) * pole.derivative
+                moved = complex(amplitudes[index], -amplitudes[index + 1]) * pole.derivative
                 turned += [moved.real, -moved.imag]
-                place += 2
+                index += 2
             else:
-                turned.append(amplitudes[place] * pole.derivative.real)
-                place += 1
+                turned.append(amplitudes[index] * pole.derivative.real)
+                index += 1
         parts: NDArray[np.float64] = np.array(turned).T @ self.growing(poles).view(np.float64)
         total: NDArray[np.complex128] = parts.view(np.complex128)
         return total
 
     def growing(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Spectra of the same times the time since the first sample: shape (m, K)."""
+        """Return spectra of the decays times the time since the first sample: shape (m, K)."""
         return self._spectra(poles, self._sum_of_time)
 
     def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:
-        """Spectra of oscillations all through the record, shape (4 n, K).
+        """Return spectra of oscillations over the whole record, shape (4 n, K).
 
-        Columns of either phase, constant and growing from nought: together any amplitude and phase
-        at the beginning and any other at the end, and that is what leaks into distant bins.
+        The columns have either phase, and are constant or grow from zero. Together they describe
+        any amplitude and phase at the beginning and any other at the end, which leaks into distant
+        bins.
         """
         none = np.zeros(0, dtype=np.complex128)
         # All but steady: on a bin's own frequency the sums would be 0 / 0.
@@ -166,29 +166,29 @@ class DecaySpectra:
     def _spectra(
         self, poles: Sequence[Pole], upper: Callable[[complex], NDArray[np.complex128]]
     ) -> NDArray[np.complex128]:
-        """Spectra of the real and, if it oscillates, the imaginary part of a complex decay."""
+        """Return spectra of the real and, if it oscillates, the imaginary part of a decay."""
         rows = np.empty((decay_columns(poles), self._turn.size), complex)
-        place = 0
+        index = 0
         for pole in poles:
             of_pole = upper(pole.at_rad_s)
             if pole.oscillates:
                 of_conjugate = upper(pole.at_rad_s.conjugate())
-                np.multiply(of_pole + of_conjugate, 0.5, out=rows[place])
-                np.multiply(of_pole - of_conjugate, -0.5j, out=rows[place + 1])
-                place += 2
+                np.multiply(of_pole + of_conjugate, 0.5, out=rows[index])
+                np.multiply(of_pole - of_conjugate, -0.5j, out=rows[index + 1])
+                index += 2
             else:
-                rows[place] = of_pole
-                place += 1
+                rows[index] = of_pole
+                index += 1
         return rows
 
     def _sum(self, pole: complex) -> NDArray[np.complex128]:
-        """Sum of ``exp(p t)`` over the samples, turned to each bin."""
+        """Return the sum of ``exp(p t)`` over the samples, rotated to each bin."""
         ratio = np.exp(pole * self._period_s) * self._turn
         total: NDArray[np.complex128] = (1 - np.exp(pole * self._duration_s)) / (1 - ratio)
         return total
 
     def _sum_of_time(self, pole: complex) -> NDArray[np.complex128]:
-        """Sum of ``t exp(p t)``: the derivative of `_sum` by the pole."""
+        """Return the sum of ``t exp(p t)``: the derivative of `_sum` by the pole."""
         ratio = np.exp(pole * self._period_s) * self._turn
         over = np.exp(pole * self._duration_s)
         reciprocal = np.reciprocal(1 - ratio)
@@ -200,10 +200,10 @@ class DecaySpectra:
 
 
 class LaterDecaySpectra(DecaySpectra):
-    """The same of decays that begin at once, within the record, and pass its low-pass filter.
+    """Spectra of decays that begin within the record and pass its low-pass filter.
 
-    They begin at a tick of the record; what the samples compared have of that is the sum over the
-    record's ticks, since the filter has no effect in the band. They end with the samples.
+    They begin at a tick of the record. Their part in the compared samples is the sum over the
+    ticks, since the filter has no effect in the band. They end with the samples.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """Headline numbers of a record: from the freest structure that it supports, with flags.
 
 A structure that fixes an order gives narrow intervals which hold only if that order is right, and
-the criterion that selected it forgives an error of 2.7 standard deviations. So what is told first
-comes from the structure in which every order is free: its intervals hold whichever simpler one is
-true. What a simpler one would give stands beside it, as a condition.
+the criterion that selected it forgives an error of 2.7 standard deviations. So the reported numbers
+are those of the structure with every order free: its intervals are valid whichever simpler one is
+true. The numbers of a simpler structure are reported in addition, as a conditional estimate.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from analysis.identify._plant import OF_BEAM
-from analysis.identify._verdict import ANOTHER_DAMPING, BESIDE_DRAG, EXCLUDED, STRONG
+from analysis.identify._verdict import ANOTHER_DAMPING, EXCLUDED, STRONG, WITH_DRAG
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
@@ -36,7 +36,7 @@ _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 _NOT_DETERMINED: Final = "not identifiable from this record"
 _AT_EDGE: Final = "at the edge of the range searched"
 
-_MODES_TO_TELL_DAMPINGS: Final = 2
+_MODES_TO_SEPARATE_DAMPINGS: Final = 2
 _NOT_APART: Final = "not separable from a damping of unknown order"
 """Damping of a low order is a stiffness, of an order near 2 an inertia."""
 
@@ -58,18 +58,18 @@ _DAMPINGS: Final[tuple[Damping, Damping]] = ("internal", "external")
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A number with its uncertainty.
+    """Value with its uncertainty.
 
     Attributes
     ----------
     value : float
         In SI units.
     std : float or None
-        Standard deviation, None if the data do not tell.
+        Standard deviation, None if the data do not determine it.
     interval_95 : tuple of float or None
-        None as above.
+        95 % interval, None as above.
     flag : str or None
-        Why it is not a property of the antenna or the rig; None if it is.
+        Reason why it is not a property of the antenna or the rig; None if it is one.
     """
 
     value: float
@@ -78,7 +78,7 @@ class Quantity:
     flag: str | None = None
 
     def flagged(self, flag: str | None) -> Quantity:
-        """Give it a flag, unless it has one.
+        """Return the value with a flag, unless it already has one.
 
         Parameters
         ----------
@@ -87,7 +87,7 @@ class Quantity:
         return self if flag is None else replace(self, flag=self.flag or flag)
 
     def as_json(self) -> dict[str, Any]:
-        """As `json.dumps` takes it."""
+        """Return the value as `json.dumps` takes it."""
         ends = None if self.interval_95 is None else list(self.interval_95)
         return {
             "value": self.value,
@@ -108,7 +108,7 @@ class Size:
     omega_rad_s : float or None
         That frequency; None if the order is fixed: then it is the coefficient itself.
     size : Quantity
-        As `DampingSize` has it.
+        Value of the loss factor, as in `DampingSize`.
     """
 
     damping: Damping
@@ -117,11 +117,11 @@ class Size:
 
     @property
     def order(self) -> str:
-        """Name of its order: "alpha" or "lambda"."""
+        """Return the name of its order: "alpha" or "lambda"."""
         return NAMES[self.damping][1]
 
     def flagged(self, flag: str | None) -> Size:
-        """Give it a flag, unless it has one.
+        """Return the loss factor with a flag, unless it already has one.
 
         Parameters
         ----------
@@ -139,25 +139,25 @@ class Mode:
     frequency_hz: Quantity
     """Frequency of the free decay."""
     damping_ratio: Quantity
-    """Share of the critical damping."""
+    """Fraction of the critical damping."""
     shown: bool
     """Whether the record shows it; else it is computed from the model."""
     source: Literal["modal", "beam"] = "beam"
-    """Model that the numbers are of: the modal one, or the beam."""
+    """Model behind the numbers: the modal one, or the beam."""
     participation: Quantity | None = None
-    """Inertia about the motor axis that takes part in it, in kg m²; None of a beam's mode."""
+    """Effective inertia about the motor axis, in kg m²; None for a mode from the beam."""
 
 
 @dataclass(frozen=True, slots=True)
 class Simpler:
-    """What a simpler structure would give, on condition that it is the true one.
+    """Estimates of a simpler structure, on condition that this structure is true.
 
     Attributes
     ----------
     name : str
-        As tables call it.
+        Name in tables.
     fixed : mapping of str to float
-        What it takes for granted: orders by name.
+        Assumed values: orders by name.
     parameters : mapping of str to Quantity
     """
 
@@ -168,29 +168,29 @@ class Simpler:
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """What one record, or all of a campaign, says in numbers, whatever structure is the true one.
+    """Estimates from one record or a campaign, without an assumption on the orders.
 
     Attributes
     ----------
     name : str
-        The freest structure that the data support, as tables call it.
+        Name in tables of the freest structure that the data support.
     parameters : mapping of str to Quantity
-        What the structure has, by the names of `RecordFit`.
+        Parameters of the structure, by the names of `RecordFit`.
     sizes : tuple of Size
     modes : tuple of Mode
     structures : tuple of (str, str)
-        Every structure fitted, as tables call it, and its status: "selected", the one that the
-        numbers are of; "compatible"; "excluded".
+        Every structure fitted, by its name in tables, and its status: "selected" for the reported
+        one; "compatible"; "excluded".
     simpler : Simpler or None
-        The simplest structure that would do, if it is not that one.
+        Estimates of the simplest sufficient structure, if it is another.
     drag_speed_m_s : float or None
-        Speed at which the parameter ``drag`` is told; None without drag.
+        Speed at which the parameter ``drag`` is reported; None without drag.
     exact : Numbers or None
-        The same on condition that the beam is uniform to 1e-5; None where that is what these are.
+        Estimates on condition that the beam is uniform to 1e-5; None if these assume that already.
     uniform_beam : UniformBeamTest or None
         Whether a uniform beam predicts the modal constants; None if no mode shows.
     tolerant : TolerantEstimate or None
-        Estimate that parameters and sizes are of, if they allow for a tolerance of the geometry.
+        Source of parameters and sizes, if they include a tolerance of the geometry.
     modal : ModalEstimate or None
         Fit of the modal model.
     """
@@ -209,7 +209,7 @@ class Numbers:
     modal: ModalEstimate | None = None
 
     def doubted(self, flag: str) -> Self:
-        """Flag every number that has no flag yet.
+        """Return the estimates with a flag on every number that has none.
 
         Parameters
         ----------
@@ -233,16 +233,16 @@ class Numbers:
 
 @dataclass(frozen=True, slots=True)
 class Headline(Numbers):
-    """What one record says in numbers, and the fit that they are of.
+    """Reported numbers of one record, and the fit that they come from.
 
     Attributes
     ----------
     fit : RecordFit
         Fit of the freest structure that the record supports.
     explained : bool
-        Whether it leaves nothing but noise; else every number carries a flag.
+        Whether its residual is noise only; else every number carries a flag.
     with_both : RecordFit
-        That fit with the damping that it lacks, if it does, which the modes are of.
+        That fit with the damping that it may lack; the modes come from this fit.
     modal : ModalFit or None
     """
 
@@ -253,16 +253,16 @@ class Headline(Numbers):
 
     @property
     def flags(self) -> dict[str, str]:
-        """Reasons by parameter, of those that have one."""
+        """Return the flags by parameter."""
         return {name: each.flag for name, each in self.parameters.items() if each.flag}
 
     @property
     def visible_modes(self) -> tuple[int, ...]:
-        """Numbers of the modes that the record shows."""
+        """Return the numbers of the modes that the record shows."""
         return tuple(mode.number for mode in self.modes if mode.shown)
 
     def with_law_assumed(self) -> Headline:
-        """Flag what rests on the law by which a stiffness was taken to depend on the deflection."""
+        """Flag the parameters that rest on the assumed law of stiffness against deflection."""
         return replace(
             self,
             parameters={
@@ -276,7 +276,7 @@ class Headline(Numbers):
         )
 
     def with_status(self, status: StructureStatus) -> tuple[str, ...]:
-        """Names of the structures with a status.
+        """Return the names of the structures with a status.
 
         Parameters
         ----------
@@ -286,25 +286,18 @@ class Headline(Numbers):
 
 
 def headline(
-    field: CandidateSet,
+    candidate_set: CandidateSet,
     orders: tuple[OrderVerdict, OrderVerdict],
     visible: tuple[int, ...],
     *,
     unexplained: str | None,
 ) -> Headline:
-    """Put together what is told first.
+    """Return the headline from the freest structure of a candidate set.
 
-    Parameters
-    ----------
-    field : CandidateSet
-    orders : tuple of OrderVerdict
-        Alpha's and lambda's, judged in the freest structure.
-    visible : tuple of int
-        Modes that the record shows.
-    unexplained : str or None
-        Why nothing is to be believed; None if that structure leaves nothing but noise.
+    `orders` are the verdicts on alpha and lambda in that structure, `visible` the modes that the
+    record shows, and `unexplained` the reason against every number; None if only noise remains.
     """
-    freest = field.freest
+    freest = candidate_set.freest
     fractional = frozenset(each.order for each in orders if each.status == "fractional")
     reasons: dict[str, str] = {
         each.order: each.reason for each in orders if each.reason is not None
@@ -314,24 +307,24 @@ def headline(
         for each in orders
         if each.profile.walked and each.order in freest.structure.free
     }
-    told = of_fit(
+    result = of_fit(
         freest.name, freest.fit, visible, reasons, intervals, unexplained,
-        field.with_both_dampings(freest),
+        candidate_set.with_both_dampings(freest),
     )  # fmt: skip
-    if field.drag is not None:
-        drag = field.drag
+    if candidate_set.drag is not None:
+        drag = candidate_set.drag
         at = Quantity(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
         sizes = (
-            each.flagged(BESIDE_DRAG) if each.damping == "external" else each for each in told.sizes
+            each.flagged(WITH_DRAG) if each.damping == "external" else each for each in result.sizes
         )
-        told = replace(
-            told,
-            parameters={**told.parameters, "drag": at},
+        result = replace(
+            result,
+            parameters={**result.parameters, "drag": at},
             sizes=tuple(sizes),
             drag_speed_m_s=drag.speed_m_s,
         )
-    simpler = _simpler(field, fractional) if unexplained is None else None
-    return replace(told, structures=structures(field, fractional), simpler=simpler)
+    simpler = _simpler(candidate_set, fractional) if unexplained is None else None
+    return replace(result, structures=structures(candidate_set, fractional), simpler=simpler)
 
 
 def of_fit(
@@ -343,26 +336,26 @@ def of_fit(
     unexplained: str | None = None,
     both: tuple[RecordFit, bool] | None = None,
 ) -> Headline:
-    """Tell one fit, with flags where they belong.
+    """Return the headline of one fit, with flags on the numbers that need them.
 
     Parameters
     ----------
     name : str
-        As tables call it.
+        Name in tables.
     fit : RecordFit
     visible : collection of int
         Modes that the record shows.
     reasons : mapping of str to str
-        Why an order is not to be believed; its coefficient shares the reason.
+        Reasons against the orders; they also hold for the coefficients.
     intervals : mapping of str to (float, float)
-        95 % intervals of orders that are better than those of the fit.
+        95 % intervals of orders, used instead of those of the fit.
     unexplained : str, optional
-        Why nothing is.
+        Reason against all numbers.
     both : tuple of (RecordFit, bool), optional
-        The same with both dampings (`CandidateSet.with_both_dampings`), which tells the modes.
+        The fit with both dampings (`CandidateSet.with_both_dampings`), for the modes.
     """
     with_both, bounded = both or (fit, False)
-    few = ONE_MODE if len(visible) < _MODES_TO_TELL_DAMPINGS else None
+    few = ONE_MODE if len(visible) < _MODES_TO_SEPARATE_DAMPINGS else None
     if ANOTHER_DAMPING in reasons.values():
         few = ANOTHER_DAMPING
     flags: dict[str, str] = {
@@ -403,35 +396,30 @@ def of_fit(
 
 
 def structures(
-    field: CandidateSet, fractional: frozenset[str]
+    candidate_set: CandidateSet, fractional: frozenset[str]
 ) -> tuple[tuple[str, StructureStatus], ...]:
-    """Say which structures a record excludes, and which would do.
+    """Return the status of every structure: which ones the record excludes.
 
-    A special case of the freest structure is excluded by the likelihood ratio; any other structure
-    where its likelihood is lower by as much and its BIC is higher than the lowest by 10. One that
-    explains the record with more than it takes is not excluded.
-    What fixes an order at 1 that the record excludes is excluded with it.
-
-    Parameters
-    ----------
-    field : CandidateSet
-        With the candidates ranked.
-    fractional : frozenset of str
-        Orders of which 1 is excluded.
+    A special case of the freest structure is excluded by the likelihood ratio. Any other structure
+    is excluded if its likelihood is lower by as much and its BIC exceeds the lowest by 10. A
+    structure that explains the record with unnecessary parameters is not excluded. A structure that
+    fixes an order at 1 is excluded if the order is in `fractional`: the record excludes 1 for it.
     """
-    return tuple((each.name, _status(field, each, fractional)) for each in field.candidates)
+    return tuple(
+        (each.name, _status(candidate_set, each, fractional)) for each in candidate_set.candidates
+    )
 
 
 def _status(
-    field: CandidateSet, candidate: Candidate, fractional: frozenset[str]
+    candidate_set: CandidateSet, candidate: Candidate, fractional: frozenset[str]
 ) -> StructureStatus:
-    freest = field.freest
+    freest = candidate_set.freest
     if candidate is freest:
         return "selected"
     simpler = set(candidate.structure.free) < set(freest.structure.free)
     if not simpler:
         behind = candidate.deviance - freest.deviance > EXCLUDED[0]
-        worse = candidate.bic > field.best.bic + STRONG
+        worse = candidate.bic > candidate_set.best.bic + STRONG
         return "excluded" if behind and worse else "compatible"
     if any(
         candidate.structure.fixed.get(order) == 1.0  # type: ignore[call-overload]
@@ -443,13 +431,14 @@ def _status(
     return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
 
 
-def _simpler(field: CandidateSet, fractional: frozenset[str]) -> Simpler | None:
-    """Find the simplest structure that would do."""
-    freest = field.freest
+def _simpler(candidate_set: CandidateSet, fractional: frozenset[str]) -> Simpler | None:
+    """Return the estimates of the simplest sufficient structure."""
+    freest = candidate_set.freest
     would_do = [
         each
-        for each in field.candidates
-        if each.parameters < freest.parameters and _status(field, each, fractional) == "compatible"
+        for each in candidate_set.candidates
+        if each.parameters < freest.parameters
+        and _status(candidate_set, each, fractional) == "compatible"
     ]
     if not would_do:
         return None
@@ -484,7 +473,7 @@ def _parameter(
 
 
 def size_of(damping: Damping, size: DampingSize, reason: str | None) -> Size:
-    """Loss factor with its 95 % interval.
+    """Return a loss factor with its 95 % interval.
 
     Parameters
     ----------
@@ -500,7 +489,7 @@ def size_of(damping: Damping, size: DampingSize, reason: str | None) -> Size:
 
 
 def _bounded(fit: RecordFit, with_both: RecordFit) -> Iterator[ModeEstimate]:
-    """Modes of a fit with the uncertainty of one that has next to nothing of another damping."""
+    """Return the modes of a fit with the uncertainty that includes the other damping."""
     theirs = {mode.number: mode for mode in with_both.modes}
     for mode in fit.modes:
         wider = theirs.get(mode.number, mode)
@@ -526,7 +515,7 @@ def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> M
 def symmetric(
     value: float, std: float, reason: str | None, half_width: float = NORMAL_95
 ) -> Quantity:
-    """Quantity with a symmetric 95 % interval.
+    """Return a value with a symmetric 95 % interval.
 
     Parameters
     ----------

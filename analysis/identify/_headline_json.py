@@ -14,36 +14,36 @@ if TYPE_CHECKING:
     from rigd.session import Validity
 
 
-class JudgedOrder(Protocol):
-    """What is known of one order, from one record or from all of a campaign."""
+class OrderResult(Protocol):
+    """Result on one order, from one record or from a campaign."""
 
     @property
     def order(self) -> str:
-        """Either "alpha" or "lambda"."""
+        """Return "alpha" or "lambda"."""
 
     @property
     def status(self) -> str:
-        """As `OrderVerdict` has it."""
+        """Return the status, as in `OrderVerdict`."""
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 %."""
+        """Return the 95 % interval."""
 
 
 def headline_json(
     file: str | None,
-    told: Numbers,
-    orders: Iterable[JudgedOrder],
+    estimates: Numbers,
+    orders: Iterable[OrderResult],
     findings: Iterable[Finding],
     validity: Validity,
 ) -> dict[str, Any]:
-    """Write a headline as the JSON document has it.
+    """Return a headline as the content of the JSON document.
 
     Parameters
     ----------
     file : str or None
         None for the estimate of a whole campaign.
-    told : Numbers
+    estimates : Numbers
     orders : iterable of JudgedOrder
     findings : iterable of Finding
     validity : Validity
@@ -54,24 +54,26 @@ def headline_json(
     dict
         Numbers may be not finite.
     """
-    uniform_beam = None if told.uniform_beam is None else told.uniform_beam.as_json()
+    uniform_beam = None if estimates.uniform_beam is None else estimates.uniform_beam.as_json()
     return {
         "file": file,
-        "type": told.name,
+        "type": estimates.name,
         "validity": {**validity.as_json(), "uniform_beam": uniform_beam},
-        "parameters": {name: each.as_json() for name, each in told.parameters.items()},
-        "drag_speed_m_s": told.drag_speed_m_s,
+        "parameters": {name: each.as_json() for name, each in estimates.parameters.items()},
+        "drag_speed_m_s": estimates.drag_speed_m_s,
         "sizes": [
             {"damping": each.damping, "omega_rad_s": each.omega_rad_s, **each.size.as_json()}
-            for each in told.sizes
+            for each in estimates.sizes
         ],
-        "modes": [_mode_json(each) for each in told.modes],
-        "uniformity_percent": None if told.tolerant is None else 100 * told.tolerant.uniformity,
-        "basis": None if told.tolerant is None else told.tolerant.basis,
-        "covariance": None if told.tolerant is None else told.tolerant.covariance_json(),
-        "modal_model": None if told.modal is None else told.modal.as_json(),
-        "exact_geometry": None if told.exact is None else _exact_json(told.exact),
-        "structures": [{"type": name, "status": status} for name, status in told.structures],
+        "modes": [_mode_json(each) for each in estimates.modes],
+        "uniformity_percent": None
+        if estimates.tolerant is None
+        else 100 * estimates.tolerant.uniformity,
+        "basis": None if estimates.tolerant is None else estimates.tolerant.basis,
+        "covariance": None if estimates.tolerant is None else estimates.tolerant.covariance_json(),
+        "modal_model": None if estimates.modal is None else estimates.modal.as_json(),
+        "exact_geometry": None if estimates.exact is None else _exact_json(estimates.exact),
+        "structures": [{"type": name, "status": status} for name, status in estimates.structures],
         "orders": {
             each.order: {
                 "status": each.status,
@@ -80,11 +82,11 @@ def headline_json(
             for each in orders
         },
         "conditional": None
-        if told.simpler is None
+        if estimates.simpler is None
         else {
-            "type": told.simpler.name,
-            "on": dict(told.simpler.fixed),
-            "parameters": {n: each.as_json() for n, each in told.simpler.parameters.items()},
+            "type": estimates.simpler.name,
+            "on": dict(estimates.simpler.fixed),
+            "parameters": {n: each.as_json() for n, each in estimates.simpler.parameters.items()},
         },
         "named": [
             {
@@ -111,7 +113,7 @@ def _mode_json(mode: Mode) -> dict[str, Any]:
 
 
 def _exact_json(exact: Numbers) -> dict[str, Any]:
-    """Numbers that hold if the beam is uniform to 1e-5."""
+    """Return the estimates that are valid if the beam is uniform to 1e-5."""
     return {
         "condition": EXACT_CONDITION,
         "parameters": {name: each.as_json() for name, each in exact.parameters.items()},

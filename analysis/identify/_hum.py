@@ -1,9 +1,9 @@
 """Narrow-band disturbance (hum) near a mode: a sinusoid that lasts while the beam does not respond.
 
-At a sharp resonance a fit attributes a hum to the beam, and the residual of a wrong model looks
-like a hum. Time separates them: a beam responds while the sweep passes, and rings down; a hum
-lasts. So the residual's spectrum is taken over the times at which the model predicts next to
-nothing there, and what stands out must be the same in all of them.
+At a sharp resonance a fit attributes a hum to the beam, and the residual of a wrong model resembles
+a hum. Time separates them: a beam responds while the sweep passes, and rings down; a hum lasts. So
+the residual's spectrum is taken over the times at which the model predicts next to nothing there,
+and a hum must be the same in all of them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._free_decay import Pole
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
 
 _RESONANCE: Final = 3.0
@@ -31,22 +31,22 @@ _RESONANCE: Final = 3.0
 _RESONANCE_BINS: Final = 20
 """The same for the sharpest of them, in bins."""
 
-_BESIDE: Final = 3.0
+_CLEARANCE: Final = 3.0
 """Range of the search for hum, in these units: farther off its skirts do not affect the mode."""
 
 _BLOCK_S: Final = 4.0
 _WRONG: Final = 0.3
-"""Share of what a model predicts that it may be wrong by, as the test has it."""
+"""Assumed relative error of the model's prediction in the test."""
 
 _LEVEL: Final = 25.0
-"""Power over that of the noise: chance does it at one frequency of 7e10, and hundreds are tried."""
+"""Power over that of the noise: chance exceeds it at one frequency in 7e10; hundreds are tested."""
 
 _VARIES: Final = 0.3
-"""Largest power of what is not steady, beyond chance, relative to the hum's."""
+"""Largest power of the unsteady part, beyond chance, relative to the hum's."""
 
 _SILENT: Final = 0.2
-"""Share of the record in which the beam has to be silent: what is there at other times may be its
-own answer to a steady excitation."""
+"""Fraction of the record in which the beam has to be silent: at other times the signal may be its
+own response to a steady excitation."""
 
 _GROWS: Final = 0.3
 """Largest change of the amplitude from end to end, relative to its mean: what rings down slowly,
@@ -77,40 +77,40 @@ class Hum:
 
     @property
     def line(self) -> Line:
-        """Frequency and amplitude."""
+        """Return frequency and amplitude."""
         return Line(self.frequency_hz, float(abs(self.phasor_nm)))
 
     def torque(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Torque in N·m at some times, of their shape."""
+        """Return the torque in N·m at some times, of their shape."""
         turning = np.exp(2j * np.pi * self.frequency_hz * time_s)
         torque: NDArray[np.float64] = (self.phasor_nm * turning).real
         return torque
 
 
 def resonance_reach_hz(pole: Pole, spacing_hz: float) -> float:
-    """How far from its frequency a resonance counts as such, bins being `spacing_hz` apart."""
+    """Return the half width of a resonance, for bins that are `spacing_hz` apart."""
     return max(_RESONANCE * abs(pole.at_rad_s.real) / (2 * np.pi), _RESONANCE_BINS * spacing_hz)
 
 
-def hum_beside_modes(
+def hum_near_modes(
     comparison: Comparison,
     plant: Plant,
     poles: tuple[Pole, ...],
-    noise: Noise,
+    noise: NoiseSpectrum,
     decaying_nm: NDArray[np.float64],
 ) -> tuple[Hum, ...]:
-    """Search for hum near each mode, including what has been taken out already.
+    """Search for hum near each mode, including the hum that has been removed already.
 
     Parameters
     ----------
     comparison : Comparison
     plant : Plant
-        As found so far.
+        Current estimate.
     poles : tuple of Pole
-        Its own.
+        Poles of the plant.
     noise : Noise
     decaying_nm : ndarray, shape (samples,)
-        Torque of the free decay that was found. Part of it may be the hum, so it is not taken off.
+        Torque of the estimated free decay. Part of it may be the hum, so it is not subtracted.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def hum_beside_modes(
         if not pole.oscillates:
             continue
         at_hz = pole.at_rad_s.imag / (2 * np.pi)
-        reach_hz = _BESIDE * resonance_reach_hz(pole, float(hz[1] - hz[0]))
+        reach_hz = _CLEARANCE * resonance_reach_hz(pole, float(hz[1] - hz[0]))
         near = (max(at_hz - reach_hz, hz[0]), min(at_hz + reach_hz, hz[-1]))
         if near[1] - near[0] < reach_hz / 2:
             continue  # a wrong model may have its modes anywhere
@@ -140,7 +140,7 @@ def hum_beside_modes(
 
 
 class _Blocks:
-    """Overlapping windows over a record, of which some count more than others."""
+    """Overlapping windows over a record, with weights."""
 
     def __init__(self, samples: int, rate_hz: float) -> None:
         self.rate_hz = rate_hz
@@ -157,14 +157,14 @@ class _Blocks:
         near_hz: tuple[float, float],
         variance: float,
     ) -> Hum | None:
-        """Find a sinusoid that lasts, in the residual.
+        """Find a steady sinusoid in the residual.
 
         Parameters
         ----------
         residual, predicted, decaying : ndarray, shape (samples,)
             Torque in N·m.
         near_hz : tuple of float
-            Between which frequencies.
+            Range of frequencies.
         variance : float
             Variance of one sample of noise as strong as that at these frequencies, in N²·m².
         """
@@ -175,8 +175,8 @@ class _Blocks:
         power = chance + (_WRONG * self._largest(predicted, *near_hz)) ** 2
         power += self._largest(decaying, *near_hz) ** 2
         weight = np.zeros(residual.size)
-        for part, share in zip(self.parts, chance / power, strict=True):
-            weight[part] += share * self.window
+        for part, ratio in zip(self.parts, chance / power, strict=True):
+            weight[part] += ratio * self.window
         if weight.mean() < _SILENT:
             return None
         hum, growth_per_s = self._strongest(residual, weight, near_hz)
@@ -196,7 +196,7 @@ class _Blocks:
     def _largest(
         self, values: NDArray[np.float64], first_hz: float, last_hz: float
     ) -> NDArray[np.float64]:
-        """Largest value of each block's spectrum between two frequencies, shape (blocks,)."""
+        """Return the largest value of each block's spectrum between two frequencies, (blocks,)."""
         count = math.ceil((last_hz - first_hz) * _BLOCK_S * 2) + 1
         hz = np.linspace(first_hz, last_hz, count)
         turn = np.exp(-2j * np.pi * np.outer(np.arange(self.window.size) / self.rate_hz, hz))
@@ -207,7 +207,7 @@ class _Blocks:
     def _amplitude(
         self, values: NDArray[np.float64], weight: NDArray[np.float64], at_hz: float
     ) -> float:
-        """Largest amplitude of a sinusoid within a bin of a frequency."""
+        """Return the largest amplitude of a sinusoid within a bin of a frequency."""
         steps = np.linspace(-1, 1, 2 * _OVERSAMPLED + 1) / values.size
         turn = np.exp(-2j * np.pi * np.outer(at_hz / self.rate_hz + steps, np.arange(values.size)))
         return 2 * float(np.abs(turn @ (weight * values)).max() / weight.sum())
@@ -218,7 +218,7 @@ class _Blocks:
         weight: NDArray[np.float64],
         near_hz: tuple[float, float],
     ) -> tuple[Hum, float]:
-        """Fit the sinusoid that explains most of a residual, and how fast it grows, per s."""
+        """Fit the sinusoid that explains most of a residual; return its growth per s as well."""
         length = _OVERSAMPLED * residual.size
         hz = np.fft.rfftfreq(length, 1 / self.rate_hz)
         near = slice(*np.searchsorted(hz, near_hz))

@@ -5,14 +5,14 @@ with the noise of the sensor. A fit of the torque to all of the angle takes part
 response: in a closed loop noise and input are correlated, and a fit that leaves out all beyond its
 band is biased by it [1]_: a chirp's tool inertia by 1.4 and its stiffness by 0.24 standard
 deviations at 1e-2 N·m. The reference was known beforehand and does not depend on the noise, so the
-part of the angle that is coherent with the reference is used as input (`following`). The torque
-that the rest makes is computed with the beam found so far, and taken out. Fitting what remains is
-the instrumental-variable estimate with the reference as instrument. Where the rest is noise it is
-unbiased whatever that beam was. But a beam that rings for long turns the motor in bands narrower
-than the following is smoothed over, and then the rest is no noise: in a record of narrow sweeps
-with 0.2 g at the tip the first beam found would bias the result by up to 45 standard deviations. So
-where a better beam makes another torque of it, what followed is told anew, with the torque that the
-motor felt as a second input (`Comparison.renewed`).
+part of the angle that is coherent with the reference is used as input (`following`). The torque by
+the remaining angle is computed with the current estimate of the beam, and removed. Fitting what
+remains is the instrumental-variable estimate with the reference as instrument. Where the remaining
+angle is noise it is unbiased for any beam. But a beam that rings for long moves the motor in bands
+narrower than the smoothing of the response, and then the remaining angle is not noise: in a record
+of narrow sweeps with 0.2 g at the tip the first beam would bias the result by up to 45 standard
+deviations. So if a better beam predicts another torque, the part of the angle that follows the
+reference is re-estimated, with the torque on the motor as a second input (`Comparison.renewed`).
 
 References
 ----------
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 _MEMORY_S: Final = 0.4
 """Standard deviation of the window over the lags of the correlations, that is how long the loop may
 remember its reference: 0.4 Hz in frequency. A longer one lets noise pass for response. A shorter
-one misses sharp features of the loop, and those of a beam that rings for long; its torque, given
-beside the reference, tells the latter."""
+one misses sharp features of the loop, and those of a beam that rings for long; its torque, given as
+a second input, provides the latter."""
 
 _RETURN_S: Final = 4.0
 """For which both are taken to return to 0 after the record. A reference that ended elsewhere and
@@ -51,10 +51,10 @@ def following(
     rate_hz: float,
     torque_nm: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Part of the angle that is coherent with the reference, shape (n,).
+    """Return the part of the angle that is coherent with the reference, shape (n,).
 
-    By the response that windowed correlations give (R. B. Blackman and J. W. Tukey, Bell System
-    Technical Journal 37 (1958) 185-282): at each frequency the least squares over its neighbours.
+    The response is estimated by windowed correlations (R. B. Blackman and J. W. Tukey, Bell System
+    Technical Journal 37 (1958) 185-282): at each frequency by least squares over its neighbours.
 
     Parameters
     ----------
@@ -62,8 +62,8 @@ def following(
         Both taken as 0 before.
     rate_hz : float
     torque_nm : ndarray, shape (n,), optional
-        Torque without noise that the motor feels beside: it may ring in bands narrower than the
-        response is smoothed over.
+        Torque on the motor without noise: it may ring in bands narrower than the smoothing of the
+        response.
     """
     way_back = 0.5 * (1 + np.cos(np.linspace(0, np.pi, round(_RETURN_S * rate_hz) + 1)[1:]))
     length = fast_length(2 * (angle_rad.size + way_back.size))

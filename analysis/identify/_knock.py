@@ -1,10 +1,10 @@
-"""Knocks: the beam was struck or touched once during the record, and rang on by itself.
+"""Impacts (knocks): the beam was struck or touched once during the record, and rang freely.
 
-While it is touched the torque is anybody's guess; from then on it is the free decay of the beam's
-modes. So a knock adds to the torque one unknown value at each sample for as long as it lasts, and a
-decay of unknown amplitude and phase of each mode. Each decay may have a pole slightly off the
-model's, to first order (a column that grows with the time in front of the decay): a blow that bends
-the beam farther than the excitation does, or poles that are not known well yet, bias nothing.
+During the contact the torque is unknown; afterwards it is the free decay of the beam's modes. So an
+impact adds to the torque one unknown value at each sample of the contact, and a decay of unknown
+amplitude and phase of each mode. Each decay may have a pole slightly off the model's, to first
+order (a column that grows with the time in front of the decay): so a larger deflection than that of
+the excitation, or inaccurate poles, cause no bias.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._data import Knock, MeasurementError
+from analysis.identify._data import MeasurementError, RecordedImpact
 from analysis.identify._finding import Finding
 from analysis.identify._fit import fit_record
 from analysis.identify._parametrization import Unknowns
@@ -36,94 +36,87 @@ if TYPE_CHECKING:
 
 _FREEST: Final = STRUCTURES["VI"]
 
-MOST_KNOCKS: Final = 3
-"""In one record: more of them are not looked for."""
+MAX_KNOCKS: Final = 3
+"""Limit of impacts in one record."""
 
 _WINDOWS_S: Final = (0.08, 0.5)
-"""To either side of the instant that a scan finds: a blow lies within the first, a touch within the
-second."""
+"""Windows to either side of the instant from the scan: for a blow, and for a touch."""
 
 _APART_S: Final = 0.1
 _AT_ONCE_S: Final = 0.4
 _RISES: Final = 0.5
-"""Largest power of the residual in that time before a knock, and so far apart from it, relative to
-that after it."""
+"""Largest power of the residual before an impact, in that time and at that distance, relative to
+the power after it."""
 
 _ROUNDS: Final = 2
-"""Each finds the poles and the noise anew, with the knock out of both."""
+"""Rounds of estimates of poles and noise, each without the impact."""
 
 _MOST: Final = 0.8
-"""Least share of what is unexplained that a knock has to explain."""
+"""Least fraction of the unexplained squares that an impact has to explain."""
 
 _WORTH: Final = 0.5
-"""Least share with which it is worth to look whether nothing else is in the record."""
+"""Least fraction that justifies a fit with the impact removed."""
 
 _ALL: Final = 0.95
-"""Share with which it is the explanation before any other has been looked for."""
+"""Fraction with which the impact is accepted before any other explanation is tested."""
 
 _RINGS: Final = 0.5
-"""Least share of the squares that a knock saves by the decays after it, not while it lasts."""
+"""Least fraction of the reduction by the decays after the impact, not during it."""
 
 _OVERWHELMING: Final = 10.0
-"""Squares over those of the noise from which on what knock and beam could both explain counts as
-the knock's, beside which the beam was fitted. Of what a wrong model leaves, at most 3 times the
-noise, it counts as the beam's: else decays would explain all of that."""
+"""Squares over those of the noise above which the part that impact and beam could both explain is
+attributed to the impact. Below it is attributed to the beam: the residual of a wrong model is at
+most 3 times the noise, and decays would explain all of it."""
 
 _QUIET_S: Final = 2.0
 _LOUDER: Final = 1.5
-"""Largest power of the residual in that time before a knock, relative to the noise's."""
+"""Largest power of the residual in that time before an impact, relative to the noise."""
 
 
 @dataclass(frozen=True, slots=True)
-class FoundKnock:
-    """A knock, and how much of a record it explains.
+class DetectedImpact:
+    """Impact, with the fraction of the record's residual that it explains.
 
     Attributes
     ----------
-    knock : Knock
-    share : float
-        Share of what was unexplained that it explains.
+    knock : RecordedImpact
+    explained_fraction : float
+        Fraction of the unexplained squares that it explains.
     before : float
-        Power of what is left in the two seconds before it, relative to the noise's.
+        Power of the residual in the two seconds before it, relative to the noise.
     """
 
-    knock: Knock
-    share: float
+    knock: RecordedImpact
+    explained_fraction: float
     before: float
 
     @property
     def evident(self) -> bool:
-        """Whether it is the most of what is unexplained, and began at once."""
-        return self.share > _MOST and self.before < _LOUDER
+        """Return whether it explains most of the residual and began abruptly."""
+        return self.explained_fraction > _MOST and self.before < _LOUDER
 
     @property
     def obvious(self) -> bool:
-        """Whether nothing else has to be looked for first."""
-        return self.share > _ALL and self.before < _LOUDER
+        """Return whether no other effect needs to be tested first."""
+        return self.explained_fraction > _ALL and self.before < _LOUDER
 
 
-def knocks_in(field: CandidateSet, *, obvious: bool = False) -> Iterator[FoundKnock]:
-    """Search for one more knock; each found may be the one, the likeliest first.
+def knocks_in(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator[DetectedImpact]:
+    """Search for one more impact; yield alternatives, the likeliest first.
 
-    A knock may be louder than all that the motor does, and a fit to the whole record then nonsense.
-    But one half of the record it has spared, or left a free decay at its start: so it is searched
-    also in what a beam leaves that was fitted to one half.
-
-    Parameters
-    ----------
-    field : CandidateSet
-    obvious : bool
-        Whether to search for an obvious one only.
+    An impact may be larger than the response to the motor, so that a fit to the whole record fails.
+    One half of the record then holds no impact, or only its free decay at the start. So the search
+    also uses the residual of fits to either half. With `obvious` it is limited to obvious impacts.
     """
-    if field.misread or len(field.comparison.measurement.knocks) == MOST_KNOCKS:
+    if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_KNOCKS:
         return
-    first = knock_in(field)
+    first = knock_in(candidate_set)
     if first is not None and first.obvious:
         yield first
         first = None
     if obvious:
         return
-    for start in _from_halves(field):
+    for start in _from_halves(candidate_set):
         found = _knock_in(start)
         if found is not None:
             yield found
@@ -131,39 +124,39 @@ def knocks_in(field: CandidateSet, *, obvious: bool = False) -> Iterator[FoundKn
         yield first
 
 
-def knock_in(field: CandidateSet) -> FoundKnock | None:
-    """Search for a knock in what the likeliest candidate leaves."""
-    likeliest = min(field.candidates, key=lambda each: each.fit.cost)
-    return _knock_in(field.refit(likeliest, 1))
+def knock_in(candidate_set: CandidateSet) -> DetectedImpact | None:
+    """Search for an impact in the residual of the likeliest candidate."""
+    likeliest = min(candidate_set.candidates, key=lambda each: each.fit.cost)
+    return _knock_in(candidate_set.refit(likeliest, 1))
 
 
-def _knock_in(refit: Refit) -> FoundKnock | None:
-    """Search in what is left at one point."""
-    place = _scan(refit)
-    if place is None:
+def _knock_in(refit: Refit) -> DetectedImpact | None:
+    """Search for an impact in the residual of a refit."""
+    sample = _scan(refit)
+    if sample is None:
         return None
     comparison = refit.objective.comparison
     for width_s in _WINDOWS_S:
         half = math.ceil(width_s * comparison.decimation.rate_hz)
-        first, last = max(place - half, 0), min(place + half, comparison.samples)
+        first, last = max(sample - half, 0), min(sample + half, comparison.samples)
         cleaned = _cleaned(refit, first, last)
         extent = _extent(cleaned, first, last)
         if extent is None:
             return None
-        found = _judged(cleaned, *extent)
-        if found.share < _WORTH:
+        found = _sized(cleaned, *extent)
+        if found.explained_fraction < _WORTH:
             return None
         if extent[0] > first:
             return found
-        if found.share < _MOST:
+        if found.explained_fraction < _MOST:
             return None
         # A touch that began before this window.
     return None
 
 
-def _from_halves(field: CandidateSet) -> Iterator[Refit]:
-    """Fit the freest structure to either half alone; give the whole record there if that fits."""
-    comparison = field.comparison
+def _from_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
+    """Fit the freest structure to either half alone; return it for the record if it fits."""
+    comparison = candidate_set.comparison
     measurement, hz = comparison.measurement, comparison.frequency_hz
     band_hz = (0.0 if comparison.bins.start == 1 else float(hz[0]), float(hz[-1]))
     middle = measurement.angle_rad.size // 2
@@ -186,29 +179,25 @@ def _from_halves(field: CandidateSet) -> Iterator[Refit]:
         fit, counts = analysis.fits[0], analysis.noise.counts
         if not whiteness(fit.residual[counts], analysis.comparison.frequency_hz[counts]).white:
             continue
-        plain = comparison.without_hum(()).with_rest_of(fit.plant)
-        unknowns = Unknowns.of(_FREEST, measurement.nominal, field.free)
+        plain = comparison.without_hum(()).with_incoherent_part_of(fit.plant)
+        unknowns = Unknowns.of(_FREEST, measurement.nominal, candidate_set.free)
         there = partial(
             Refit.descend, plain, unknowns, unknowns.vector(fit.plant), max_evaluations=1
         )
-        loud = there(noise=field.noise)
+        loud = there(noise=candidate_set.noise)
         every = replace(loud.noise_here(), counts=np.ones(hz.size, dtype=bool), lines=())
         yield there(noise=every)
 
 
-def with_knock(measurement: Measurement, found: FoundKnock) -> Measurement:
-    """Take a knock for known."""
+def with_knock(measurement: Measurement, found: DetectedImpact) -> Measurement:
+    """Return the measurement with a known impact."""
     return replace(measurement, knocks=(*measurement.knocks, found.knock))
 
 
-def of_knocks(knocks: tuple[Knock, ...], *, explained: bool) -> Iterator[Finding]:
-    """Name the knocks of a record.
+def of_knocks(knocks: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
+    """Yield the findings of the impacts of a record.
 
-    Parameters
-    ----------
-    knocks : tuple of Knock
-    explained : bool
-        Whether all else in the record is explained.
+    `explained` states whether the remaining record is explained.
     """
     for knock in knocks:
         within_s = knock.resolution_s
@@ -235,10 +224,10 @@ def of_knocks(knocks: tuple[Knock, ...], *, explained: bool) -> Iterator[Finding
 
 
 def _scan(refit: Refit) -> int | None:
-    """Sample at which decays of all modes would explain most; None if chance may explain as much.
+    """Return the sample at which decays of all modes explain most; None if chance may do so.
 
-    By one correlation per column: the sums that decide for all samples at once are those for a
-    decay from the first on, turned in time.
+    This takes one correlation per column: the sums for a decay from the first sample on, reversed
+    in time, give those for all samples at once.
     """
     comparison, weight = refit.objective.comparison, refit.noise.weight
     poles = comparison.poles(refit.plant)
@@ -254,22 +243,22 @@ def _scan(refit: Refit) -> int | None:
     gram = (decays.conj() @ decays.T).real / np.outer(scale, scale)
     along /= scale[:, None]
     saved = np.sum(along * np.linalg.solve(gram + 1e-9 * np.eye(scale.size), along), axis=0)
-    place = int(np.argmax(saved))
-    deviate = chi_square_deviate(float(saved[place]), scale.size)
+    sample = int(np.argmax(saved))
+    deviate = chi_square_deviate(float(saved[sample]), scale.size)
     if deviate < math.sqrt(2 * largest_of(comparison.samples)):
         return None
     # What a wrong model leaves at a resonance rises and falls with the sweep; a knock does not.
     power = comparison.in_time(residual) ** 2
     rate_hz = comparison.decimation.rate_hz
     apart, until = (math.ceil(each * rate_hz) for each in (_APART_S, _APART_S + _AT_ONCE_S))
-    earlier = power[max(place - until, 0) : max(place - apart, 0)]
-    later = power[place : place + until]
+    earlier = power[max(sample - until, 0) : max(sample - apart, 0)]
+    later = power[sample : sample + until]
     at_once = earlier.size == 0 or earlier.mean() < _RISES * later.mean()
-    return place if at_once else None
+    return sample if at_once else None
 
 
 def _cleaned(refit: Refit, first: int, last: int) -> Refit:
-    """Fit with a knock between two samples, the noise being what remains then."""
+    """Fit with an impact between two samples, under the noise of the new residual."""
     comparison, before = refit.objective.comparison, refit.columns
     for _ in range(_ROUNDS):
         knock = _knock(refit, first, last)
@@ -284,12 +273,12 @@ def _cleaned(refit: Refit, first: int, last: int) -> Refit:
     )
 
 
-def _knock(refit: Refit, first: int, last: int) -> Knock:
-    """Knock between two samples with the poles found, of no size."""
+def _knock(refit: Refit, first: int, last: int) -> RecordedImpact:
+    """Return an impact of no size between two samples, with the poles of the fit."""
     comparison = refit.objective.comparison
     rate_hz = comparison.decimation.rate_hz
     poles = comparison.poles(refit.plant)
-    return Knock(
+    return RecordedImpact(
         first_s=comparison.first_s + first / rate_hz,
         last_s=comparison.first_s + last / rate_hz,
         # A touch that begins softly is seen when it has grown.
@@ -298,23 +287,17 @@ def _knock(refit: Refit, first: int, last: int) -> Knock:
     )
 
 
-def _in_time(comparison: Comparison, knock: Knock) -> NDArray[np.float64]:
-    """Columns of a knock at the samples compared, shape (c, samples)."""
+def _in_time(comparison: Comparison, knock: RecordedImpact) -> NDArray[np.float64]:
+    """Return the columns of an impact at the compared samples, shape (c, samples)."""
     return knock.columns(comparison.times_s(), comparison.decimation.rate_hz)
 
 
 def _sums(refit: Refit, columns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Squares saved by each of some columns beside those before it, shape (c,).
+    """Return the cost reduction by each column in addition to those before it, shape (c,).
 
-    Everything that is free already stays free, to first order.
-
-    Parameters
-    ----------
-    refit : Refit
-    columns : ndarray, shape (c, samples)
-        Torque at the samples compared.
+    All free parameters stay free, to first order. The columns are torques at the compared samples.
     """
-    free, residual = refit.beside(refit.objective.comparison.spectrum(columns))
+    free, residual = refit.unexplained_columns(refit.objective.comparison.spectrum(columns))
     free /= np.maximum(np.linalg.norm(free, axis=1), np.finfo(float).tiny)[:, None]
     # One after the other (Gram and Schmidt's method): each of what the former have left.
     basis, upper = np.linalg.qr(np.ascontiguousarray(free).view(np.float64).T)
@@ -329,10 +312,10 @@ _DEPENDENT: Final = 1e-6
 
 
 def _extent(refit: Refit, first: int, last: int) -> tuple[int, int] | None:
-    """First sample of a knock within a window, and the one after its last; None if there is none.
+    """Return first sample and end of an impact within a window; None if there is none.
 
-    Each sample of unknown torque has to save what BIC counts a parameter as. There is no knock
-    where the samples do without the decays: then it was the sensor that was disturbed.
+    Each sample of unknown torque has to save the BIC penalty of a parameter. There is no impact if
+    the samples suffice without the decays: then the sensor was disturbed.
     """
     price = math.log(2 * np.count_nonzero(refit.noise.counts))
     comparison = refit.objective.comparison
@@ -357,15 +340,15 @@ def _extent(refit: Refit, first: int, last: int) -> tuple[int, int] | None:
     return (begins, ends) if sure and rings > _RINGS * float(alone.sum()) else None
 
 
-def _judged(refit: Refit, first: int, last: int) -> FoundKnock:
-    """Give a knock its size, and say how much it explains."""
+def _sized(refit: Refit, first: int, last: int) -> DetectedImpact:
+    """Return an impact with its size and the fraction that it explains."""
     comparison = refit.objective.comparison
     knock = _knock(refit, first, last)
     in_time = _in_time(comparison, knock)
     cost, expected = refit.cost, refit.expected_cost
     shared = bool(cost < _OVERWHELMING * expected)
-    beside, residual = refit.beside(comparison.spectrum(in_time), beam_free=shared)
-    free = beside.view(np.float64)
+    whitened, residual = refit.unexplained_columns(comparison.spectrum(in_time), beam_free=shared)
+    free = whitened.view(np.float64)
     scale = np.linalg.norm(free, axis=1)
     scale[scale == 0] = 1.0
     free /= scale[:, None]
@@ -377,12 +360,12 @@ def _judged(refit: Refit, first: int, last: int) -> FoundKnock:
     after = slice(first, first + math.ceil(comparison.decimation.rate_hz))
     before = comparison.in_time(left)
     quiet = before[max(first - math.ceil(_QUIET_S * comparison.decimation.rate_hz), 0) : first]
-    return FoundKnock(
+    return DetectedImpact(
         knock=replace(
             knock,
             sizes=tuple(sizes.tolist()),
             largest_nm=float(np.abs(torque_nm[after]).max()),
         ),
-        share=float((cost - explained) / max(cost - expected, 1.0)),
+        explained_fraction=float((cost - explained) / max(cost - expected, 1.0)),
         before=float(np.mean(quiet**2) / np.mean(before**2)) if quiet.size else 0.0,
     )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._noise import Noise, noise_of, smooth_power
+from analysis.identify._noise import NoiseSpectrum, noise_of, smooth_power
 
 if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
@@ -26,16 +26,16 @@ _LEAKS: Final = 0.3
 """Leaked power over that of the noise that does no harm."""
 
 
-def without_leakage(noise: Noise, comparison: Comparison, fit: RecordFit) -> Noise:
-    """Leave out the bins into which a line beyond the band leaks, and name the line.
+def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit) -> NoiseSpectrum:
+    """Exclude the bins into which a line beyond the band leaks, and return the line.
 
     Parameters
     ----------
     noise : Noise
-        As the estimator found it.
+        Estimated noise.
     comparison : Comparison
     fit : RecordFit
-        What explains the record best under that noise: its torque is taken off.
+        Best fit under that noise: its torque is subtracted.
     """
     rate_hz, samples = comparison.decimation.rate_hz, comparison.samples
     end_hz = float(comparison.frequency_hz[-1])
@@ -43,9 +43,9 @@ def without_leakage(noise: Noise, comparison: Comparison, fit: RecordFit) -> Noi
     residual = np.fft.rfft(comparison.torque_nm[comparison.kept] - torque)
     all_hz = np.fft.rfftfreq(samples, 1 / rate_hz).astype(np.float64)
     near = np.abs(all_hz - end_hz) < min(_NEAR_HZ, rate_hz / 2 - end_hz)
-    share = comparison.measurement.torque_share
+    known_fraction = comparison.measurement.known_torque_fraction
     anywhere = np.zeros(np.count_nonzero(near), dtype=bool)
-    found = noise_of(residual[near], all_hz[near], samples, share, near_mode=anywhere)
+    found = noise_of(residual[near], all_hz[near], samples, known_fraction, near_mode=anywhere)
     counts, lines = noise.counts.copy(), list(noise.lines)
     for line in found.lines:
         # A line leaks as peak / (pi distance in bins).
@@ -60,12 +60,12 @@ def without_leakage(noise: Noise, comparison: Comparison, fit: RecordFit) -> Noi
     # What leaked has raised the estimated noise of whole blocks of bins.
     clean = (fit.residual * np.sqrt(noise.power / 2))[counts]
     bins = np.arange(counts.size)
-    power = np.exp(np.interp(bins, bins[counts], np.log(smooth_power(clean) / share)))
-    return Noise(power, counts, tuple(lines))
+    power = np.exp(np.interp(bins, bins[counts], np.log(smooth_power(clean) / known_fraction)))
+    return NoiseSpectrum(power, counts, tuple(lines))
 
 
 def repeats_after_s(comparison: Comparison) -> float:
-    """Period of the angle's motion in s, 0 if it does not repeat at least once as a whole."""
+    """Return the period of the angle in s, 0 if it does not repeat at least once as a whole."""
     angle = comparison.angle_rad[comparison.kept]
     angle = angle - angle.mean()
     count = angle.size

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
     from analysis.identify._residual_tests import InputRelation, Whiteness
 
@@ -59,11 +59,11 @@ _NEAREST_BINS: Final = 24
 the frequency, and bins beyond."""
 
 _NOISE_PASSES: Final = 3
-_SETTLED: Final = 0.02
+_CONVERGED: Final = 0.02
 """Change of the noise's mean logarithm below which it is not estimated again."""
 
 _MOST_FURTHER: Final = 2
-"""Resonances beyond those of the beam that are looked for: of the sensor or the mount."""
+"""Limit of resonances in addition to those of the beam: of the sensor or the mount."""
 
 _EVIDENCE: Final = 60.0
 """Deviance that a further resonance must save."""
@@ -79,7 +79,7 @@ class ModalFit(ModalEstimate):
     Attributes
     ----------
     evidence : tuple of float
-        Deviance that each mode saves.
+        Deviance reduction by each mode.
     residual : ndarray of complex, shape (K,)
         Whitened; parts of variance 1 where chance is all that remains.
     noise : Noise
@@ -95,14 +95,14 @@ class ModalFit(ModalEstimate):
 
     evidence: tuple[float, ...]
     residual: NDArray[np.complex128]
-    noise: Noise
+    noise: NoiseSpectrum
     whiteness: Whiteness
     input_relation: InputRelation
     ringing: Ringing
     span: NDArray[np.float64]
 
     def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Squares that each of some further columns would save, shape (c,).
+        """Return the squares that each of some further columns would save, shape (c,).
 
         Parameters
         ----------
@@ -118,17 +118,17 @@ class ModalFit(ModalEstimate):
 
     @property
     def explained(self) -> bool:
-        """Whether nothing but noise remains."""
+        """Return whether only noise remains."""
         return self.whiteness.white and not self.input_relation.related
 
     @property
     def visible(self) -> tuple[int, ...]:
-        """Numbers of the beam's modes that the record shows."""
+        """Return the numbers of the beam's modes that the record shows."""
         shown = zip(self.numbers, self.evidence, strict=True)
         return tuple(sorted(number for number, saved in shown if number and saved > _VISIBLE))
 
     def plant_like(self, plant: Plant) -> Plant:
-        """Give a plant the frequencies of the visible modes, each by a stiffness of its own.
+        """Return a plant with the frequencies of the visible modes, each by its own stiffness.
 
         Parameters
         ----------
@@ -149,21 +149,21 @@ class ModalFit(ModalEstimate):
 
 def fit_modes(
     comparison: Comparison,
-    noise: Noise,
+    noise: NoiseSpectrum,
     starts: Sequence[tuple[int, float, float]],
     columns: NDArray[np.complex128] | None = None,
 ) -> ModalFit | None:
-    """Fit the modal model.
+    """Fit the modal model to a record.
 
     Parameters
     ----------
     comparison : Comparison
     noise : Noise
-        First estimate; its lines stay left out.
+        First estimate; its lines stay excluded.
     starts : sequence of (int, float, float)
         Number, frequency (Hz) and damping ratio of each mode, roughly.
     columns : ndarray of complex, shape (c, K), optional
-        Spectra of known shape and unknown size, as `Objective` takes them.
+        Spectra of known shape and unknown size, as for `Objective`.
 
     Returns
     -------
@@ -177,31 +177,31 @@ def fit_modes(
     further = further if columns is None else columns
     lowest_hz = _LOWEST * min(hz for _, hz, _ in inside)
     counts = noise.counts & (comparison.frequency_hz >= lowest_hz)
-    search = _Search(
+    search = _ModalSearch(
         comparison,
         replace(noise, counts=counts),
         further,
         tuple(number for number, _, _ in inside),
         np.array([[math.log(2 * math.pi * hz), 2 * ratio] for _, hz, ratio in inside]).ravel(),
     )
-    return search.without_unexcited_modes().settled().with_further_resonances().fit()
+    return search.without_unexcited_modes().converged().with_further_resonances().fit()
 
 
 @dataclass(frozen=True, slots=True)
-class _Search:
-    """Modes at one point of the search, under one estimate of the noise."""
+class _ModalSearch:
+    """Modes at one point of the search, under one noise estimate."""
 
     comparison: Comparison
-    noise: Noise
+    noise: NoiseSpectrum
     further: NDArray[np.complex128]
     numbers: tuple[int, ...]
     x: NDArray[np.float64]
 
-    def problem(self) -> _Problem:
-        """Residual of these modes under this noise."""
-        return _Problem(self.comparison, self.noise.weight, self.further, self.numbers)
+    def problem(self) -> _ModalProblem:
+        """Return the residual of these modes under this noise."""
+        return _ModalProblem(self.comparison, self.noise.weight, self.further, self.numbers)
 
-    def descended(self) -> _Search:
+    def descended(self) -> _ModalSearch:
         """Descend under this noise."""
         low = np.column_stack([self.x[::2] - _NEAR, np.full(len(self.numbers), _NARROWEST)])
         high = np.column_stack([self.x[::2] + _NEAR, np.full(len(self.numbers), _WIDEST)])
@@ -214,8 +214,8 @@ class _Search:
         )
         return replace(self, x=found.x)
 
-    def settled(self) -> _Search:
-        """Descend, and estimate the noise and what is unknown of the record, in turns."""
+    def converged(self) -> _ModalSearch:
+        """Alternate descents with estimates of noise and unknown torque until they converge."""
         search = self
         for _ in range(_NOISE_PASSES):
             search = search.descended()
@@ -225,18 +225,18 @@ class _Search:
             comparison = search.comparison.renewed(model, search.noise).filled(model)
             power = smooth_power(residual, finely=True)
             power = with_peaks(residual, power, ~search.near_modes())
-            power /= comparison.measurement.torque_share
+            power /= comparison.measurement.known_torque_fraction
             counts = search.noise.counts
             change = np.abs(np.log(power / search.noise.power)[counts]).mean()
             search = replace(
                 search, comparison=comparison, noise=replace(search.noise, power=power)
             )
-            if change < _SETTLED and comparison.measurement.torque_known.all():
+            if change < _CONVERGED and comparison.measurement.torque_known.all():
                 break
         return search.descended()
 
     def near_modes(self) -> NDArray[np.bool_]:
-        """Bins in which what remains may be a mode's, not the noise's, shape (K,)."""
+        """Return the bins in which the residual may belong to a mode, shape (K,)."""
         hz = self.comparison.frequency_hz[:, None]
         frequencies, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
         bins_hz = _NEAREST_BINS * float(hz[1, 0] - hz[0, 0])
@@ -245,12 +245,12 @@ class _Search:
         return near
 
     def cost(self) -> float:
-        """Sum of whitened squares at this point."""
+        """Return the sum of whitened squares at this point."""
         residual = self.problem().at(self.x).residual
         return float(residual @ residual)
 
-    def with_further_resonances(self) -> _Search:
-        """Add a resonance where the residual still follows the angle, if that explains it."""
+    def with_further_resonances(self) -> _ModalSearch:
+        """Add a resonance where the residual still follows the angle, if it explains that."""
         search = self
         for _ in range(_MOST_FURTHER):
             related = search.relation(search.problem().at(search.x))
@@ -259,7 +259,7 @@ class _Search:
             start = [math.log(2 * math.pi * related.at_hz), 0.02]
             more = replace(
                 search, numbers=(*search.numbers, 0), x=np.concatenate([search.x, start])
-            ).settled()
+            ).converged()
             at = replace(search, noise=more.noise, comparison=more.comparison).descended()
             if at.cost() - more.cost() < _EVIDENCE or more.last_overlaps():
                 break
@@ -267,34 +267,34 @@ class _Search:
         return search
 
     def last_overlaps(self) -> bool:
-        """Whether the last resonance lies within the width of another: they share one peak."""
+        """Return whether the last resonance lies within the width of another."""
         frequencies = np.exp(self.x[::2])
         half_widths = frequencies * self.x[1::2] / 2
         reach = _HALF_WIDTHS * (half_widths[:-1] + half_widths[-1])
         return bool(np.any(np.abs(frequencies[:-1] - frequencies[-1]) < reach))
 
-    def without_unexcited_modes(self) -> _Search:
-        """Leave out modes that save nothing at first and then follow a line of the noise."""
+    def without_unexcited_modes(self) -> _ModalSearch:
+        """Remove modes that save nothing at first and then follow a line of the noise."""
         saved = self.evidence()
         if saved.min() >= _EVIDENCE:
             return self
         undamped = self.descended().x[1::2] < 2 * _NARROWEST
         search = self
-        for place in np.flatnonzero((saved < _EVIDENCE) & undamped)[::-1].tolist():
-            search = search._without(place)
+        for index in np.flatnonzero((saved < _EVIDENCE) & undamped)[::-1].tolist():
+            search = search._without(index)
         return search
 
-    def _without(self, place: int) -> _Search:
-        numbers = self.numbers[:place] + self.numbers[place + 1 :]
-        return replace(self, numbers=numbers, x=np.delete(self.x, [2 * place, 2 * place + 1]))
+    def _without(self, index: int) -> _ModalSearch:
+        numbers = self.numbers[:index] + self.numbers[index + 1 :]
+        return replace(self, numbers=numbers, x=np.delete(self.x, [2 * index, 2 * index + 1]))
 
     def evidence(self) -> NDArray[np.float64]:
-        """Sum of squares that each mode saves with the others where they are, shape (n,)."""
+        """Return the cost reduction by each mode with the others unchanged, shape (n,)."""
         own = self.cost()
         return np.array([self._without(i).cost() - own for i in range(len(self.numbers))])
 
-    def relation(self, point: _Point) -> InputRelation:
-        """Relation of the residual at this point to the angle."""
+    def relation(self, point: _ModalPoint) -> InputRelation:
+        """Return the relation of the residual at this point to the angle."""
         residual = point.residual.view(np.complex128)
         angle = self.comparison.spectrum(self.comparison.angle_rad[self.comparison.kept])
         counts = self.noise.counts
@@ -338,26 +338,26 @@ class _Search:
 
 
 def _gram(
-    rows: NDArray[np.float64], ridge: float
+    rows: NDArray[np.float64], regularization: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Rows of length 1, their Gram matrix with a ridge, and the lengths that they had."""
+    """Return rows of length 1, their regularized Gram matrix, and their original lengths."""
     scale = np.sqrt(np.einsum("ij,ij->i", rows, rows))
     scale[scale == 0] = 1.0  # a decay that is over at once
     scaled = rows / scale[:, None]
     gram = scaled @ scaled.T
-    gram[np.diag_indices_from(gram)] += ridge
+    gram[np.diag_indices_from(gram)] += regularization
     return scaled, gram, scale
 
 
 def _orthonormal(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Orthonormal rows that span some rows, and the factor that times these gives the rows."""
+    """Return orthonormal rows with the same span, and the factor that restores the rows."""
     scaled, gram, scale = _gram(rows, 1e-13)
     factor = np.linalg.cholesky(gram)
     return np.linalg.solve(factor, scaled), factor * scale[:, None]
 
 
 @dataclass(frozen=True, slots=True)
-class _Point:
+class _ModalPoint:
     """Whitened residual of the best linear parameters at one point, and its derivatives."""
 
     residual: NDArray[np.float64]
@@ -369,7 +369,7 @@ class _Point:
 
 
 def _unit_pole(eta: float) -> complex:
-    """Upper root of ``1 + eta q + q²``."""
+    """Return the upper root of ``1 + eta q + q²``."""
     return complex(-eta / 2, math.sqrt(1 - eta * eta / 4))
 
 
@@ -378,8 +378,8 @@ def _unit_pole_slope(eta: float) -> complex:
     return complex(-0.5, -eta / (4 * math.sqrt(1 - eta * eta / 4)))
 
 
-class _Problem:
-    """Whitened residual of a number of modes over their frequencies and damping."""
+class _ModalProblem:
+    """Whitened residual of some modes as a function of frequencies and damping."""
 
     def __init__(
         self,
@@ -388,7 +388,7 @@ class _Problem:
         further: NDArray[np.complex128],
         numbers: tuple[int, ...],
     ) -> None:
-        self._recent: Recent[_Point] = Recent()
+        self._recent: Recent[_ModalPoint] = Recent()
         self._numbers = numbers
         self._comparison = comparison
         self._weight = weight
@@ -407,7 +407,7 @@ class _Problem:
         return self._white(comparison.spectrum(comparison.prediction.in_time(responses)))
 
     def _poles(self, x: NDArray[np.float64]) -> list[Pole]:
-        """Poles at a point, differentiated by it."""
+        """Return the poles at a point, with derivatives by it."""
         poles = []
         for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
             omega, q = math.exp(log_omega), _unit_pole(eta)
@@ -421,7 +421,7 @@ class _Problem:
         return np.concatenate([self._comparison.nuisance(poles), self._further])
 
     def _drag(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Change of the torque by drag with the poles, and its derivatives, shape (1 + k, K)."""
+        """Return the change of the torque by drag with the poles, and derivatives, (1 + k, K)."""
         total = np.zeros((1 + 2 * len(poles), self._weight.size), dtype=np.complex128)
         drag = self._comparison.drag
         if drag is None:
@@ -436,14 +436,14 @@ class _Problem:
                 total[1:] += np.outer(pole.derivative.imag, by_imaginary)
         return total
 
-    def at(self, x: NDArray[np.float64]) -> _Point:
+    def at(self, x: NDArray[np.float64]) -> _ModalPoint:
         """Eliminate the linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
 
-        The last two points cost nothing again.
+        The last two points are cached.
         """
         return self._recent.at(x, self._at)
 
-    def _at(self, x: NDArray[np.float64]) -> _Point:
+    def _at(self, x: NDArray[np.float64]) -> _ModalPoint:
         modes = x.reshape(-1, 2)
         rows: list[NDArray[np.complex128]] = []
         slopes: list[NDArray[np.complex128]] = []
@@ -478,10 +478,10 @@ class _Problem:
             jacobian[2 * k] += a * four[0] + b * four[2]
             jacobian[2 * k + 1] += a * four[1] + b * four[3]
         projected = jacobian - (jacobian @ span.T) @ span
-        return _Point(residual, linear, columns, span, jacobian, projected)
+        return _ModalPoint(residual, linear, columns, span, jacobian, projected)
 
     def model(self, x: NDArray[np.float64]) -> ModalModel:
-        """Modal model at a point."""
+        """Return the modal model at a point."""
         linear = self.at(x).linear
         modes = x.reshape(-1, 2)
         poles, residues = [], []
@@ -498,7 +498,7 @@ class _Problem:
         return ModalModel(tuple(poles), tuple(residues), tuple(background.tolist()))
 
     def residual(self, x: NDArray[np.float64], model: ModalModel) -> NDArray[np.complex128]:
-        """Residual of the model at a point in N·m, not whitened."""
+        """Return the residual of the model at a point in N·m, not whitened."""
         first = 2 * len(self._numbers) + BACKGROUND
         amplitudes = self.at(x).linear[first:]
         here = self._poles(x)
@@ -508,31 +508,31 @@ class _Problem:
         drag: NDArray[np.complex128] = self._drag(here)[0]
         return drag + bare + amplitudes @ self._nuisance(here)
 
-    def covariance(self, point: _Point) -> NDArray[np.float64]:
-        """Covariance of the unknowns and the linear parameters."""
+    def covariance(self, point: _ModalPoint) -> NDArray[np.float64]:
+        """Return the covariance of the unknowns and the linear parameters."""
         _, gram, scale = _gram(np.concatenate([point.full_jacobian, point.columns]), 1e-14)
         covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(scale, scale)
         return covariance
 
-    def ringing(self, point: _Point, covariance: NDArray[np.float64]) -> Ringing:
-        """Free decay at the beginning, two amplitudes a mode, and its chi-square."""
+    def ringing(self, point: _ModalPoint, covariance: NDArray[np.float64]) -> Ringing:
+        """Return the free decay at the beginning, two amplitudes a mode, and its chi-square."""
         count = len(self._numbers)
         first = 2 * count + BACKGROUND
         decays = point.linear[first : first + 2 * count]
-        places = slice(2 * count + first, 2 * count + first + 2 * count)
+        rows = slice(2 * count + first, 2 * count + first + 2 * count)
         return Ringing(
             amplitude_nm=tuple(np.hypot(decays[::2], decays[1::2]).tolist()),
-            chi_square=float(decays @ np.linalg.solve(covariance[places, places], decays)),
+            chi_square=float(decays @ np.linalg.solve(covariance[rows, rows], decays)),
             degrees_of_freedom=decays.size,
         )
 
     def constants(
-        self, point: _Point, x: NDArray[np.float64], covariance: NDArray[np.float64]
+        self, point: _ModalPoint, x: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """`CONSTANTS` of all modes, and their covariance with that of the background."""
+        """Return `CONSTANTS` of all modes, and their covariance with that of the background."""
         count = x.size // 2
         constants = np.empty(4 * count)
-        linear = x.size + 2 * count  # place of the first coefficient of the background
+        linear = x.size + 2 * count  # index of the first coefficient of the background
         chain = np.zeros((4 * count + BACKGROUND, linear + BACKGROUND))
         background = chain[4 * count :]
         background[:, linear:] = np.diag(self.scale_rad_s ** -np.arange(float(BACKGROUND)))
@@ -565,7 +565,7 @@ class _Problem:
         return constants, chain @ own @ chain.T
 
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
-        """As the descent takes them (Kaufman's Jacobian)."""
+        """Return the normal equations for the descent (Kaufman's Jacobian)."""
         point = self.at(x)
         return NormalEquations(
             cost=float(point.residual @ point.residual),

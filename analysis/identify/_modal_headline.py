@@ -1,9 +1,9 @@
 """Headline of a record from its modal model, and from a beam with a tolerance of the geometry.
 
-Modes are those of the modal model, which no antenna contradicts. Damping and stiffness are those of
-a beam whose modes may lie where those of a uniform one do not, by a stated tolerance: what an order
-of the damping does to a frequency, an unevenness of a thousandth does as well. What the record
-would tell of a beam that is uniform to 1e-5 is reported as a condition.
+Modes are those of the modal model, which holds for every antenna. Damping and stiffness are those
+of a beam whose mode frequencies may differ from those of a uniform one by a stated tolerance: an
+unevenness of a thousandth changes a frequency as much as an order of the damping does. The
+estimates for a beam that is uniform to 1e-5 are reported as conditional estimates.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from analysis.statistics import NORMAL_95
 if TYPE_CHECKING:
     from analysis.identify._headline import Size, StructureStatus
     from analysis.identify._modal_model import ModalEstimate
-    from analysis.identify._profile_likelihood import Order, Profile
+    from analysis.identify._profile_likelihood import LikelihoodProfile, Order
     from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
 
 NOT_UNIFORM: Final = (
@@ -37,7 +37,7 @@ _EFFECTIVE: Final = (*OF_BEAM, "delay_s")
 
 
 def refused_reason(test: UniformBeamTest) -> str | None:
-    """Say why values of a uniform beam are not to be believed; None where they may be."""
+    """Return why values of a uniform beam are not valid; None if they may be."""
     if test.status != "refused":
         return None
     return f"a uniform beam does not predict the modal constants ({test.summary.chance})"
@@ -56,18 +56,18 @@ def with_modal_model(
     *,
     half_width: float = NORMAL_95,
 ) -> _N:
-    """Put modes and tolerant parameters in front of those of an exactly uniform beam.
+    """Replace modes and parameters of an exactly uniform beam by the tolerant estimates.
 
     Parameters
     ----------
     exact : Numbers
-        Those of the exactly uniform beam.
+        Estimates for an exactly uniform beam.
     modal : ModalEstimate
     test : UniformBeamTest
     tolerant : TolerantEstimate or None
-        None to keep the parameters: the beam is stated to be uniform, or too few modes show.
+        None retains the parameters: the beam is stated to be uniform, or too few modes show.
     doubt, mode_doubt : str or None
-        Why no number of the record, or no mode, is to be believed.
+        Reason against every number of the record, or against every mode.
     half_width : float
         Half width of the modes' 95 % intervals, in standard deviations.
     """
@@ -77,11 +77,11 @@ def with_modal_model(
     # What drag does depends on how a mode decays, which the beam takes into account.
     of_beam = test.status == "passed" and (tolerant is None or "drag" in exact.parameters)
     modes = _modes(condition, modal, mode_doubt, half_width, own=of_beam)
-    told = replace(condition, modes=modes, uniform_beam=test, modal=modal)
+    numbers = replace(condition, modes=modes, uniform_beam=test, modal=modal)
     if tolerant is None:
-        return told
+        return numbers
     return replace(
-        told,
+        numbers,
         parameters={
             **{
                 name: quantity
@@ -107,11 +107,11 @@ def with_modal_model(
 
 
 def _modes(
-    told: Numbers, modal: ModalEstimate, doubt: str | None, half_width: float, *, own: bool
+    numbers: Numbers, modal: ModalEstimate, doubt: str | None, half_width: float, *, own: bool
 ) -> tuple[Mode, ...]:
-    """Modes that show by the modal model, the others as the beam has them."""
+    """Return the visible modes from the modal model, and the others from the beam."""
     visible = modal.visible
-    found: dict[int, Mode] = {mode.number: mode for mode in told.modes}
+    found: dict[int, Mode] = {mode.number: mode for mode in numbers.modes}
     for number in visible:
         its = modal.mode(number)
         inertia, spread = modal.inertia(number)
@@ -136,16 +136,11 @@ def _modes(
 def _parameters(
     estimate: TolerantEstimate, doubt: str | None, effective: str | None
 ) -> dict[str, Quantity]:
-    """Parameters of the nearly uniform beam, with flags where the modes do not determine them.
+    """Return the parameters of the nearly uniform beam, with flags on undetermined ones.
 
-    Parameters
-    ----------
-    estimate : TolerantEstimate
-    doubt : str or None
-        Why no number of the record is to be believed.
-    effective : str or None
-        Why stiffness, density and delay are not those of beam and channels alone: a mass at the
-        tip or a clamp that yields changes all modes alike, by far more than the tolerance.
+    `doubt` is the reason against every number. `effective` is the reason why stiffness, density and
+    delay are effective values: a tip mass or a compliant clamp changes all modes alike, by far more
+    than the tolerance.
     """
     return {
         name: Quantity(
@@ -159,7 +154,7 @@ def _parameters(
 
 
 def _reason(estimate: TolerantEstimate, name: str) -> str | None:
-    """Say why a parameter is not to be believed; None if it may be."""
+    """Return the reason against a parameter; None if it is valid."""
     if estimate.basis == "none":
         return NO_ORDER
     for order, coefficient in COEFFICIENT_OF.items():
@@ -169,7 +164,7 @@ def _reason(estimate: TolerantEstimate, name: str) -> str | None:
 
 
 def identifiable(estimate: TolerantEstimate, order: str) -> bool:
-    """Whether the modes bound an order within less than half of its range."""
+    """Return whether the modes bound an order within less than half of its range."""
     low, high = estimate.interval[order]
     wide = WIDEST_SHARE * (ORDER_RANGE[1] - ORDER_RANGE[0])
     shows = estimate.deviance_without[COEFFICIENT_OF[order]] > NORMAL_95**2
@@ -179,7 +174,7 @@ def identifiable(estimate: TolerantEstimate, order: str) -> bool:
 def _structures(
     exact: Numbers, estimate: TolerantEstimate
 ) -> tuple[tuple[str, StructureStatus], ...]:
-    """Say which structures the losses exclude: what the modes' places would exclude is no proof."""
+    """Return the status of the structures by their losses; mode frequencies are no proof."""
 
     def status(name: str, before: StructureStatus) -> StructureStatus:
         if before == "selected":
@@ -202,8 +197,8 @@ def _structures(
 def tolerant_sizes(test: UniformBeamTest, estimate: TolerantEstimate) -> tuple[Size, ...]:
     """Return the loss factors where they depend least on their orders.
 
-    That of external damping is relative to the inertia, which is an effective value where the test
-    refuses a uniform beam.
+    The loss factor of external damping is relative to the inertia, which is an effective value if
+    the test refuses a uniform beam.
 
     Parameters
     ----------
@@ -228,24 +223,16 @@ def tolerant_sizes(test: UniformBeamTest, estimate: TolerantEstimate) -> tuple[S
 def tolerant_order(
     order: Order,
     estimate: TolerantEstimate,
-    profile: Profile,
+    profile: LikelihoodProfile,
     doubt: str | None,
     *,
     refused: bool,
 ) -> OrderVerdict:
-    """Judge one order with a tolerance of the geometry.
+    """Assess one order with a tolerance of the geometry.
 
-    Parameters
-    ----------
-    order : str
-    estimate : TolerantEstimate
-    profile : Profile
-        Profile of the order on an exactly uniform beam.
-    doubt : str or None
-        Why no number of the record is to be believed.
-    refused : bool
-        Whether a uniform beam does not predict the modes: what makes them differ may have a loss of
-        its own, so no order is excluded.
+    `profile` is the profile of the order on an exactly uniform beam, `doubt` the reason against
+    every number of the record. With `refused`, a uniform beam does not predict the modes: the cause
+    of their difference may have a loss of its own, so no order is excluded.
     """
     status, reason = tolerant_status(order, estimate, refused=refused)
     if reason is not None:
@@ -259,14 +246,14 @@ def tolerant_order(
 def tolerant_status(
     order: Order, estimate: TolerantEstimate, *, refused: bool
 ) -> tuple[Status, str | None]:
-    """Judge one order by an estimate, with the reason where it is not identifiable.
+    """Assess one order by an estimate, with the reason where it is not identifiable.
 
     Parameters
     ----------
     order : str
     estimate : TolerantEstimate
     refused : bool
-        As `tolerant_order` takes it.
+        Whether the test refused a uniform beam.
     """
     if estimate.basis == "none":
         return "not identifiable", NO_ORDER

@@ -5,7 +5,7 @@ With angle in and coupling torque out, of any linear constant antenna on any mou
     G(s) = sum_k ( R_k / (s - p_k) + R_k* / (s - p_k*) ) + b0 + b1 s + b2 s² + b3 s³ + b4 s⁴
 
 Residues are complex: external damping, a lossy clamp, a delay and the sensor's lag all turn their
-phase. The background stands for the modes beyond the band, the tool's inertia and the delay. No law
+phase. The background represents the modes beyond the band, the tool's inertia and the delay. No law
 of the damping is assumed, nor that the beam is uniform.
 
 References
@@ -73,19 +73,19 @@ class ModalModel:
 
     @property
     def frequencies_hz(self) -> tuple[float, ...]:
-        """Frequencies of the free decay."""
+        """Return the frequencies of the free decay."""
         return tuple(pole.imag / (2 * math.pi) for pole in self.poles_rad_s)
 
     @property
     def damping_ratios(self) -> tuple[float, ...]:
-        """Fractions of the critical damping."""
+        """Return the damping ratios (fractions of the critical damping)."""
         return tuple(-pole.real / abs(pole) for pole in self.poles_rad_s)
 
     @property
     def effective_inertias_kg_m2(self) -> tuple[float, ...]:
-        """Inertia about the motor axis that takes part in each mode.
+        """Return the effective inertia of each mode about the motor axis.
 
-        Those of an undamped beam add up to its moment of inertia.
+        The inertias of an undamped beam add up to its moment of inertia.
         """
         return tuple(
             2 * abs(residue) / abs(pole) ** 3
@@ -93,7 +93,7 @@ class ModalModel:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """As `json.dumps` takes it."""
+        """Return the model as `json.dumps` takes it."""
         return {
             "poles_rad_s": [[pole.real, pole.imag] for pole in self.poles_rad_s],
             "residues": [[residue.real, residue.imag] for residue in self.residues],
@@ -123,7 +123,7 @@ class ModalModel:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> ModalModel:
-        """Read what `as_json` wrote.
+        """Read the result of `as_json`.
 
         Parameters
         ----------
@@ -159,24 +159,24 @@ class ModalEstimate:
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """Covariance of the constants, shape (4 n, 4 n)."""
+        """Return the covariance of the constants, shape (4 n, 4 n)."""
         return self.joint_covariance[: self.constants.size, : self.constants.size]
 
     @property
     def visible(self) -> tuple[int, ...]:
-        """Numbers of the beam's modes that the data show."""
+        """Return the numbers of the beam's modes that the data show."""
         return tuple(sorted(number for number in self.numbers if number))
 
     def rows(self, numbers: Sequence[int]) -> NDArray[np.intp]:
-        """Places of the constants of some modes, shape (4 m,).
+        """Return the indices of the constants of some modes, shape (4 m,).
 
         Parameters
         ----------
         numbers : sequence of int
         """
         each = np.arange(len(CONSTANTS))
-        places = [each + each.size * self.numbers.index(number) for number in numbers]
-        return np.concatenate(places) if places else np.zeros(0, dtype=np.intp)
+        indices = [each + each.size * self.numbers.index(number) for number in numbers]
+        return np.concatenate(indices) if indices else np.zeros(0, dtype=np.intp)
 
     def mode(self, number: int) -> ModeEstimate:
         """Return a mode with its standard deviations.
@@ -193,7 +193,7 @@ class ModalEstimate:
         )
 
     def inertia(self, number: int) -> tuple[float, float]:
-        """Effective inertia of a mode in kg m², and its relative standard deviation.
+        """Return the effective inertia of a mode in kg m², and its relative standard deviation.
 
         Parameters
         ----------
@@ -209,12 +209,12 @@ class ModalEstimate:
 
     def of_visible(self) -> ModalEstimate:
         """Return the estimate of the visible modes alone, with the same background."""
-        rows, places = self.rows(self.visible), [self.numbers.index(n) for n in self.visible]
+        rows, indices = self.rows(self.visible), [self.numbers.index(n) for n in self.visible]
         joint = np.concatenate([rows, self.constants.size + np.arange(BACKGROUND)])
         return ModalEstimate(
             ModalModel(
-                tuple(self.model.poles_rad_s[place] for place in places),
-                tuple(self.model.residues[place] for place in places),
+                tuple(self.model.poles_rad_s[index] for index in indices),
+                tuple(self.model.residues[index] for index in indices),
                 self.model.background,
             ),
             self.visible,
@@ -223,7 +223,7 @@ class ModalEstimate:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """As `json.dumps` takes it."""
+        """Return the estimate as `json.dumps` takes it."""
         names = [f"{name}_{k}" for k in range(1, len(self.numbers) + 1) for name in CONSTANTS]
         names += [f"background_{power}" for power in range(BACKGROUND)]
         return {

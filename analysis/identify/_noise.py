@@ -1,8 +1,8 @@
 """Noise spectrum of the torque, from the residual of a fit: smooth, and narrow-band lines.
 
-The spectrum is smoothed by medians over blocks of bins, which what a wrong model leaves at a mode,
-or a hum at one frequency, does not raise; a line is a group of bins far above it that lasts all
-through the record.
+The spectrum is smoothed by medians over blocks of bins. The residual of a wrong model at a mode, or
+a hum at one frequency, does not raise a median. A line is a group of bins far above the spectrum
+that lasts through the whole record.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ hundred."""
 _MEDIAN_OVER_MEAN: Final = float(np.log(2.0))
 
 _LINE: Final = 20.0
-"""Power over that of the noise from which a bin stands out: chance does it once in 5e8 bins."""
+"""Power over that of the noise from which a bin is significant: chance exceeds it once in 5e8
+bins."""
 
 _GUARD: Final = 16
-"""Bins to either side of a line that tell when it was there: parts of 1/32 of the record."""
+"""Bins to either side of a line that resolve its duration: parts of 1/32 of the record."""
 
 _EIGHTHS: Final = 8
 _STEADY: Final = 0.3
@@ -48,8 +49,8 @@ class Line:
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
-    """Noise in the torque, as found from a residual.
+class NoiseSpectrum:
+    """Noise in the torque, as estimated from a residual.
 
     Attributes
     ----------
@@ -66,7 +67,7 @@ class Noise:
 
     @property
     def weight(self) -> NDArray[np.float64]:
-        """Factor that gives both parts of the residual variance 1, and nought at the lines."""
+        """Return the whitening factor of the residual (parts of variance 1); 0 at the lines."""
         weight: NDArray[np.float64] = np.sqrt(2 / self.power) * self.counts
         return weight
 
@@ -75,9 +76,9 @@ def noise_of(
     residual: NDArray[np.complex128],
     frequency_hz: NDArray[np.float64],
     samples: int,
-    share: float = 1.0,
+    known_fraction: float = 1.0,
     near_mode: NDArray[np.bool_] | None = None,
-) -> Noise:
+) -> NoiseSpectrum:
     """Separate noise and hum in a residual.
 
     Parameters
@@ -86,18 +87,18 @@ def noise_of(
         Transform of `samples` samples in N·m, on neighbouring bins.
     frequency_hz : ndarray, shape (K,)
     samples : int
-    share : float
-        Share of the samples at which the residual is known; it is nought at the others.
+    known_fraction : float
+        Fraction of the samples at which the residual is known; it is 0 at the others.
     near_mode : ndarray of bool, shape (K,), optional
-        Bins that are compared whatever stands out there, skirts of a line beside them included;
-        without it no line is looked for. A resonance that is left out is not fitted, and what is
-        not fitted there always stands out.
+        Bins that are compared in any case, with the skirts of adjacent lines; without this no line
+        is searched for. An excluded resonance is not fitted, and would therefore always appear as a
+        line.
     """
-    power = smooth_power(residual) / share
+    power = smooth_power(residual) / known_fraction
     counts = np.ones(power.size, dtype=bool)
     lines: list[Line] = []
     if near_mode is None:
-        return Noise(power, counts, ())
+        return NoiseSpectrum(power, counts, ())
     for part in _standing_out(residual, power):
         own = np.abs(residual[part]) ** 2
         if near_mode[part][np.argmax(own)] or not _steady(residual, part):
@@ -106,19 +107,19 @@ def noise_of(
         lines.append(
             Line(
                 frequency_hz=float(own @ frequency_hz[part] / own.sum()),
-                amplitude_nm=float(2 * np.sqrt(own.sum()) / (samples * share)),
+                amplitude_nm=float(2 * np.sqrt(own.sum()) / (samples * known_fraction)),
             )
         )
-    return Noise(power, counts, tuple(lines))
+    return NoiseSpectrum(power, counts, tuple(lines))
 
 
 def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> NDArray[np.float64]:
-    """Smooth power of a residual's spectrum, shape (K,): the expected ``|residual|²`` of each bin.
+    """Return the smooth power of a residual's spectrum, shape (K,): the mean ``|residual|²``.
 
-    The power of noise in one bin is exponentially distributed, so its mean is the median over
-    ln 2; the median of a block of bins does not see what a wrong model leaves at a mode or a hum
-    at one frequency, which are not noise. The logarithm is interpolated between block centres.
-    Blocks are narrower at low frequency, where drift makes the spectrum steep.
+    The power of noise in one bin is exponentially distributed, so its mean is the median over ln 2.
+    The median of a block ignores the residual of a wrong model at a mode, and a hum at one
+    frequency, which are not noise. The logarithm is interpolated between block centres. Blocks are
+    narrower at low frequency, where drift makes the spectrum steep.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> N
 def with_peaks(
     residual: NDArray[np.complex128], power: NDArray[np.float64], where: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Power of the noise with peaks that are narrower than the blocks of `smooth_power`, (K,).
+    """Return the noise power with peaks narrower than the blocks of `smooth_power`, (K,).
 
     Parameters
     ----------
@@ -155,31 +156,31 @@ def with_peaks(
     """
     ratio = (residual.real**2 + residual.imag**2) / power
     local = np.convolve(ratio, np.full(_PEAK_BINS, 1 / _PEAK_BINS), mode="same")
-    # Around each place that stands out, as far as the mean over so many bins sees it.
+    # Around each significant bin, as far as the mean over so many bins includes it.
     out = np.convolve(local > _PEAK, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
     return np.where(out & where, power * np.maximum(local, 1.0), power)
 
 
 def _edges(bins: int) -> NDArray[np.intp]:
-    """Borders of the blocks: widths grow with frequency, from `_FEWEST_BINS` up."""
-    places = bins * np.linspace(0, 1, _BLOCKS + 1) ** 2
+    """Return the block borders: widths grow with frequency, from `_FEWEST_BINS` up."""
+    positions = bins * np.linspace(0, 1, _BLOCKS + 1) ** 2
     edges = [0]
-    for place in places[1:-1]:
-        if place - edges[-1] >= _FEWEST_BINS and bins - place >= _FEWEST_BINS:
-            edges.append(round(float(place)))
+    for position in positions[1:-1]:
+        if position - edges[-1] >= _FEWEST_BINS and bins - position >= _FEWEST_BINS:
+            edges.append(round(float(position)))
     return np.array([*edges, bins])
 
 
 def _fine_edges(bins: int) -> NDArray[np.intp]:
-    """Borders of equal blocks of `_FINE_BINS` or a little more."""
+    """Return the borders of equal blocks of `_FINE_BINS` or a little more."""
     return np.linspace(0, bins, max(bins // _FINE_BINS, 1) + 1).round().astype(np.intp)
 
 
 def _standing_out(residual: NDArray[np.complex128], power: NDArray[np.float64]) -> list[slice]:
     """Find groups of bins far above the noise, each with its skirts.
 
-    A line leaks into its neighbours as 1 / distance; at three times the distance at which it
-    stands out it is down to the noise.
+    A line leaks into its neighbours as 1 / distance: at three times the distance at which it is
+    significant the leakage is below the noise.
     """
     bins = np.flatnonzero(np.abs(residual) ** 2 > _LINE * power)
     if bins.size == 0:
@@ -194,9 +195,9 @@ def _standing_out(residual: NDArray[np.complex128], power: NDArray[np.float64]) 
 
 
 def _steady(residual: NDArray[np.complex128], part: slice) -> bool:
-    """Whether what stands out was there all the time.
+    """Return whether a line lasts through the whole record.
 
-    What a wrong model leaves at a mode is there when the sweep passes it, and rings down.
+    The residual of a wrong model at a mode begins when the sweep passes the mode, and decays.
     """
     around = residual[max(part.start - _GUARD, 0) : part.stop + _GUARD]
     length = _EIGHTHS * (-(-4 * around.size // _EIGHTHS))

@@ -7,7 +7,7 @@ Mode i, relative to its root, is driven by the angle; a further restoring force 
 
 with, relative to the largest deflection R and the largest speed V that the mode reaches,
 
-* ``n = e r³ / R²``: stiffness that rises by the share e at R; acts at once and three times the
+* ``n = e r³ / R²``: stiffness that rises by the fraction e at R; acts at once and three times the
   drive's frequency (odd harmonics);
 * ``n = e r² / R``: stiffness that differs from side to side; even harmonics;
 * ``n = 2 e r'|r'| / (omega V)``: drag that grows with the square of the speed, as of air; the
@@ -29,7 +29,7 @@ from analysis.identify._candidates import INTEGER_INTERNAL
 from analysis.identify._data import fast_length
 from analysis.identify._predictor import torque_channel
 from analysis.identify._refit import Refit
-from analysis.identify._residual_tests import SURE
+from analysis.identify._residual_tests import SIGNIFICANT_STD
 from analysis.identify._verdict import STRONG
 from rigd.beam import clamped_free_eigenvalues, participation
 
@@ -58,20 +58,20 @@ _CONVERGED: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One restoring force that is not linear, of one mode."""
+    """One nonlinear restoring force of one mode."""
 
     kind: Kind
     mode: int
 
 
 class ModalForces:
-    """Columns of a record: torque by restoring forces of unit size.
+    """Torque columns of a record by restoring forces of unit size.
 
     Parameters
     ----------
     comparison : Comparison
     plant : Plant
-        The linear part.
+        Linear plant.
     """
 
     __slots__ = ("_comparison", "_growth", "_length", "_p", "_plant", "_s", "_samples")
@@ -90,9 +90,9 @@ class ModalForces:
         self._p = ratio * self._s**2 + damping.gamma * self._s**damping.lambda_
 
     def column(self, term: Term, size: float = 0.0) -> NDArray[np.complex128]:
-        """Spectrum, shape (K,), of the torque by a force, divided by its `size`.
+        """Return the spectrum, shape (K,), of the torque by a force, divided by its `size`.
 
-        Not finite where the repeated substitution leads nowhere: so large a force is not known.
+        It is not finite if the repeated substitution diverges: the force is then too large.
 
         Parameters
         ----------
@@ -118,15 +118,15 @@ class ModalForces:
                     if change < _CONVERGED * most:
                         break
         beam = self._plant.beam
-        share = float(participation(beam, term.mode)[-1]) * beam.bending_stiffness_n_m2
-        torque = -share * k * self._p / resists * force * torque_channel(self._plant, self._s)
+        scale = float(participation(beam, term.mode)[-1]) * beam.bending_stiffness_n_m2
+        torque = -scale * k * self._p / resists * force * torque_channel(self._plant, self._s)
         in_time = np.fft.irfft(torque, self._length)[: self._samples]
         in_time *= self._growth[::_OVERSAMPLING]
         spectrum: NDArray[np.complex128] = self._comparison.spectrum(in_time[self._comparison.kept])
         return spectrum
 
     def _stiffness(self, mode: int) -> tuple[float, NDArray[np.complex128]]:
-        """k⁴ of a mode, and the same with its damping."""
+        """Return k⁴ of a mode, and k⁴ with its damping."""
         plant = self._plant
         k = float(clamped_free_eigenvalues(mode)[-1] / plant.beam.length_m) ** 4
         damped = k * (1 + plant.damping.zeta * self._s**plant.damping.alpha)
@@ -135,7 +135,7 @@ class ModalForces:
     def _force(
         self, kind: Kind, moved: NDArray[np.complex128], linear: NDArray[np.complex128]
     ) -> NDArray[np.complex128]:
-        """Transform of n, shape (length // 2 + 1,), for a motion; the linear one sets R and V."""
+        """Return the transform of n, shape (length // 2 + 1,); the linear motion sets R and V."""
         if kind == "quadratic drag":
             speed = self._fine(moved * self._s)
             fastest = np.abs(self._fine(linear * self._s)).max()
@@ -151,7 +151,7 @@ class ModalForces:
         return spectrum / _OVERSAMPLING
 
     def _fine(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Values over the record at the multiple of the rate."""
+        """Return values over the record at the multiple of the rate."""
         fine = np.fft.irfft(_OVERSAMPLING * spectrum, _OVERSAMPLING * self._length)
         values: NDArray[np.float64] = fine[: self._growth.size] * self._growth
         return values
@@ -161,30 +161,31 @@ class ModalForces:
 
 _MOST_TERMS: Final = 2
 _ROUNDS: Final = 6
-_SETTLED: Final = 0.005
-_GAIN: Final = SURE**2 + 2 * math.log(30)
-"""Deviance that a term must save: three forces on three modes and three rounds are tried."""
+_SIZE_TOLERANCE: Final = 0.005
+_GAIN: Final = SIGNIFICANT_STD**2 + 2 * math.log(30)
+"""Deviance reduction that a term needs: three forces on three modes are tested in three rounds."""
 
 _HINT: Final = 6.0
-"""Deviance that the most wanted term must promise before any is tried; chance promises as much in
+"""Predicted deviance reduction of the best term from which terms are tested; chance reaches it in
 one record of ten."""
 
 _HOPELESS: Final = 2000.0
-"""Deviance behind the best, to first order, from which no substitution leads back."""
+"""First-order deviance above the best from which no substitution recovers."""
 
 _EXPLAINED: Final = 0.5
-"""Share of what exceeds chance that the terms must explain; else something else is there."""
+"""Fraction of the squares beyond chance that the terms must explain; else there is another
+cause."""
 
 
 @dataclass(frozen=True, slots=True)
 class NonlinearForce:
-    """A restoring force that is not linear.
+    """Estimated nonlinear restoring force.
 
     Attributes
     ----------
     term : Term
     size : float
-        Share of the stiffness at the largest deflection, or damping ratio at the largest speed.
+        Fraction of the stiffness at the largest deflection, or damping ratio at the largest speed.
     std : float
     """
 
@@ -194,83 +195,73 @@ class NonlinearForce:
 
 
 def nonlinear_forces(
-    field: CandidateSet, modes: tuple[int, ...]
+    candidate_set: CandidateSet, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
-    """Add forces one by one while each saves far more than chance would; refit all with them.
+    """Add significant nonlinear forces one by one; refit all candidates with them.
 
-    A mode whose stiffness rises looks much like one that lies elsewhere, or like a fractional
-    order. Where the best candidate has these, the search also starts from those without. But even
-    then such a force leaves its trace, by which the best would gain; without one nothing is tried.
-
-    Parameters
-    ----------
-    field : CandidateSet
-        Without such forces.
-    modes : tuple of int
-        Modes that the record shows.
-
-    Returns
-    -------
-    field : CandidateSet
-        The one given, if there is nothing.
-    forces : tuple of NonlinearForce
+    A mode whose stiffness rises resembles a mode at another frequency, or a fractional order. If
+    the best candidate has these, the search also starts from those without. Even then such a force
+    leaves a trace that would improve the best candidate; without that trace nothing is tested.
+    `modes` are the visible modes. Returns the set with the forces, or the given set and no forces.
     """
-    best = field.best
-    here = field.refit(best)
-    if _gain(best, here.cost, _most_wanted(field, here, modes, [])[1]) < _HINT:
-        return field, ()
-    for lead in _leads(field):
-        found, forces = _added(field, lead, modes)
-        if forces and found.bic < field.bic - STRONG and _explain(field, found):
+    best = candidate_set.best
+    here = candidate_set.refit(best)
+    if _gain(best, here.cost, _best_term(candidate_set, here, modes, [])[1]) < _HINT:
+        return candidate_set, ()
+    for lead in _leads(candidate_set):
+        found, forces = _added(candidate_set, lead, modes)
+        if forces and found.bic < candidate_set.bic - STRONG and _explain(candidate_set, found):
             return found, forces
-    return field, ()
+    return candidate_set, ()
 
 
-def _leads(field: CandidateSet) -> tuple[Candidate, ...]:
-    """Candidates to start from: the best, and before it those that are simpler."""
-    best = field.best
+def _leads(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
+    """Return the candidates to start from: simpler ones, then the best."""
+    best = candidate_set.best
     if "alpha" not in best.structure.free:
         return (best,)
-    return (*(c for c in field.candidates if c.structure in INTEGER_INTERNAL), best)
+    return (*(c for c in candidate_set.candidates if c.structure in INTEGER_INTERNAL), best)
 
 
 def _added(
-    field: CandidateSet, lead: Candidate, modes: tuple[int, ...]
+    candidate_set: CandidateSet, lead: Candidate, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
     """Add forces to one candidate, then to all."""
     terms: list[Term] = []
     sizes = std = np.zeros(0)
-    best = field.best
-    here = field.refit(lead)
+    best = candidate_set.best
+    here = candidate_set.refit(lead)
     while len(terms) < _MOST_TERMS:
-        term, cost = _most_wanted(field, here, modes, terms)
+        term, cost = _best_term(candidate_set, here, modes, terms)
         behind = _gain(best, cost, best.fit.cost)
         if term is None or _gain(best, here.cost, cost) < _GAIN or behind > _HOPELESS:
             break
-        tried = _with_terms(field, here, [*terms, term], np.append(sizes, 0.0))
+        tried = _with_terms(candidate_set, here, [*terms, term], np.append(sizes, 0.0))
         if tried is None or _gain(best, here.cost, tried[0].cost) < _GAIN:
             break
         terms.append(term)
         here, sizes, std = tried
     if not terms:
-        return field, ()
-    every = field.with_columns(here.columns, here.noise_here())
+        return candidate_set, ()
+    every = candidate_set.with_columns(here.columns, here.noise_here())
     forces = zip(terms, sizes.tolist(), std.tolist(), strict=True)
     return every, tuple(NonlinearForce(term, size, s) for term, size, s in forces)
 
 
 def _gain(candidate: Candidate, before: float, after: float) -> float:
-    """Deviance saved between two sums of squares."""
+    """Return the reduction of deviance between two sums of squares."""
     return candidate.values * math.log(before / after)
 
 
-def _most_wanted(
-    field: CandidateSet, refit: Refit, modes: tuple[int, ...], taken: list[Term]
+def _best_term(
+    candidate_set: CandidateSet, refit: Refit, modes: tuple[int, ...], taken: list[Term]
 ) -> tuple[Term | None, float]:
-    """Find the term that to first order saves most, and the cost with it."""
-    forces = ModalForces(field.comparison, refit.plant)
+    """Return the term with the largest first-order reduction, and the cost with it."""
+    forces = ModalForces(candidate_set.comparison, refit.plant)
     # Air that brakes the whole beam has been found already, and no mode is braked by itself.
-    kinds = KINDS if field.drag is None else tuple(k for k in KINDS if k != "quadratic drag")
+    kinds = (
+        KINDS if candidate_set.drag is None else tuple(k for k in KINDS if k != "quadratic drag")
+    )
     terms = [Term(kind, mode) for kind in kinds for mode in modes]
     terms = [term for term in terms if term not in taken]
     if not terms:
@@ -281,33 +272,37 @@ def _most_wanted(
 
 
 def _with_terms(
-    field: CandidateSet, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
+    candidate_set: CandidateSet, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
 ) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]] | None:
-    """Fit with the columns of these terms, at the sizes that they turn out to have.
+    """Fit with the columns of these terms, iterating over their sizes.
 
-    None if these are larger than the columns are known for.
+    Return None if the sizes exceed the range in which the columns are known.
     """
     std = np.zeros(sizes.size)
     for _ in range(_ROUNDS):
-        forces = ModalForces(field.comparison, refit.plant)
+        forces = ModalForces(candidate_set.comparison, refit.plant)
         of_terms = [forces.column(term, e) for term, e in zip(terms, sizes.tolist(), strict=True)]
         if not np.isfinite(of_terms).all():
             return None
-        columns = np.concatenate([field.columns, of_terms])
+        columns = np.concatenate([candidate_set.columns, of_terms])
         refit = Refit.descend(
-            field.comparison, refit.objective.unknowns, refit.x, field.noise, columns
+            candidate_set.comparison,
+            refit.objective.unknowns,
+            refit.x,
+            candidate_set.noise,
+            columns,
         )
         before = sizes
-        sizes, std = (values[len(field.columns) :] for values in refit.amplitudes())
-        if np.all(np.abs(sizes - before) < np.maximum(0.3 * std, _SETTLED * np.abs(sizes))):
+        sizes, std = (values[len(candidate_set.columns) :] for values in refit.amplitudes())
+        if np.all(np.abs(sizes - before) < np.maximum(0.3 * std, _SIZE_TOLERANCE * np.abs(sizes))):
             break
     return refit, sizes, std
 
 
 def _explain(without: CandidateSet, within: CandidateSet) -> bool:
-    """Whether the forces explain what the linear beam left, or at least half of it."""
+    """Return whether the forces explain the residual of the linear beam, or at least half of it."""
     power = np.abs(without.best.fit.residual) ** 2
     before = without.best.fit.cost - without.best.fit.degrees_of_freedom
-    chance = SURE * math.sqrt(2 * power.size * 2)
+    chance = SIGNIFICANT_STD * math.sqrt(2 * power.size * 2)
     after = within.best.fit.cost - within.best.fit.degrees_of_freedom
     return after < max(_EXPLAINED * before, chance)

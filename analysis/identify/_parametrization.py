@@ -1,8 +1,8 @@
 """Parametrization of a fit: its vector of unknowns, the way from it to a plant, and suitable steps.
 
 Damping of a low order acts as stiffness, damping of an order near 2 as inertia. With density and
-stiffness free, such damping and the beam can make up for each other over a long and curved
-valley, in which a descent takes hundreds of steps. So the unknowns are what a record shows
+stiffness free, such damping and the beam can compensate each other along a curved flat direction,
+in which a descent takes hundreds of steps. So the unknowns are quantities that a record determines
 directly; orders then change alone:
 
 * internal damping by its loss relative to the stiffness, ``ln(z sin(alpha pi/2))`` with
@@ -14,11 +14,12 @@ directly; orders then change alone:
   as logarithms relative to the nominal beam's;
 * the delay in ms, and the tool inertia relative to the nominal beam's.
 
-Where damping is larger than the stiffness or inertia it adds to, loss and order make up for each
-other: what shows is the phase theta of ``1 ± size exp(j order pi/2)``, and at constant theta they
-trade over many powers of ten. A straight step leaves that valley at once, and a descent with
-straight steps takes a hundred of them. So a step is taken along ``ln tan(theta/2)`` and the order
-in place of ``ln loss`` and the order (`Steps`); where the damping is small the two are the same.
+Where damping is larger than the stiffness or inertia it adds to, loss and order compensate each
+other: the record determines only the phase theta of ``1 ± size exp(j order pi/2)``, and at constant
+theta loss and order vary over many powers of ten. A straight step leaves this curve at once, and a
+descent with straight steps takes a hundred of them. So a step is taken along ``ln tan(theta/2)``
+and the order instead of ``ln loss`` and the order (`Steps`); where the damping is small the two
+are the same.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class Unknowns:
     ----------
     structure : Structure
     nominal : Plant
-        All that is not free stays at its values; its damping does not matter.
+        Source of the values that are not free; its damping is not used.
     free : tuple of str
         Free settings, in the order of `SETTINGS`.
     omega_rad_s : tuple of float
@@ -81,7 +82,7 @@ class Unknowns:
 
     @classmethod
     def of(cls, structure: Structure, nominal: Plant, free: tuple[Setting, ...]) -> Unknowns:
-        """Unknowns of a structure with some settings free.
+        """Return the unknowns of a structure with some settings free.
 
         Parameters
         ----------
@@ -98,17 +99,17 @@ class Unknowns:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the free parameters, in the vector's order."""
+        """Return the names of the free parameters, in the order of the vector."""
         return (*self.structure.free, *self.free)
 
     @cached_property
     def gradient_names(self) -> tuple[str, ...]:
-        """The same as the prediction names what it differentiates by."""
+        """Return the same names as the prediction uses for its derivatives."""
         return tuple(_GRADIENT_NAMES.get(name, name) for name in self.names)
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper bounds, shape (k,)."""
+        """Return lower and upper bounds, shape (k,)."""
         size = (math.log(SIZE_RANGE[0]), math.log(SIZE_RANGE[1]))
         delay = _DELAY_RANGE_S / _DELAY_UNIT_S
         ranges = {
@@ -125,7 +126,7 @@ class Unknowns:
         return np.array(low), np.array(high)
 
     def start(self, sizes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Vector with damping as `analysis.paper._fit` gives it, settings at their nominal values.
+        """Return the vector for given damping sizes, with settings at their nominal values.
 
         Parameters
         ----------
@@ -145,13 +146,13 @@ class Unknowns:
         return np.array([at[name] for name in self.names])
 
     def vector(self, plant: Plant) -> NDArray[np.float64]:
-        """Unknowns of a plant, shape (k,): the inverse of `plant`.
+        """Return the unknowns of a plant, shape (k,): the inverse of `plant`.
 
         Parameters
         ----------
         plant : Plant
-            Found in whatever structure: damping keeps its loss at the mode where its order is
-            fixed otherwise; damping that is absent comes in small, of order 1.
+            Plant of any structure. If this one fixes another order, the damping has the same loss
+            at the mode; absent damping starts small, with order 1.
         """
         damping, nominal = plant.damping, self.nominal.beam
         first, second = self.omega_rad_s
@@ -175,19 +176,19 @@ class Unknowns:
         return np.array([at[name] for name in self.names])
 
     def plant(self, x: NDArray[np.float64]) -> Plant:
-        """Everything the prediction depends on, at `x`."""
+        """Return the plant at `x`."""
         return self._plant_of(self._values(x)[0])
 
     def plant_and_gradient(self, x: NDArray[np.float64]) -> tuple[Plant, NDArray[np.float64]]:
-        """Give `plant` at `x`, and differentiate what the prediction is differentiated by.
+        """Return `plant` at `x` and the derivatives of its parameters by `x`.
 
-        That is `gradient_names` by `x`, shape (k, k): zeta and gamma themselves, not their
+        The parameters are `gradient_names`, shape (k, k): zeta and gamma themselves, not their
         logarithms.
         """
         values, derivative = self._values(x)
-        for place, name in enumerate(self.names):
+        for index, name in enumerate(self.names):
             if name in ("zeta", "gamma"):
-                derivative[place] *= values[name]
+                derivative[index] *= values[name]
         return self._plant_of(values), derivative
 
     def _plant_of(self, values: Mapping[str, float]) -> Plant:
@@ -201,12 +202,12 @@ class Unknowns:
         )
 
     def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
-        """All parameters at `x`."""
+        """Return all parameters at `x`."""
         return self.plant(x).parameters
 
     @cached_property
     def units(self) -> Mapping[str, float]:
-        """What 1 stands for in the unknowns that are linear."""
+        """Return the size of a unit of each linear unknown."""
         beam = self.nominal.beam
         units = {
             "delay_s": _DELAY_UNIT_S,
@@ -215,32 +216,32 @@ class Unknowns:
         return MappingProxyType(units)
 
     @cached_property
-    def _places(self) -> Mapping[str, int]:
-        """Place of each free parameter in the vector."""
+    def _indices(self) -> Mapping[str, int]:
+        """Return the index of each free parameter in the vector."""
         return MappingProxyType({name: i for i, name in enumerate(self.names)})
 
     @cached_property
     def _given(self) -> Mapping[str, float]:
-        """Parameters before any is set free."""
+        """Return the parameters before any is set free."""
         fixed = dict(self.structure.fixed.items())
         return MappingProxyType({**self.nominal.parameters, **fixed})
 
     def _linear(self, plant: Plant) -> dict[str, float]:
-        """Unknowns of a plant that are linear, by name."""
+        """Return the linear unknowns of a plant, by name."""
         values = plant.parameters
         return {name: values[name] / unit for name, unit in self.units.items()}
 
     def estimates_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Differentiate the free parameters by `x`, shape (k, k): [parameter, unknown].
 
-        Those of `LOGARITHMIC` count as logarithms.
+        `LOGARITHMIC` parameters count as logarithms.
         """
         derivative: NDArray[np.float64] = self._values(x)[1]
         return derivative
 
     def _values(self, x: NDArray[np.float64]) -> tuple[dict[str, float], NDArray[np.float64]]:
-        """All parameters at `x`, and `estimates_by_unknowns`."""
-        place = self._places
+        """Return all parameters at `x`, and `estimates_by_unknowns`."""
+        index = self._indices
         given: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))
         values: dict[str, float] = dict(self._given)
         derivative = np.eye(x.size)
@@ -252,34 +253,34 @@ class Unknowns:
             ln_z, slope = _size(given["zeta"], order)
             values["zeta"] = math.exp(ln_z - order * math.log(second))
             stiffening = self._addition(ln_z, order, 1.0, "zeta", "alpha", slope)
-            if "alpha" in place:
-                derivative[place["zeta"], place["alpha"]] = slope - math.log(second)
+            if "alpha" in index:
+                derivative[index["zeta"], index["alpha"]] = slope - math.log(second)
         if self.structure.external:
             values["lambda"] = order = given.get("lambda", values["lambda"])
             ln_g, slope = _size(given["gamma"], order)
             inertial = self._addition(ln_g, order, -1.0, "gamma", "lambda", slope)
-            if "lambda" in place:
-                derivative[place["gamma"], place["lambda"]] = slope - math.log(first)
+            if "lambda" in index:
+                derivative[index["gamma"], index["lambda"]] = slope - math.log(first)
         for name, sign in (("density_over_stiffness", 1.0), ("bending_stiffness_n_m2", -1.0)):
-            if name in place:
+            if name in index:
                 added = sign * stiffening - (inertial if sign > 0 else 0.0)
                 values[name] *= math.exp(given[name] + added[-1])
-                derivative[place[name]] += added[:-1]
+                derivative[index[name]] += added[:-1]
         if self.structure.external:
             ratio = values["density_over_stiffness"]
             values["gamma"] = ratio * math.exp(ln_g + (2 - values["lambda"]) * math.log(first))
-            if "density_over_stiffness" in place:
-                derivative[place["gamma"]] += derivative[place["density_over_stiffness"]]
+            if "density_over_stiffness" in index:
+                derivative[index["gamma"]] += derivative[index["density_over_stiffness"]]
         units = self.units
-        for name in units.keys() & place.keys():
+        for name in units.keys() & index.keys():
             values[name] = given[name] * units[name]
-            derivative[place[name], place[name]] = units[name]
+            derivative[index[name], index[name]] = units[name]
         return values, derivative
 
     def _addition(
         self, ln_size: float, order: float, sign: float, coefficient: str, of: str, slope: float
     ) -> NDArray[np.float64]:
-        """Slopes of ``ln |1 ± size exp(j order pi/2)|`` by the unknowns, and last the value.
+        """Return slopes of ``ln |1 ± size exp(j order pi/2)|`` by the unknowns; last the value.
 
         `slope` is that of `ln_size` by the order at constant loss.
         """
@@ -287,24 +288,24 @@ class Unknowns:
         square = 1 + 2 * size * math.cos(angle) + size * size
         by_ln_size = size * (math.cos(angle) + size) / square
         addition = np.zeros(len(self.names) + 1)
-        addition[self._places[coefficient]] = by_ln_size
-        if of in self._places:
+        addition[self._indices[coefficient]] = by_ln_size
+        if of in self._indices:
             turning = -_QUARTER_TURN * size * math.sin(angle) / square
-            addition[self._places[of]] = by_ln_size * slope + turning
+            addition[self._indices[of]] = by_ln_size * slope + turning
         addition[-1] = math.log(square) / 2
         return addition
 
 
 def _size(ln_loss: float, order: float) -> tuple[float, float]:
-    """``ln size`` of a damping of that loss, and its slope by the order."""
+    """Return ``ln size`` of a damping with a loss, and its slope by the order."""
     angle = _QUARTER_TURN * order
     return ln_loss - math.log(math.sin(angle)), -_QUARTER_TURN / math.tan(angle)
 
 
 # Steps
 
-_SHARE: Final = 0.5
-"""Longest step of an order, as a share of the way to 0 or 2."""
+_STEP_FRACTION: Final = 0.5
+"""Longest step of an order, as a fraction of the distance to 0 or 2."""
 
 NEXT_TO_NOTHING: Final = 1e-4
 """Loss that may vanish in one step."""
@@ -314,21 +315,21 @@ _LARGEST_GROWTH: Final = 50.0
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Where steps from a vector of unknowns lead, and how far they may go.
+    """Curved steps from a vector of unknowns, and their limits.
 
     Attributes
     ----------
     lower, upper : ndarray, shape (k,)
         Bounds of the unknowns.
     dampings : tuple of (int, int, bool)
-        Places of the loss and of the order of each damping whose order is free, and whether it adds
-        to the stiffness; otherwise it takes from the inertia.
+        Indices of loss and order of each damping with a free order, and whether it adds to the
+        stiffness; otherwise it reduces the inertia.
     losses : tuple of int
-        Places of the losses of dampings whose order is fixed.
+        Indices of the losses of dampings with a fixed order.
     linear_below : float
-        Loss below which a step that raises a loss is one of the loss itself, to which all that it
-        does is proportional. Its logarithm would leap from next to nothing to the upper bound, and
-        most of a descent would be spent on taking that back.
+        Loss below which a step changes the loss itself, to which its effect is proportional. Its
+        logarithm would jump from a negligible value to the upper bound, and most of a descent would
+        be spent on the way back.
     """
 
     lower: NDArray[np.float64]
@@ -339,13 +340,13 @@ class Steps:
 
     @classmethod
     def of(cls, unknowns: Unknowns, linear_below: float = 0.0) -> Steps:
-        """Find bounds and dampings of a vector of unknowns.
+        """Return the steps for a vector of unknowns.
 
         Parameters
         ----------
         unknowns : Unknowns
         linear_below : float
-            As the field of that name.
+            Value of the attribute `linear_below`.
         """
         names = unknowns.names
         dampings = tuple(
@@ -361,26 +362,26 @@ class Steps:
         return cls(*unknowns.bounds, dampings, losses, linear_below)
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and largest step in each unknown, shape (k,).
+        """Return the least and largest step in each unknown, shape (k,).
 
-        Orders approach 0 and 2 by a share of the way at a time: what damping does goes with the
-        logarithm of that distance. Damping that has vanished keeps its order.
+        Orders approach 0 and 2 by a fraction of the distance at a time: the effect of damping
+        depends on the logarithm of that distance. Vanished damping has a constant order.
         """
         least, most = self.lower - x, self.upper - x
         for loss, order, _ in self.dampings:
-            share = _SHARE if x[loss] > self.lower[loss] else 0.0
-            least[order] = max(least[order], -share * x[order])
-            most[order] = min(most[order], share * (2 - x[order]))
+            fraction = _STEP_FRACTION if x[loss] > self.lower[loss] else 0.0
+            least[order] = max(least[order], -fraction * x[order])
+            most[order] = min(most[order], fraction * (2 - x[order]))
         return least, most
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Point within the bounds that a step leads to, shape (k,).
+        """Return the point within the bounds that a step leads to, shape (k,).
 
         Parameters
         ----------
         x : ndarray, shape (k,)
         step : ndarray, shape (k,)
-            Within the `limits`; tangent to the way at `x`.
+            Step within the `limits`, tangent to the curve at `x`.
         """
         end = np.clip(x + step, self.lower, self.upper)
         for i in self.losses:
@@ -403,10 +404,10 @@ class Steps:
 def _along(
     loss: float, step: float, before: float, after: float, most: float, *, linear: bool
 ) -> tuple[float, float]:
-    """Loss and turn to which a step of ``ln loss`` leads while the turn goes from before to after.
+    """Return loss and phase after a step of ``ln loss`` while the phase goes from before to after.
 
-    The turn comes out otherwise where no loss up to `most` shows at `after` what is to show: then
-    that largest loss is combined with the turn at which it does.
+    If no loss up to `most` gives the required phase, the largest loss is combined with the phase
+    that it gives.
     """
     size = loss / math.sin(before)
     real = 1 + size * math.cos(before)
@@ -425,7 +426,7 @@ def _along(
 
 
 def _turn(order: float, elastic: bool) -> float:
-    """Phase of the damping against the stiffness or the inertia, 0 to pi."""
+    """Return the phase of the damping against stiffness or inertia, 0 to pi."""
     turn = math.pi / 2 * float(order)
     return turn if elastic else math.pi - turn
 

@@ -1,4 +1,4 @@
-"""Parameters that the predicted torque depends on: beam, damping, settings and what is stated."""
+"""Parameters of the predicted torque: beam, damping, settings and stated values."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ SETTINGS: Final[tuple[Setting, ...]] = (
     "delay_s",
     "tool_inertia_kg_m2",
 )
-"""What is free beside the damping unless it is fixed: rho/EI in s²/m⁴, EI in N·m², by how much the
-torque is older than the angle, and the inertia between torque sensor and beam."""
+"""Free parameters in addition to the damping, unless fixed: rho/EI in s²/m⁴, EI in N·m², the age of
+the torque relative to the angle, and the inertia between torque sensor and beam."""
 
 
 def free_settings(fixed: Collection[Setting]) -> tuple[Setting, ...]:
-    """All `SETTINGS` but some, in their order.
+    """Return all `SETTINGS` except some, in their order.
 
     Parameters
     ----------
@@ -50,21 +50,20 @@ LOGARITHMIC: Final = frozenset({"zeta", "gamma", *OF_BEAM})
 
 @dataclass(frozen=True, slots=True)
 class Plant:
-    """One point of the search: everything the predicted torque depends on.
+    """One point of the search: all parameters of the predicted torque.
 
     Attributes
     ----------
     beam : Beam
     damping : Damping
     delay_s : float
-        By how much the torque is older than the angle.
+        Age of the torque relative to the angle.
     tool_inertia_kg_m2 : float
     stiffness_offsets : tuple of float
-        By how much the stiffness of modes 2, 3, … differs from the uniform beam's, relatively.
+        Relative deviation of the stiffness of modes 2, 3, … from the uniform beam.
     root_compliance_rad_per_nm : float
-        By how much the clamp turns for a torque on the beam's root. The tool inertia is on the
-        motor's side of it: what is bolted to the sensor is stiff, what yields is the grip on the
-        beam.
+        Rotation of the clamp per torque on the beam's root. The tool inertia is on the motor's side
+        of it: the bolted parts are stiff, and the grip on the beam yields.
     tip_mass_kg : float
         Point mass at the beam's tip.
     filter_time_constant_s : float
@@ -85,14 +84,14 @@ class Plant:
 
     @property
     def extras(self) -> dict[str, float]:
-        """Values of all `EXTRAS`."""
+        """Return the values of all `EXTRAS`."""
         return {name: getattr(self, name) for name in EXTRAS}
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values by name: zeta, alpha, gamma, lambda, the `SETTINGS`, stiffness_offset_2, ….
+        """Return values by name: zeta, alpha, gamma, lambda, the `SETTINGS`, stiffness_offset_2, ….
 
-        Those of the `EXTRAS` that are not 0.
+        Only those of the `EXTRAS` that are not 0 are included.
         """
         return {
             "zeta": self.damping.zeta,

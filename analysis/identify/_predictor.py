@@ -4,13 +4,14 @@ The response from measured angle to measured torque is::
 
     H(s) = (R(s) + J_tool s²) Q(s) exp(-s tau),    R = G / (1 + kappa G)
 
-G is Eq. 25 of the paper; with a tip mass, or with modes that have a stiffness of their own, that of
-`rigd.beam._tip_mass`. kappa is the clamp's compliance, between tool and beam. Q holds the low-pass
-filters of the torque's channel, ``1 / (1 + tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)``
-(Butterworth), and tau is the delay of the torque's channel relative to the angle's.
+G is the exact fractional-order beam (Eq. 25 of the reference paper). With a tip mass, or with
+deviating stiffness of single modes, G is that of `rigd.beam._tip_mass`. kappa is the clamp's
+compliance, between tool and beam. Q holds the low-pass filters of the torque's channel, ``1 / (1 +
+tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)`` (Butterworth), and tau is the delay of the
+torque's channel relative to the angle's.
 
 The angle is convolved with H causally, over the whole record, on ``s = sigma + j omega``: see
-`Prediction`.
+`TorquePredictor`.
 """
 
 from __future__ import annotations
@@ -37,10 +38,7 @@ if TYPE_CHECKING:
 
 @lru_cache(maxsize=16)
 def eigenvalues(count: int) -> NDArray[np.float64]:
-    """First roots of ``1 + cos z cosh z = 0``, shape (count,), kept: every evaluation needs them.
-
-    Not to be written to.
-    """
+    """Return the first roots of ``1 + cos z cosh z = 0``, shape (count,); cached and read-only."""
     z = clamped_free_eigenvalues(count)
     z.flags.writeable = False
     return z
@@ -53,7 +51,7 @@ _BUTTERWORTH: Final = 2**0.5
 def torque_channel(
     plant: Plant, s: NDArray[np.complexfloating[Any, Any]]
 ) -> NDArray[np.complex128]:
-    """Give what the torque's channel makes of a torque: delay and filters, of the shape of `s`.
+    """Return the factor of delay and filters of the torque channel, of the shape of `s`.
 
     Parameters
     ----------
@@ -71,7 +69,7 @@ def torque_channel(
 
 
 def _divisor(name: str, constant_s: float, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Denominator of a filter."""
+    """Return the denominator of a filter."""
     if name == "filter_time_constant_s":
         return 1 + constant_s * s
     return 1 + constant_s * (_BUTTERWORTH * s + constant_s * s * s)
@@ -96,7 +94,7 @@ class ResponseGrid:
 
     @property
     def s(self) -> NDArray[np.complex128]:
-        """The grid, shape (n,)."""
+        """Return the grid, shape (n,)."""
         return self._s
 
     def evaluate(
@@ -105,15 +103,15 @@ class ResponseGrid:
         wrt: Sequence[str] = (),
         angle: NDArray[np.complex128] | float = 1.0,
     ) -> NDArray[np.complex128]:
-        """Torque for an angle, and its derivatives.
+        """Return the torque for an angle, and its derivatives.
 
         Parameters
         ----------
         plant : Plant
             Where to evaluate.
         wrt : sequence of str
-            Names from `rigd.beam.PARAMETERS`, "delay_s" and "tool_inertia_kg_m2"; each derivative
-            holds all others constant.
+            Names from `rigd.beam.PARAMETERS`, "delay_s" and "tool_inertia_kg_m2"; for each
+            derivative all others are constant.
         angle : ndarray of complex, shape (n,), or float
             Transform of the angle.
 
@@ -141,7 +139,7 @@ class ResponseGrid:
     def _of_beam(
         self, plant: Plant, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
-        """G on a rigid clamp, and its derivatives by what of `wrt` it depends on."""
+        """Return G on a rigid clamp, and its derivatives by the names in `wrt` that affect it."""
         of_beam = [name for name in wrt if name in PARAMETERS]
         if plant.tip_mass_kg or plant.stiffness_offsets:
             found, slopes = differentiated_response(
@@ -169,12 +167,13 @@ what the decimation left beyond the band grow by exp(6.6 / 1.1) = 400."""
 
 
 class Prediction:
-    """Response of the exact model to one angle, and its derivatives.
+    """Prediction of the torque from one angle, with derivatives by the parameters.
 
-    A finite convolution by discrete transforms wraps round, and a lightly damped beam rings longer
-    than any padding. So the angle is multiplied with exp(-sigma t) before it is transformed, which
-    is its Laplace transform on s = sigma + j omega; there it is multiplied with the response, and
-    after the way back the exponential is undone: what wrapped round has decayed.
+    A finite convolution by discrete transforms wraps around, and a lightly damped beam rings longer
+    than any padding. So the angle is multiplied with exp(-sigma t) before the transform, which
+    gives its Laplace transform on s = sigma + j omega. It is multiplied with the response there,
+    and after the inverse transform the exponential is removed: the part that wrapped around has
+    decayed.
 
     Parameters
     ----------
@@ -182,15 +181,15 @@ class Prediction:
         From rest, band-limited: nothing left at half the rate.
     rate_hz : float
     kept : slice
-        Samples of which the prediction is wanted.
+        Retained samples of the prediction.
     """
 
     __slots__ = (
         "_decay",
         "_growth",
-        "_kept",
         "_length",
         "_response",
+        "_retained",
         "_sigma",
         "_spectrum",
         "rate_hz",
@@ -198,7 +197,7 @@ class Prediction:
 
     def __init__(self, angle_rad: NDArray[np.float64], rate_hz: float, kept: slice) -> None:
         self.rate_hz = rate_hz
-        self._kept = kept
+        self._retained = kept
         self._length = fast_length(int(np.ceil(_PADDED * angle_rad.size)))
         self._sigma = sigma = _DECAY * rate_hz / self._length
         time_s = np.arange(angle_rad.size) / rate_hz
@@ -209,14 +208,14 @@ class Prediction:
         self._growth = np.exp(sigma * time_s[kept])
 
     def of_other(self, angle_rad: NDArray[np.float64]) -> Prediction:
-        """Predict from another angle of the same length, shape (n,)."""
+        """Return the prediction from another angle of the same length, shape (n,)."""
         other = copy(self)
         other._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
         return other
 
     @property
     def s(self) -> NDArray[np.complex128]:
-        """Grid of the Laplace variable on which a response is taken, in rad/s."""
+        """Return the grid of the Laplace variable for responses, in rad/s."""
         return self._response.s
 
     def in_time(self, responses: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -228,20 +227,20 @@ class Prediction:
             On `s`.
         """
         spectra = responses * self._spectrum
-        torque: NDArray[np.float64] = np.fft.irfft(spectra, self._length)[..., self._kept]
+        torque: NDArray[np.float64] = np.fft.irfft(spectra, self._length)[..., self._retained]
         return torque * self._growth
 
     def torque(
         self, plant: Plant | ModalModel, wrt: Sequence[str] = ()
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Torque in N·m at the samples kept, and its derivatives.
+        """Return the torque in N·m at the retained samples, and its derivatives.
 
         Parameters
         ----------
         plant : Plant or ModalModel
             Where to evaluate.
         wrt : sequence of str
-            As `ResponseGrid.evaluate` takes them; none of a modal model.
+            Names as for `ResponseGrid.evaluate`; none for a modal model.
 
         Returns
         -------
@@ -249,11 +248,11 @@ class Prediction:
         gradient : ndarray, shape (k, m)
         """
         spectra = self._spectra(plant, wrt)
-        in_time = np.fft.irfft(spectra, self._length)[:, self._kept] * self._growth
+        in_time = np.fft.irfft(spectra, self._length)[:, self._retained] * self._growth
         return in_time[0], in_time[1:]
 
     def _spectra(self, plant: Plant | ModalModel, wrt: Sequence[str]) -> NDArray[np.complex128]:
-        """Transform of the torque and its derivatives, shape (1 + k, n)."""
+        """Return the transform of the torque and its derivatives, shape (1 + k, n)."""
         if isinstance(plant, ModalModel):
             return (plant.response(self.s) * self._spectrum)[None]
         return self._response.evaluate(plant, wrt, self._spectrum)
@@ -262,10 +261,10 @@ class Prediction:
         self,
         plant: Plant | ModalModel,
         factor: int,
-        places: NDArray[np.intp],
+        indices: NDArray[np.intp],
         wrt: Sequence[str] = (),
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predict the same at a multiple of the rate, at some places only.
+        """Return the torque at single indices of a multiple of the rate, and its derivatives.
 
         Parameters
         ----------
@@ -275,15 +274,15 @@ class Prediction:
             Names of the derivatives, k of them.
         factor : int
             Rate, in multiples of `rate_hz`.
-        places : ndarray of int, shape (p,)
-            In samples of that rate from the angle's first sample on.
+        indices : ndarray of int, shape (p,)
+            Samples of that rate, from the angle's first sample on.
 
         Returns
         -------
         torque : ndarray, shape (p,)
         gradient : ndarray, shape (k, p)
         """
-        growth = np.exp(self._sigma * places / (factor * self.rate_hz))
+        growth = np.exp(self._sigma * indices / (factor * self.rate_hz))
         spectra = self._spectra(plant, wrt)
         # As many short transforms, each of them shifted by a tick, as the factor says: they stay
         # in the cache, and take less than half the time of a long one.
@@ -292,8 +291,8 @@ class Prediction:
         np.cumprod(shifts, axis=0, out=shifts)
         if self._length % 2 == 0:
             shifts[:, -1] *= 2  # at the longer length this bin and its mirror image are two
-        at = np.empty((len(spectra), places.size))
+        at = np.empty((len(spectra), indices.size))
         for row, spectrum in zip(at, spectra, strict=True):
-            row[:] = np.fft.irfft(shifts * spectrum, self._length).T.ravel()[places]
+            row[:] = np.fft.irfft(shifts * spectrum, self._length).T.ravel()[indices]
         at *= growth
         return at[0], at[1:]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Linearisation:
-    """Residual, prediction minus measurement, and its derivatives at one point.
+    """Residual (prediction minus measurement) and its derivatives at one point.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Linearisation:
 
 @dataclass(frozen=True, slots=True)
 class Projected:
-    """A linearisation whitened, with what free decay explains taken out.
+    """Whitened linearisation with the free decay projected out.
 
     Attributes
     ----------
@@ -63,11 +63,11 @@ class Projected:
 
     @property
     def cost(self) -> float:
-        """Sum of squares."""
+        """Return the sum of squares."""
         return float(np.vdot(self.residual, self.residual).real)
 
     def normal_equations(self) -> NormalEquations:
-        """As the descent wants them."""
+        """Return the normal equations for the descent."""
         jacobian = _parts(self.jacobian)
         return NormalEquations(
             cost=self.cost,
@@ -80,7 +80,7 @@ _FILLINGS: Final = 8
 """As often unknown torques are put as predicted, at most."""
 
 _CONVERGED: Final = 1e-6
-"""Change of the unknowns below which what is put for unknown torques is final."""
+"""Change of the unknowns below which the fill of unknown torques is final."""
 
 
 class Objective:
@@ -110,7 +110,7 @@ class Objective:
         self._recent: Recent[Linearisation] = Recent()
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
-        """Residual and derivatives at `x`; the last two points cost nothing again."""
+        """Return residual and derivatives at `x`; the last two points are cached."""
         return self._recent.at(x, self._linearise)
 
     def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
@@ -125,7 +125,7 @@ class Objective:
         residual = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
         jacobian = (chain.T @ _parts(comparison.spectrum(gradient))).view(np.complex128)
         if comparison.drag is not None:
-            change, slopes = comparison.drag.beside(plant, poles, unknowns.names, chain)
+            change, slopes = comparison.drag.change_to(plant, poles, unknowns.names, chain)
             residual += change
             jacobian += slopes
         return Linearisation(
@@ -136,16 +136,16 @@ class Objective:
         )
 
     def project(self, at: Linearisation, weight: NDArray[np.float64] | float) -> Projected:
-        """Whiten, and take out what free decay explains (variable projection).
+        """Whiten, and project out the free decay (variable projection).
 
-        The amplitudes that fit best at each point are linear in the residual; the Jacobian is
-        Kaufman's (BIT 15 (1975) 49-57), with the poles' motion.
+        The best amplitudes at each point are linear in the residual; the Jacobian is Kaufman's (BIT
+        15 (1975) 49-57), with the motion of the poles.
 
         Parameters
         ----------
         at : Linearisation
         weight : ndarray, shape (K,), or float
-            That of `Noise`, or 1 not to whiten.
+            Weight of `NoiseSpectrum`, or 1 not to whiten.
         """
         residual, jacobian = at.residual * weight, at.jacobian * weight
         columns = _parts(at.columns * weight)
@@ -168,7 +168,7 @@ class Objective:
     def normal_equations(
         self, x: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> NormalEquations:
-        """Sum of squares at `x`, with what a Gauss-Newton step needs.
+        """Return the sum of squares at `x`, with gradient and Hessian of a Gauss-Newton step.
 
         Parameters
         ----------
@@ -189,20 +189,20 @@ class Objective:
         max_evaluations: int = 200,
         hopeless: tuple[int, float] | None = None,
     ) -> tuple[Objective, Minimum]:
-        """Descend; again, while what is put for unknown torques moves the minimum.
+        """Descend; repeat while the fill of unknown torques moves the minimum.
 
         Parameters
         ----------
         start : ndarray, shape (k,)
         weight : ndarray, shape (K,)
-            That of `Noise`.
+            That of `NoiseSpectrum`.
         region, relative_tolerance, max_evaluations, hopeless
-            As `descend` takes them.
+            Arguments of `descend`.
 
         Returns
         -------
         objective : Objective
-            With the unknown torques as they were put last; `self` if all are known.
+            Objective with the last fill of unknown torques; `self` if all are known.
         minimum : Minimum
             Minimum of that objective.
         """
@@ -217,16 +217,16 @@ class Objective:
                 max_evaluations=max_evaluations,
                 hopeless=hopeless,
             )
-            settled = objective is self or np.abs(found.x - x).max() < _CONVERGED
+            converged = objective is self or np.abs(found.x - x).max() < _CONVERGED
             x = found.x
-            # A descent that did not end does not end with torques that are put anew.
+            # A descent that did not converge does not converge with new fills either.
             given_up = hopeless is not None and found.equations.cost > hopeless[1]
-            if settled or given_up or found.evaluations >= max_evaluations:
+            if converged or given_up or found.evaluations >= max_evaluations:
                 break
         return objective, found
 
     def _filled(self, x: NDArray[np.float64]) -> Objective:
-        """Put what is predicted at `x` where the torque is unknown; `self` if all is known."""
+        """Fill unknown torques with the prediction at `x`; return `self` if all are known."""
         comparison = self.comparison.filled(self.unknowns.plant(x))
         if comparison is self.comparison:
             return self
@@ -234,9 +234,9 @@ class Objective:
 
 
 def _parts(values: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Real and imaginary parts side by side, shape (..., 2 K), of the same memory.
+    """Return real and imaginary parts side by side, shape (..., 2 K), as a view.
 
-    Products of these are the real parts of those of the complex values, at half the price.
+    Products of these are the real parts of complex products, at half the cost.
     """
     parts: NDArray[np.float64] = np.ascontiguousarray(values).view(np.float64)
     return parts

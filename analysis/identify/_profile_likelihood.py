@@ -1,8 +1,8 @@
-"""Profile likelihood of the damping's orders: everything else is refitted at each value.
+"""Profile likelihood of the damping orders: all other parameters are refitted at each value.
 
-The 95 % interval is all that the chi-square limit of one degree of freedom admits. A walk goes from
-the minimum both ways until the record excludes what lies beyond, and looks on a coarse grid for
-valleys that it would not come to.
+The 95 % interval holds all values within the chi-square limit of one degree of freedom. A walk goes
+from the minimum in both directions until the record excludes the values beyond. A coarse grid finds
+other local minima.
 """
 
 from __future__ import annotations
@@ -34,35 +34,35 @@ if TYPE_CHECKING:
 Order = Literal["alpha", "lambda"]
 
 WIDEST_SHARE: Final = 0.25
-"""Share of the range 0 to 2: an order known to ±0.25 only tells no material from another."""
+"""Fraction of the range 0 to 2: an order with ±0.25 does not distinguish materials."""
 
 
 @dataclass(frozen=True, slots=True)
-class Profile:
-    """Deviance of an order's values, everything else refitted at each.
+class LikelihoodProfile:
+    """Deviance of the values of an order, with all other parameters refitted at each.
 
     Attributes
     ----------
     order : str
         "alpha" or "lambda".
     structure : str
-        In which it was free.
+        Structure in which the order was free.
     values : tuple of float
         Increasing.
     deviance : tuple of float
         Above the lowest.
     estimate : float
         Value of the lowest deviance.
-    valleys : tuple of float
-        Values that explain the record equally, the lowest deviance first: bottoms of valleys that
-        the 95 % limit admits, parted by a ridge.
+    local_minima : tuple of float
+        Values that explain the record equally, the lowest deviance first: local minima within the
+        95 % limit, separated by a barrier.
     interval : tuple of float
-        95 %, by the likelihood ratio, over all valleys; where it is open it ends at the edge of the
-        range.
+        95 % interval, by the likelihood ratio, over all local minima; an open interval ends at the
+        edge of the range.
     open_below, open_above : bool
         Whether the record excludes no value on that side.
     gain : float
-        Deviance that the structure saves by freeing the order; 0 if it was free.
+        Reduction of deviance by freeing the order; 0 if it was free.
     """
 
     order: Order
@@ -70,15 +70,15 @@ class Profile:
     values: tuple[float, ...]
     deviance: tuple[float, ...]
     estimate: float
-    valleys: tuple[float, ...]
+    local_minima: tuple[float, ...]
     interval: tuple[float, float]
     open_below: bool
     open_above: bool
     gain: float
 
     @classmethod
-    def unwalked(cls, candidate: Candidate, order: Order) -> Profile:
-        """Stand for an order that nothing could tell: one value, and no limit to either side.
+    def unwalked(cls, candidate: Candidate, order: Order) -> LikelihoodProfile:
+        """Return the profile of an order that nothing determines: one value without limits.
 
         Parameters
         ----------
@@ -90,29 +90,29 @@ class Profile:
 
     @property
     def walked(self) -> bool:
-        """Whether any other value was looked at."""
+        """Return whether another value was computed."""
         return len(self.values) > 1
 
     @property
-    def share(self) -> float:
-        """Part of the range that the interval spans."""
+    def relative_width(self) -> float:
+        """Return the fraction of the range that the interval spans."""
         return (self.interval[1] - self.interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])
 
     @property
     def identifiable(self) -> bool:
-        """Whether the record says anything of use about this order."""
-        narrow = self.share <= WIDEST_SHARE and not (self.open_below or self.open_above)
-        return narrow and len(self.valleys) < 2
+        """Return whether the record determines this order to a useful precision."""
+        narrow = self.relative_width <= WIDEST_SHARE and not (self.open_below or self.open_above)
+        return narrow and len(self.local_minima) < 2
 
     @property
     def admits_one(self) -> bool:
-        """Whether the integer order 1 lies in the interval."""
+        """Return whether the interval holds the integer order 1."""
         return self.interval[0] <= 1 <= self.interval[1]
 
 
 @dataclass(frozen=True, slots=True)
 class Profiled:
-    """A profile, and where its valleys are.
+    """Profile with the plants at its local minima.
 
     Attributes
     ----------
@@ -120,52 +120,44 @@ class Profiled:
     structure : Structure
         With the order free.
     plants : tuple of Plant
-        At the bottoms of the valleys, the lowest first.
+        Plants at the local minima, the lowest first.
     cost : float
         The lowest sum of squares.
     """
 
-    profile: Profile
+    profile: LikelihoodProfile
     structure: Structure
     plants: tuple[Plant, ...]
     cost: float
 
 
 def profile(
-    field: CandidateSet, candidate: Candidate, order: Order, *, elsewhere: bool = True
+    candidate_set: CandidateSet, candidate: Candidate, order: Order, *, elsewhere: bool = True
 ) -> Profiled:
-    """Walk away from the minimum both ways until the record excludes what lies beyond.
+    """Walk from the minimum in both directions until the record excludes the values beyond.
 
-    Each refit starts on the tangent of the last, and each step goes to where the deviance, were it
-    a parabola, would reach the next level. Where much of the range is admitted, the rest of it is
-    looked over for another valley, which is then walked as well.
-
-    Parameters
-    ----------
-    field : CandidateSet
-    candidate : Candidate
-        In whose structure the order is freed, if it is not free.
-    order : str
-    elsewhere : bool
-        Whether there may be another valley.
+    The order is freed in the structure of `candidate`, if it is not free. Each refit starts on the
+    tangent of the last, and each step goes to the value at which a parabolic deviance would reach
+    the next level. If much of the range is admitted and `elsewhere` is set, the remaining range is
+    searched for another local minimum, and a walk starts there as well.
     """
-    walk = Walk(field, candidate, order)
+    walk = Walk(candidate_set, candidate, order)
     walk.both_ways()
     walk.from_candidates()
     if elsewhere:
         walk.elsewhere()
     values, deviance = walk.curve()
-    bottoms = valleys(values, deviance)
+    bottoms = local_minima(values, deviance)
     interval, open_below, open_above = admitted(values, deviance)
     lowest = min(walk.costs.values())
     return Profiled(
-        profile=Profile(
+        profile=LikelihoodProfile(
             order=order,
             structure=candidate.name,
             values=tuple(values.tolist()),
             deviance=tuple(deviance.tolist()),
             estimate=bottoms[0],
-            valleys=bottoms,
+            local_minima=bottoms,
             interval=interval,
             open_below=open_below,
             open_above=open_above,
@@ -184,59 +176,47 @@ _ROUNDS: Final = 3
 
 
 def profiled(
-    field: CandidateSet, settled: Collection[Order] = (), *, walk: bool = True
-) -> tuple[CandidateSet, Profile, Profile]:
+    candidate_set: CandidateSet, determined: Collection[Order] = (), *, walk: bool = True
+) -> tuple[CandidateSet, LikelihoodProfile, LikelihoodProfile]:
     """Profile alpha and lambda in the freest structure.
 
-    What a walk finds lower than the candidates are, or in another valley, is where all of them
-    start once more, so that the fit selected and the profile tell of one minimum.
-
-    Parameters
-    ----------
-    field : CandidateSet
-    settled : collection of str
-        Orders of which no other valley need be looked for.
-    walk : bool
-        Whether the orders can be told at all.
-
-    Returns
-    -------
-    field : CandidateSet
-        With the candidates ranked again.
-    alpha, lambda_ : Profile
+    If a walk finds a lower cost than the candidates, or another local minimum, all candidates start
+    there once more, so that the selected fit and the profile agree. Orders in `determined` need no
+    search for another local minimum, and `walk` states whether the orders can be determined.
+    Returns the ranked candidates and both profiles.
     """
     for round_ in range(1, _ROUNDS + 1):
-        freest = field.freest
-        # The order of a damping that does not show could be anything: no walk would tell more.
+        freest = candidate_set.freest
+        # The order of an insignificant damping is undetermined: a walk would not help.
         walks = {
-            order: profile(field, freest, order, elsewhere=order not in settled)
+            order: profile(candidate_set, freest, order, elsewhere=order not in determined)
             for order in _ORDERS
             if walk and freest.structure.has(order)
         }
-        before = [candidate.fit.cost for candidate in field.candidates]
+        before = [candidate.fit.cost for candidate in candidate_set.candidates]
         if round_ == _ROUNDS:
             break
         for found in walks.values():
-            if _news(field, found):
+            if _may_improve(candidate_set, found):
                 for plant in found.plants:
-                    field = field.tried_from(plant)
-        if [candidate.fit.cost for candidate in field.candidates] == before:
+                    candidate_set = candidate_set.restarted_from(plant)
+        if [candidate.fit.cost for candidate in candidate_set.candidates] == before:
             break
     of_alpha, of_lambda = (
-        walks[order].profile if order in walks else Profile.unwalked(freest, order)
+        walks[order].profile if order in walks else LikelihoodProfile.unwalked(freest, order)
         for order in _ORDERS
     )
-    return field, of_alpha, of_lambda
+    return candidate_set, of_alpha, of_lambda
 
 
-def _news(field: CandidateSet, found: Profiled) -> bool:
-    """Whether a candidate may be elsewhere than its lowest minimum."""
+def _may_improve(candidate_set: CandidateSet, found: Profiled) -> bool:
+    """Return whether a candidate may have a lower minimum elsewhere."""
     if len(found.plants) > 1:
         return True
     free = set(found.structure.free)
     as_free = [
         candidate.fit.cost
-        for candidate in field.candidates
+        for candidate in candidate_set.candidates
         if free <= set(candidate.structure.free)
     ]
     return bool(as_free) and found.cost < min(as_free) * (1 - MISSED)
@@ -260,18 +240,19 @@ _NARROW: Final = 1.1
 
 _SHARPENINGS: Final = 2
 
-_DOUBTFUL_SHARE: Final = 0.025
-"""Share of the range 0 to 2 within the 95 % limit from which there may be another valley."""
+_DOUBTFUL_FRACTION: Final = 0.025
+"""Fraction of the range 0 to 2 within the 95 % limit from which there may be another local
+minimum."""
 
 _GRID: Final = 0.2
-_LOOKS: Final = 8
-"""Spacing of the orders at which it is looked for, and evaluations at each."""
+_TRIAL_EVALUATIONS: Final = 8
+"""Spacing of the orders in that search, and evaluations at each."""
 
 
 def with_order(structure: Structure, order: Order) -> Structure:
-    """Take a structure's damping with one order free.
+    """Return a structure with one order of its damping free.
 
-    Damping that the structure lacks comes in, its coefficient free.
+    A missing damping is added, with a free coefficient.
     """
     coefficient = COEFFICIENT_OF[order]
     fixed = {name: at for name, at in structure.fixed.items() if name not in (coefficient, order)}
@@ -280,45 +261,46 @@ def with_order(structure: Structure, order: Order) -> Structure:
 
 
 class Walk:
-    """Refits with one order held, and what they cost."""
+    """Refits with one order held, and their costs."""
 
-    def __init__(self, field: CandidateSet, candidate: Candidate, order: Order) -> None:
+    def __init__(self, candidate_set: CandidateSet, candidate: Candidate, order: Order) -> None:
         self.order = order
         self.structure = with_order(candidate.structure, order)
-        self._field, self._values = field, candidate.values
-        self._unknowns = unknowns = field.unknowns(self.structure)
-        self._place = unknowns.names.index(order)
-        first = field.descent(unknowns, unknowns.vector(candidate.fit.plant), _MAX_EVALUATIONS)
+        self._field, self._values = candidate_set, candidate.values
+        self._unknowns = unknowns = candidate_set.unknowns(self.structure)
+        self._index = unknowns.names.index(order)
+        first = candidate_set.descent(
+            unknowns, unknowns.vector(candidate.fit.plant), _MAX_EVALUATIONS
+        )
         self.costs: dict[float, float] = {}
         self._at: dict[float, Refit] = {}
-        self._stand_at(first)
+        self._start_at(first)
 
-    def _stand_at(self, bottom: Refit) -> None:
-        """Walk from a minimum with the order free."""
+    def _start_at(self, bottom: Refit) -> None:
+        """Start the walk from a minimum with the order free."""
         self._first = bottom
-        self._centre = float(bottom.x[self._place])
-        self._keep(self._centre, bottom)
+        self._centre = float(bottom.x[self._index])
+        self._store_lower(self._centre, bottom)
 
     def plant(self, value: float) -> Plant:
-        """Everything that was fitted at a value that was looked at."""
+        """Return the fitted plant at a computed value."""
         return self._at[value].plant
 
     def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Values in order, shape (n,), and their deviances above the lowest."""
+        """Return the values in order, shape (n,), and their deviances above the lowest."""
         values = np.array(sorted(self.costs))
         costs = np.array([self.costs[value] for value in values])
         return values, self._values * np.log(costs / costs.min())
 
     def both_ways(self) -> None:
-        """Walk from where it stands."""
+        """Walk in both directions from the current minimum."""
         for sign in (-1.0, 1.0):
             self._outwards(sign)
 
     def from_candidates(self) -> None:
-        """Walk from where special cases lie that are as good, and outside of what is admitted.
+        """Walk from equally good special cases outside of the admitted interval.
 
-        The order is fixed there, mostly to 1. A ridge over which no refit leads may part them from
-        the minimum.
+        Their order is fixed, mostly to 1. A barrier may separate them from the minimum.
         """
         coefficient, free = COEFFICIENT_OF[self.order], set(self.structure.free)
         for candidate in self._field.candidates:
@@ -329,40 +311,42 @@ class Walk:
             behind = self._values * math.log(candidate.fit.cost / min(self.costs.values()))
             if behind < CHI_SQUARE_95 and not low <= candidate.fit.parameters[self.order] <= high:
                 start = self._unknowns.vector(candidate.fit.plant)
-                self._stand_at(self._descend(start, _MAX_EVALUATIONS, hold=(self.order,)))
+                self._start_at(self._descend(start, _MAX_EVALUATIONS, hold=(self.order,)))
                 self.both_ways()
 
     def elsewhere(self) -> None:
-        """Look for another valley, if much of the range is admitted, and walk it."""
+        """Search for another local minimum if much of the range is admitted, and walk from it."""
         (low, high), open_below, open_above = admitted(*self.curve())
-        wide = high - low > _DOUBTFUL_SHARE * (ORDER_RANGE[1] - ORDER_RANGE[0])
-        places = gaps(list(self.costs), ORDER_RANGE, _GRID)
-        if not (wide or open_below or open_above) or not places:
+        wide = high - low > _DOUBTFUL_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
+        orders = gaps(list(self.costs), ORDER_RANGE, _GRID)
+        if not (wide or open_below or open_above) or not orders:
             return
         # Loss at a mode and order are separate unknowns: the loss stays as the order changes.
-        looks = {}
-        for value in places:
+        trials = {}
+        for value in orders:
             start = self._first.x.copy()
-            start[self._place] = value
-            looks[value] = self._descend(start, _LOOKS, hold=(self.order,))
+            start[self._index] = value
+            trials[value] = self._descend(start, _TRIAL_EVALUATIONS, hold=(self.order,))
         most = min(self.costs.values()) * math.exp(FAR_BEHIND / self._values)
-        for value in dips({value: look.cost for value, look in looks.items()}):
-            bottom = self._descend(looks[value].x, _MAX_EVALUATIONS, hopeless=(_LOOKS, most))
+        for value in dips({value: trial.cost for value, trial in trials.items()}):
+            bottom = self._descend(
+                trials[value].x, _MAX_EVALUATIONS, hopeless=(_TRIAL_EVALUATIONS, most)
+            )
             values, deviance = self.curve()
-            at = float(bottom.x[self._place])
+            at = float(bottom.x[self._index])
             here = self._values * math.log(bottom.cost / min(self.costs.values()))
             known = float(np.interp(at, values, deviance, math.inf, math.inf))
-            if here < min(CHI_SQUARE_95, known - RIDGE):
-                self._stand_at(bottom)
+            if here < min(CHI_SQUARE_95, known - MIN_BARRIER):
+                self._start_at(bottom)
                 self.both_ways()
 
-    def _keep(self, value: float, found: Refit) -> None:
-        """Keep the lower of two refits at one value."""
+    def _store_lower(self, value: float, found: Refit) -> None:
+        """Store the lower of two refits at one value."""
         if found.cost < self.costs.get(value, math.inf):
             self.costs[value], self._at[value] = found.cost, found
 
     def _outwards(self, sign: float) -> None:
-        """Cross the threshold, go on for a little of the curve, and sharpen the crossing."""
+        """Cross the threshold, continue a little, and refine the crossing."""
         low, high = ORDER_RANGE
         here, distance, root = self._centre, self._spread(), 0.0
         inside, outside = here, None
@@ -379,7 +363,7 @@ class Walk:
         for _ in range(_SHARPENINGS if outside is not None else 0):
             assert outside is not None
             if abs(inside - self._centre) >= abs(outside - self._centre):
-                break  # there is a ridge between
+                break  # there is a barrier between
             below, above = self._root(inside), self._root(outside)
             if above - below < _NARROW:
                 break
@@ -390,50 +374,53 @@ class Walk:
                 outside = middle
 
     def _spread(self) -> float:
-        """Give the standard deviation of the order, or what stands for it."""
-        (scaled, scale), place = self._first.equations.scaled_hessian(), self._place
+        """Return the standard deviation of the order, or a substitute."""
+        (scaled, scale), index = self._first.equations.scaled_hessian(), self._index
         inverse = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))
-        variance = inverse[place, place] / scale[place] ** 2
+        variance = inverse[index, index] / scale[index] ** 2
         std = math.sqrt(variance * self._first.cost / self._values) if variance > 0 else _FIRST_STEP
         return min(max(std, 1e-4), 0.25)
 
     def _root(self, value: float) -> float:
-        """Root of the deviance at a value."""
+        """Return the root of the deviance at a value."""
         lowest = self.costs[self._centre]
         return math.sqrt(max(self._values * math.log(self.costs[value] / lowest), 0.0))
 
     def _hold(self, value: float, near: Refit) -> float:
-        """Fit all else with the order at `value`; give the root of the deviance."""
+        """Fit all other parameters with the order at `value`; return the root of the deviance."""
         hold, most = (self.order,), self.costs[self._centre] * math.exp(FAR_BEHIND / self._values)
         found = self._descend(
-            self._tangent(value, near), _MAX_EVALUATIONS, hold=hold, hopeless=(_LOOKS, most)
+            self._tangent(value, near),
+            _MAX_EVALUATIONS,
+            hold=hold,
+            hopeless=(_TRIAL_EVALUATIONS, most),
         )
         if found.cost > most:
             # Near its ends an order turns a loss into inertia or stiffness: the tangent may lead
             # far astray, where no descent ends. All else stays, the loss at a mode too.
-            found = self._lower(found, near, value, (_LOOKS, most))
+            found = self._lower(found, near, value, (_TRIAL_EVALUATIONS, most))
         if found.cost > most:
             # Without the damping its order says nothing.
             found = self._lower(found, self._without_damping, value)
-        self._keep(value, found)
+        self._store_lower(value, found)
         return self._root(value)
 
     def _lower(
         self, found: Refit, other: Refit, value: float, hopeless: tuple[int, float] | None = None
     ) -> Refit:
-        """Descend from another refit with only the order moved; give the lower of the two."""
+        """Descend from another refit with only the order changed; return the lower of the two."""
         start = other.x.copy()
-        start[self._place] = value
+        start[self._index] = value
         again = self._descend(start, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless)
         return min(found, again, key=lambda refit: refit.cost)
 
     @cached_property
     def _without_damping(self) -> Refit:
-        """Fit without the damping whose order is walked along: what it costs at any order."""
+        """Fit without the damping of this order: the cost at any value of the order."""
         coefficient = COEFFICIENT_OF[self.order]
         start = self._first.x.copy()
-        place = self._unknowns.names.index(coefficient)
-        start[place] = self._unknowns.bounds[0][place]
+        index = self._unknowns.names.index(coefficient)
+        start[index] = self._unknowns.bounds[0][index]
         return self._descend(start, _MAX_EVALUATIONS, hold=(self.order, coefficient))
 
     def _descend(
@@ -444,14 +431,14 @@ class Walk:
         hold: tuple[str, ...] = (),
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
-        """Fit from a vector of unknowns, some of them held where they start."""
-        field = self._field
+        """Fit from a vector of unknowns, some of them held at their start."""
+        candidate_set = self._field
         return Refit.descend(
-            field.comparison,
+            candidate_set.comparison,
             self._unknowns,
             start,
-            field.noise,
-            field.columns,
+            candidate_set.noise,
+            candidate_set.columns,
             max_evaluations=max_evaluations,
             relative_tolerance=_TOLERANCE,
             hold=hold,
@@ -459,53 +446,48 @@ class Walk:
         )
 
     def _tangent(self, value: float, near: Refit) -> NDArray[np.float64]:
-        """Where all else would be with the order at `value`, to first order, shape (k,)."""
-        x, place = near.x.copy(), self._place
+        """Return the first-order estimate of the other unknowns with the order at `value`, (k,)."""
+        x, index = near.x.copy(), self._index
         scaled, scale = near.equations.scaled_hessian()
         lower, upper = self._unknowns.bounds
-        others = (x > lower) & (x < upper) & (np.arange(x.size) != place)
+        others = (x > lower) & (x < upper) & (np.arange(x.size) != index)
         block = scaled[np.ix_(others, others)] + 1e-9 * np.eye(int(others.sum()))
-        slope = -np.linalg.solve(block, scaled[others, place]) / scale[others] * scale[place]
-        x[others] += slope * (value - x[place])
-        x[place] = value
+        slope = -np.linalg.solve(block, scaled[others, index]) / scale[others] * scale[index]
+        x[others] += slope * (value - x[index])
+        x[index] = value
         return x
 
 
-# Limits and valleys of a profile
+# Limits and local minima of a profile
 
 CHI_SQUARE_95: Final = 3.841458820694124
 """Deviance that the true value exceeds once in twenty records (one degree of freedom)."""
 
-RIDGE: Final = 0.5
-"""Deviance by which a ridge must rise over the higher of two valleys to part them: far more than
-the refits' tolerance."""
+MIN_BARRIER: Final = 0.5
+"""Deviance by which a barrier must exceed the higher of two local minima to separate them: far more
+than the tolerance of the refits."""
 
 
-def valleys(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple[float, ...]:
-    """Bottoms of the valleys that the 95 % limit admits, the lowest first.
+def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple[float, ...]:
+    """Return the local minima within the 95 % limit, the lowest first.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Increasing.
-    deviance : ndarray, shape (n,)
-        Above the lowest.
+    `values`, shape (n,), increase; `deviance`, shape (n,), is above the lowest.
     """
     padded = np.concatenate([[np.inf], deviance, [np.inf]])
     lows = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] < padded[2:]))
     lows = lows[deviance[lows] < CHI_SQUARE_95]
-    kept: list[int] = []
+    distinct: list[int] = []
     for low in lows[np.argsort(deviance[lows], kind="stable")].tolist():
-        ridges = (deviance[min(low, k) : max(low, k) + 1].max() for k in kept)
-        if all(ridge > deviance[low] + RIDGE for ridge in ridges):
-            kept.append(low)
-    return tuple(values[kept].tolist())
+        barriers = (deviance[min(low, k) : max(low, k) + 1].max() for k in distinct)
+        if all(barrier > deviance[low] + MIN_BARRIER for barrier in barriers):
+            distinct.append(low)
+    return tuple(values[distinct].tolist())
 
 
 def admitted(
     values: NDArray[np.float64], deviance: NDArray[np.float64]
 ) -> tuple[tuple[float, float], bool, bool]:
-    """Find the ends of all that the 95 % limit admits, ridges between valleys included.
+    """Return the interval of all values within the 95 % limit, barriers included.
 
     Returns
     -------
@@ -521,35 +503,31 @@ def admitted(
 
 
 def crossing(inside: float, outside: float, below: float, above: float) -> float:
-    """Where the limit is crossed between two values; the root of a deviance is all but linear.
+    """Return the value at which the limit is crossed; the root of a deviance is almost linear.
 
-    Parameters
-    ----------
-    inside, outside : float
-        Values on either side of the limit.
-    below, above : float
-        Their deviances.
+    `inside` and `outside` are values on either side of the limit, `below` and `above` their
+    deviances.
     """
     low, high = math.sqrt(max(below, 0.0)), math.sqrt(max(above, 0.0))
-    share = (math.sqrt(CHI_SQUARE_95) - low) / (high - low)
-    return inside + share * (outside - inside)
+    fraction = (math.sqrt(CHI_SQUARE_95) - low) / (high - low)
+    return inside + fraction * (outside - inside)
 
 
 def gaps(known: list[float], span: tuple[float, float], spacing: float) -> list[float]:
-    """Values within a span, equally spaced, that lie outside of all that is known."""
+    """Return equally spaced values within a span that lie outside of all known ones."""
     grid = np.arange(span[0] + spacing / 2, span[1], spacing).tolist()
     low, high = min(known), max(known)
     return [value for value in grid if value < low - spacing / 4 or value > high + spacing / 4]
 
 
 def dips(curve: dict[float, float]) -> list[float]:
-    """Places on a coarse curve that are lower than both neighbours, the ends included."""
-    places = sorted(curve)
-    heights = [math.inf, *(curve[place] for place in places), math.inf]
+    """Return the values on a coarse curve that are lower than both neighbours, ends included."""
+    values = sorted(curve)
+    heights = [math.inf, *(curve[value] for value in values), math.inf]
     return [
-        place
-        for place, (before, here, after) in zip(
-            places, zip(heights, heights[1:], heights[2:], strict=False), strict=True
+        value
+        for value, (before, here, after) in zip(
+            values, zip(heights, heights[1:], heights[2:], strict=False), strict=True
         )
         if here <= before and here <= after
     ]

@@ -1,7 +1,7 @@
-"""Refit from where a fit ended: another structure, other noise, an order held, or further columns.
+"""Refit from the end of a fit: another structure, other noise, a held order, or further columns.
 
-What the linear beam cannot do (a stiffness that depends on the deflection, say) adds to the torque
-a column of known shape and unknown size, which is projected out as the free decay is.
+A nonlinear effect (for example a stiffness that depends on the deflection) adds to the torque a
+column of known shape and unknown size, which is projected out like the free decay.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from analysis.identify._candidate import Candidate
 from analysis.identify._fit import summary
-from analysis.identify._noise import Noise, smooth_power
+from analysis.identify._noise import NoiseSpectrum, smooth_power
 from analysis.identify._parametrization import NEXT_TO_NOTHING, Steps
 from analysis.identify._problem import Objective
 
@@ -36,15 +36,15 @@ MANY: Final = 40
 """Evaluations of a descent that is to end."""
 
 MISSED: Final = 1e-5
-"""Share of a sum of squares, which is some 1e4, that counts; BIC counts a parameter as 9."""
+"""Significant fraction of a sum of squares (some 1e4); the BIC penalty of a parameter is 9."""
 
 _TOLERANCE: Final = 1e-8
-"""Relative tolerance of the sum of squares (some 1e4): 1e-4 of what BIC tells apart."""
+"""Relative tolerance of the sum of squares (some 1e4): 1e-4 of a significant difference of BIC."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refit:
-    """A minimum: where, of which sum of squares, under which noise.
+    """Minimum of a sum of squares under one noise spectrum.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Refit:
     objective: Objective
     x: NDArray[np.float64]
     equations: NormalEquations
-    noise: Noise
+    noise: NoiseSpectrum
 
     @classmethod
     def descend(
@@ -66,7 +66,7 @@ class Refit:
         comparison: Comparison,
         unknowns: Unknowns,
         start: NDArray[np.float64],
-        noise: Noise,
+        noise: NoiseSpectrum,
         columns: NDArray[np.complex128] | None = None,
         *,
         max_evaluations: int = 60,
@@ -74,30 +74,17 @@ class Refit:
         hold: Sequence[str] = (),
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
-        """Descend from `start`, unknown torques being put as they are predicted there.
+        """Descend from `start`, with unknown torques filled by the prediction there.
 
-        Parameters
-        ----------
-        comparison : Comparison
-        unknowns : Unknowns
-        start : ndarray, shape (k,)
-        noise : Noise
-        columns : ndarray of complex, shape (c, K), or None
-            Spectra to be projected out beside the free decay.
-        max_evaluations : int
-            Most evaluations of the sum of squares; with 1 nothing moves.
-        relative_tolerance : float
-            As `descend` takes it.
-        hold : sequence of str
-            Unknowns that stay where they start.
-        hopeless : tuple of int and float, optional
-            As `analysis.optimizer.descend` takes it.
+        `columns`, shape (c, K), are projected out in addition to the free decay. `hold` names
+        unknowns that stay at their start. `relative_tolerance` and `hopeless` are those of
+        `analysis.optimizer.descend`; with `max_evaluations` of 1 nothing moves.
         """
         region = Steps.of(unknowns, NEXT_TO_NOTHING)
         x = np.clip(start, region.lower, region.upper)
         for name in hold:
-            place = unknowns.names.index(name)
-            region.lower[place] = region.upper[place] = x[place]
+            index = unknowns.names.index(name)
+            region.lower[index] = region.upper[index] = x[index]
         objective, found = Objective(comparison, unknowns, columns).minimum(
             x,
             noise.weight,
@@ -109,14 +96,9 @@ class Refit:
         return cls(objective, found.x, found.equations, noise)
 
     def further(self, max_evaluations: int) -> Refit:
-        """Descend on from here, with nothing held, as `descend` does from the same point.
+        """Continue the descent from here, with nothing held, as `descend` does from the same point.
 
-        What was evaluated here is not evaluated again, unless torques are unknown.
-
-        Parameters
-        ----------
-        max_evaluations : int
-            Most evaluations of the sum of squares, this one counted.
+        The evaluation at this point, which counts, is not repeated unless torques are unknown.
         """
         objective, found = self.objective.minimum(
             self.x,
@@ -129,28 +111,28 @@ class Refit:
 
     @property
     def columns(self) -> NDArray[np.complex128]:
-        """What was projected out beside the free decay, shape (c, K)."""
+        """Return the columns that were projected out in addition to the free decay, (c, K)."""
         return self.objective.columns
 
     @property
     def cost(self) -> float:
-        """Sum of squares here."""
+        """Return the sum of squares here."""
         return self.equations.cost
 
     @property
     def expected_cost(self) -> float:
-        """What it is where noise alone is left."""
-        share = self.objective.comparison.measurement.torque_share
-        return float(2 * np.count_nonzero(self.noise.counts) * share)
+        """Return the expected sum of squares if only noise remains."""
+        known_fraction = self.objective.comparison.measurement.known_torque_fraction
+        return float(2 * np.count_nonzero(self.noise.counts) * known_fraction)
 
     @property
-    def promised_cost(self) -> float:
-        """What it would be at the minimum, as far as can be seen from here."""
-        return max(self.cost + float(self.equations.gradient @ self.promised_step), 0.0)
+    def predicted_cost(self) -> float:
+        """Return the cost at the minimum that the Gauss-Newton step predicts."""
+        return max(self.cost + float(self.equations.gradient @ self.predicted_step), 0.0)
 
     @property
-    def promised_step(self) -> NDArray[np.float64]:
-        """Way to that minimum (Gauss and Newton's), shape (k,)."""
+    def predicted_step(self) -> NDArray[np.float64]:
+        """Return the Gauss-Newton step to that minimum, shape (k,)."""
         equations = self.equations
         held = equations.held(self.x, *self.objective.unknowns.bounds)
         free = ~held & (np.diag(equations.hessian) > 0)
@@ -163,19 +145,19 @@ class Refit:
 
     @property
     def plant(self) -> Plant:
-        """The plant found."""
+        """Return the fitted plant."""
         return self.objective.unknowns.plant(self.x)
 
     def amplitudes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Amplitudes of the further columns, in units of them, and their deviations, shape (c,).
+        """Return amplitudes of the further columns, and their standard deviations, shape (c,).
 
-        The deviations count the uncertainty of everything else that was fitted.
+        The deviations include the uncertainty of all other fitted parameters.
         """
         values, covariance = self.amplitude_covariance()
         return values, np.sqrt(np.diag(covariance))
 
     def amplitude_covariance(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Amplitudes of the further columns, shape (c,), and their covariance, shape (c, c)."""
+        """Return amplitudes of the further columns, (c,), and their covariance, (c, c)."""
         at = self.objective.linearise(self.x)
         projected = self.objective.project(at, self.noise.weight)
         white = at.columns * self.noise.weight
@@ -191,22 +173,14 @@ class Refit:
         covariance = np.linalg.inv(gram)[first:, first:] / np.outer(own, own)
         return projected.amplitudes[projected.amplitudes.size - len(self.columns) :], covariance
 
-    def beside(
+    def unexplained_columns(
         self, columns: NDArray[np.complex128], *, beam_free: bool = True
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Whiten further columns and leave of them what nothing free already could explain.
+        """Whiten further columns and remove the part that other free terms explain.
 
-        Parameters
-        ----------
-        columns : ndarray of complex, shape (c, K)
-        beam_free : bool
-            Whether the unknowns may explain a part as well; else only what is projected out may.
-
-        Returns
-        -------
-        free : ndarray of complex, shape (c, K)
-        residual : ndarray of complex, shape (K,)
-            What is left here, prediction less measurement, whitened.
+        Also returns the whitened residual (prediction minus measurement), shape (K,). With
+        `beam_free` the unknowns may explain a part as well, else only the terms that are projected
+        out.
         """
         weight, at = self.noise.weight, self.objective.linearise(self.x)
         projected = self.objective.project(at, weight)
@@ -216,20 +190,20 @@ class Refit:
         return unexplained_part(columns * weight, known), projected.residual
 
     def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Squares that each of some further columns alone would save to first order, shape (c,).
+        """Return the first-order cost reduction by each further column alone, shape (c,).
 
         Parameters
         ----------
         columns : ndarray of complex, shape (c, K)
         """
-        free, residual = self.beside(columns)
+        free, residual = self.unexplained_columns(columns)
         along = (free.conj() @ residual).real
         squares = np.maximum(np.sum(np.abs(free) ** 2, axis=1), np.finfo(float).tiny)
         saved: NDArray[np.float64] = along**2 / squares
         return saved
 
     def fit(self) -> RecordFit:
-        """Everything that follows from this minimum."""
+        """Return the full result at this minimum."""
         fit = summary(self.objective, self.x, self.noise)
         if not len(self.columns):
             return fit
@@ -249,31 +223,27 @@ class Refit:
         )
 
     def candidate(self) -> Candidate:
-        """Make a candidate of what was found."""
+        """Return the result as a candidate."""
         of = self.objective.unknowns
         return Candidate(of.structure, self.fit(), len(self.columns))
 
-    def noise_here(self) -> Noise:
-        """Take for noise what remains here and no column explains; lines stay left out."""
+    def noise_here(self) -> NoiseSpectrum:
+        """Return the noise of the residual that no column explains; lines stay excluded."""
         residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
-        share = self.objective.comparison.measurement.torque_share
-        return replace(self.noise, power=smooth_power(residual) / share)
+        known_fraction = self.objective.comparison.measurement.known_torque_fraction
+        return replace(self.noise, power=smooth_power(residual) / known_fraction)
 
 
 def unexplained_part(
     columns: NDArray[np.complex128], known: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
-    """Part of whitened columns that nothing that is free already could explain, shape (c, K).
+    """Return the part of whitened columns that other free terms do not explain, shape (c, K).
 
-    Parameters
-    ----------
-    columns : ndarray of complex, shape (c, K)
-    known : ndarray of complex, shape (k, K)
-        What the free parameters and amplitudes do to the torque, whitened.
+    `known`, shape (k, K), are the whitened derivatives by all free parameters and amplitudes.
     """
     scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
     basis = known[scale > 0] / scale[scale > 0, None]
     gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
-    shares = np.linalg.solve(gram, (basis.conj() @ columns.T).real)
-    part: NDArray[np.complex128] = columns - shares.T @ basis
+    coefficients = np.linalg.solve(gram, (basis.conj() @ columns.T).real)
+    part: NDArray[np.complex128] = columns - coefficients.T @ basis
     return part

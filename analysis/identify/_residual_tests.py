@@ -1,12 +1,11 @@
 """Residual tests: whiteness, coherence with the input, harmonics of the sweep.
 
-Chance is ruled out at one level throughout (`SURE`). The cumulative periodogram of a white residual
-is a straight line but for a Kolmogorov statistic (Bartlett's test). A residual that is coherent
-with the angle is linear dynamics that the model lacks.
+Chance is ruled out at one level throughout (`SIGNIFICANT_STD`). The cumulative periodogram of a
+white residual is a straight line but for a Kolmogorov statistic (Bartlett's test). A residual that
+is coherent with the angle is linear dynamics that the model lacks.
 
-A linear beam answers at the frequency it is driven at, and rings at frequencies that the sweep has
-passed. Twice or three times the drive's frequency is another matter: something is not linear. No
-model of it is needed.
+A linear beam responds at the drive frequency, and rings at frequencies that the sweep has passed. A
+response at twice or three times the drive frequency is nonlinear. This test needs no model.
 
 References
 ----------
@@ -29,22 +28,22 @@ if TYPE_CHECKING:
 
 # Chance
 
-SURE: Final = 5.0
-"""Standard deviations from which chance is ruled out: 3 in 10 million, whatever was looked at."""
+SIGNIFICANT_STD: Final = 5.0
+"""Standard deviations from which chance is ruled out: 3 in 10 million for all tests together."""
 
 
 def largest_of(count: int) -> float:
-    """Add to `SURE`, squared and halved, what the largest of `count` may exceed: ln count."""
-    return SURE**2 / 2 + math.log(max(count, 1))
+    """Return the limit of half the square of a deviate, for the largest of `count` values."""
+    return SIGNIFICANT_STD**2 / 2 + math.log(max(count, 1))
 
 
 # Whiteness, and coherence with the input
 
 _LEVEL: Final = 1e-6
-"""Probability of chance: what `SURE` means for the other tests."""
+"""Probability of chance: what `SIGNIFICANT_STD` means for the other tests."""
 
 _DOUBTFUL: Final = 0.01
-"""The same where a doubt is looked into, at the cost of time alone."""
+"""The same where a false alarm costs only computing time."""
 
 _WINDOWS: Final = (8, 32)
 _LOUD: Final = 1.4
@@ -92,18 +91,18 @@ class Whiteness:
 
     @property
     def white(self) -> bool:
-        """Whether nothing speaks against noise alone."""
+        """Return whether the residual is consistent with noise alone."""
         return self.probability > _LEVEL and not self.loud
 
     @property
     def all_but_white(self) -> bool:
-        """Whether chance may have shaped it, once in a hundred records at least."""
+        """Return whether chance exceeds the residual in one record of 100."""
         return self.probability > _DOUBTFUL and not self.loud
 
 
 @dataclass(frozen=True, slots=True)
 class InputRelation:
-    """Tests whether the residual still follows the angle: linear dynamics that the model lacks.
+    """Tests of whether the residual still follows the angle: linear dynamics outside the model.
 
     Attributes
     ----------
@@ -134,7 +133,7 @@ class InputRelation:
 
 
 def cumulative_periodogram(residual: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Share of the power up to each bin, shape (K,), of a whitened residual.
+    """Return the fraction of the power up to each bin, shape (K,), of a whitened residual.
 
     Examples
     --------
@@ -144,12 +143,12 @@ def cumulative_periodogram(residual: NDArray[np.complex128]) -> NDArray[np.float
     [0.25 0.5  0.75 1.  ]
     """
     power = np.cumsum(residual.real**2 + residual.imag**2)
-    share: NDArray[np.float64] = power / power[-1]
-    return share
+    cumulative: NDArray[np.float64] = power / power[-1]
+    return cumulative
 
 
 def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64]) -> Whiteness:
-    """Test a residual.
+    """Test a whitened residual for whiteness.
 
     Parameters
     ----------
@@ -173,7 +172,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
             loudest = deviate
             edges = (float(frequency_hz[i]), float(frequency_hz[i + width - 1]))
             ratio = float(total[i]) / (2 * width)
-        loud |= deviate > SURE + 0.5 and float(total[i]) / (2 * width) > _LOUD
+        loud |= deviate > SIGNIFICANT_STD + 0.5 and float(total[i]) / (2 * width) > _LOUD
     return Whiteness(
         distance=distance,
         band=KOLMOGOROV_95 / math.sqrt(count),
@@ -189,7 +188,7 @@ def input_relation(
     angle: NDArray[np.complex128],
     frequency_hz: NDArray[np.float64],
 ) -> InputRelation:
-    """Compare a residual with the angle.
+    """Test a residual for a linear relation to the angle.
 
     Parameters
     ----------
@@ -240,7 +239,9 @@ def input_relation(
         deviate=deviate,
         correlation=float(correlation[at]),
         lag_s=float(at_s[at]),
-        related=bool(local or deviate > SURE or correlation[at] ** 2 / 2 > largest_of(tried)),
+        related=bool(
+            local or deviate > SIGNIFICANT_STD or correlation[at] ** 2 / 2 > largest_of(tried)
+        ),
     )
 
 
@@ -249,7 +250,7 @@ def input_relation(
 MULTIPLES: Final = (2, 3)
 _BLOCK_S: Final = 1.0
 _LOWEST_HZ: Final = 2.0
-"""Below, a block cannot tell a frequency from its double."""
+"""Below, a block does not resolve a frequency and its double."""
 
 _STEADY: Final = 0.3
 _FEWEST_BLOCKS: Final = 5
@@ -283,12 +284,12 @@ def harmonics(
     rate_hz: float,
     band_hz: tuple[float, float],
 ) -> tuple[Harmonic, ...]:
-    """Look along the sweep; empty if the angle is not a sweep.
+    """Test along the sweep for harmonics; return nothing if the angle is not a sweep.
 
     Parameters
     ----------
     angle_rad, residual : ndarray, shape (n,)
-        Angle, and whitened residual of variance 1 per sample were it white to half the rate.
+        Angle, and whitened residual (variance 1 per sample if white up to half the rate).
     rate_hz : float
     band_hz : tuple of float
         In which the residual is known.
@@ -323,7 +324,8 @@ def harmonics(
                 deviate=deviate,
                 drive_hz=float(drive_hz[inside][largest]),
                 present=bool(
-                    deviate > SURE or chi_square[largest] / 2 > largest_of(chi_square.size)
+                    deviate > SIGNIFICANT_STD
+                    or chi_square[largest] / 2 > largest_of(chi_square.size)
                 ),
             )
         )
@@ -331,7 +333,7 @@ def harmonics(
 
 
 def _analytic(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Signal whose transform vanishes at negative frequencies, shape (n,)."""
+    """Return the analytic signal (no negative frequencies), shape (n,)."""
     spectrum = np.fft.fft(values - values.mean())
     n = values.size
     spectrum[(n + 1) // 2 :] = 0

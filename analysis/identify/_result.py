@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._noise import Noise
+from analysis.identify._noise import NoiseSpectrum
 from analysis.statistics import chi_square_p_value, nrmse_percent
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from analysis.models import Structure
 
 _RARE: Final = 1e-4
-"""p-value below which a beam is said to have rung when the record began."""
+"""p-value below which a beam rang when the record began."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +34,9 @@ class DampingSize:
     omega_rad_s : float or None
         That frequency, not below the first mode; None if the order is fixed or not determined.
     value, std : float
-        ``zeta omega^alpha sin(alpha pi/2)`` of internal damping, of external damping
-        ``gamma omega^lambda sin(lambda pi/2)`` over ``rho/EI omega²``: what is lost in a radian
-        over what is stored. Without that frequency zeta or gamma itself.
+        ``zeta omega^alpha sin(alpha pi/2)`` of internal damping, of external damping ``gamma
+        omega^lambda sin(lambda pi/2)`` over ``rho/EI omega²``: energy lost per radian over stored
+        energy. Without that frequency zeta or gamma itself.
     """
 
     omega_rad_s: float | None
@@ -62,14 +62,14 @@ class ModeEstimate:
 
 @dataclass(frozen=True, slots=True)
 class Ringing:
-    """Free decay with which the record begins, beyond what the motor caused since.
+    """Free decay with which the record begins, in addition to the response to the motor.
 
     Attributes
     ----------
     amplitude_nm : tuple of float
         By mode, at the first sample compared.
     chi_square : float
-        Chi-square of all its amplitudes together, beside the hum if there is some.
+        Chi-square of all its amplitudes together, with the hum, if any, fitted as well.
     degrees_of_freedom : int
     """
 
@@ -79,32 +79,32 @@ class Ringing:
 
     @property
     def significant(self) -> bool:
-        """Whether chance would give as much in fewer than one record of ten thousand."""
+        """Return whether chance gives as much in less than one record of ten thousand."""
         freedom = self.degrees_of_freedom
         return bool(freedom and chi_square_p_value(self.chi_square, freedom) < _RARE)
 
 
 @dataclass(frozen=True, slots=True)
 class RecordFit:
-    """One structure fitted to a whole record.
+    """Fit of one structure to a whole record.
 
     Attributes
     ----------
     structure : Structure
     plant : Plant
-        What was found, ready for `rigd.beam`.
+        Fitted plant, for use with `rigd.beam`.
     parameters : dict of str to float
         zeta, alpha, gamma, lambda, density_over_stiffness (s²/m⁴), bending_stiffness_n_m2, delay_s
         and tool_inertia_kg_m2, the fixed ones included.
     std : dict of str to (float or None)
         Standard deviations of the same: 0 for the fixed ones, None for those that rest on a bound
-        or that the data do not determine. Of a tool inertia that rests on 0: what it would be
-        without that bound. An estimate that cannot be negative of a value that is 0 lies 0 to one
-        side of it half of the time and a half-normal error to the other: on average it is
-        1/sqrt(2 pi) = 0.40 of this deviation too large, and it scatters by 0.58 of it.
+        or that the data do not determine. For a tool inertia at the bound 0: the value without that
+        bound. An estimate of 0 that cannot be negative is 0 in half of the records, and has a
+        half-normal error in the others: its mean is 1/sqrt(2 pi) = 0.40 of this deviation too
+        large, and it scatters by 0.58 of it.
     interval : dict of str to ((float, float) or None)
-        95 % confidence intervals of the free ones, None as above. Of the positive parameters they
-        are symmetric in the logarithm; that of a tool inertia ends at 0 (`interval_from_zero`).
+        95 % confidence intervals of the free ones, None as above. Those of positive parameters are
+        symmetric in the logarithm; that of a tool inertia ends at 0 (`interval_from_zero`).
     determined : tuple of str
         Free parameters in the order of `covariance`.
     covariance : ndarray, shape (k, k)
@@ -120,7 +120,7 @@ class RecordFit:
     cost : float
         Sum of squares of the whitened residual.
     degrees_of_freedom : int
-        How large the cost would be on average by chance alone.
+        Expected cost by chance alone.
     residual : ndarray of complex, shape (K,)
         Whitened spectrum of the residual in the band (prediction minus measurement): real and
         imaginary parts of variance 1 if chance is all that remains.
@@ -144,25 +144,25 @@ class RecordFit:
 
     @property
     def correlation(self) -> NDArray[np.float64]:
-        """Correlations of the determined parameters, shape (k, k)."""
+        """Return the correlations of the determined parameters, shape (k, k)."""
         std = np.sqrt(np.diag(self.covariance))
         correlation: NDArray[np.float64] = self.covariance / np.outer(std, std)
         return correlation
 
     @property
     def free_parameters(self) -> int:
-        """Number of parameters that were estimated."""
+        """Return the number of estimated parameters."""
         return len(self.determined) + len(self.at_bounds)
 
 
 @dataclass(frozen=True, slots=True)
 class RecordAnalysis:
-    """All structures fitted to one record, under one spectrum of the noise.
+    """Fits of all structures to one record, under one noise spectrum.
 
     Attributes
     ----------
     fits : tuple of RecordFit
-        In the order asked for; their costs can be compared.
+        Fits in the requested order; their costs are comparable.
     frequency_hz : ndarray, shape (K,)
         Bins of the residuals.
     compared : ndarray of bool, shape (K,)
@@ -170,9 +170,9 @@ class RecordAnalysis:
     noise_nm2_per_hz : ndarray, shape (K,)
         One-sided power spectral density of the torque's noise, without lines.
     lines : tuple of Line
-        Narrow-band disturbances of the torque, left out of all comparisons.
+        Narrow-band disturbances of the torque, excluded from all comparisons.
     comparison : Comparison
-        What they were compared with.
+        Data that all of them were compared with.
     """
 
     fits: tuple[RecordFit, ...]
@@ -183,13 +183,15 @@ class RecordAnalysis:
     comparison: Comparison
 
     @classmethod
-    def of(cls, fits: Iterable[RecordFit], noise: Noise, comparison: Comparison) -> RecordAnalysis:
-        """Put together fits to one comparison under one noise.
+    def of(
+        cls, fits: Iterable[RecordFit], noise: NoiseSpectrum, comparison: Comparison
+    ) -> RecordAnalysis:
+        """Return the analysis of fits to one comparison under one noise.
 
         Parameters
         ----------
         fits : iterable of RecordFit
-            Fits in the order asked for.
+            Fits in the requested order.
         noise : Noise
             Noise under which all of them were made.
         comparison : Comparison
@@ -205,16 +207,16 @@ class RecordAnalysis:
         )
 
     @property
-    def noise(self) -> Noise:
-        """The noise as the fits had it: the power of each bin."""
+    def noise(self) -> NoiseSpectrum:
+        """Return the noise spectrum of the fits: the power of each bin."""
         scale = self.comparison.samples * self.comparison.decimation.rate_hz / 2
-        return Noise(self.noise_nm2_per_hz * scale, self.compared, self.lines)
+        return NoiseSpectrum(self.noise_nm2_per_hz * scale, self.compared, self.lines)
 
     def fit_percent(self, fit: RecordFit | ModalFit) -> float:
-        """Fit of one of the models to the measured torque in the band (`nrmse_percent`).
+        """Return the fit of a model to the measured torque in the band (`nrmse_percent`).
 
-        Narrow-band disturbances are not part of it, and nothing is compared at their lines; a
-        decay that began before the record counts as explained, as initial conditions do.
+        Narrow-band disturbances are removed, and bins at their lines are not compared. A decay that
+        began before the record counts as explained, as initial conditions do.
 
         Parameters
         ----------
@@ -222,7 +224,9 @@ class RecordAnalysis:
             One of `fits`, or one under the same noise.
         """
         comparison, noise = self.comparison, self.noise
-        torque_nm = comparison.torque_nm[comparison.kept] + comparison.apart_nm - comparison.hum_nm
+        torque_nm = (
+            comparison.torque_nm[comparison.kept] + comparison.removed_nm - comparison.hum_nm
+        )
         measured = comparison.spectrum(torque_nm)[noise.counts]
         residual = (fit.residual * np.sqrt(noise.power / 2))[noise.counts]
         return nrmse_percent(residual, measured)

@@ -1,15 +1,15 @@
-"""Uncertainty of what no session shows: the scales of torque and length, combined with its own.
+"""Uncertainty by the scales of torque and length, combined with the statistical one.
 
 A wrong scale of the torque or a wrong length of the beam leaves no trace in the residual: other
-parameters make up for it exactly. With z = beta L the response (Eq. 25) is::
+parameters compensate it exactly. With z = beta L the response (Eq. 25) is::
 
     G = -(EI/L) (1 + zeta s^alpha) F(z),    z^4 = -(rho/EI L^4 s² + gamma L^4 s^lambda) / (1 + ...)
 
-so that a session shows EI/L, rho/EI L^4, gamma L^4, zeta and both orders, and nothing else of the
-beam. A torque that is read too large by a factor enlarges EI by it, and the tool inertia with it;
-the drag of the air goes with the torque and with the square of the speed, which goes with the
-length, times the square of the length that it acts over. So every parameter goes with a power of
-each scale (`SCALE_EXPONENTS`), and the relative variances add (JCGM 100:2008, GUM, 5.1.6).
+so that a session determines EI/L, rho/EI L^4, gamma L^4, zeta and both orders only. A torque that
+is read too large by a factor enlarges EI by it, and the tool inertia with it; the drag of the air
+goes with the torque and with the square of the speed, which goes with the length, times the square
+of the length that it acts over. So every parameter goes with a power of each scale
+(`SCALE_EXPONENTS`), and the relative variances add (JCGM 100:2008, GUM, 5.1.6).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _OF_DENSITY: Final = {"torque_scale": 1, "length": -3}
 
 
 def scales_absorbed(fit: RecordFit) -> bool:
-    """Whether the parameters make up for a wrong scale: not if some are held at given values.
+    """Return whether the parameters absorb a wrong scale: false if some of them are held.
 
     Parameters
     ----------
@@ -77,8 +77,8 @@ def with_scales(
     Returns
     -------
     dict of str to Quantity
-        Those that depend on a scale whose uncertainty is given and that have an interval, with the
-        combined standard uncertainty and 95 % interval.
+        Parameters with an interval that depend on a scale of given uncertainty, with the combined
+        standard uncertainty and 95 % interval.
     """
     return {
         name: _combined(each, relative, logarithmic=name in LOGARITHMIC)
@@ -92,11 +92,11 @@ def _relative(exponents: Mapping[str, int], uncertainty: Mapping[str, float]) ->
     return math.hypot(*(power * uncertainty.get(scale, 0.0) for scale, power in exponents.items()))
 
 
-def _combined(told: Quantity, relative: float, *, logarithmic: bool) -> Quantity:
-    """Widen an interval on either side by what the scales add, in quadrature."""
-    assert told.interval_95 is not None
-    value, (low, high) = told.value, told.interval_95
-    std = math.hypot(told.std or 0.0, value * relative)
+def _combined(quantity: Quantity, relative: float, *, logarithmic: bool) -> Quantity:
+    """Widen an interval on either side by the uncertainty of the scales, in quadrature."""
+    assert quantity.interval_95 is not None
+    value, (low, high) = quantity.value, quantity.interval_95
+    std = math.hypot(quantity.std or 0.0, value * relative)
     if logarithmic:
         below, above = (
             math.hypot(math.log(end / value), NORMAL_95 * relative) for end in (low, high)
@@ -107,21 +107,21 @@ def _combined(told: Quantity, relative: float, *, logarithmic: bool) -> Quantity
         ends = value - math.hypot(value - low, half), value + math.hypot(high - value, half)
         # What cannot be negative ends at 0.
         ends = max(ends[0], 0.0), ends[1]
-    return replace(told, std=std, interval_95=ends)
+    return replace(quantity, std=std, interval_95=ends)
 
 
 @dataclass(frozen=True, slots=True)
 class DensityCheck:
-    """Mass per length of the beam from the record, beside that of the file.
+    """Mass per length of the beam from the record, compared with that of the file.
 
-    Only where torque scale and length are right do they agree.
+    They agree only if torque scale and length are right.
 
     Attributes
     ----------
     found_kg_per_m, found_std_kg_per_m : float
         rho/EI times EI, with the combined standard uncertainty.
     stated_kg_per_m, stated_std_kg_per_m : float
-        That of the file.
+        Value of the file with its standard uncertainty.
     """
 
     found_kg_per_m: float
@@ -131,7 +131,7 @@ class DensityCheck:
 
     @property
     def agree(self) -> bool:
-        """Whether they differ by no more than 95 % of chance."""
+        """Return whether they differ by no more than the 95 % limit of chance."""
         apart = abs(self.found_kg_per_m - self.stated_kg_per_m)
         return apart <= NORMAL_95 * math.hypot(self.found_std_kg_per_m, self.stated_std_kg_per_m)
 
@@ -139,13 +139,13 @@ class DensityCheck:
 def density_check(
     fit: RecordFit, stated_kg_per_m: float, uncertainty: Mapping[str, float]
 ) -> DensityCheck | None:
-    """Compare the mass per length that a record shows with the stated one.
+    """Compare the mass per length of a record with the stated one.
 
     Parameters
     ----------
     fit : RecordFit
     stated_kg_per_m : float
-        As the file has it.
+        Value of the file.
     uncertainty : mapping of str to float
         Relative standard uncertainties of "torque_scale", "length" and "density".
 
@@ -157,8 +157,8 @@ def density_check(
     determined = all(name in fit.determined for name in _ABSORBING)
     if not determined or not uncertainty.keys() >= {*_OF_DENSITY, "density"}:
         return None
-    places = [fit.determined.index(name) for name in _ABSORBING]
-    own = float(fit.covariance[np.ix_(places, places)].sum())
+    indices = [fit.determined.index(name) for name in _ABSORBING]
+    own = float(fit.covariance[np.ix_(indices, indices)].sum())
     found = fit.parameters[_RATIO] * fit.parameters[_STIFFNESS]
     relative = math.sqrt(own + _relative(_OF_DENSITY, uncertainty) ** 2)
     return DensityCheck(

@@ -1,8 +1,9 @@
 """Search for the lowest minimum of one structure: coarse response first, then the whole record.
 
 The ratio of the whole record's two transforms (the empirical transfer function estimate) is exact
-but for what rings before and after it. A few hundred of its points, densest at the resonances, tell
-the minima apart in a hundredth of the time; the descents on the whole record start at its minima.
+except for ringing before and after the record. A few hundred of its points, densest at the
+resonances, distinguish the minima in a hundredth of the time. The descents on the whole record
+start at its minima.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._free_decay import decay_columns
-from analysis.identify._hum import hum_beside_modes, resonance_reach_hz
-from analysis.identify._noise import Noise, noise_of
+from analysis.identify._hum import hum_near_modes, resonance_reach_hz
+from analysis.identify._noise import NoiseSpectrum, noise_of
 from analysis.identify._parametrization import Steps
 from analysis.identify._predictor import ResponseGrid
 from analysis.identify._problem import Objective
@@ -43,9 +44,9 @@ _MODERATE: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
 
 
 def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArray[np.float64]:
-    """Find what brings the resonances of a vector of unknowns to where they are, shape (k,).
+    """Return the shift of the unknowns that aligns the resonances, shape (k,).
 
-    With a resonance off by more than it is wide, no descent would find it.
+    If a resonance is off by more than its width, no descent finds it.
 
     Parameters
     ----------
@@ -56,12 +57,12 @@ def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArr
     moderate = unknowns.start(np.array([_MODERATE[name] for name in unknowns.structure.free]))
     shift = np.zeros(moderate.size)
     if "density_over_stiffness" in unknowns.names:
-        place = unknowns.names.index("density_over_stiffness")
+        index = unknowns.names.index("density_over_stiffness")
         costs = []
         for step in _SCAN:
-            shift[place] = step
+            shift[index] = step
             costs.append(cost(unknowns.plant(moderate + shift)))
-        shift[place] = _SCAN[int(np.argmin(costs))]
+        shift[index] = _SCAN[int(np.argmin(costs))]
     return shift
 
 
@@ -70,7 +71,7 @@ def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArr
 _POINTS: Final = 400
 _TOLERANCE: Final = 1e-2
 _SAME_MINIMUM: Final = 0.05
-"""Minima whose plants differ by less than this share of the cost are one."""
+"""Minima whose plants differ by less than this fraction of the cost are one."""
 
 _MAX_EVALUATIONS: Final = 60
 _SIZES: Final = {name: tuple(np.log([1e-4, 1e-3, 1e-2, 1e-1])) for name in ("zeta", "gamma")}
@@ -80,7 +81,7 @@ _ORDERS: Final = (0.5, 1.5)
 
 
 class CoarseResponse:
-    """Few points of the whole record's frequency response, with their weights."""
+    """Some points of the whole record's frequency response, with their weights."""
 
     __slots__ = ("_costs", "_frequency_hz", "_measured", "_response", "_weights")
 
@@ -91,8 +92,8 @@ class CoarseResponse:
         band = np.flatnonzero((hz >= first) & (hz <= last))
         angle = np.fft.rfft(comparison.angle_rad)[band]
         torque = np.fft.rfft(comparison.torque_nm)[band]
-        # Where nothing was asked of the motor it moved with the noise: no response is seen there.
-        given = np.fft.rfft(comparison.followed_rad())[band]
+        # Without excitation the motor moved with the noise: such bins show no response.
+        given = np.fft.rfft(comparison.coherent_rad())[band]
         power = given.real**2 + given.imag**2
         excited = power > 1e-12 * power.max()
         response, weights = torque[excited] / angle[excited], power[excited]
@@ -102,8 +103,8 @@ class CoarseResponse:
         self._response = ResponseGrid(2j * np.pi * self._frequency_hz)
         self._costs: dict[Plant, float] = {}
 
-    def whitened(self, noise: Noise, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
-        """Take the same points with the weights that they have under a noise.
+    def whitened(self, noise: NoiseSpectrum, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
+        """Return the same points with their weights under a noise.
 
         Parameters
         ----------
@@ -118,25 +119,25 @@ class CoarseResponse:
         return other
 
     def cost(self, plant: Plant) -> float:
-        """Weighted mean square of the deviation, in (N·m/rad)²."""
-        # Kept: structures that differ in what is free only are scanned at the same plants.
+        """Return the weighted mean square of the deviation, in (N·m/rad)²."""
+        # Cached: structures that differ only in the free parameters are scanned at the same plants.
         if plant not in self._costs:
             deviation = self._response.evaluate(plant)[0] - self._measured
             self._costs[plant] = self._mean_square(deviation)
         return self._costs[plant]
 
     def distance(self, one: Plant, other: Plant) -> float:
-        """Weighted mean square of the difference between two plants."""
+        """Return the weighted mean square of the difference between two plants."""
         return self._mean_square(
             self._response.evaluate(one)[0] - self._response.evaluate(other)[0]
         )
 
     def alike(self, one: Plant, other: Plant) -> bool:
-        """Whether two plants stand for the same minimum."""
+        """Return whether two plants belong to the same minimum."""
         return self.distance(one, other) <= _SAME_MINIMUM * min(self.cost(one), self.cost(other))
 
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
-        """Compute the same and its derivatives by the unknowns."""
+        """Return the cost and its derivatives by the unknowns."""
         plant, chain = unknowns.plant_and_gradient(x)
         response, *gradient = self._response.evaluate(plant, unknowns.gradient_names)
         deviation = response - self._measured
@@ -153,10 +154,10 @@ class CoarseResponse:
 
 
 def initial_guesses(coarse: CoarseResponse, unknowns: Unknowns) -> list[NDArray[np.float64]]:
-    """Points from which descents lead to all minima of interest, each of shape (k,).
+    """Return points from which descents lead to all relevant minima, each of shape (k,).
 
-    The damping that fits best with all orders 1, which most materials and air come close to; then
-    the same losses with the orders apart.
+    The first is the best fit with all orders 1, which most materials and air come close to. The
+    others have the same losses with different orders.
     """
     shift = resonance_shift(coarse.cost, unknowns)
     sizes = [_SIZES.get(name, (1.0,)) for name in unknowns.structure.free]
@@ -174,7 +175,7 @@ def initial_guesses(coarse: CoarseResponse, unknowns: Unknowns) -> list[NDArray[
 def coarse_minima(
     coarse: CoarseResponse, unknowns: Unknowns, points: Iterable[NDArray[np.float64]]
 ) -> list[Minimum]:
-    """Different minima of the coarse response's cost, the lowest first, from some points."""
+    """Return the distinct minima of the coarse cost from some points, the lowest first."""
     steps = Steps.of(unknowns)
     found = [
         descend(
@@ -186,48 +187,48 @@ def coarse_minima(
         )
         for point in points
     ]
-    kept: list[Minimum] = []
+    distinct: list[Minimum] = []
     for minimum in sorted(found, key=lambda m: m.cost):
         plant = unknowns.plant(minimum.x)
-        if not any(coarse.alike(plant, unknowns.plant(other.x)) for other in kept):
-            kept.append(minimum)
-    return kept
+        if not any(coarse.alike(plant, unknowns.plant(other.x)) for other in distinct):
+            distinct.append(minimum)
+    return distinct
 
 
 # Descents on the whole record
 
 _BETWEEN_RIVALS: Final = 1e-2
-"""Relative tolerance that tells which of several minima is lower."""
+"""Relative tolerance that decides which of several minima is lower."""
 
 _RIVALS: Final = 2
 _NO_RIVAL: Final = 1.5
 """A coarse minimum whose cost is larger than the lowest one's by this factor is not gone after."""
 
 _CLEARLY: Final = 0.9
-"""Cost, relative to where a descent has ended, that makes another coarse minimum worth a look."""
+"""Cost, relative to the end of a descent, below which another coarse minimum is refined."""
 
 _MOST_MINIMA: Final = 4
 RENEWALS: Final = 4
-"""How often it is told anew at most what followed the reference."""
+"""Limit of re-estimates of the angle that follows the reference."""
 
-_LOOKS: Final = 3
+_HUM_SEARCHES: Final = 3
 """Number of searches for hum: the first fit attributed part of it to the beam."""
 
 
 @dataclass(frozen=True, slots=True)
 class Descent:
-    """Where one structure has come to."""
+    """State of the descent of one structure."""
 
     objective: Objective
     x: NDArray[np.float64]
 
     @property
     def plant(self) -> Plant:
-        """The plant there."""
+        """Return the plant at this point."""
         return self.objective.unknowns.plant(self.x)
 
     def to_minimum(
-        self, noise: Noise, tolerance: float, hopeless: tuple[int, float] | None = None
+        self, noise: NoiseSpectrum, tolerance: float, hopeless: tuple[int, float] | None = None
     ) -> Descent:
         """Descend to the minimum under a noise spectrum.
 
@@ -237,7 +238,7 @@ class Descent:
         tolerance : float
             Relative, of the sum of squares.
         hopeless : tuple of int and float, optional
-            As `descend` takes it.
+            Argument of `descend`.
         """
         region = Steps.of(self.objective.unknowns)
         objective, minimum = self.objective.minimum(
@@ -245,12 +246,15 @@ class Descent:
         )
         return Descent(objective, minimum.x)
 
-    def cost(self, noise: Noise) -> float:
-        """Sum of squares here under a noise spectrum."""
+    def cost(self, noise: NoiseSpectrum) -> float:
+        """Return the sum of squares here under a noise spectrum."""
         return self.objective.normal_equations(self.x, noise.weight).cost
 
-    def renewed(self, noise: Noise, tolerance: float) -> Descent:
-        """Tell anew what followed the reference, until that is settled; `self` if it is."""
+    def renewed(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
+        """Re-estimate the angle that follows the reference until it converges.
+
+        Return `self` if it has converged.
+        """
         here = self
         for _ in range(RENEWALS):
             comparison = here.objective.comparison.renewed(here.plant, noise)
@@ -262,18 +266,18 @@ class Descent:
         return here
 
     def hum(self) -> tuple[Hum, ...]:
-        """Search for narrow-band disturbances near the modes of the beam found so far."""
+        """Search for narrow-band disturbances near the modes of the current beam."""
         comparison = self.objective.comparison
         at, noise = self.objective.linearise(self.x), self.noise()
         amplitudes = self.objective.project(at, noise.weight).amplitudes
         decays = decay_columns(at.poles) * (1 + len(comparison.later_decays))
         decaying_nm = comparison.in_time(amplitudes[:decays] @ at.columns[:decays])
-        return hum_beside_modes(comparison, self.plant, at.poles, noise, decaying_nm)
+        return hum_near_modes(comparison, self.plant, at.poles, noise, decaying_nm)
 
     def without_hum(self, tolerance: float) -> Descent:
-        """Take out the hum near modes and descend again; `self` if there is none."""
+        """Remove the hum near modes and descend again; return `self` if there is none."""
         here = self
-        for _ in range(_LOOKS):
+        for _ in range(_HUM_SEARCHES):
             hum = here.hum()
             if not hum:
                 return self
@@ -284,8 +288,8 @@ class Descent:
             here = here.to_minimum(here.noise(), tolerance)
         return here
 
-    def noise(self, *, with_lines: bool = False) -> Noise:
-        """Take for noise what remains here and is not a free decay."""
+    def noise(self, *, with_lines: bool = False) -> NoiseSpectrum:
+        """Return the noise of the residual here without the free decay."""
         objective, comparison = self.objective, self.objective.comparison
         at = objective.linearise(self.x)
         near_mode = None
@@ -299,21 +303,21 @@ class Descent:
             objective.project(at, 1.0).residual,
             comparison.frequency_hz,
             comparison.samples,
-            comparison.measurement.torque_share,
+            comparison.measurement.known_torque_fraction,
             near_mode,
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
-    """One structure on one record: where its minima may lie.
+class StructureSearch:
+    """Search for the minima of one structure on one record.
 
     Attributes
     ----------
     objective : Objective
     coarse : CoarseResponse
     first : ndarray, shape (k,)
-        Where the orders are 1.
+        Minimum with orders of 1.
     minima : list of Minimum
         Minima of the coarse response, noise taken as white; the lowest first.
     """
@@ -324,35 +328,35 @@ class Search:
     minima: list[Minimum]
 
     @classmethod
-    def of(cls, objective: Objective, coarse: CoarseResponse) -> Search:
-        """Look over the whole range of the unknowns."""
+    def of(cls, objective: Objective, coarse: CoarseResponse) -> StructureSearch:
+        """Search the whole range of the unknowns on the coarse response."""
         starts = initial_guesses(coarse, objective.unknowns)
         return cls(objective, coarse, starts[0], coarse_minima(coarse, objective.unknowns, starts))
 
     @property
     def unknowns(self) -> Unknowns:
-        """What is searched for."""
+        """Return the unknowns of the search."""
         return self.objective.unknowns
 
-    def on(self, comparison: Comparison) -> Search:
-        """Compare with something else, from the same starts."""
+    def on(self, comparison: Comparison) -> StructureSearch:
+        """Return the search on another comparison, with the same starts."""
         return replace(self, objective=Objective(comparison, self.unknowns))
 
     def lowest(self) -> Descent:
-        """Where the coarse response is lowest."""
+        """Return the point where the coarse response has its lowest cost."""
         return Descent(self.objective, self.minima[0].x)
 
-    def under(self, noise: Noise, near: Descent | None = None) -> Descent:
-        """Go next to the lowest minimum of the whole record.
+    def under(self, noise: NoiseSpectrum, near: Descent | None = None) -> Descent:
+        """Descend to the lowest minimum of the whole record.
 
-        Under another noise another minimum may be the lowest: all are looked at again on the coarse
-        response, which costs little, and the best few descended to.
+        Under another noise another minimum may be the lowest. So all are compared again on the
+        coarse response, which is cheap, and the best few are refined.
 
         Parameters
         ----------
         noise : Noise
         near : Descent, optional
-            Where one of the minima is known already.
+            Descent at a known minimum.
         """
         coarse = self.coarse.whitened(noise, self.objective.comparison.frequency_hz)
         points = [minimum.x for minimum in self.minima[:_MOST_MINIMA]]

@@ -25,7 +25,7 @@ from analysis.identify._explanations import finding as explanation_finding
 from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
 from analysis.identify._headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
-from analysis.identify._knock import MOST_KNOCKS, knocks_in, of_knocks, with_knock
+from analysis.identify._knock import MAX_KNOCKS, knocks_in, of_knocks, with_knock
 from analysis.identify._modal_fit import fit_modes
 from analysis.identify._modal_headline import tolerant_order, with_modal_model
 from analysis.identify._nonlinear import nonlinear_forces
@@ -46,11 +46,11 @@ from analysis.identify._uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify._verdict import (
     EVEN,
     NOT_DETERMINED,
-    Row,
+    CandidateRow,
     Verdict,
+    not_reported_reason,
     order_verdict,
     rivals,
-    untold_reason,
 )
 from analysis.identify._visible_modes import visible_modes
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
@@ -70,33 +70,33 @@ if TYPE_CHECKING:
     from analysis.identify._profile_likelihood import Order
     from analysis.identify._residual_tests import Harmonic
     from analysis.identify._result import RecordFit
-    from analysis.identify._time_varying import Change
+    from analysis.identify._time_varying import TemporalChange
     from analysis.identify._uniform_beam import UniformBeamTest
 
 
-_MODES_TO_JUDGE: Final = 2
+_MODES_TO_TEST: Final = 2
 _TILTED: Final = "the axis is tilted, and fits to the whole record are of one that is plumb"
 _CLIPPED: Final = "the torque is clipped"
 INTEGER: Final = STRUCTURES["III"]
-"""Both dampings of order 1. It is fitted from everywhere: what a record does not tell of orders has
-no valleys there, and no damping that is a stiffness or an inertia in truth."""
+"""Both dampings of order 1. It is fitted from every start: it has no local minima by undetermined
+orders, and no damping that is in fact a stiffness or an inertia."""
 
 _MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
 _NOT_SEARCHED: Final = frozenset({"sign", "unit", "clipping", "stop"})
-"""What makes a search for knocks idle. Settings at an edge may be a loud knock's doing."""
+"""Findings that make a search for impacts useless. A large impact may drive settings to an edge."""
 _OF_CHANNELS: Final = _MISREAD_KINDS | {"clipping", "stop"}
-"""All that is said where the record contradicts its file."""
+"""Findings that are reported if the record contradicts its file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """A verdict with what it rests on.
+    """Verdict on a record, with the fits that it rests on.
 
     Attributes
     ----------
     verdict : Verdict
     headline : Headline
-        The numbers to be told first, with flags.
+        Reported numbers, with flags.
     candidates : tuple of Candidate
         All fits, the lowest BIC first.
     analysis : RecordAnalysis
@@ -110,12 +110,12 @@ class Selection:
 
     @property
     def fit(self) -> RecordFit:
-        """The fit that the headline's numbers are of."""
+        """Return the fit behind the numbers of the headline."""
         return self.headline.fit
 
     @property
-    def settled(self) -> frozenset[Order]:
-        """Orders that the record determines: it admits a single minimum along each."""
+    def determined(self) -> frozenset[Order]:
+        """Return the orders that the record determines: a single minimum along each."""
         orders = (self.verdict.alpha, self.verdict.lambda_)
         return frozenset(each.order for each in orders if each.profile.identifiable)
 
@@ -127,14 +127,14 @@ def select(
     band_hz: tuple[float, float] = BAND_HZ,
     earlier: Selection | None = None,
 ) -> Selection:
-    """Report what a record supports: modes first, orders where the beam earns them.
+    """Select the model that a record supports, and report its parameters.
 
-    The modal model is fitted to what remains of hum, knocks and gaps, and the modes are its own. If
-    it leaves nothing but noise, the antenna is linear and constant. Otherwise drag, forces that are
-    not linear, changes along the record and knocks are looked for. A uniform beam is tested against
-    the modal constants; orders, coefficients and stiffness are estimated from these with the
-    tolerance of the geometry that the measurement states. All structures are also fitted to the
-    record, on an exactly uniform beam: their values are a condition.
+    The modal model is fitted to the record without hum, impacts and gaps; the reported modes are
+    its modes. If its residual is noise, the antenna is linear and constant. Otherwise drag,
+    nonlinear forces, changes along the record and impacts are tested. A uniform beam is tested
+    against the modal constants; orders, coefficients and stiffness are estimated from these with
+    the tolerance of the geometry that the measurement states. All structures are also fitted to the
+    record on an exactly uniform beam: their values are conditional estimates.
 
     Parameters
     ----------
@@ -143,8 +143,9 @@ def select(
         Settings that stay as the file states them.
     band_hz : tuple of float
     earlier : Selection, optional
-        That of an earlier part of the record. All candidates start from its own where the first of
-        them explains all of it, in a third of the time; of several minima one may be missed.
+        Selection of an earlier part of the record. If its first candidate explains the whole
+        record, all candidates start from the earlier ones, in a third of the time; one of several
+        minima may be missed.
 
     Raises
     ------
@@ -154,51 +155,53 @@ def select(
         There is no such setting.
     """
     fixed = tuple(fixed)
-    return _with_knocks(measurement, lambda each: _selected(each, fixed, band_hz, earlier)).said
+    return _with_knocks(measurement, lambda each: _selected(each, fixed, band_hz, earlier)).result
 
 
 _T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
-class _Told(Generic[_T]):
-    """What is said of a record, and what it rests on.
+class _Assessment(Generic[_T]):
+    """Result on a record, with the candidates that it rests on.
 
     Attributes
     ----------
-    said : _T
-    field : CandidateSet
-        Led by the candidate that the numbers are of.
+    result : _T
+    candidate_set : CandidateSet
+        Set led by the candidate of the reported numbers.
     explained : bool
-        Whether that leaves nothing but noise.
+        Whether its residual is noise only.
     kinds : collection of str
-        Kinds of what was found.
+        Kinds of the findings.
     """
 
-    said: _T
-    field: CandidateSet
+    result: _T
+    candidate_set: CandidateSet
     explained: bool
     kinds: Collection[str]
 
 
-def _with_knocks(measurement: Measurement, tell: Callable[[Measurement], _Told[_T]]) -> _Told[_T]:
-    """Judge a record; where all leaves more than noise, with the knocks that explain it."""
-    told = tell(measurement)
-    for _ in range(MOST_KNOCKS):
-        if told.explained or not _NOT_SEARCHED.isdisjoint(told.kinds):
+def _with_knocks(
+    measurement: Measurement, assess: Callable[[Measurement], _Assessment[_T]]
+) -> _Assessment[_T]:
+    """Assess a record; if its residual is more than noise, with the impacts that explain it."""
+    assessment = assess(measurement)
+    for _ in range(MAX_KNOCKS):
+        if assessment.explained or not _NOT_SEARCHED.isdisjoint(assessment.kinds):
             break
         better = None
         # A sweep with harmonics has them all along; but a loud knock may pass for some.
-        for found in knocks_in(told.field, obvious="harmonics" in told.kinds):
-            again = tell(with_knock(told.field.comparison.measurement, found))
+        for found in knocks_in(assessment.candidate_set, obvious="harmonics" in assessment.kinds):
+            again = assess(with_knock(assessment.candidate_set.comparison.measurement, found))
             if again.explained or found.evident:
                 better = again
             if again.explained:
                 break
         if better is None:
             break
-        told = better
-    return told
+        assessment = better
+    return assessment
 
 
 def _selected(
@@ -206,56 +209,58 @@ def _selected(
     fixed: tuple[Setting, ...],
     band_hz: tuple[float, float],
     earlier: Selection | None,
-) -> _Told[Selection]:
-    """Choose the structure with what is known to have struck the beam."""
+) -> _Assessment[Selection]:
+    """Select the structure with the known impacts."""
     before = earlier.candidates if earlier else ()
     again = CandidateSet.from_earlier(before, measurement, fixed, band_hz) if before else None
     linear = again or CandidateSet.of(measurement, fixed, band_hz)
     modal = _modal(linear)
-    field, small = linear, None
+    candidate_set, small = linear, None
     forces: tuple[NonlinearForce, ...] = ()
-    changes: tuple[Change, ...] = ()
+    changes: tuple[TemporalChange, ...] = ()
     plain = modal is not None and _linear_and_constant(linear, modal, band_hz)
     if not (plain or measurement.knocks):
         for knock in knocks_in(linear, obvious=True):
-            struck = _selected(with_knock(measurement, knock), fixed, band_hz, None)
-            if struck.explained:
-                return struck
+            with_impact = _selected(with_knock(measurement, knock), fixed, band_hz, None)
+            if with_impact.explained:
+                return with_impact
     if modal is not None:
         small = small_effect(linear.comparison, modal, modal.plant_like(linear.likeliest.plant))
     alone = modal if small is None else _modal(linear, small.column[None])
     suffices = alone is not None and _linear_and_constant(linear, alone, band_hz)
     if not (plain or suffices) or (small is not None and small.large):
-        field, forces, changes = _with_effects(linear, again=again is not None)
-        modal = _modal(field)
-        if suffices and not (modal is not None and _linear_and_constant(field, modal, band_hz)):
-            field, forces, changes, modal = linear, (), (), alone
+        candidate_set, forces, changes = _with_effects(linear, again=again is not None)
+        modal = _modal(candidate_set)
+        if suffices and not (
+            modal is not None and _linear_and_constant(candidate_set, modal, band_hz)
+        ):
+            candidate_set, forces, changes, modal = linear, (), (), alone
         else:
             small = None
     elif small is not None and small.saved > LARGE:
-        field = linear.with_effect(small.column[None])
-        modal = _modal(field)
+        candidate_set = linear.with_effect(small.column[None])
+        modal = _modal(candidate_set)
     else:
         modal = alone
-    field = field.with_orders_free()
-    visible = _visible(field, modal)
+    candidate_set = candidate_set.with_orders_free()
+    visible = _visible(candidate_set, modal)
     test = _uniform_beam_test(measurement, modal)
     refused = test is not None and test.status == "refused"
-    # Another valley that a part of the record excludes, all of it does as well.
-    settled = earlier.settled if earlier and again else ()
-    walk = untold_reason(field, visible) is None and not refused
-    field, *profiles = profiled(field, settled, walk=walk)
-    told = field.led_by(field.freest)
-    white, related, multiples = _tests(told, modal, band_hz)
+    # The whole record excludes every local minimum that a part of it excludes.
+    determined = earlier.determined if earlier and again else ()
+    walk = not_reported_reason(candidate_set, visible) is None and not refused
+    candidate_set, *profiles = profiled(candidate_set, determined, walk=walk)
+    leading = candidate_set.led_by(candidate_set.freest)
+    white, related, multiples = _tests(leading, modal, band_hz)
     explained = white.white and not related.related
-    found = findings(told, forces, multiples)
+    found = findings(leading, forces, multiples)
     kinds = {finding.kind for finding in found}
-    wrong = _wrong(kinds, explained=explained)
+    wrong = _wrong_model_reason(kinds, explained=explained)
     clipped = _CLIPPED if "clipping" in kinds else None
-    doubt = wrong or clipped or _doubt(changes, one_sweep=measurement.one_sweep)
-    alpha, lambda_ = (order_verdict(field, each, visible, doubt=doubt) for each in profiles)
-    orders, close = (alpha, lambda_), rivals(field, EVEN)
-    numbers = headline(field, orders, visible, unexplained=wrong)
+    doubt = wrong or clipped or _doubt_reason(changes, one_sweep=measurement.one_sweep)
+    alpha, lambda_ = (order_verdict(candidate_set, each, visible, doubt=doubt) for each in profiles)
+    orders, close = (alpha, lambda_), rivals(candidate_set, EVEN)
+    numbers = headline(candidate_set, orders, visible, unexplained=wrong)
     if doubt is not None:
         numbers = numbers.doubted(doubt)
     # A change that was fitted too moved the modes to the middle of the record.
@@ -269,26 +274,26 @@ def _selected(
         orders = alpha, lambda_
     if "nonlinear stiffness" in kinds:
         numbers = numbers.with_law_assumed()
-    said, advice = [], []
+    sentences, advice = [], []
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
         along = tuple(changing(changes, one_sweep=measurement.one_sweep))
-        found += _settings(told, numbers, kinds)
+        found += _settings(leading, numbers, kinds)
         found += () if small is None else (small.finding(),)
         if modal is not None and test is not None and refused and wrong is None:
-            found += _explanation(measurement, told, modal, test)
-        found = _as_sure(found, along, wrong, doubt, numbers.flags, explained=explained)
-        found = _with_knocks_and_rest(told, found, white, related)
-        said = of_headline(numbers, orders, alone=doubt is None)
-        advice = experiments(field, orders, visible, found, close)
+            found += _explanation(measurement, leading, modal, test)
+        found = _with_doubts(found, along, wrong, doubt, numbers.flags, explained=explained)
+        found = _with_knocks_and_unexplained(leading, found, white, related)
+        sentences = of_headline(numbers, orders, alone=doubt is None)
+        advice = experiments(candidate_set, orders, visible, found, close)
     advice += [each.remedy for each in found if each.remedy]
-    best = field.best
+    best = candidate_set.best
     selection = Selection(
-        candidates=field.candidates,
+        candidates=candidate_set.candidates,
         headline=numbers,
         analysis=RecordAnalysis.of(
-            (c.fit for c in field.candidates), field.noise, field.comparison
+            (c.fit for c in candidate_set.candidates), candidate_set.noise, candidate_set.comparison
         ),
         verdict=Verdict(
             name=measurement.name,
@@ -300,46 +305,44 @@ def _selected(
             lambda_=lambda_,
             visible_modes=visible,
             findings=found,
-            table=_table(field),
+            table=_table(candidate_set),
             whiteness=white,
             input_relation=related,
             harmonics=multiples,
-            sentences=(*said, *(each.sentence for each in found)),
+            sentences=(*sentences, *(each.sentence for each in found)),
             experiments=tuple(dict.fromkeys(advice)),
-            damping_with_amplitude=damping_with_amplitude(told),
+            damping_with_amplitude=damping_with_amplitude(leading),
         ),
     )
-    return _Told(selection, told, explained, kinds)
+    return _Assessment(selection, leading, explained, kinds)
 
 
-def _modal(field: CandidateSet, further: NDArray[np.complex128] | None = None) -> ModalFit | None:
-    """Fit the modal model to what a set of candidates was fitted to; None if no mode shows.
+def _modal(
+    candidate_set: CandidateSet, further: NDArray[np.complex128] | None = None
+) -> ModalFit | None:
+    """Fit the modal model to the data of a candidate set; return None if no mode is visible.
 
-    Parameters
-    ----------
-    field : CandidateSet
-    further : ndarray of complex, shape (c, K), optional
-        Spectra of unknown size beside the candidates' own.
+    `further`, shape (c, K), are spectra of unknown size in addition to those of the candidates.
     """
-    if field.misread:
+    if candidate_set.misread:
         return None
     starts = [
         (mode.number, mode.frequency_hz, mode.damping_ratio)
-        for mode in field.likeliest.modes
+        for mode in candidate_set.likeliest.modes
         if mode.frequency_hz > 0
     ]
-    columns, drag = field.columns, field.comparison.drag
+    columns, drag = candidate_set.columns, candidate_set.comparison.drag
     if further is not None:
         columns = np.concatenate([columns, further])
     if drag is not None:  # its size is not known exactly
         columns = np.concatenate([columns, drag.by_law])
-    return fit_modes(field.comparison, field.noise, starts, columns)
+    return fit_modes(candidate_set.comparison, candidate_set.noise, starts, columns)
 
 
-def _visible(field: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
-    """Numbers of the modes that a record shows."""
+def _visible(candidate_set: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
+    """Return the numbers of the modes that a record shows."""
     if modal is None:
-        return visible_modes(field.comparison, field.noise, field.best.fit)
+        return visible_modes(candidate_set.comparison, candidate_set.noise, candidate_set.best.fit)
     return modal.visible
 
 
@@ -351,19 +354,10 @@ def _with_modes(
     doubt: str | None,
     mode_doubt: str | None,
 ) -> Headline:
-    """Put the modal model in front of a headline, and parameters with the stated tolerance.
+    """Add the modal model to a headline of a uniform beam, and apply the stated tolerance.
 
-    Parameters
-    ----------
-    exact : Headline
-        That of an exactly uniform beam.
-    measurement : Measurement
-    modal : ModalFit or None
-        None keeps `exact`.
-    test : UniformBeamTest or None
-        None with it.
-    doubt, mode_doubt : str or None
-        Why no number, or no mode, is to be believed.
+    Return `exact` if there is no modal model. `doubt` and `mode_doubt` are the reasons against
+    every number and against every mode.
     """
     if modal is None or test is None:
         return exact
@@ -378,72 +372,71 @@ def _with_modes(
 
 
 def _uniform_beam_test(measurement: Measurement, modal: ModalFit | None) -> UniformBeamTest | None:
-    """Test whether the beam that the file states predicts the modes, but for its parameters."""
+    """Test whether a uniform beam with free parameters predicts the modes."""
     if modal is None:
         return None
     return uniform_beam_test(modal, measurement.nominal, measurement.axis_tilt_deg)
 
 
 def _explanation(
-    measurement: Measurement, told: CandidateSet, modal: ModalFit, test: UniformBeamTest
+    measurement: Measurement, candidate_set: CandidateSet, modal: ModalFit, test: UniformBeamTest
 ) -> tuple[Finding, ...]:
-    """Name simple causes that would explain what a uniform beam does not.
+    """Name simple causes of the deviations from a uniform beam.
 
-    Two modes leave no degree of freedom to test one.
+    Two modes leave no degree of freedom for this test.
     """
-    if len(modal.visible) <= _MODES_TO_JUDGE:
+    if len(modal.visible) <= _MODES_TO_TEST:
         return ()
     causes = explanations(modal, measurement.nominal, measurement.axis_tilt_deg)
-    step = step_score(told.comparison, modal) if measurement.one_sweep else None
+    step = step_score(candidate_set.comparison, modal) if measurement.one_sweep else None
     return (explanation_finding(test, causes, step),)
 
 
-def _settings(field: CandidateSet, told: Headline, kinds: Collection[str]) -> tuple[Finding, ...]:
-    """Find what the file states otherwise, where at least two modes show and nothing is absurd."""
-    if "implausible" in kinds or len(told.visible_modes) < _MODES_TO_JUDGE:
+def _settings(
+    candidate_set: CandidateSet, result: Headline, kinds: Collection[str]
+) -> tuple[Finding, ...]:
+    """Find settings that differ from the file, if at least two modes show and nothing is absurd."""
+    if "implausible" in kinds or len(result.visible_modes) < _MODES_TO_TEST:
         return ()
-    return tuple(of_settings(field, told))
+    return tuple(of_settings(candidate_set, result))
 
 
 def _linear_and_constant(
-    field: CandidateSet, modal: ModalFit, band_hz: tuple[float, float]
+    candidate_set: CandidateSet, modal: ModalFit, band_hz: tuple[float, float]
 ) -> bool:
-    """Whether the modal model leaves nothing but noise: nothing else need be looked for."""
-    _, _, multiples = _tests(field, modal, band_hz)
+    """Return whether the residual of the modal model is noise: then no other effect is tested."""
+    _, _, multiples = _tests(candidate_set, modal, band_hz)
     return modal.explained and not any(each.present for each in multiples)
 
 
 def _with_effects(
     linear: CandidateSet, *, again: bool
-) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[Change, ...]]:
-    """Look for what no linear constant antenna does.
+) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[TemporalChange, ...]]:
+    """Test for nonlinear and time-varying effects.
 
-    Returns
-    -------
-    field : CandidateSet
-        With what explains the record best.
-    forces : tuple of NonlinearForce
-    changes : tuple of Change
-        Along the record.
+    Return the set with the best explanation, its nonlinear forces, and its changes along the
+    record.
     """
-    field = linear if again else with_evident_drag(linear)
-    if field is linear:
-        field = linear if linear.misread else with_air_drag(linear)
+    candidate_set = linear if again else with_evident_drag(linear)
+    if candidate_set is linear:
+        candidate_set = linear if linear.misread else with_air_drag(linear)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
-    field, forces = (field, ()) if field.misread else nonlinear_forces(field, visible)
-    if forces and field.drag is not None:
+    candidate_set, forces = (
+        (candidate_set, ()) if candidate_set.misread else nonlinear_forces(candidate_set, visible)
+    )
+    if forces and candidate_set.drag is not None:
         # A stiffness that depends on the deflection may have passed for a little drag.
         without, alone = nonlinear_forces(linear, visible)
-        if alone and without.bic < field.bic:
-            field, forces = without, alone
-    field, changes = along_time(field.with_orders_free())
+        if alone and without.bic < candidate_set.bic:
+            candidate_set, forces = without, alone
+    candidate_set, changes = along_time(candidate_set.with_orders_free())
     one_sweep = linear.comparison.measurement.one_sweep
-    if not one_sweep and (forces or field.drag is not None):
-        # What changes along the record may have looked like an amplitude, which does so as well.
-        other, other_changes = along_time(linear.with_orders_free(), rival_bic=field.bic)
-        if other_changes and other.bic < field.bic:
+    if not one_sweep and (forces or candidate_set.drag is not None):
+        # A change along the record may have been mistaken for a dependence on the amplitude.
+        other, other_changes = along_time(linear.with_orders_free(), rival_bic=candidate_set.bic)
+        if other_changes and other.bic < candidate_set.bic:
             return other, (), other_changes
-    return field, forces, changes
+    return candidate_set, forces, changes
 
 
 def freest_alone(
@@ -451,10 +444,10 @@ def freest_alone(
 ) -> tuple[Headline, tuple[Finding, ...], RecordAnalysis]:
     """Fit the freest structure on a uniform beam, in a quarter of `select`'s time.
 
-    The modes are those of `select` where that selects such a beam with all orders free. Where it
-    selects anything else (drag, forces that are not linear), the residual shows it, and every
-    number carries a flag. Orders are not profiled: that one is not identifiable is told by
-    the modes that show and by the width of its interval.
+    The modes are those of `select` if that selects such a beam with all orders free. If it selects
+    another model (drag, nonlinear forces), the residual is not noise, and every number carries a
+    flag. Orders are not profiled: the visible modes and the width of the interval decide whether an
+    order is identifiable.
 
     Parameters
     ----------
@@ -465,95 +458,99 @@ def freest_alone(
     -------
     headline : Headline
     findings : tuple of Finding
-        What shows without a rival.
+        Findings that need no comparison of candidates.
     analysis : RecordAnalysis
-        That fit and one of `INTEGER`, the first first, with the noise.
+        That fit, then one of `INTEGER`, with the noise.
 
     Raises
     ------
     MeasurementError
         The record cannot be used.
     """
-    return _with_knocks(measurement, lambda each: _freest_alone(each, band_hz)).said
+    return _with_knocks(measurement, lambda each: _freest_alone(each, band_hz)).result
 
 
 def _freest_alone(
     measurement: Measurement, band_hz: tuple[float, float]
-) -> _Told[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
-    """Fit the freest structure alone with what is known to have struck the beam."""
+) -> _Assessment[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
+    """Fit the freest structure alone with the known impacts."""
     misread = tuple(wrong_scale(Comparison.of(measurement, band_hz)))
-    beside = () if misread else (INTEGER,)
-    field = replace(CandidateSet.of_freest(measurement, (), band_hz, beside), misread=misread)
+    additional = () if misread else (INTEGER,)
+    candidate_set = replace(
+        CandidateSet.of_freest(measurement, (), band_hz, additional), misread=misread
+    )
     if not misread:
-        field = field.with_special_cases()
-    modal = _modal(field)
-    visible = _visible(field, modal)
-    white, related, multiples = _tests(field, modal, band_hz)
-    found = findings(field, (), multiples)
+        candidate_set = candidate_set.with_special_cases()
+    modal = _modal(candidate_set)
+    visible = _visible(candidate_set, modal)
+    white, related, multiples = _tests(candidate_set, modal, band_hz)
+    found = findings(candidate_set, (), multiples)
     kinds = {finding.kind for finding in found}
     explained = white.white and not related.related
-    wrong = _wrong(kinds, explained=explained)
-    told = of_fit(
-        field.best.name,
-        field.best.fit,
+    wrong = _wrong_model_reason(kinds, explained=explained)
+    result = of_fit(
+        candidate_set.best.name,
+        candidate_set.best.fit,
         visible,
-        {} if misread else _untold_orders(field, visible),
+        {} if misread else _unidentifiable_orders(candidate_set, visible),
         unexplained=wrong,
-        both=None if misread else field.with_both_dampings(field.best),
+        both=None if misread else candidate_set.with_both_dampings(candidate_set.best),
     )
     doubt = wrong or (_CLIPPED if "clipping" in kinds else None)
     test = _uniform_beam_test(measurement, modal)
-    told = _with_modes(told, measurement, modal, test, doubt, doubt)
+    result = _with_modes(result, measurement, modal, test, doubt, doubt)
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
-        found += _settings(field, told, kinds)
-        found = _as_sure(found, (), wrong, doubt, told.flags, explained=explained)
-        found = _with_knocks_and_rest(field, found, white, related)
-    told = told.doubted(_CLIPPED) if "clipping" in kinds else told
-    others = (each.fit for each in field.candidates if each.structure is INTEGER)
-    analysis = RecordAnalysis.of((told.fit, *others), field.noise, field.comparison)
-    return _Told((told, found, analysis), field, explained, kinds)
+        found += _settings(candidate_set, result, kinds)
+        found = _with_doubts(found, (), wrong, doubt, result.flags, explained=explained)
+        found = _with_knocks_and_unexplained(candidate_set, found, white, related)
+    result = result.doubted(_CLIPPED) if "clipping" in kinds else result
+    others = (each.fit for each in candidate_set.candidates if each.structure is INTEGER)
+    analysis = RecordAnalysis.of(
+        (result.fit, *others), candidate_set.noise, candidate_set.comparison
+    )
+    return _Assessment((result, found, analysis), candidate_set, explained, kinds)
 
 
-def _untold_orders(field: CandidateSet, visible: tuple[int, ...]) -> dict[str, str]:
-    """Say by the fit alone which orders are not identifiable, and why."""
-    freest, *others = field.candidates
-    untold = untold_reason(field, visible)
+def _unidentifiable_orders(candidate_set: CandidateSet, visible: tuple[int, ...]) -> dict[str, str]:
+    """Return the orders that are not identifiable by the fit alone, with reasons."""
+    freest, *others = candidate_set.candidates
+    reason = not_reported_reason(candidate_set, visible)
     found = {}
     for name in COEFFICIENT_OF.keys() & set(freest.structure.free):
         low, high = freest.fit.interval[name] or (-math.inf, math.inf)
         too_wide = high - low > WIDEST_SHARE * (ORDER_RANGE[1] - ORDER_RANGE[0])
-        # An interval that is too narrow for what lies between: a valley of its own.
+        # An interval that is too narrow for what lies between: a local minimum of its own.
         astray = not low <= 1 <= high and any(
             each.structure.fixed.get(name) == 1.0  # type: ignore[call-overload]
             and each.deviance - freest.deviance < NORMAL_95**2
             for each in others
         )
-        if untold or too_wide or astray or freest.fit.interval[COEFFICIENT_OF[name]] is None:
-            found[name] = untold or NOT_DETERMINED
+        if reason or too_wide or astray or freest.fit.interval[COEFFICIENT_OF[name]] is None:
+            found[name] = reason or NOT_DETERMINED
     return found
 
 
-def _wrong(kinds: Collection[str], *, explained: bool) -> str | None:
-    """Say why the model is not to be believed, by what was found; None: it may be."""
+def _wrong_model_reason(kinds: Collection[str], *, explained: bool) -> str | None:
+    """Return why the findings refute the model; None if they do not."""
     if not _MISREAD_KINDS.isdisjoint(kinds):
         return MISREAD
     return UNEXPLAINED if "harmonics" in kinds or not explained else None
 
 
-def _doubt(changes: tuple[Change, ...], *, one_sweep: bool) -> str | None:
-    """Say why no parameter is to be believed though all of the record is explained, or None.
+def _doubt_reason(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> str | None:
+    """Return why no parameter is valid although the record is explained, or None.
 
-    The modes are what each was when it was passed.
+    The mode parameters are those at the time when the sweep passed each mode.
     """
     if established(changes, one_sweep=one_sweep):
         return None
     return next((f"{change.name} would explain the record as well" for change in changes), None)
 
 
-def _as_sure(
-    beside: tuple[Finding, ...],
+def _with_doubts(
+    from_model: tuple[Finding, ...],
     along: tuple[Finding, ...],
     wrong: str | None,
     doubt: str | None,
@@ -561,49 +558,46 @@ def _as_sure(
     *,
     explained: bool,
 ) -> tuple[Finding, ...]:
-    """Tell as facts only what is sure.
+    """Return all findings, with the doubtful ones marked as not established.
 
-    Parameters
-    ----------
-    beside, along : tuple of Finding
-        Beside the beam, and what changes along the record, which says itself how sure it is.
-    wrong, doubt : str or None
-        Why the model is not to be believed, and why no number of it.
-    flags : mapping of str to str
-        Reasons against single parameters, as the headline has them.
-    explained : bool
-        Whether harmonics are all that remains: then they are what they seem to be.
+    `from_model` are effects that were fitted with the beam, `along` the changes along the record,
+    which already state their certainty. `wrong` is the reason against the model, `doubt` the reason
+    against all numbers and `flags` those against single parameters. `explained` states that
+    harmonics are all that remains.
     """
 
-    def as_sure(each: Finding) -> Finding:
+    def qualified(each: Finding) -> Finding:
         flag = next((flags[name] for name in each.parameters if name in flags), None)
         reason = doubt or flag
         if reason is None or (each.kind == "harmonics" and explained):
             return each
         return doubted(each, reason)
 
-    beside = tuple(map(as_sure, beside))
+    from_model = tuple(map(qualified, from_model))
     if wrong is not None:
         along = tuple(doubted(each, wrong) for each in along)
-    return (*beside, *along)
+    return (*from_model, *along)
 
 
-def _with_knocks_and_rest(
-    told: CandidateSet, found: tuple[Finding, ...], white: Whiteness, related: InputRelation
+def _with_knocks_and_unexplained(
+    candidate_set: CandidateSet,
+    found: tuple[Finding, ...],
+    white: Whiteness,
+    related: InputRelation,
 ) -> tuple[Finding, ...]:
-    """Name knocks before all that was found, and after it what remains unexplained."""
+    """Add impacts before the other findings, and the unexplained residual after them."""
     explained = white.white and not related.related
-    knocks = of_knocks(told.comparison.measurement.knocks, explained=explained)
-    rest = () if explained else (unexplained(white, related, told.best.fit.modes),)
+    knocks = of_knocks(candidate_set.comparison.measurement.knocks, explained=explained)
+    rest = () if explained else (unexplained(white, related, candidate_set.best.fit.modes),)
     return (*knocks, *found, *rest)
 
 
 def _tests(
-    field: CandidateSet, modal: ModalFit | None, band_hz: tuple[float, float]
+    candidate_set: CandidateSet, modal: ModalFit | None, band_hz: tuple[float, float]
 ) -> tuple[Whiteness, InputRelation, tuple[Harmonic, ...]]:
-    """Test what the modal model leaves, or the first candidate where there is none."""
-    comparison, counts = field.comparison, field.noise.counts
-    residual = field.best.fit.residual if modal is None else modal.residual
+    """Test the residual of the modal model, or of the first candidate if there is none."""
+    comparison, counts = candidate_set.comparison, candidate_set.noise.counts
+    residual = candidate_set.best.fit.residual if modal is None else modal.residual
     angle_rad = comparison.angle_rad[comparison.kept]
     of_variance_1 = comparison.in_time(residual) * math.sqrt(comparison.samples / 2)
     multiples = harmonics(angle_rad, of_variance_1, comparison.decimation.rate_hz, band_hz)
@@ -616,15 +610,15 @@ def _tests(
     )
 
 
-def _table(field: CandidateSet) -> tuple[Row, ...]:
-    best, least_aic = field.best, min(c.aic for c in field.candidates)
+def _table(candidate_set: CandidateSet) -> tuple[CandidateRow, ...]:
+    best, least_aic = candidate_set.best, min(c.aic for c in candidate_set.candidates)
     return tuple(
-        Row(
+        CandidateRow(
             structure=c.structure.name,
             parameters=c.parameters,
             cost=c.fit.cost,
             delta_bic=c.bic - best.bic,
             delta_aic=c.aic - least_aic,
         )
-        for c in field.candidates
+        for c in candidate_set.candidates
     )

@@ -1,4 +1,4 @@
-"""Sentences of the verdict on one record, and which experiments would tell more."""
+"""Sentences of the verdict on one record, and experiments that would clarify it."""
 
 from __future__ import annotations
 
@@ -44,38 +44,33 @@ LOSSES: Final[Mapping[Order, str]] = {
 
 
 def of_headline(
-    told: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, alone: bool
+    headline: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, alone: bool
 ) -> list[str]:
-    """Say what the modes show, what is known of the damping, and on which condition.
+    """Return sentences on the modes, the damping and the conditions of these numbers.
 
-    Parameters
-    ----------
-    told : Headline
-    orders : tuple of OrderVerdict
-        Alpha's and lambda's.
-    alone : bool
-        Whether nothing else explains the record as well.
+    `orders` are those of alpha and lambda; `alone` states that nothing else explains the record as
+    well.
     """
-    if len(told.visible_modes) < _SEVERAL:
-        said = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
+    if len(headline.visible_modes) < _SEVERAL:
+        sentences = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
     else:
-        said = [*uniformity(told.uniform_beam), *_of_damping(told, orders)]
-    if told.tolerant is None:
-        said += [order(each) for each in orders]
+        sentences = [*uniformity(headline.uniform_beam), *_of_damping(headline, orders)]
+    if headline.tolerant is None:
+        sentences += [order(each) for each in orders]
     else:
-        said += [slope(told, each) for each in orders]
-        said += _if_exact(told)
-    if told.explained:
-        said.append(
+        sentences += [slope(headline, each) for each in orders]
+        sentences += _if_exact(headline)
+    if headline.explained:
+        sentences.append(
             "The residual is white: this model suffices for this record."
             if alone
             else "The residual is white, but another model fits the record equally well."
         )
-    return said
+    return sentences
 
 
 def uniformity(test: UniformBeamTest | None) -> list[str]:
-    """Say whether a uniform beam predicts the modal constants; nothing if that was not tested.
+    """Return the sentence on the test of a uniform beam; nothing if it was not tested.
 
     Parameters
     ----------
@@ -96,32 +91,32 @@ def uniformity(test: UniformBeamTest | None) -> list[str]:
     ]
 
 
-def _of_damping(told: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -> list[str]:
-    """Say which damping there is, and which structures are excluded."""
-    if told.tolerant is not None:
-        excluded = told.with_status("excluded")
+def _of_damping(headline: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -> list[str]:
+    """Return sentences on the damping and the excluded structures."""
+    if headline.tolerant is not None:
+        excluded = headline.with_status("excluded")
         return [f"Excluded by the losses: {_types(excluded)}."] if excluded else []
-    free = told.fit.structure
+    free = headline.fit.structure
     dampings = _DAMPING[free.name]
     if any(each.reason == ANOTHER_DAMPING for each in orders):
         dampings = dampings.replace("only", "alone would do")
-    said = [f"{dampings}. Numbers are those of type {told.name}, all orders free."]
-    excluded = told.with_status("excluded")
-    if told.explained and excluded:
-        said.append(f"Excluded: {_types(excluded)}.")
-    if told.simpler is not None and told.simpler.fixed:
-        said.append(_condition(told.simpler))
-    return said
+    sentences = [f"{dampings}. Numbers are those of type {headline.name}, all orders free."]
+    excluded = headline.with_status("excluded")
+    if headline.explained and excluded:
+        sentences.append(f"Excluded: {_types(excluded)}.")
+    if headline.simpler is not None and headline.simpler.fixed:
+        sentences.append(_condition(headline.simpler))
+    return sentences
 
 
-def slope(told: Headline, verdict: OrderVerdict) -> str:
-    """Say what is known of one order as the slope of a loss over the modes in sight."""
-    estimate = told.tolerant
+def slope(headline: Headline, verdict: OrderVerdict) -> str:
+    """Return the sentence on one order: the slope of a loss over the visible modes."""
+    estimate = headline.tolerant
     assert estimate is not None
     name, of = verdict.order, _OF[verdict.order]
     if verdict.value is None or verdict.interval is None:
         return f"The order {name} of the {of} is not identifiable: {verdict.reason}."
-    shown = [mode.frequency_hz.value for mode in told.modes if mode.shown]
+    shown = [mode.frequency_hz.value for mode in headline.modes if mode.shown]
     return slope_of_loss(
         name, verdict.value, verdict.interval, shown, estimate, verdict.status, verdict.reason
     )
@@ -136,7 +131,7 @@ def slope_of_loss(
     status: Status,
     reason: str | None,
 ) -> str:
-    """Say how a loss grows over the modes in sight, on which assumption, and whether as f.
+    """Return the sentence on the growth of a loss over the visible modes, with its conditions.
 
     Parameters
     ----------
@@ -147,33 +142,33 @@ def slope_of_loss(
     shown_hz : sequence of float
         Frequencies of the modes.
     estimate : TolerantEstimate
-        What the order is of.
+        Estimate that contains the order.
     status : str
         "compatible", "fractional" or "open".
     reason : str or None
-        Why the order is not established; None if it is.
+        Reason why the order is not established; None if it is.
     """
     std = (interval[1] - interval[0]) / (2 * NORMAL_95)
     written, low, high = to_uncertainty((value, *interval), std)
     condition = "by damping ratios and residue phases alone"
     if estimate.basis == "geometry":
         condition = f"if frequencies are those of a uniform beam to {100 * estimate.uniformity:g} %"
-    said = (
+    sentences = (
         f"Between {min(shown_hz):.3g} and {max(shown_hz):.3g} Hz the {LOSSES[order]} grows as "
         f"f^{written} ({order}; 95 %: {low} to {high}), {condition}"
     )
     if reason is not None:
-        return f"{said}; not established, because {reason}."
+        return f"{sentences}; not established, because {reason}."
     end = {
         "compatible": "consistent with order 1",
         "fractional": "damping ratios and residue phases alone exclude order 1",
     }.get(status, "order 1 is doubtful, but damping ratios and residue phases do not exclude it")
-    return f"{said}: {end}."
+    return f"{sentences}: {end}."
 
 
-def _if_exact(told: Headline) -> list[str]:
-    """Say what an exactly uniform beam would give, where one predicts the modes."""
-    exact = told.exact
+def _if_exact(headline: Headline) -> list[str]:
+    """Return sentences on the estimates for an exactly uniform beam that predicts the modes."""
+    exact = headline.exact
     if exact is None:
         return []
     numbers = [
@@ -187,7 +182,7 @@ def _if_exact(told: Headline) -> list[str]:
 
 
 def order(verdict: OrderVerdict) -> str:
-    """Say what is known of one order on an exactly uniform beam."""
+    """Return the sentence on one order on an exactly uniform beam."""
     profile = verdict.profile
     low, high = profile.interval
     name, of = verdict.order, _OF[verdict.order]
@@ -214,12 +209,12 @@ def order(verdict: OrderVerdict) -> str:
 
 
 def _types(names: tuple[str, ...]) -> str:
-    """List structures."""
+    """Return a list of structures in words."""
     return f"type{'s' if len(names) > 1 else ''} {listed(sorted(names))}"
 
 
 def _condition(simpler: Simpler) -> str:
-    """Say what a simpler structure would give."""
+    """Return the sentence on the conditional estimate of a simpler structure."""
     taken = " and ".join(f"{name} = {value:g}" for name, value in simpler.fixed.items())
     numbers = [
         f"{name} = {_with_interval(simpler.parameters[name])}"
@@ -233,7 +228,7 @@ def _condition(simpler: Simpler) -> str:
 
 
 def _with_interval(quantity: Quantity) -> str:
-    """Write a number with its 95 % interval, to the digits that this gives a meaning."""
+    """Return a number with its 95 % interval, rounded to significant digits."""
     if quantity.interval_95 is None or not quantity.std:
         return f"{quantity.value:.4g}"
     low, high = quantity.interval_95
@@ -252,8 +247,8 @@ def _why_not(verdict: OrderVerdict) -> str:
     low, high = profile.interval
     if verdict.reason is not None and (profile.identifiable or not profile.walked):
         return verdict.reason
-    if len(profile.valleys) > 1:
-        equal = " and ".join(f"{value:.3f}" for value in sorted(profile.valleys))
+    if len(profile.local_minima) > 1:
+        equal = " and ".join(f"{value:.3f}" for value in sorted(profile.local_minima))
         return (
             f"{equal} fit the record equally well, each with a different damping (95 %: {low:.3f} "
             f"to {high:.3f}, with all that lies between)"
@@ -279,19 +274,19 @@ _ORDINALS: Final = {1: "first", 2: "second"}
 
 
 def experiments(
-    field: CandidateSet,
+    candidate_set: CandidateSet,
     orders: tuple[OrderVerdict, ...],
     visible: tuple[int, ...],
     found: tuple[Finding, ...],
     close: tuple[Candidate, ...],
 ) -> list[str]:
-    """Say what would tell more, beside the findings' remedies."""
+    """Return experiments that would clarify the verdict, in addition to the findings' remedies."""
     advice = []
     unknown = [o for o in orders if o.status == "not identifiable"]
     if unknown:
         names = " and ".join(o.order for o in unknown)
         if len(visible) < _ENOUGH:
-            advice.append(f"To determine {names}, {_for_two_modes(field, visible)}")
+            advice.append(f"To determine {names}, {_for_two_modes(candidate_set, visible)}")
         else:
             advice.append(
                 f"To determine {names}, run narrow, slow sweeps around the modes, or a wider sweep "
@@ -305,20 +300,20 @@ def experiments(
     return advice
 
 
-def _for_two_modes(field: CandidateSet, visible: tuple[int, ...]) -> str:
-    """Say how both of the first two modes would show."""
-    modes = {mode.number: mode.frequency_hz for mode in field.best.fit.modes}
+def _for_two_modes(candidate_set: CandidateSet, visible: tuple[int, ...]) -> str:
+    """Return the experiment that would show both of the first two modes."""
+    modes = {mode.number: mode.frequency_hz for mode in candidate_set.best.fit.modes}
     first_hz = modes.get(1, 0.0)
     at_hz = {1: first_hz, 2: modes.get(2, _SECOND * first_hz)}
     missing = next(number for number in (1, 2) if number not in visible)
     other = 3 - missing
-    last_hz = float(field.comparison.frequency_hz[-1])
+    last_hz = float(candidate_set.comparison.frequency_hz[-1])
     if at_hz[missing] > last_hz:
         return (
             f"analyse and excite the {_ORDINALS[missing]} mode as well: band and sweep up to at "
             f"least {1.3 * at_hz[missing]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
         )
-    if not driven(field.comparison, at_hz[missing], relative_to_hz=at_hz[other]):
+    if not driven(candidate_set.comparison, at_hz[missing], relative_to_hz=at_hz[other]):
         return f"excite the {_ORDINALS[missing]} mode as well: sweep " + (
             f"up to at least {1.3 * at_hz[2]:.0f} Hz."
             if missing == 2

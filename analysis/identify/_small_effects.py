@@ -1,10 +1,9 @@
-"""Small effects that are not linear, as columns beside the modal model.
+"""Small nonlinear effects, as columns in addition to the modal model.
 
 To first order in its size each adds to the torque a column of known shape: stiffness that rises
-with the deflection, air drag, backlash, dry friction, a sensor whose gain depends on the torque.
-One that
-improves the modal model is fitted with it, so that it biases no mode; it is named, and no fact: of
-several small effects a record seldom tells which it is.
+with the deflection, air drag, backlash, dry friction, a sensor whose gain depends on the torque. An
+effect that improves the modal model is fitted with it, so that it biases no mode. Its name is only
+a hypothesis: a record seldom distinguishes between several small effects.
 """
 
 from __future__ import annotations
@@ -46,18 +45,18 @@ the turning points alone."""
 
 @dataclass(frozen=True, slots=True)
 class SmallEffect:
-    """An effect that would improve the modal model.
+    """Small effect that would improve the modal model.
 
     Attributes
     ----------
     kind : str
-        As of a `Finding`.
+        Kind of the `Finding`.
     words : str
-        What it is, as sentences begin.
+        Description, as the beginning of a sentence.
     column : ndarray of complex, shape (K,)
         Spectrum of its torque in N·m per unit of its size.
     saved : float
-        Deviance that it saves.
+        Reduction of deviance.
     """
 
     kind: Kind
@@ -67,16 +66,16 @@ class SmallEffect:
 
     @property
     def linear(self) -> bool:
-        """Whether the first order in its size is exact."""
+        """Return whether the first order in its size is exact."""
         return self.kind in _LINEAR
 
     @property
     def large(self) -> bool:
-        """Whether it needs a model of its own."""
+        """Return whether it needs a model of its own."""
         return self.saved > LARGE and not self.linear
 
     def finding(self) -> Finding:
-        """Name it, as no fact."""
+        """Return the finding that names it as not established."""
         return Finding(
             kind=self.kind,
             sentence=(
@@ -89,14 +88,9 @@ class SmallEffect:
 
 
 def small_effect(comparison: Comparison, modal: ModalFit, plant: Plant) -> SmallEffect | None:
-    """Find the effect that would improve the modal model most, if any would.
+    """Return the effect that would improve the modal model most; None if none does.
 
-    Parameters
-    ----------
-    comparison : Comparison
-    modal : ModalFit
-    plant : Plant
-        A beam near it, whose motion the effects are computed of.
+    The effects are computed for the motion of `plant`, a beam close to the modal model.
     """
     effects = list(_effects(comparison, modal, plant))
     saved = modal.saved_by(np.array([column for _, _, column in effects]))
@@ -136,7 +130,7 @@ def _effects(
 
 
 def _friction(comparison: Comparison) -> NDArray[np.complex128]:
-    """Spectrum of a dry friction of 1 N·m against the motion of the motor, shape (K,)."""
+    """Return the spectrum of a dry friction of 1 N·m against the motor's motion, shape (K,)."""
     measurement = comparison.measurement
     angle = measurement.angle_from_rest(float(comparison.frequency_hz[-1]))
     speed = np.gradient(angle) * measurement.rate_hz

@@ -1,9 +1,10 @@
 """Score of a step of the stiffness in time: a clamp that slips, a beam that cracks.
 
-A mode of frequency omega that rings with q, and becomes stiffer by the share e at an instant,
-gains to first order what a force ``-e omega² q`` makes of it from then on; its state stays. In one
-sweep each mode is passed once, so such a step looks like modes that do not fit together: which
-instant saves most of the modal model's residual tells whether a step is a likely cause.
+If the stiffness of a ringing mode q of frequency omega rises by the fraction e at an instant, its
+response changes to first order by that to a force ``-e omega² q`` from then on; its state is
+continuous. In one sweep each mode is passed once, so such a step makes the modes inconsistent. The
+largest reduction of the modal model's residual over all instants shows whether a step is a likely
+cause.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ _DECAY: Final = 6.6
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Step of the stiffness that saves most of a residual.
+    """Step of the stiffness that explains most of a residual.
 
     Attributes
     ----------
     score : float
-        Deviance that it saves, to first order.
+        First-order reduction of deviance.
     instant_s : float
         Since the record's first tick.
     relative_change : float
@@ -54,12 +55,12 @@ class Step:
 
     @property
     def named(self) -> bool:
-        """Whether it saves more than chance would."""
+        """Return whether it explains more than chance would."""
         return self.score > NAMED_ABOVE
 
     @property
     def words(self) -> str:
-        """As sentences take it."""
+        """Return the step in words, for sentences."""
         change = float(f"{100 * self.relative_change:.1g}")
         return (
             f"a step of the stiffness by about {change:+g} % near {self.instant_s:.0f} s (each "
@@ -67,7 +68,7 @@ class Step:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """As `json.dumps` takes it."""
+        """Return the step as `json.dumps` takes it."""
         return {
             "name": "step in time",
             "score": self.score,
@@ -77,20 +78,13 @@ class Step:
 
 
 def step_score(comparison: Comparison, fit: ModalFit) -> Step:
-    """Find the step of the stiffness that saves most of the modal model's residual.
-
-    Parameters
-    ----------
-    comparison : Comparison
-        That was fitted to.
-    fit : ModalFit
-    """
+    """Return the step of the stiffness that explains most of the modal model's residual."""
     residual = fit.residual.view(np.float64)
     stiffened = _Stiffened(comparison, fit)
-    best, places = Step(0.0, 0.0, 0.0), np.linspace(0, comparison.samples, _INSTANTS + 2)[1:-1]
-    spacing = float(places[1] - places[0])
+    best, instants = Step(0.0, 0.0, 0.0), np.linspace(0, comparison.samples, _INSTANTS + 2)[1:-1]
+    spacing = float(instants[1] - instants[0])
     for _ in range(2):
-        found = np.array([stiffened.spectrum(int(place)) for place in places])
+        found = np.array([stiffened.spectrum(int(instant)) for instant in instants])
         rows = np.ascontiguousarray(found * fit.noise.weight).view(np.float64)
         rows = rows - (rows @ fit.span.T) @ fit.span
         sizes = np.einsum("ij,ij->i", rows, rows)
@@ -101,16 +95,17 @@ def step_score(comparison: Comparison, fit: ModalFit) -> Step:
         if scores[first] > best.score:
             best = Step(
                 score=float(scores[first]),
-                instant_s=comparison.first_s + float(places[first]) / comparison.decimation.rate_hz,
+                instant_s=comparison.first_s
+                + float(instants[first]) / comparison.decimation.rate_hz,
                 relative_change=float(along[first] / sizes[first]),
             )
-        places = places[first] + spacing * np.linspace(-1, 1, 2 * _FINER + 3)[1:-1]
-        places = places[(places > 0) & (places < comparison.samples)]
+        instants = instants[first] + spacing * np.linspace(-1, 1, 2 * _FINER + 3)[1:-1]
+        instants = instants[(instants > 0) & (instants < comparison.samples)]
     return best
 
 
 class _Stiffened:
-    """Torque by a stiffness that is larger from an instant on."""
+    """Torque by a higher stiffness from an instant on."""
 
     def __init__(self, comparison: Comparison, fit: ModalFit) -> None:
         self._comparison = comparison
@@ -133,11 +128,11 @@ class _Stiffened:
                 answers.append(turned * inertia * square * follows)
         self._vibrations, self._answers = np.array(vibrations), np.array(answers)
 
-    def spectrum(self, place: int) -> NDArray[np.complex128]:
-        """Spectrum of the torque by a change of 1 from a sample on, over the change, (K,)."""
+    def spectrum(self, instant: int) -> NDArray[np.complex128]:
+        """Return the spectrum of the torque by a step at a sample, per unit change, (K,)."""
         kept = self._comparison.kept
         later = self._vibrations.copy()
-        later[:, : kept.start + place] = 0.0
+        later[:, : kept.start + instant] = 0.0
         forces = np.fft.rfft(later, self._length)
         torque = np.fft.irfft(np.sum(forces * self._answers, axis=0), self._length)
         torque = torque[: self._decay.size] / self._decay

@@ -1,22 +1,21 @@
 """Changes along the record (damping, stiffness, gain), clocks of different rates, and backlash.
 
-Columns of known shape and unknown size, as `analysis.identify._refit` takes them: what the torque
-would gain if damping, stiffness or gain rose in proportion to the time, and what a hub does that
-follows the shaft only once a gap is closed. In one sweep time and frequency go together, so a
-damping that drifts competes with an order of the damping, and a gain that drifts with a filter.
-Where torque and angle were sampled by clocks of different rates, the torque's delay changes along
-the record.
+The columns have a known shape and unknown size, as for `analysis.identify._refit`: the change of
+the torque if damping, stiffness or gain rise in proportion to time, and the effect of a hub that
+follows the shaft with backlash. In one sweep time and frequency go together, so a damping that
+drifts competes with an order of the damping, and a gain that drifts with a filter. Where torque and
+angle were sampled by clocks of different rates, the torque's delay changes along the record.
 
-A mode that rings for seconds remembers the damping and the stiffness that it had: at 0.4 % of
-stiffness in 22 s, one of 2.6 Hz is 0.03 rad out of phase with what its frequency of the moment
-would make of it. With ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``,
-``R = p / (c k⁴ + p)``, its place in space u (a angle, where it does not vibrate, with the part q
-that vibrates) and what changes as ``1 + e w(t)``, a stress D of stiffness or damping::
+A mode that rings for seconds depends on its damping and stiffness in the past: with 0.4 % of
+stiffness in 22 s, a mode of 2.6 Hz is 0.03 rad out of phase with a mode of its present frequency.
+With ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``, ``R = p / (c k⁴ + p)``, its
+position u (the rigid part a angle plus the vibration q) and a stress D of the stiffness or damping
+that changes as ``1 + e w(t)``::
 
     D = o k⁴ q + gamma s^lambda u,    q = -R a angle - e (c k⁴ + p)^-1 w D
 
-the torque gains ``e a EI (w gamma s^lambda u - R w D)``, where w multiplies in time what stands to
-its right; o is ``zeta s^alpha`` for a damping that changes, and c for the stiffness of a beam whose
+the torque gains ``e a EI (w gamma s^lambda u - R w D)``, where w multiplies the term to its right
+in time; o is ``zeta s^alpha`` for a damping that changes, and c for the stiffness of a beam whose
 mass stays. The second equation put into the first, again and again, gives D.
 """
 
@@ -32,7 +31,7 @@ from analysis.identify._data import fast_length
 from analysis.identify._finding import Finding
 from analysis.identify._predictor import ResponseGrid, eigenvalues, torque_channel
 from analysis.identify._refit import MANY, Refit
-from analysis.identify._residual_tests import SURE
+from analysis.identify._residual_tests import SIGNIFICANT_STD
 from analysis.identify._verdict import STRONG
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
@@ -55,12 +54,12 @@ What = Literal["damping", "stiffness", "gain", "clock", "play"]
 
 _LEADS: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
 _GRADIENT: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness")
-_GAIN: Final = SURE**2 + 2 * math.log(20)
+_GAIN: Final = SIGNIFICANT_STD**2 + 2 * math.log(20)
 """Deviance that a column must save: five of them are tried on four candidates."""
 
 _IN_SIGHT: Final = 0.75
-"""Share of a rival's lower BIC that a column has to promise. The first order foretells it to a
-tenth."""
+"""Fraction of a rival's lower BIC that a column has to reach by prediction. The first order
+predicts it to a tenth."""
 
 UNIT_PLAY_RAD: Final = 1e-4
 _CLOCK_UNIT: Final = 1e-5
@@ -69,21 +68,21 @@ _TERMS: Final = 16
 """Terms of a Taylor series in time: enough for three radians."""
 
 _ROUNDS: Final = 8
-_SETTLED: Final = 0.01
+_CONVERGED: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
-    """One thing that changes along the record, or the backlash.
+class TemporalChange:
+    """Change of one property along the record, or the backlash.
 
     Attributes
     ----------
     what : str
     size, std : float
-        Change from the first sample to the last, relative; of clocks the relative difference of
+        Relative change from the first sample to the last; for clocks the relative difference of
         their rates; the backlash in rad.
     behind : float
-        BIC with it above the lowest without it.
+        BIC with it minus the lowest BIC without it.
     """
 
     what: What
@@ -93,81 +92,73 @@ class Change:
 
     @property
     def name(self) -> str:
-        """As sentences begin."""
+        """Return the name, as the beginning of a sentence."""
         return _NAMES[self.what]
 
     @property
     def certain(self) -> bool:
-        """Whether nothing else explains the record as well."""
+        """Return whether nothing else explains the record as well."""
         return self.behind < -STRONG
 
 
 def along_time(
-    field: CandidateSet, rival_bic: float = math.inf
-) -> tuple[CandidateSet, tuple[Change, ...]]:
-    """Find what changes along the record; refit all with it if nothing else explains it as well.
+    candidate_set: CandidateSet, rival_bic: float = math.inf
+) -> tuple[CandidateSet, tuple[TemporalChange, ...]]:
+    """Find changes along the record; refit all candidates with a certain one.
 
-    Parameters
-    ----------
-    field : CandidateSet
-    rival_bic : float
-        What else explains the record has this BIC (`CandidateSet.bic`): only what promises to come
-        near it is fitted.
-
-    Returns
-    -------
-    field : CandidateSet
-        The one given, unless something changes for certain.
-    changes : tuple of Change
-        What explains the record best of all, or as well as the best candidate.
+    Only columns that may come near `rival_bic`, the BIC of another explanation
+    (`CandidateSet.bic`), are fitted. Returns the candidates and the changes that explain the record
+    best or equally well.
     """
-    if field.misread:
-        return field, ()
-    lag = _lag_of_play(field.comparison)
-    most = field.best.bic + min(STRONG, _IN_SIGHT * (rival_bic - field.bic))
+    if candidate_set.misread:
+        return candidate_set, ()
+    lag = _lag_of_play(candidate_set.comparison)
+    most = candidate_set.best.bic + min(STRONG, _IN_SIGHT * (rival_bic - candidate_set.bic))
     tried: dict[What, tuple[float, Refit]] = {}
-    for lead in _leads(field):
-        for what, promised in _promising(field, lead, lag, most):
-            if promised < tried.get(what, (math.inf,))[0]:
-                refit, bic = _fitted(field, lead, what, lag)
+    for lead in _leads(candidate_set):
+        for what, predicted in _promising(candidate_set, lead, lag, most):
+            if predicted < tried.get(what, (math.inf,))[0]:
+                refit, bic = _fitted(candidate_set, lead, what, lag)
                 if bic < tried.get(what, (math.inf,))[0]:
                     tried[what] = (bic, refit)
     found = []
     for what, (bic, refit) in tried.items():
         sizes, std = refit.amplitudes()
         unit = _UNITS.get(what, 1.0)
-        change = Change(what, unit * float(sizes[-1]), unit * float(std[-1]), bic - field.best.bic)
+        change = TemporalChange(
+            what, unit * float(sizes[-1]), unit * float(std[-1]), bic - candidate_set.best.bic
+        )
         if change.behind < STRONG and _possible(change):
             found.append((change, refit))
     found.sort(key=lambda pair: pair[0].behind)
     if not found:
-        return field, ()
+        return candidate_set, ()
     first, refit = found[0]
     changes = tuple(c for c, _ in found if c.behind < first.behind + STRONG)
     if not first.certain or len(changes) > 1:
-        return field, changes
-    return field.with_columns(refit.columns, refit.noise_here()), changes
+        return candidate_set, changes
+    return candidate_set.with_columns(refit.columns, refit.noise_here()), changes
 
 
-def _possible(change: Change) -> bool:
-    """Whether a size is one: backlash is positive, and nothing changes by more than itself."""
+def _possible(change: TemporalChange) -> bool:
+    """Return whether a size is possible: backlash is positive, and no change exceeds 100 %."""
     return change.size > 0 if change.what == "play" else abs(change.size) < 1
 
 
-def _leads(field: CandidateSet) -> Iterator[Candidate]:
-    """Give the best candidate, and the simple ones that something may stand beside instead."""
-    yield field.best
-    for candidate in field.candidates[1:]:
+def _leads(candidate_set: CandidateSet) -> Iterator[Candidate]:
+    """Return the best candidate, and simple ones that a change may explain instead."""
+    yield candidate_set.best
+    for candidate in candidate_set.candidates[1:]:
         if candidate.structure in _LEADS:
             yield candidate
 
 
 def _promising(
-    field: CandidateSet, lead: Candidate, lag: NDArray[np.float64], most_bic: float
+    candidate_set: CandidateSet, lead: Candidate, lag: NDArray[np.float64], most_bic: float
 ) -> Iterator[tuple[What, float]]:
-    """Columns that to first order would make a candidate the best, with the BIC they promise."""
-    refit = field.refit(lead, 1)
-    columns = _columns(field.comparison, lead.fit.plant, lag)
+    """Return the columns whose predicted BIC would make a candidate the best, with the BIC."""
+    refit = candidate_set.refit(lead, 1)
+    columns = _columns(candidate_set.comparison, lead.fit.plant, lag)
     saved = refit.saved_by(np.array(list(columns.values())))
     for what, squares in zip(columns, saved.tolist(), strict=True):
         left = max(refit.cost - squares, 1e-3 * refit.cost)
@@ -178,22 +169,27 @@ def _promising(
 
 
 def _fitted(
-    field: CandidateSet, lead: Candidate, what: What, lag: NDArray[np.float64]
+    candidate_set: CandidateSet, lead: Candidate, what: What, lag: NDArray[np.float64]
 ) -> tuple[Refit, float]:
-    """Fit a candidate with one column beside it; give its BIC as well."""
-    refit = field.refit(lead, 1)
+    """Fit a candidate with one additional column; return its BIC as well."""
+    refit = candidate_set.refit(lead, 1)
     unknowns = refit.objective.unknowns
     size = 0.0
     for _ in range(_ROUNDS):
-        column = _column(field.comparison, refit.plant, lag, what, size)
-        columns = np.concatenate([field.columns, column[None]])
+        column = _column(candidate_set.comparison, refit.plant, lag, what, size)
+        columns = np.concatenate([candidate_set.columns, column[None]])
         before = refit.cost
         refit = Refit.descend(
-            field.comparison, unknowns, refit.x, field.noise, columns, max_evaluations=MANY
+            candidate_set.comparison,
+            unknowns,
+            refit.x,
+            candidate_set.noise,
+            columns,
+            max_evaluations=MANY,
         )
         moved, size = size, float(refit.amplitudes()[0][-1])
-        settled = abs(size - moved) < _SETTLED * abs(size)
-        if settled and abs(lead.values * math.log(before / refit.cost)) < 1:
+        converged = abs(size - moved) < _CONVERGED * abs(size)
+        if converged and abs(lead.values * math.log(before / refit.cost)) < 1:
             break
     deviance = lead.values * math.log(refit.cost / lead.values)
     return refit, deviance + (lead.parameters + 1) * math.log(lead.values)
@@ -202,13 +198,13 @@ def _fitted(
 def _columns(
     comparison: Comparison, plant: Plant, lag: NDArray[np.float64]
 ) -> dict[What, NDArray[np.complex128]]:
-    """Spectra of the torque by a change of 1 from the first sample to the last, each of (K,)."""
+    """Return spectra of the torque by a change of 1 over the record, each of (K,)."""
     slopes = _slopes(comparison, plant)
     return {what: _column(comparison, plant, lag, what, 0.0, slopes) for what in _NAMES}
 
 
 def _slopes(comparison: Comparison, plant: Plant) -> dict[What, NDArray[np.float64]]:
-    """Torque per relative change of what may change in time, each of shape (samples,)."""
+    """Return the torque per relative change of each property, each of shape (samples,)."""
     _, (zeta, gamma, gain, ratio) = comparison.prediction.torque(plant, _GRADIENT)
     return {
         "damping": plant.damping.zeta * zeta + plant.damping.gamma * gamma,
@@ -225,9 +221,9 @@ def _column(
     size: float,
     slopes: Mapping[What, NDArray[np.float64]] | None = None,
 ) -> NDArray[np.complex128]:
-    """Column at a size that is perhaps not small, divided by it, shape (K,).
+    """Return the column at a finite size, divided by the size, shape (K,).
 
-    `slopes` are those of `_slopes`, where they are known already.
+    `slopes` are the results of `_slopes`, if known.
     """
     if what == "play":
         return comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
@@ -236,27 +232,15 @@ def _column(
     ramp = np.linspace(-0.5, 0.5, comparison.samples)
     change = ramp * (slopes or _slopes(comparison, plant))[what]
     if what != "gain":
-        change += remembered(comparison, plant, ramp, what, size)
+        change += memory_torque(comparison, plant, ramp, what, size)
     return comparison.spectrum(change)
 
 
 def _sampled_late(comparison: Comparison, plant: Plant, size: float) -> NDArray[np.float64]:
-    """Torque that a faster clock adds to the samples, over the difference of the rates.
+    """Return the torque by a faster clock per difference of the rates, shape (samples,).
 
     The torque with time stamp t is that of t plus the difference times the time since the middle of
-    the record, by its Taylor series.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    plant : Plant
-    size : float
-        Difference of the rates, in `_CLOCK_UNIT`.
-
-    Returns
-    -------
-    ndarray, shape (samples,)
-        For one unit.
+    the record, by its Taylor series. `size` is in `_CLOCK_UNIT`.
     """
     prediction, time_s = comparison.prediction, comparison.times_s()
     since_s = _CLOCK_UNIT * (time_s - time_s.mean())
@@ -272,12 +256,12 @@ def _sampled_late(comparison: Comparison, plant: Plant, size: float) -> NDArray[
 
 
 def play(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Spectrum of the torque by a backlash of `UNIT_PLAY_RAD`, shape (K,)."""
+    """Return the spectrum of the torque by a backlash of `UNIT_PLAY_RAD`, shape (K,)."""
     return _column(comparison, plant, _lag_of_play(comparison), "play", 0.0)
 
 
 def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
-    """Hub's angle less the shaft's with a backlash of `UNIT_PLAY_RAD`, at the decimated rate."""
+    """Return the angle of the hub less that of the shaft with backlash, at the decimated rate."""
     highest_hz = float(comparison.frequency_hz[-1])
     half, here, hub = UNIT_PLAY_RAD / 2, 0.0, []
     shaft = comparison.measurement.angle_from_rest(highest_hz)
@@ -300,32 +284,21 @@ _DECAY: Final = 9.0
 
 _ORDERS: Final = 12
 _SMALL: Final = 1e-4
-"""Orders of the size that are followed at most, and the share of the stress that counts."""
+"""Highest order of the size, and smallest fraction of the stress that is significant."""
 
 
-def remembered(
+def memory_torque(
     comparison: Comparison,
     plant: Plant,
     change: NDArray[np.float64],
     what: Literal["damping", "stiffness"],
     size: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Torque by what changes, over its size, less what the derivative of the moment makes of it.
+    """Return the torque by the past of a change, per unit size, shape (samples,).
 
-    Parameters
-    ----------
-    comparison : Comparison
-    plant : Plant
-    change : ndarray, shape (samples,)
-        w at the samples kept; before and after as at its ends.
-    what : str
-        "stiffness": while the mass stays.
-    size : float
-        e.
-
-    Returns
-    -------
-    ndarray, shape (samples,)
+    This is the torque beyond the instantaneous derivative. `change`, shape (samples,), is w at the
+    retained samples, constant before and after. With `what` of "stiffness" the mass stays. `size`
+    is e.
     """
     n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
     length = fast_length(int(np.ceil(_PADDED * n)))
@@ -351,8 +324,8 @@ def remembered(
         return found
 
     of_modes = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
-    shares = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * of_modes)
-    for share, k in zip(shares.tolist(), of_modes.tolist(), strict=True):
+    stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * of_modes)
+    for stiffness, k in zip(stiffnesses.tolist(), of_modes.tolist(), strict=True):
         compliance = 1 / ((1 + internal) * k + inertial)
         follows = inertial * compliance
         at_first = own * k * -follows + external * (1 - follows)
@@ -363,9 +336,11 @@ def remembered(
             before, stress = stress, steady + size * (own * k + external) * moved
             if np.abs(stress - before).max() < _SMALL * np.abs(steady).max():
                 break
-        place = (1 - follows) * angle + size * moved
-        late = in_time(inertial * moved) + w * in_time(external * place)
-        total += share * (late - w * in_time(external * (1 - follows) * angle - follows * steady))
+        deflection = (1 - follows) * angle + size * moved
+        late = in_time(inertial * moved) + w * in_time(external * deflection)
+        total += stiffness * (
+            late - w * in_time(external * (1 - follows) * angle - follows * steady)
+        )
     return total[kept]
 
 
@@ -387,14 +362,15 @@ _KINDS: Final[dict[What, Kind]] = {
 }
 
 
-def established(changes: tuple[Change, ...], *, one_sweep: bool) -> bool:
-    """Whether one change, and nothing else, explains the record.
+def established(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> bool:
+    """Return whether one change, and nothing else, explains the record.
 
-    What changes with time never is from one sweep: it may change with frequency. Backlash may be.
+    A change with time is never established by one sweep: it may depend on frequency instead.
+    Backlash may be established.
 
     Parameters
     ----------
-    changes : tuple of Change
+    changes : tuple of TemporalChange
     one_sweep : bool
         As `Measurement` has it.
     """
@@ -403,12 +379,12 @@ def established(changes: tuple[Change, ...], *, one_sweep: bool) -> bool:
     return changes[0].what == "play" or not one_sweep
 
 
-def changing(changes: tuple[Change, ...], *, one_sweep: bool) -> Iterator[Finding]:
-    """Put in words what changes along the record.
+def changing(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> Iterator[Finding]:
+    """Yield findings on the changes along the record.
 
     Parameters
     ----------
-    changes : tuple of Change
+    changes : tuple of TemporalChange
     one_sweep : bool
         As `Measurement` has it.
     """
@@ -429,7 +405,7 @@ def changing(changes: tuple[Change, ...], *, one_sweep: bool) -> Iterator[Findin
             )
 
 
-def _size(change: Change) -> str:
+def _size(change: TemporalChange) -> str:
     if change.what == "play":
         return f"{1e3 * change.size:.2g} mrad"
     if change.what == "clock":
@@ -446,7 +422,7 @@ _THERE_AND_BACK: Final = (
 )
 
 
-def _finding(change: Change) -> Finding:
+def _finding(change: TemporalChange) -> Finding:
     half = NORMAL_95 * change.std
     of_play = change.what == "play"
     remedy = f"S{_THERE_AND_BACK}"

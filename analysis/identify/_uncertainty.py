@@ -1,4 +1,4 @@
-"""Uncertainty of what was estimated, and of what follows from it (delta method).
+"""Uncertainty of the estimates and of quantities derived from them (delta method).
 
 The covariance of the unknowns is that of a weighted least-squares estimate under the noise spectrum
 found, from the curvature of the sum of squares; parameters, modes, loss factors and the free decay
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _WORST_CONDITION: Final = 1e13
 
 _UNDETERMINED: Final = 20.0
-"""Standard deviation of a logarithm that says nothing: a factor of 1e9 either way."""
+"""Standard deviation of an undetermined logarithm: a factor of 1e9 either way."""
 
 _LARGEST_LN_OMEGA: Final = 50.0
 
@@ -41,7 +41,7 @@ _LARGEST_LN_OMEGA: Final = 50.0
 def covariance_of_unknowns(
     jacobian: NDArray[np.complex128], scatter: float, held: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Covariance of the unknowns that the data determine.
+    """Return the covariance of the unknowns that the data determine.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def parameter_uncertainty(
 
 
 def interval(name: str, value: float, std: float) -> tuple[float, float]:
-    """95 % confidence interval; `std` is of the logarithm where that is what was estimated."""
+    """Return the 95 % interval; `std` is that of the logarithm for logarithmic parameters."""
     half = NORMAL_95 * std
     if name in LOGARITHMIC:
         return value * math.exp(-half), value * math.exp(half)
@@ -143,17 +143,17 @@ def interval(name: str, value: float, std: float) -> tuple[float, float]:
 
 
 def interval_from_zero(value: float, std: float) -> tuple[float, float]:
-    """95 % confidence interval of what cannot be negative: of the symmetric one, what is possible.
+    """Return the 95 % interval of a non-negative quantity: the possible part of the symmetric one.
 
-    It begins at 0, one-sided, for an estimate within 1.96 standard deviations of it, also for one
-    that rests there. It covers a true value of 0 in 97.5 % of all records, others in 95 to 97.5 %.
+    It begins at 0, one-sided, if the estimate is within 1.96 standard deviations of 0 or at 0. It
+    covers a true value of 0 in 97.5 % of all records, others in 95 to 97.5 %.
 
     Parameters
     ----------
     value : float
         The estimate, 0 or more.
     std : float
-        Standard deviation that it would have if it could be negative.
+        Standard deviation without the bound at 0.
     """
     half = NORMAL_95 * std
     return max(value - half, 0.0), value + half
@@ -170,10 +170,10 @@ def damping_size(
     covariance: NDArray[np.float64],
     least_omega_rad_s: float,
 ) -> DampingSize | None:
-    """Loss factor that a damping causes, at the frequency where it depends least on its order.
+    """Return the loss factor of a damping at the frequency where it depends least on its order.
 
-    A record shows the loss. ``zeta omega^alpha`` alone is its size only to the first degree in the
-    order: where that is uncertain by 0.15, it is off by 4 % more than the loss is.
+    A record determines the loss. ``zeta omega^alpha`` equals it only to first order: if the order
+    is uncertain by 0.15, it is uncertain by 4 % more than the loss.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def damping_size(
     covariance : ndarray, shape (k, k)
         Theirs, coefficients as logarithms.
     least_omega_rad_s : float
-        That of the first mode: below it nothing rings, and what is lost there is of no use.
+        Frequency of the first mode: below it no mode rings, and a loss there is of no use.
     """
     if coefficient not in names:
         return None
@@ -218,7 +218,7 @@ def damping_size(
 
 
 def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[ModeEstimate, ...]:
-    """Frequencies and damping ratios with standard deviations, by the delta method.
+    """Return frequencies and damping ratios with standard deviations, by the delta method.
 
     Parameters
     ----------
@@ -263,37 +263,29 @@ def ringing(
     columns: NDArray[np.complex128],
     hum: NDArray[np.complex128],
 ) -> Ringing:
-    """Amplitudes of the free decay by mode, and how far beyond chance they are.
+    """Return the amplitudes of the free decay by mode, with their significance.
 
-    A hum is left out bin by bin, but starts and ends with the record and so leaks into all other
-    bins, which free decay would explain in part: what counts is what it explains beside the hum.
-
-    Parameters
-    ----------
-    poles : sequence of Pole
-    projected : Projected
-    scatter : float
-        Variance of the whitened residual's parts.
-    columns : ndarray of complex, shape (m, K)
-        Whitened spectra of the free decays, and of what was projected out beside them.
-    hum : ndarray of complex, shape (h, K)
-        Those of the lines.
+    A hum is excluded bin by bin. But it starts and ends with the record and so leaks into all other
+    bins, which the free decay would partly explain: only its reduction in addition to the hum
+    counts. `columns`, shape (m, K), are the whitened spectra of the free decays and of the other
+    projected terms, `hum`, shape (h, K), those of the lines, and `scatter` is the variance of the
+    residual's parts.
     """
     count = decay_columns(poles)
     columns, decays = columns[:count], projected.amplitudes[:count]
     explained = float(decays @ projected.amplitude_gram[:count, :count] @ decays)
     if len(hum) and decays.size:
         without = projected.residual - decays @ columns
-        beside, left = _combination(without, np.concatenate([columns, hum]))
+        combined, left = _combination(without, np.concatenate([columns, hum]))
         explained = _combination(without, hum)[1] - left
-        decays = beside[: decays.size]
+        decays = combined[: decays.size]
     amplitudes: dict[int, float] = {}
-    place = 0
+    start = 0
     for pole in poles:
         width = 2 if pole.oscillates else 1
-        size = float(np.linalg.norm(decays[place : place + width]))
+        size = float(np.linalg.norm(decays[start : start + width]))
         amplitudes[pole.mode] = max(amplitudes.get(pole.mode, 0.0), size)
-        place += width
+        start += width
     return Ringing(
         amplitude_nm=tuple(amplitudes.values()),
         chi_square=explained / scatter,
@@ -304,7 +296,7 @@ def ringing(
 def _combination(
     values: NDArray[np.complex128], columns: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], float]:
-    """Best real combination of columns, shape (m,), and the sum of squares that it leaves."""
+    """Return the best real combination of columns, (m,), and its remaining sum of squares."""
     parts = np.ascontiguousarray(columns).view(np.float64)
     size = np.sqrt(np.einsum("ij,ij->i", parts, parts))
     size[size == 0] = 1.0

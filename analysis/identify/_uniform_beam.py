@@ -1,10 +1,10 @@
-"""Test whether a uniform beam predicts the modal constants, and what its parameters then are.
+"""Test of a uniform beam against the modal constants, and estimate of its parameters.
 
 A plain uniform beam with both dampings predicts frequency, damping ratio and residue of every mode
 from seven parameters. Chi-square of the constants measured against those predicted is the test. No
 antenna is uniform to the precision at which frequencies are measured, so parameters are estimated
-with a stated tolerance: each ln f is uncertain by that much, each ln of a residue by three times as
-much, beside the noise.
+with a stated tolerance: each ln f has that standard deviation, each ln of a residue three times as
+much, in addition to the noise.
 """
 
 from __future__ import annotations
@@ -53,12 +53,13 @@ _LN_LOSS_RANGE: Final = (-18.0, 2.0)
 frequency."""
 
 _LN_RANGE: Final = 2.0
-"""How far ratio and stiffness may be from where the search begins, in logarithms."""
+"""Largest distance of ratio and stiffness from the start of the search, in logarithms."""
 
 _DELAY_UNIT_S: Final = 0.01
 _LARGEST_DELAY: Final = 1.0
 _RENEWALS: Final = 4
-"""Times that the shapes of a loaded or tilted beam are computed, with the beam found so far."""
+"""Number of times that the shapes of a loaded or tilted beam are computed, each with the current
+beam."""
 
 _STEP: Final = 1e-5
 _NEWTON_STEPS: Final = 6
@@ -74,15 +75,15 @@ REFUSED_BELOW: Final = 0.01
 
 _PLAUSIBLE: Final = 0.3
 """p-value from which the stated tolerance suffices: a beam that is more uneven reaches a lower one,
-since orders make up for part of what the tolerance does not."""
+since orders compensate a part of the excess."""
 
 _PLAUSIBLE_WIDER: Final = 0.1
 
 _WIDER: Final = 3e-3
-"""Tolerance that is tried where the stated one does not suffice."""
+"""Tolerance that is tested if the stated one does not suffice."""
 
 _LOOSE: Final = 0.05
-"""Tolerance with which frequencies and residues say next to nothing."""
+"""Tolerance with which frequencies and residues have almost no weight."""
 
 _FEWEST_MODES: Final = 2
 _NO_EFFECT: Final = 1e-4
@@ -99,7 +100,7 @@ _LARGEST_LN: Final = 300.0
 class ConstantsProblem:
     """Deviations of a uniform beam's modal constants from those measured.
 
-    Unknowns are what internal damping adds to the stiffness at the highest visible mode
+    Unknowns are the contribution of internal damping to the stiffness at the highest visible mode
     (``ln zeta omega^alpha``) and external damping to the inertia at the lowest
     (``ln gamma omega^lambda / (rho/EI omega²)``), which depend little on the orders; alpha and
     lambda; the logarithms of rho/EI and EI; and the delay.
@@ -112,7 +113,7 @@ class ConstantsProblem:
     nominal : Plant
         Rig and specimen as the file states them; with a mass at the tip, if it states one.
     uniformity : float
-        Relative standard deviation of each frequency, beside the noise.
+        Relative standard deviation of each frequency, in addition to the noise.
     tilt_deg : float, optional
         Inclination of the plane of motion along the beam at rest as the file states it.
     """
@@ -125,16 +126,16 @@ class ConstantsProblem:
         uniformity: float = 0.0,
         tilt_deg: float | None = None,
     ) -> None:
-        places = fit.rows(modes)
+        rows = fit.rows(modes)
         count = len(modes)
         self.modes = tuple(modes)
         self.nominal = nominal
         self.uniformity = uniformity
-        self.measured = fit.constants[places]
+        self.measured = fit.constants[rows]
         extra = np.zeros((count, len(CONSTANTS)))
         extra[:, CONSTANTS.index("ln_frequency")] = uniformity
         extra[:, CONSTANTS.index("ln_residue")] = 3 * uniformity
-        self.covariance = fit.covariance[np.ix_(places, places)] + np.diag(extra.ravel() ** 2)
+        self.covariance = fit.covariance[np.ix_(rows, rows)] + np.diag(extra.ravel() ** 2)
         self.compared = count * len(CONSTANTS)
         self._whitener = np.linalg.inv(np.linalg.cholesky(self.covariance))
         length = nominal.beam.length_m
@@ -170,11 +171,11 @@ class ConstantsProblem:
         self._offset[2] = 2 * first
 
     def parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """`PARAMETERS` of unknowns, shape (..., 7), those of `LOGARITHMIC` by their logarithms."""
+        """Return `PARAMETERS` for unknowns, shape (..., 7); `LOGARITHMIC` ones as logarithms."""
         return x @ self.transform.T + self._offset
 
     def plant(self, x: NDArray[np.float64]) -> Plant:
-        """Beam of a vector of unknowns."""
+        """Return the plant of a vector of unknowns."""
         zeta, alpha, gamma, lambda_, ratio, stiffness, delay_s = self.parameters(x).tolist()
         bending = math.exp(stiffness)
         return replace(
@@ -193,13 +194,9 @@ class ConstantsProblem:
     def constants(
         self, x: NDArray[np.float64], terms: ModeTerms | None = None
     ) -> NDArray[np.float64]:
-        """Modal constants of beams, from unknowns of shape (m, 7): (m, 4 n).
+        """Return the modal constants of beams, (m, 4 n), for unknowns of shape (m, 7).
 
-        Parameters
-        ----------
-        x : ndarray, shape (m, 7)
-        terms : ModeTerms, optional
-            Those of another beam than the one stated.
+        `terms` are those of a beam other than the stated one.
         """
         terms = self.terms if terms is None else terms
         zeta, alpha, gamma, lambda_, ratio, stiffness, delay = self.parameters(x).T[..., None]
@@ -247,13 +244,9 @@ class ConstantsProblem:
     def differences(
         self, x: NDArray[np.float64], terms: ModeTerms | None = None
     ) -> NDArray[np.float64]:
-        """Differences from the constants measured, (m, 4 n).
+        """Return the differences from the measured constants, (m, 4 n).
 
-        Parameters
-        ----------
-        x : ndarray, shape (m, 7)
-        terms : ModeTerms, optional
-            Those of another beam than the one stated.
+        `terms` are those of a beam other than the stated one.
         """
         with np.errstate(all="ignore"):  # a mode without a pole gives NaN
             off = self.constants(x, terms) - self.measured
@@ -265,7 +258,7 @@ class ConstantsProblem:
         return np.nan_to_num(self.differences(x) @ self._whitener.T, nan=1e6)
 
     def equations(self, x: NDArray[np.float64]) -> NormalEquations:
-        """Chi-square at a point and its derivatives, by central differences."""
+        """Return chi-square at a point and its derivatives, by central differences."""
         steps = _STEP * np.eye(x.size)
         every = self._deviations(np.concatenate([x[None], x + steps, x - steps]))
         deviation = every[0]
@@ -275,7 +268,7 @@ class ConstantsProblem:
         )
 
     def starts(self) -> list[NDArray[np.float64]]:
-        """Beams of several orders, with the losses that fit best."""
+        """Return beams of several orders, with the losses that fit best."""
         omega, first, last = self._omega, self._omega[0], self._omega[-1]
         found = []
         for alpha, lambda_ in itertools.product(_ORDERS, repeat=2):
@@ -298,7 +291,7 @@ class ConstantsProblem:
         return _descend(self.equations, x, self.lower, self.upper)
 
     def minima(self) -> list[Minimum]:
-        """Minima from all starts, the lowest first."""
+        """Return the minima from all starts, the lowest first."""
         found = self._minima(self.starts())
         for _ in range(_RENEWALS if self.stated != Alteration() else 0):
             self.terms = mode_terms(self.stated, self.plant(found[0].x).beam, self.modes)
@@ -308,38 +301,26 @@ class ConstantsProblem:
     def _minima(self, starts: Sequence[NDArray[np.float64]]) -> list[Minimum]:
         return sorted((self.minimum(x) for x in starts), key=lambda each: each.cost)
 
-    def held_at_edge(self, place: int, x: NDArray[np.float64]) -> Minimum:
-        """Descend with the size of a damping at the lower edge, where it does nothing.
+    def held_at_edge(self, index: int, x: NDArray[np.float64]) -> Minimum:
+        """Descend from `x` with a damping at the lower edge of its size, where it has no effect.
 
-        Parameters
-        ----------
-        place : int
-            Position of its coefficient among `PARAMETERS`.
-        x : ndarray, shape (7,)
-            Unknowns from which the search begins.
+        `index` is that of its coefficient among `PARAMETERS`.
         """
         high = self.upper.copy()
-        high[place] = self.lower[place]
+        high[index] = self.lower[index]
         return _descend(self.equations, x, self.lower, high)
 
-    def held(self, place: int, value: float, x: NDArray[np.float64]) -> Minimum:
-        """Descend with one of `PARAMETERS` held; `x` of the result are the unknowns.
+    def held(self, index: int, value: float, x: NDArray[np.float64]) -> Minimum:
+        """Descend from `x` with one of `PARAMETERS` held; the result's `x` are the unknowns.
 
-        Parameters
-        ----------
-        place : int
-            Among `PARAMETERS`.
-        value : float
-            As `parameters` has it.
-        x : ndarray, shape (7,)
-            Unknowns from which the search begins.
+        `value` is as in `parameters`.
         """
-        # The parameter takes the place of the unknown that it is made of with factor 1.
+        # The parameter replaces the unknown that contributes to it with factor 1.
         forward = np.eye(x.size)
-        forward[place] = self.transform[place] / self.transform[place, place]
+        forward[index] = self.transform[index] / self.transform[index, index]
         backward = np.linalg.inv(forward)
         low, high = self.lower.copy(), self.upper.copy()
-        low[place] = high[place] = (value - self._offset[place]) / self.transform[place, place]
+        low[index] = high[index] = (value - self._offset[index]) / self.transform[index, index]
 
         def equations(y: NDArray[np.float64]) -> NormalEquations:
             found = self.equations(backward @ y)
@@ -369,12 +350,12 @@ def _descend(
 
 @dataclass(frozen=True, slots=True)
 class UniformBeamTest:
-    """Whether a plain uniform beam predicts the modal constants that a record shows.
+    """Test of whether a plain uniform beam predicts the modal constants of a record.
 
     Attributes
     ----------
     status : str
-        "passed", "refused", or "not tested" where the modes leave nothing to test.
+        "passed", "refused", or "not tested" without degrees of freedom.
     chi_square : float
     degrees_of_freedom : int
     p_value : float or None
@@ -396,24 +377,24 @@ class UniformBeamTest:
 
     @property
     def summary(self) -> BeamUniformity:
-        """Status and p-value, with their sentence."""
+        """Return status and p-value with the sentence."""
         return BeamUniformity(self.status, self.p_value)
 
     def as_json(self) -> dict[str, Any]:
-        """As `json.dumps` takes it; numbers may be not finite."""
+        """Return the test as `json.dumps` takes it; numbers may be not finite."""
         return {
             **self.summary.as_json(),
             "chi_square": self.chi_square,
             "degrees_of_freedom": self.degrees_of_freedom,
             "constants": [
                 {
-                    "mode": self.modes[place // len(CONSTANTS)],
-                    "name": CONSTANTS[place % len(CONSTANTS)],
+                    "mode": self.modes[index // len(CONSTANTS)],
+                    "name": CONSTANTS[index % len(CONSTANTS)],
                     "measured": measured,
                     "std": std,
                     "predicted": predicted,
                 }
-                for place, (measured, std, predicted) in enumerate(
+                for index, (measured, std, predicted) in enumerate(
                     zip(
                         self.measured.tolist(),
                         self.std.tolist(),
@@ -427,7 +408,7 @@ class UniformBeamTest:
 
 @dataclass(frozen=True, slots=True)
 class TolerantEstimate:
-    """Parameters of a nearly uniform beam from the modal constants, with a tolerance of geometry.
+    """Parameters of a nearly uniform beam, from the modal constants with a tolerance of geometry.
 
     Attributes
     ----------
@@ -436,7 +417,7 @@ class TolerantEstimate:
         ratios and residue phases alone; "none": no beam with two dampings of one order each
         explains even these.
     uniformity : float
-        Relative standard deviation of each frequency that was allowed for.
+        Assumed relative standard deviation of each frequency.
     p_value : float or None
     plant : Plant
     values, std : mapping of str to float
@@ -449,10 +430,10 @@ class TolerantEstimate:
     first_rad_s : float
         Frequency of the first visible mode.
     deviance_of_one : mapping of str to float
-        By how much order 1 raises chi-square of damping ratios and residue phases alone, by order;
-        0 where the interval holds 1.
+        Increase of chi-square of damping ratios and residue phases alone with order 1, by order; 0
+        where the interval holds 1.
     deviance_without : mapping of str to float
-        By how much chi-square rises without a damping, by its coefficient.
+        Increase of chi-square without a damping, by its coefficient.
     """
 
     basis: Basis
@@ -468,7 +449,7 @@ class TolerantEstimate:
     deviance_without: dict[str, float]
 
     def covariance_json(self) -> dict[str, Any]:
-        """Covariance of the parameters as `json.dumps` takes it."""
+        """Return the covariance of the parameters as `json.dumps` takes it."""
         names = [f"ln_{name}" if name in LOGARITHMIC else name for name in PARAMETERS]
         return {"names": names, "matrix": self.covariance.tolist()}
 
@@ -487,9 +468,9 @@ def uniform_beam_test(
         Inclination of the plane of motion along the beam at rest as the file states it.
     """
     modes = fit.visible
-    places = fit.rows(modes)
-    measured, std = fit.constants[places], np.sqrt(np.diag(fit.covariance)[places])
-    freedom = len(places) - len(PARAMETERS)
+    rows = fit.rows(modes)
+    measured, std = fit.constants[rows], np.sqrt(np.diag(fit.covariance)[rows])
+    freedom = len(rows) - len(PARAMETERS)
     if freedom <= 0:
         none = np.full(measured.size, np.nan)
         return UniformBeamTest("not tested", math.nan, 0, None, modes, measured, none, std)
@@ -514,8 +495,8 @@ def tolerant_estimate(
 ) -> TolerantEstimate | None:
     """Estimate damping and beam with a tolerance of the geometry.
 
-    A wider tolerance is taken where a uniform beam with the stated one does not predict the
-    constants; then losses and phases alone.
+    If a uniform beam with the stated tolerance does not predict the constants, a wider tolerance is
+    used; if that fails too, losses and phases alone.
 
     Parameters
     ----------
@@ -571,7 +552,7 @@ def tolerant_estimate(
 
 
 def _idle(problem: ConstantsProblem, best: Minimum) -> int:
-    """Count unknowns that do nothing at a minimum: those of a damping that is not there."""
+    """Count the unknowns without effect at a minimum: those of an absent damping."""
     spread = np.diag(best.equations.hessian)
     held = best.equations.held(best.x, problem.lower, problem.upper)
     return int(np.count_nonzero(held | (spread < _NO_EFFECT)))
@@ -580,7 +561,7 @@ def _idle(problem: ConstantsProblem, best: Minimum) -> int:
 def _estimate(
     problem: ConstantsProblem, minima: Sequence[Minimum], basis: Basis, p_value: float | None
 ) -> TolerantEstimate:
-    """Values, deviations and intervals at a minimum."""
+    """Return values, deviations and intervals at a minimum."""
     best = minima[0]
     plant = problem.plant(best.x)
     hessian = best.equations.hessian + np.diag(1 / (problem.upper - problem.lower) ** 2)
@@ -594,11 +575,11 @@ def _estimate(
     near = [each for each in minima if each.cost - best.cost < NORMAL_95**2]
     ends: dict[str, tuple[float, float]] = {}
     std: dict[str, float] = {}
-    for place, name in enumerate(PARAMETERS):
-        value, spread = float(values[place]), float(spreads[place])
+    for index, name in enumerate(PARAMETERS):
+        value, spread = float(values[index]), float(spreads[index])
         if name in _PROFILED:
-            low, high = (_end(problem, place, best, side * spread) for side in (-1.0, 1.0))
-            others = [float(problem.parameters(each.x)[place]) for each in near]
+            low, high = (_end(problem, index, best, side * spread) for side in (-1.0, 1.0))
+            others = [float(problem.parameters(each.x)[index]) for each in near]
             low, high = min(low, *others), max(high, *others)
         else:
             low, high = value - NORMAL_95 * spread, value + NORMAL_95 * spread
@@ -621,21 +602,22 @@ def _estimate(
     )
 
 
-def _end(problem: ConstantsProblem, place: int, best: Minimum, spread: float) -> float:
-    """End of a 95 % interval: where the profile of chi-square has risen by 3.84.
+def _end(problem: ConstantsProblem, index: int, best: Minimum, spread: float) -> float:
+    """Return the end of a 95 % interval, where the profile of chi-square has risen by 3.84.
 
-    Where it does not rise so far within the range of an order, the edge of that.
+    It is the edge of the range of an order if chi-square does not rise so far. `index` and `spread`
+    are the parameter and its standard deviation with the side as sign.
     """
-    centre = float(problem.parameters(best.x)[place])
+    centre = float(problem.parameters(best.x)[index])
     edge = math.copysign(math.inf, spread)
-    if PARAMETERS[place] in ("alpha", "lambda"):
+    if PARAMETERS[index] in ("alpha", "lambda"):
         edge = _ORDER_RANGE[0 if spread < 0 else 1]
     inside, rise, x = centre, 0.0, best.x
     trial = centre + NORMAL_95 * spread
     outside: float | None = None
     for _ in range(_PROFILE_STEPS):
         trial = max(trial, edge) if spread < 0 else min(trial, edge)
-        found = problem.held(place, trial, x)
+        found = problem.held(index, trial, x)
         root = math.sqrt(max(found.cost - best.cost, 0.0))
         if abs(root - NORMAL_95) < _CLOSE:
             return trial

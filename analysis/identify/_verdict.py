@@ -1,4 +1,4 @@
-"""The verdict on one record: structure, orders, what is not known, and what would tell."""
+"""Verdict on one record: structure, orders, limits of the data, and clarifying experiments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._drag import DampingAt
     from analysis.identify._finding import Finding
-    from analysis.identify._profile_likelihood import Order, Profile
+    from analysis.identify._profile_likelihood import LikelihoodProfile, Order
     from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
     from analysis.models import Structure
 
@@ -24,7 +24,7 @@ Status = Literal["compatible", "fractional", "open", "not identifiable", "absent
 
 STRONG: Final = 10.0
 """Difference of BIC from which the worse structure may be dismissed (Kass and Raftery, J. American
-Statistical Association 90 (1995) 773-795); below `EVEN` the data do not tell the two apart."""
+Statistical Association 90 (1995) 773-795); below `EVEN` the data do not distinguish the two."""
 
 EVEN: Final = 6.0
 
@@ -34,8 +34,8 @@ parameters that it lacks: chi-square's 0.1 %. A true one is excluded once in a t
 
 NOT_DETERMINED: Final = "the record does not determine the order"
 
-BESIDE_DRAG: Final = "air drag contributes to it, and its law is known to a few per cent only"
-"""Why external damping beside drag must not be taken for a property of the beam: of two records
+WITH_DRAG: Final = "air drag contributes to it, and its law is known to a few per cent only"
+"""Why external damping with drag is not a property of the beam: of two records
 of one rig, one had lambda four standard deviations off, with a drag that fell with the speed."""
 
 
@@ -43,7 +43,7 @@ of one rig, one had lambda four standard deviations off, with a drag that fell w
 
 _MODES_FOR_AN_ORDER: Final = 2
 _MODES_FOR_ONE_DAMPING: Final = 3
-"""Modes from which on it shows that there is no second damping: two loss factors are explained by
+"""Number of modes that shows whether there is a second damping: two loss factors are explained by
 coefficient and order of one damping as well as by two dampings."""
 
 ANOTHER_DAMPING: Final = "from two modes it cannot be told whether there is another damping as well"
@@ -51,7 +51,7 @@ ANOTHER_DAMPING: Final = "from two modes it cannot be told whether there is anot
 
 @dataclass(frozen=True, slots=True)
 class OrderVerdict:
-    """One order of the damping.
+    """Verdict on one order of the damping.
 
     Attributes
     ----------
@@ -60,13 +60,14 @@ class OrderVerdict:
     status : str
         "compatible": the 95 % interval holds 1; "fractional": the record excludes 1; "open": 1 is
         doubtful but not excluded, or something else explains as much; "not identifiable": it could
-        be almost anything; "absent": such damping does not show, though three modes would show it.
+        be almost any value; "absent": such damping is insignificant, though three modes would show
+        it.
     value : float or None
-        The estimate with the order free, where the order is identifiable.
+        Estimate with the order free, if it is identifiable.
     interval : tuple of float or None
         Its 95 % interval, by the likelihood ratio.
     reason : str or None
-        Why the number is not a property of the beam; None if it is.
+        Reason why the number is not a property of the beam; None if it is one.
     profile : Profile
     """
 
@@ -75,25 +76,22 @@ class OrderVerdict:
     value: float | None
     interval: tuple[float, float] | None
     reason: str | None
-    profile: Profile
+    profile: LikelihoodProfile
 
 
 def order_verdict(
-    field: CandidateSet, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
+    candidate_set: CandidateSet,
+    profile: LikelihoodProfile,
+    visible: tuple[int, ...],
+    *,
+    doubt: str | None,
 ) -> OrderVerdict:
-    """Judge one order.
+    """Assess one order in the freest structure.
 
-    Parameters
-    ----------
-    field : CandidateSet
-    profile : Profile
-        Profile of the order, in the freest structure on the beam selected.
-    visible : tuple of int
-        Modes that the record shows.
-    doubt : str or None
-        Why nothing that rests on that structure is to be believed; None: it may be.
+    `profile` is that of the order on the selected beam, `visible` the visible modes, and `doubt`
+    the reason against that structure; None if it is valid.
     """
-    status, reason = _judged(field, profile, visible, doubt=doubt)
+    status, reason = _status(candidate_set, profile, visible, doubt=doubt)
     known = status not in ("not identifiable", "absent")
     return OrderVerdict(
         order=profile.order,
@@ -105,27 +103,20 @@ def order_verdict(
     )
 
 
-def untold_reason(field: CandidateSet, visible: tuple[int, ...]) -> str | None:
-    """Say why no order can be told from a record, whatever its likelihood says; None if it may.
-
-    Parameters
-    ----------
-    field : CandidateSet
-    visible : tuple of int
-        Modes that the record shows.
-    """
-    return too_few_modes(field.freest.structure, len(visible))
+def not_reported_reason(candidate_set: CandidateSet, visible: tuple[int, ...]) -> str | None:
+    """Return why a record determines no order, whatever its likelihood; None if it may."""
+    return too_few_modes(candidate_set.freest.structure, len(visible))
 
 
 def too_few_modes(structure: Structure, modes: int) -> str | None:
-    """Say why so many modes tell no order, whatever the likelihood says; None if they may.
+    """Return why so many modes determine no order, whatever the likelihood; None if they may.
 
     Parameters
     ----------
     structure : Structure
         The freest that the data support.
     modes : int
-        How many show.
+        Number of visible modes.
     """
     # The loss at one frequency is all that one mode shows; what may narrow an order then is how
     # exactly the beam is uniform.
@@ -136,8 +127,8 @@ def too_few_modes(structure: Structure, modes: int) -> str | None:
     return None
 
 
-def deviance_of_one(profile: Profile) -> float:
-    """Deviance of order 1 above the lowest; infinite where the walk along the order ended before.
+def deviance_of_one(profile: LikelihoodProfile) -> float:
+    """Return the deviance of order 1 above the lowest; infinite beyond the end of the walk.
 
     Parameters
     ----------
@@ -146,21 +137,25 @@ def deviance_of_one(profile: Profile) -> float:
     return float(np.interp(1.0, profile.values, profile.deviance, left=np.inf, right=np.inf))
 
 
-def _judged(
-    field: CandidateSet, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
+def _status(
+    candidate_set: CandidateSet,
+    profile: LikelihoodProfile,
+    visible: tuple[int, ...],
+    *,
+    doubt: str | None,
 ) -> tuple[Status, str | None]:
-    freest, order = field.freest, profile.order
-    untold = untold_reason(field, visible)
-    if untold is not None:
-        return "not identifiable", untold
+    freest, order = candidate_set.freest, profile.order
+    reason = not_reported_reason(candidate_set, visible)
+    if reason is not None:
+        return "not identifiable", reason
     if not freest.structure.has(order):
         return "absent", "no such damping shows"
     if not profile.identifiable:
         return "not identifiable", NOT_DETERMINED
     if doubt is not None:
         return "open", doubt
-    if order == "lambda" and field.drag is not None:
-        return "open", BESIDE_DRAG
+    if order == "lambda" and candidate_set.drag is not None:
+        return "open", WITH_DRAG
     if profile.admits_one:
         return "compatible", None
     return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
@@ -170,8 +165,8 @@ def _judged(
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """One line of the table of candidates.
+class CandidateRow:
+    """Row of the table of candidates.
 
     Attributes
     ----------
@@ -193,7 +188,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What can be said of one record.
+    """Conclusions on one record.
 
     Attributes
     ----------
@@ -202,17 +197,17 @@ class Verdict:
     structure : str
         Structure of the lowest BIC: "I" to "VII".
     rivals : tuple of str
-        Structures that the data cannot tell from it.
+        Structures that the data do not distinguish from it.
     parameters : mapping of str to float
-        Those of the freest structure, as `RecordFit` names them, but for those that carry a flag.
+        Parameters of the freest structure without a flag, as `RecordFit` names them.
     adequate : bool
-        Whether what remains of that is noise.
+        Whether the residual of that structure is noise.
     alpha, lambda_ : OrderVerdict
     visible_modes : tuple of int
-        Modes that stand out of the noise.
+        Modes significantly above the noise.
     findings : tuple of Finding
-        What else is in the record.
-    table : tuple of Row
+        Other effects in the record.
+    table : tuple of CandidateRow
         All candidates, the lowest BIC first.
     whiteness : Whiteness
     input_relation : InputRelation
@@ -220,9 +215,9 @@ class Verdict:
     sentences : tuple of str
         The verdict in words, the most important first.
     experiments : tuple of str
-        What would tell more.
+        Experiments that would clarify the verdict.
     damping_with_amplitude : tuple of DampingAt
-        Damping in free vibration, where the air brakes the beam; else empty.
+        Damping in free vibration with air drag; else empty.
     """
 
     name: str
@@ -234,7 +229,7 @@ class Verdict:
     lambda_: OrderVerdict
     visible_modes: tuple[int, ...]
     findings: tuple[Finding, ...]
-    table: tuple[Row, ...]
+    table: tuple[CandidateRow, ...]
     whiteness: Whiteness
     input_relation: InputRelation
     harmonics: tuple[Harmonic, ...]
@@ -243,16 +238,16 @@ class Verdict:
     damping_with_amplitude: tuple[DampingAt, ...] = ()
 
     def as_json(self) -> dict[str, object]:
-        """As `json.dumps` takes it; what is not finite becomes null."""
+        """Return the verdict as `json.dumps` takes it; numbers that are not finite become null."""
         plain = _plain(dataclasses.asdict(self))
         assert isinstance(plain, dict)
         return plain
 
 
-def rivals(field: CandidateSet, within: float) -> tuple[Candidate, ...]:
-    """Candidates whose BIC is less than so much above that of the first, without the first."""
-    limit = field.best.bic + within
-    return tuple(c for c in field.candidates[1:] if c.bic < limit)
+def rivals(candidate_set: CandidateSet, within: float) -> tuple[Candidate, ...]:
+    """Return the candidates whose BIC is within a limit above that of the first."""
+    limit = candidate_set.best.bic + within
+    return tuple(c for c in candidate_set.candidates[1:] if c.bic < limit)
 
 
 def _plain(value: object) -> object:

@@ -1,4 +1,4 @@
-"""Visible modes: which a record shows, and whether the motor was driven where the others are."""
+"""Visible modes of a record, and excitation near the other modes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._result import RecordFit
 
 _EVIDENCE: Final = 400.0
@@ -19,7 +19,7 @@ _EVIDENCE: Final = 400.0
 then known to a twentieth of its height, and its damping to about a tenth."""
 
 _OVER_NOISE: Final = 1.4
-"""What remains of a smooth response, over the noise, which is itself known to 10-20 % only."""
+"""Least residual of a smooth response over the noise, which is known to 10-20 % only."""
 
 _NEAR: Final = 0.05
 _HALF_WIDTHS: Final = 4.0
@@ -31,28 +31,22 @@ _FEWEST_BINS: Final = 8
 """To either side."""
 
 _DEGREE: Final = 2
-"""Degree of the polynomial in frequency that a response without a resonance is near the mode."""
+"""Degree in frequency of the polynomial for a response without a resonance near the mode."""
 
 _DRIVEN: Final = 0.2
-"""Amplitude of what the motor was asked for, relative to that at mode 1, from which a mode counts
-as driven: a sweep has 1 there at all modes it passes, a step 1/6 at mode 2."""
+"""Amplitude of the reference, relative to that at mode 1, from which a mode counts as driven: a
+sweep has 1 there at all modes it passes, a step 1/6 at mode 2."""
 
 
-def visible_modes(comparison: Comparison, noise: Noise, fit: RecordFit) -> tuple[int, ...]:
-    """Modes without whose resonance the record cannot be explained.
+def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) -> tuple[int, ...]:
+    """Return the modes whose resonance is needed to explain the record.
 
-    Near each mode, the torque is compared with the best response to the angle that is smooth
-    there. What that leaves is noise alone, with chi-square of known mean and scatter, unless there
-    is a resonance: its energy against the noise is the evidence. Nothing is said of where exactly
-    in the window it lies, so a beam that is not uniform shows its modes as well. What the fit
-    explains better than the smooth response is evidence as well, in a long record of weaker ones.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    noise : Noise
-    fit : RecordFit
-        Tells where the modes are, and how wide.
+    Near each mode the torque is compared with the best smooth response to the angle. Without a
+    resonance the residual is noise, with chi-square of known mean and scatter; the energy of a
+    resonance against the noise is the evidence. The position of the resonance in the window does
+    not matter, so the modes of a beam that is not uniform are found as well. A fit that is better
+    than the smooth response is evidence as well, for weaker resonances in a long record. `fit`
+    provides the frequencies and widths of the modes.
     """
     torque = comparison.spectrum(comparison.torque_nm[comparison.kept])
     angle = comparison.spectrum(comparison.angle_rad[comparison.kept])
@@ -69,21 +63,21 @@ def visible_modes(comparison: Comparison, noise: Noise, fit: RecordFit) -> tuple
             torque[near] * weight, angle[near] * weight, offset[near] / reach_hz
         )
         # Chance does neither: together they are nearly eight standard deviations, or more.
-        stands_out = left - freedom > _EVIDENCE and left > _OVER_NOISE * freedom
+        significant = left - freedom > _EVIDENCE and left > _OVER_NOISE * freedom
         # In many bins a resonance need not stand out of the noise, where the fit knows where it is.
         own = float(np.vdot(fit.residual[near], fit.residual[near]).real)
-        if stands_out or left - own > _EVIDENCE:
+        if significant or left - own > _EVIDENCE:
             found.append(mode.number)
     return tuple(found)
 
 
 def driven(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
-    """Whether the motor was driven near one frequency nearly as much as near another."""
+    """Return whether the excitation near one frequency is almost as large as near another."""
     measurement = comparison.measurement
-    asked = measurement.reference_rad
-    asked_rad = measurement.angle_from_rest(1.0) if asked is None else asked - asked[0]
-    power = np.abs(np.fft.rfft(asked_rad)) ** 2
-    hz = np.fft.rfftfreq(asked_rad.size, 1 / measurement.rate_hz)
+    reference = measurement.reference_rad
+    moved_rad = measurement.angle_from_rest(1.0) if reference is None else reference - reference[0]
+    power = np.abs(np.fft.rfft(moved_rad)) ** 2
+    hz = np.fft.rfftfreq(moved_rad.size, 1 / measurement.rate_hz)
 
     def amplitude(at_hz: float) -> float:
         near = np.abs(hz - at_hz) <= max(_NEAR * at_hz, _FEWEST_BINS * hz[1])
@@ -93,24 +87,19 @@ def driven(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -
 
 
 def _reach_hz(comparison: Comparison, frequency_hz: float, damping_ratio: float) -> float:
-    """How far to either side of a mode is looked."""
+    """Return the half width of the window around a mode."""
     spacing_hz = float(comparison.frequency_hz[1] - comparison.frequency_hz[0])
-    share = min(max(_NEAR, _HALF_WIDTHS * damping_ratio), _FARTHEST)
-    return max(share * frequency_hz, (_FEWEST_BINS + 0.5) * spacing_hz)
+    fraction = min(max(_NEAR, _HALF_WIDTHS * damping_ratio), _FARTHEST)
+    return max(fraction * frequency_hz, (_FEWEST_BINS + 0.5) * spacing_hz)
 
 
 def _chi_square_of_smooth(
-    torque: NDArray[np.complex128], angle: NDArray[np.complex128], place: NDArray[np.float64]
+    torque: NDArray[np.complex128], angle: NDArray[np.complex128], position: NDArray[np.float64]
 ) -> float:
-    """Sum of squares that the best smooth response leaves.
+    """Return the sum of squares of the best smooth response to whitened spectra of shape (K,).
 
-    Parameters
-    ----------
-    torque, angle : ndarray of complex, shape (K,)
-        Whitened spectra.
-    place : ndarray, shape (K,)
-        Within the window, -1 to 1.
+    `position` is that within the window, -1 to 1.
     """
-    columns, _ = np.linalg.qr(np.array([place**k * angle for k in range(_DEGREE + 1)]).T)
+    columns, _ = np.linalg.qr(np.array([position**k * angle for k in range(_DEGREE + 1)]).T)
     left = torque - columns @ (columns.conj().T @ torque)
     return float(np.vdot(left, left).real)

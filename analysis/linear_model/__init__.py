@@ -1,7 +1,8 @@
 """Linear models of an identified antenna, for the design of controllers and for simulations.
 
-`identified_in_session` and `identified_in_document` hold what an analysis found; `linear_model`
-makes a state space of it with its error, its uncertainty and samples of the posterior.
+`identified_in_session` and `identified_in_document` return the result of an analysis;
+`linear_model` converts it to a state space with its error, its uncertainty and samples of the
+posterior.
 """
 
 import lazy_loader as lazy

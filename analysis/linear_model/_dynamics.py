@@ -39,12 +39,12 @@ _BUTTERWORTH: Final = 2**0.5
 
 
 class LinearModelError(UserError, ValueError):
-    """A model cannot be realised; the message names the cause and the remedy."""
+    """The model cannot be realised; the message names the cause and the remedy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dynamics:
-    """What is realised: a response from motor angle to coupling torque and its poles.
+    """Response from motor angle to coupling torque, with its poles, to be realised.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Dynamics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertain:
-    """Dynamics that depend on parameters of which values and covariance are known.
+    """Dynamics as a function of parameters with known values and covariance.
 
     Attributes
     ----------
@@ -237,8 +237,8 @@ def modal_dynamics(
         pairs=np.concatenate([modes, residual]),
         names=(
             *(
-                f"mode_{number}" if number else f"resonance_{place}"
-                for place, number in enumerate(numbers, start=1)
+                f"mode_{number}" if number else f"resonance_{index}"
+                for index, number in enumerate(numbers, start=1)
             ),
             *(f"residual_{number}" for number in range(1, residual.size + 1)),
         ),

@@ -117,13 +117,13 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearModel:
-    """A model that was exported.
+    """An exported model.
 
     Attributes
     ----------
     identified : IdentifiedModel
     kind : str
-        Which of its models was realised: "beam" or "modal".
+        Realised model: "beam" or "modal".
     uncertain : Uncertain
         Its parameters.
     options : ModelOptions
@@ -145,7 +145,7 @@ class LinearModel:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of the model."""
+        """Return remarks for users of the model."""
         if self.kind == "modal":
             return self.identified.modal_notes
         status, _ = self.identified.gate

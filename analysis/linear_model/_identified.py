@@ -1,4 +1,4 @@
-"""What an analysis identified, as a linear model needs it: from its document, or from a session."""
+"""Identified model of an analysis for linear models: from its document, or from a session."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class IdentifiedModel:
 
     @property
     def gate(self) -> tuple[str, float | None]:
-        """Whether a uniform beam predicts the modes: status, and p-value if it was tested."""
+        """Return the test of a uniform beam: status, and p-value if it was tested."""
         validity = self.headline.get("validity")
         gate = validity.get("uniform_beam") if isinstance(validity, dict) else None
         if not isinstance(gate, dict):
@@ -85,7 +85,7 @@ class IdentifiedModel:
 
     @property
     def modal(self) -> ModalModel | None:
-        """The modal model; None in documents of older versions."""
+        """Return the modal model; None in documents of older versions."""
         content = self.headline.get("modal_model")
         if content is None:
             return None
@@ -119,7 +119,7 @@ class IdentifiedModel:
 
     @property
     def beam_notes(self) -> tuple[str, ...]:
-        """What is doubtful about the parameters of the beam, or is not in a linear model."""
+        """Return doubts about the beam's parameters, and effects that a linear model lacks."""
         parameters = self._beam_block["parameters"]
         flagged = [name for name, each in parameters.items() if _flag(each)]
         notes = [f"flagged by the analysis: {', '.join(flagged)}"] if flagged else []
@@ -137,7 +137,7 @@ class IdentifiedModel:
 
     @property
     def modal_notes(self) -> tuple[str, ...]:
-        """Which modes of the modal model are doubtful."""
+        """Return the doubtful modes of the modal model."""
         listed = self.headline.get("modes")
         flagged = [
             str(each.get("mode"))
@@ -150,10 +150,10 @@ class IdentifiedModel:
 
     @property
     def _beam_block(self) -> Mapping[str, Any]:
-        """Parameters and covariance of the beam that the response is computed from.
+        """Return parameters and covariance of the beam for the response.
 
-        The beam that fits the record exactly where its covariance is stated: parameters with a
-        tolerance of the geometry do not place the resonances as exactly as they were measured.
+        This is the beam with exact geometry, if its covariance is stated: parameters with a
+        tolerance of the geometry reproduce the resonances less exactly than they were measured.
         """
         exact = self.headline.get("exact_geometry")
         if isinstance(exact, dict) and isinstance(exact.get("parameters"), dict):
@@ -340,7 +340,7 @@ def identified_in_session(path: Path) -> IdentifiedModel:
 
 
 def _flag(quantity: object) -> object:
-    """Return why a quantity is doubtful; nothing if it is not."""
+    """Return why a quantity is doubtful; an empty string if it is not."""
     return quantity.get("flag") if isinstance(quantity, dict) else None
 
 
@@ -357,7 +357,7 @@ def _is_finite(value: complex) -> bool:
 
 
 def _allowed(values: Mapping[str, float]) -> bool:
-    """Whether sampled parameters are those of a possible beam."""
+    """Return whether sampled parameters describe a possible beam."""
     orders = all(0 <= values[name] < 2 for name in _ORDERS if name in values)
     signed = all(
         value >= 0 or name in _NOT_LINEAR or name.startswith(_SIGNED)

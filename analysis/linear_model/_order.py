@@ -77,7 +77,7 @@ def realised(fit: PoleFit, order: int | None, given: Input) -> tuple[PoleStructu
 
 
 def _suffice(fit: PoleFit, pairs: int, real: int) -> bool:
-    """Whether a number of real poles suffices, with both integrators."""
+    """Return whether a number of real poles suffices, with both integrators."""
     ladders = _ladders(pairs, real, _MOST_INTEGRATORS)
     return any(fit.solve(structure)[1] <= MAX_RELATIVE_ERROR for structure in ladders)
 
@@ -104,7 +104,7 @@ def _best(
 ) -> tuple[PoleStructure, StateSpace] | None:
     """Return the most accurate stable realisation within a tolerance, None if there is none.
 
-    With the numbers of pairs and at least as many real poles as are given.
+    It has the given number of pairs and at least the given number of real poles.
     """
     found: list[tuple[float, int, PoleStructure, NDArray[np.float64]]] = []
     for structure in (

@@ -109,13 +109,13 @@ class PoleFit:
 
     @cached_property
     def check_s(self) -> NDArray[np.complex128]:
-        """Points of the band at which the error is determined, in rad/s."""
+        """Return the points of the band for the error, in rad/s."""
         frequency_hz = self._crowded(self.dynamics.band_hz, _CHECK_POINTS)
         return imaginary_axis(frequency_hz[self._apart(frequency_hz)])
 
     @cached_property
     def exact(self) -> NDArray[np.complex128]:
-        """Response there with filters, without delay, in N·m/rad."""
+        """Return the response there with filters, without delay, in N·m/rad."""
         return self.dynamics.filtered(self.check_s)
 
     def real_poles(self, structure: PoleStructure) -> tuple[float, ...]:
@@ -137,7 +137,7 @@ class PoleFit:
         Returns
         -------
         coefficients : ndarray
-            Residues, then D, V and K as far as it has them.
+            Residues, then those of D, V and K that the structure has.
         error : float
             Largest relative error in the band, on the points of the fit.
         """
@@ -184,7 +184,7 @@ class PoleFit:
         return np.abs(angle_response(system, self.check_s) / self.exact - 1)
 
     def stable_on_motor(self, structure: PoleStructure, coefficients: NDArray[np.float64]) -> bool:
-        """Whether a motor without friction, as heavy as the beam, is stable with it.
+        """Return whether a motor without friction, as heavy as the beam, is stable with it.
 
         Parameters
         ----------

@@ -55,7 +55,7 @@ class StateSpace:
 
     @property
     def order(self) -> int:
-        """Number of states."""
+        """Return the number of states."""
         return len(self.a)
 
     def response(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
@@ -89,7 +89,7 @@ class StateSpace:
 
 
 def with_filter(system: StateSpace, time_constant_s: float, order: int) -> StateSpace:
-    """Let the only output through a low-pass filter of order 1 or 2 (Butterworth).
+    """Return the system with a low-pass filter of order 1 or 2 (Butterworth) at its only output.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Frequency response of a record, by Welch's method (as in the paper) or by another estimator."""
+"""Frequency response of a record, by Welch's method (as in the reference paper) or another one."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 
 
 class EstimateError(ValueError):
-    """A record from which the estimate asked for cannot be made."""
+    """The requested frequency response cannot be estimated from this record."""
 
 
 class SettingsError(EstimateError):
-    """Settings that make no sense, or none for this record's rate."""
+    """The settings are inconsistent, or do not suit the record's rate."""
 
 
 def estimate(
     record: Record, settings: WelchSettings
 ) -> tuple[FrequencyResponse, FrequencyResponse]:
-    """Estimate the response that is to be fitted, and the whole-record one to compare it with.
+    """Estimate the response for the fits, and that of the whole record for comparison.
 
     Parameters
     ----------
@@ -112,9 +112,9 @@ def estimate(
 
 
 def _moving_reference_rad(record: Record) -> NDArray[np.float64]:
-    """Movement asked for, from where it began, shape (n,); `EstimateError` if there is none.
+    """Return the requested motion from its start, shape (n,).
 
-    An imported record may lack it.
+    Raise `EstimateError` if there is none: an imported record may lack it.
     """
     reference: NDArray[np.float64] = record.reference_rad - record.reference_rad[0]
     if not reference[record.first_sweep].any():
@@ -135,7 +135,7 @@ def _check_band(record: Record, band_hz: tuple[float, float]) -> None:
 
 
 def _check_segmentation(record: Record, segmentation: Segmentation) -> None:
-    """Say in terms of the options what `welch_response` would refuse."""
+    """Raise if `welch_response` would refuse the segments, in terms of the options."""
     length, overlap, nfft = segmentation.segment_length, segmentation.overlap, segmentation.nfft
     if overlap >= length:
         raise SettingsError(
@@ -156,7 +156,7 @@ def _check_segmentation(record: Record, segmentation: Segmentation) -> None:
 
 
 def _remedy(samples: int) -> str:
-    """Say what would fit a sweep of so many samples, as the end of a sentence."""
+    """Return segments that fit a sweep of so many samples, as the end of a sentence."""
     try:
         length, overlap = segment_lengths(samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION)
     except SpectralError:
@@ -170,7 +170,7 @@ def _remedy(samples: int) -> str:
 def estimate_warnings(
     record: Record, settings: WelchSettings, response: FrequencyResponse
 ) -> tuple[str, ...]:
-    """Sentences on what makes an estimate doubtful."""
+    """Return sentences on the reasons against an estimate."""
     found = []
     is_welch = settings.estimator != "fft"
     length = (
@@ -201,7 +201,7 @@ def estimate_warnings(
 
 
 def _excited_band_hz(metadata: Mapping[str, str]) -> tuple[float, float] | None:
-    """Band of the excitation, which may have swept it either way; None if the file lacks it."""
+    """Return the band of the excitation, in rising order; None if the file lacks it."""
     try:
         start_hz, stop_hz = float(metadata["start_hz"]), float(metadata["stop_hz"])
     except (KeyError, ValueError):

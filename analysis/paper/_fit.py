@@ -1,22 +1,22 @@
-"""Fit of the damping structures to a measured frequency response: the paper's cost, Eq. (26).
+"""Fit of the damping structures to a frequency response: Eq. (26) of the reference paper.
 
 ``J = sum_p W_p |G_exp(j omega_p) - Ĝ(j omega_p)|²`` with complex deviations and the weights of
-`analysis.models`. Its minimum is sought over the whole range of physical damping, without a guess
-from the user: a coarse sweep of all unknowns, descents from each of its hollows on a few hundred
-points that stand for all, and the best few of these polished on every point.
+`analysis.models`. Its minimum is searched over the whole range of physical damping, without a guess
+from the user: a coarse sweep of all unknowns, descents from each of its local minima on a few
+hundred representative points, and refinement of the best few on every point.
 
 The sweep is needed: the cost of types III, V and VI has several minima, and from a random start
-type VI falls into the best one in fewer than half of the cases. The paper sweeps the whole range of
-physical interest finely; here it is swept coarsely (`starts`).
+type VI falls into the best one in fewer than half of the cases. The reference paper sweeps the
+whole range of physical interest finely; here the sweep is coarse (`starts`).
 
-Standard deviations are from the covariance of a weighted least-squares fit, which reads every
-deviation of the model from the measurement as chance. What that is worth, measured on simulated
-sessions with type VI:
+Standard deviations are from the covariance of a weighted least-squares fit, which treats every
+deviation of the model from the measurement as random. Their accuracy on simulated sessions with
+type VI:
 
 * errors that are independent from bin to bin: within 20 % of the scatter of repeated fits;
 * errors shared by the nine neighbours that zero padding makes alike: half of that scatter, since
   a resonance is then narrower than one error and the fit absorbs most of it;
-* Welch's estimate of a chirp: leakage, not noise, is what remains, and the standard deviations
+* Welch's estimate of a chirp: leakage, not noise, dominates, and the standard deviations
   are 3 to 50 times the scatter between sessions. The bias itself is 1 to 7 times as large as
   they are, and 4 to 20 times if the structure is wrong.
 
@@ -57,12 +57,12 @@ _SAME_MINIMUM: Final = 0.02
 
 
 class FitError(ValueError):
-    """A frequency response to which no model can be fitted."""
+    """No model can be fitted to the frequency response."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrfFit:
-    """One structure fitted with one weighting.
+    """Fit of one structure with one weighting.
 
     Attributes
     ----------
@@ -70,13 +70,13 @@ class FrfFit:
     weighting : str
         Name of the weighting.
     damping : Damping
-        What was found, ready for `rigd.beam`.
+        Fitted damping, for use with `rigd.beam`.
     parameters : dict
         zeta, alpha, gamma and lambda, the fixed ones included.
     std : dict or None
-        Standard deviations of the same, 0 for the fixed ones; None if a parameter rests on the
-        edge of its range or the data do not determine it. Computed as if all that the model
-        leaves unexplained were chance, so no confidence intervals: see `analysis.paper._fit`.
+        Standard deviations of the same, 0 for the fixed ones; None if a parameter rests on the edge
+        of its range or the data do not determine it. Computed as if the whole residual were random,
+        so they give no confidence intervals: see `analysis.paper._fit`.
     cost : float
         Eq. (26) at the minimum, in (N·m/rad)².
     at_bounds : tuple of str
@@ -164,16 +164,16 @@ def fit_many(
 ) -> tuple[FrfFit, ...]:
     """Fit every structure with every weighting, structure by structure: see `fit_frf`.
 
-    Each fit comes out as it would alone; what they share is the work of preparing the grids.
+    Each fit has the same result as alone; only the preparation of the grids is common.
 
     Parameters
     ----------
     frequency_hz, response, beam, tool_inertia_kg_m2
         As for `fit_frf`.
     structures : iterable of Structure
-        By default the paper's six.
+        By default the six of the reference paper.
     weightings : iterable of str or callable
-        By default the paper's two.
+        By default the two of the reference paper.
     """
     structures, weightings = tuple(structures), tuple(weightings)
     _check(frequency_hz, response, structures)
@@ -182,10 +182,10 @@ def fit_many(
     grids: list[tuple[_Grid, _Grid]] = []
     for weighting in weightings:
         every = weights(omega, weighting)
-        index, share = thinned(response, every, _THINNED_POINTS)
+        index, point_weights = thinned(response, every, _THINNED_POINTS)
         few_model = FrequencyResponseModel(frequency_hz[index], beam, tool_inertia_kg_m2)
         grids.append(
-            (_Grid(few_model, response[index], share), _Grid(whole_model, response, every))
+            (_Grid(few_model, response[index], point_weights), _Grid(whole_model, response, every))
         )
     return tuple(
         _fit(structure, weighting_name(weighting), few, whole)
@@ -206,7 +206,7 @@ class _Grid:
     weights: NDArray[np.float64]
 
 
-class _Problem:
+class _FrfProblem:
     """Eq. (26) for one structure on one grid, as a function of the unknowns."""
 
     def __init__(self, unknowns: DampingUnknowns, grid: _Grid) -> None:
@@ -219,7 +219,7 @@ class _Problem:
         return float(self.grid.weights @ (deviation.real**2 + deviation.imag**2))
 
     def deviation_and_jacobian(self, x: NDArray[np.float64]) -> _Linearised:
-        """Model minus measurement, shape (n,), and its derivatives by the unknowns, (k, n)."""
+        """Return model minus measurement, (n,), and its derivatives by the unknowns, (k, n)."""
         return self._recent.at(x, self._linearise)
 
     def _linearise(self, x: NDArray[np.float64]) -> _Linearised:
@@ -242,7 +242,7 @@ class _Problem:
 def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfFit:
     unknowns = DampingUnknowns.of(structure, whole.model.beam)
     bounds = Box(*unknowns.bounds)
-    thin, full = _Problem(unknowns, few), _Problem(unknowns, whole)
+    thin, full = _FrfProblem(unknowns, few), _FrfProblem(unknowns, whole)
     found = [
         descend(thin.normal_equations, x, bounds, relative_tolerance=_THINNED_TOLERANCE)
         for x in starts(structure, thin.cost)
@@ -267,8 +267,8 @@ def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfF
     )
 
 
-def _polished(problem: _Problem, rough: Minimum, bounds: Box) -> Minimum:
-    """Descend to the bottom from where a rougher descent ended."""
+def _polished(problem: _FrfProblem, rough: Minimum, bounds: Box) -> Minimum:
+    """Continue to the minimum from the end of a rougher descent."""
     return descend(
         problem.normal_equations,
         rough.x,
@@ -279,15 +279,15 @@ def _polished(problem: _Problem, rough: Minimum, bounds: Box) -> Minimum:
 
 
 def _different(found: list[Minimum]) -> list[Minimum]:
-    """Minima that differ, the lowest first."""
-    kept: list[Minimum] = []
+    """Return the distinct minima, the lowest first."""
+    distinct: list[Minimum] = []
     for minimum in sorted(found, key=lambda m: m.cost):
-        if all(np.abs(minimum.x - other.x).max() > _SAME_MINIMUM for other in kept):
-            kept.append(minimum)
-    return kept
+        if all(np.abs(minimum.x - other.x).max() > _SAME_MINIMUM for other in distinct):
+            distinct.append(minimum)
+    return distinct
 
 
-def _standard_deviations(problem: _Problem, x: NDArray[np.float64]) -> dict[str, float] | None:
+def _standard_deviations(problem: _FrfProblem, x: NDArray[np.float64]) -> dict[str, float] | None:
     deviation, jacobian = problem.deviation_and_jacobian(x)
     covariance = sandwich_covariance(deviation, jacobian, problem.grid.weights)
     if covariance is None:
@@ -322,7 +322,7 @@ def _check(
 def thinned(
     measured: NDArray[np.complex128], weights: NDArray[np.float64], count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Choose points, densest where they count: on the flanks of peaks, and under large weights.
+    """Choose points, densest on the flanks of peaks and under large weights.
 
     Parameters
     ----------
@@ -337,7 +337,7 @@ def thinned(
     index : ndarray of int, shape (m,), m <= count
         Increasing.
     weights : ndarray, shape (m,)
-        Each point's share: its own weight and that of the points left out around it. Of sum 1.
+        Weight of each point with that of the omitted points around it. The sum is 1.
     """
     n = measured.size
     if n <= count:
@@ -408,12 +408,12 @@ def sandwich_covariance(
     jacobian: NDArray[np.complex128],
     weights: NDArray[np.float64],
 ) -> NDArray[np.float64] | None:
-    """Covariance of the unknowns, ``A⁻¹ B A⁻¹``, from the deviations that remain.
+    """Return the covariance of the unknowns, ``A⁻¹ B A⁻¹``, from the residual deviations.
 
     A is the Gauss-Newton Hessian and B the covariance of the gradient, summed over neighbouring
     bins as well as each bin alone (Newey and West, "A simple, positive semi-definite,
     heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica 55 (1987)
-    703-708): zero padding and the window make neighbours much alike.
+    703-708): zero padding and the window make neighbours similar.
 
     Parameters
     ----------
@@ -446,7 +446,7 @@ def sandwich_covariance(
 
 
 def _alike(deviation: NDArray[np.complex128]) -> int:
-    """Count the neighbouring bins that deviate alike: twice the lag of half the correlation."""
+    """Count correlated neighbouring bins: twice the lag of half the correlation."""
     half = 0.5 * np.vdot(deviation, deviation).real
     # A few lags, so not by transforms: those would cost as much as the model on every point.
     for lag in range(1, deviation.size):

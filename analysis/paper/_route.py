@@ -1,8 +1,8 @@
-"""Welch method, as in the paper: Welch's estimate of a record, twelve fits, and their indices.
+"""Welch method of the reference paper: Welch's estimate of a record, twelve fits, and indices.
 
 Each of six structures is fitted with two weightings. The indices are the distances between measured
 and fitted response, Eqs. (28) to (30), and the deviations of their resonant peaks, Eqs. (31) and
-(32); the torque that a model predicts in time is compared beside them.
+(32); the predicted torque is compared in the time domain as well.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def resonant_peaks(
     response: NDArray[np.complex128],
     mode_hz: NDArray[np.float64],
 ) -> tuple[Peak | None, ...]:
-    """Resonant peaks on the bins, as the paper takes them (not interpolated).
+    """Return the resonant peaks on the bins, as in the reference paper (not interpolated).
 
     Parameters
     ----------
@@ -111,8 +111,8 @@ def resonant_peaks(
         Positive, increasing.
     response : ndarray of complex, shape (n,)
     mode_hz : ndarray, shape (m,)
-        Where the modes are expected, increasing: a peak is sought between the geometric means of
-        neighbours, beyond the first and last as far again. The undamped frequencies will do.
+        Approximate mode frequencies, increasing: a peak is searched between the geometric means of
+        neighbours, and as far beyond the first and last. The undamped frequencies suffice.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def resonant_peaks(
     """
     magnitude = np.abs(response)
     ratio = np.sqrt(mode_hz[1:] / mode_hz[:-1])
-    # A lone mode is sought within half an octave.
+    # A single mode is searched within half an octave.
     first, last = (ratio[0], ratio[-1]) if ratio.size else (np.sqrt(2.0), np.sqrt(2.0))
     lower = mode_hz / np.concatenate(([first], ratio))
     upper = mode_hz * np.concatenate((ratio, [last]))
@@ -150,9 +150,9 @@ def resonant_peaks(
 
 
 def peak_deviation(measured: Peak, model: Peak) -> PeakDeviation:
-    """Deviations ``|omega_q - omega^_q|`` and ``||G| - |Ĝ||`` in dB, Eqs. (31) and (32).
+    """Return ``|omega_q - omega^_q|`` and ``||G| - |Ĝ||`` in dB, Eqs. (31) and (32).
 
-    The paper averages them over sessions; this is the term of one.
+    The reference paper averages them over sessions; this is the term of one session.
 
     Parameters
     ----------
@@ -179,13 +179,13 @@ _DECAY_OVER_RECORD = 2.7
 
 
 def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
-    """Causal response of the exact model to the whole record's measured angle.
+    """Return the causal response of the exact model to the whole record's measured angle.
 
-    The beam is taken to rest before the first sample, at the angle of the segment ``rest`` or else
-    at the first angle. The record times exp(-sigma t) is padded with zeros and transformed: that
-    is its transform on s = sigma + j omega, where what wraps around has decayed. There it is
-    multiplied with ``G(s) + J_tool s²`` and the difference of the two channels' delays, then
-    transformed back, and the exponential undone.
+    The beam is assumed at rest before the first sample, at the angle of the segment ``rest`` or
+    else at the first angle. The record times exp(-sigma t) is padded with zeros and transformed:
+    this is its transform on s = sigma + j omega, where the part that wraps around has decayed. It
+    is multiplied with ``G(s) + J_tool s²`` and the difference of the two channels' delays,
+    transformed back, and divided by the exponential.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
 def band_limited(
     values: NDArray[np.float64], rate_hz: float, band_hz: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Values without what lies outside a band, by masking their Fourier transform (no delay).
+    """Return the values limited to a band, by a mask on their Fourier transform (no delay).
 
     Parameters
     ----------
@@ -237,14 +237,11 @@ def band_limited(
 
 
 _NEAR: Final = 0.1
-"""Half the width of the band whose envelope is looked at, as a share of its middle."""
+"""Half width of the band of the envelope, relative to its centre."""
 
 
 def loudest_moment_s(values: NDArray[np.float64], rate_hz: float, frequency_hz: float) -> float:
-    """Time at which the oscillation near a frequency is largest.
-
-    The envelope is the magnitude of the analytic signal in ``frequency_hz (1 ± 0.1)``, so it works
-    for a chirp as for any other excitation.
+    """Return the time at which the oscillation near a frequency is largest.
 
     Parameters
     ----------
@@ -287,7 +284,7 @@ LARGEST_SHIFT: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class FittedModel:
-    """One fit with all that is said of it.
+    """One fit with its indices, modes and peaks.
 
     Attributes
     ----------
@@ -299,7 +296,8 @@ class FittedModel:
         Modes of the beam alone, from its poles; empty where damping is so strong that one has none.
     followed : tuple of bool
         Mode by mode, whether it vibrates, and within `LARGEST_SHIFT` of the undamped beam's
-        frequency. If not, the fit has let go of that resonance: the mode is not the antenna's.
+        frequency. If not, the fit does not follow that resonance: the mode is not that of the
+        antenna.
     peaks : tuple of Peak or None
         Resonant peaks of `response`, mode by mode.
     deviations : tuple of PeakDeviation or None
@@ -317,15 +315,15 @@ class FittedModel:
 
 @dataclass(frozen=True, slots=True)
 class WelchAnalysis:
-    """Results for one record.
+    """Results of the Welch method for one record.
 
     Attributes
     ----------
     record : Record
     settings : WelchSettings
-        As asked for.
+        Requested settings.
     segmentation : Segmentation
-        As used: the settings at the record's rate.
+        Segments at the record's rate.
     response : FrequencyResponse
         In the band, without the channels' delays.
     whole_record : FrequencyResponse
@@ -335,7 +333,7 @@ class WelchAnalysis:
     models : tuple of FittedModel
         By type, then by weighting, in the order of the settings.
     warnings : tuple of str
-        What an analyst should read beside the results, the record's included.
+        Warnings for the analyst, including those of the record.
     """
 
     record: Record
@@ -390,7 +388,7 @@ def analyse(
             )
         except (FitError, WeightingError) as error:
             raise SettingsError(f"{record.path}: {error}") from error
-        models.extend(_judged(fit, record.beam, response, beam_on_tool, peaks) for fit in fits)
+        models.extend(_evaluated(fit, record.beam, response, beam_on_tool, peaks) for fit in fits)
         on_step(f"type {name}")
     return WelchAnalysis(
         record=record,
@@ -405,7 +403,7 @@ def analyse(
 
 
 def _check_excited(record: Record) -> None:
-    """Refuse a record in which the motor did not move, before segments and bands are discussed."""
+    """Raise if the motor did not move, before the checks of segments and bands."""
     angles = record.angle_rad[record.angle_known]
     if record.metadata.get("excitation") == "hold":
         raise EstimateError(
@@ -419,14 +417,14 @@ def _check_excited(record: Record) -> None:
         )
 
 
-def _judged(
+def _evaluated(
     fit: FrfFit,
     beam: Beam,
     measured: FrequencyResponse,
     beam_on_tool: FrequencyResponseModel,
     measured_peaks: tuple[Peak | None, ...],
 ) -> FittedModel:
-    """Evaluate a fitted model and all indices of it."""
+    """Return a fitted model with all its indices."""
     response = beam_on_tool.evaluate(fit.damping)
     peaks = _peaks(beam, measured.frequency_hz, response)
     try:
@@ -448,7 +446,7 @@ def _judged(
 
 
 def _followed(found: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
-    """Tell the modes that vibrate about where the undamped beam's do."""
+    """Return whether each mode vibrates near the frequency of the undamped beam."""
     undamped_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
     return tuple(
         mode.damping_ratio < 1 and abs(mode.frequency_hz / own_hz - 1) < LARGEST_SHIFT
@@ -459,6 +457,6 @@ def _followed(found: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
 def _peaks(
     beam: Beam, frequency_hz: NDArray[np.float64], response: NDArray[np.complex128]
 ) -> tuple[Peak | None, ...]:
-    """Resonant peaks near the beam's first undamped frequencies."""
+    """Return the resonant peaks near the beam's first undamped frequencies."""
     mode_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
     return resonant_peaks(frequency_hz, response, mode_hz)

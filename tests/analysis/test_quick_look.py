@@ -157,7 +157,7 @@ def test_the_last_look_is_found_by_start_and_specimen(tmp_path, name, content, f
     last = look_path(tmp_path / "last.mcap")
     last.write_text(json.dumps(look_with(2.5, start_utc_ns=4, file="last.mcap")))
     look_path(tmp_path / f"{name}.mcap").write_text(json.dumps(content))
-    found = quick_look._last_look(tmp_path / "now.mcap", "a", 8)
+    found = quick_look._last_quick_look(tmp_path / "now.mcap", "a", 8)
     assert found["file"] == file
 
 

@@ -40,7 +40,7 @@ def test_a_record_is_taken_over():
     assert measurement.reference_rad is RECORD.reference_rad
     assert measurement.angle_known.all()
     assert measurement.torque_known.all()
-    assert measurement.torque_share == 1.0
+    assert measurement.known_torque_fraction == 1.0
     assert measurement.angle_from_rest(50.0) == pytest.approx(RECORD.angle_rad - 0.1)
 
 
@@ -56,6 +56,6 @@ def test_its_masks_and_its_first_angle():
     measurement = Measurement.of_record(
         SimpleNamespace(**vars(RECORD) | masks | {"rest_angle_rad": None})
     )
-    assert measurement.torque_share == pytest.approx(0.9)
+    assert measurement.known_torque_fraction == pytest.approx(0.9)
     assert measurement.angle_from_rest(50.0)[0] == 0.0
     assert measurement.angle_from_rest(50.0) == pytest.approx(RECORD.angle_rad - 0.1, abs=1e-4)

@@ -142,7 +142,7 @@ def test_the_torque_that_was_taken_out_comes_back_beside_the_beam(short, here, t
     assert with_drag.drag is not None
     names = ("gamma",)
     poles = mode_poles(there, 3, names)
-    change, _ = with_drag.drag.beside(there, poles, names, np.eye(1))
+    change, _ = with_drag.drag.change_to(there, poles, names, np.eye(1))
     linear = with_drag.spectrum(short.prediction.torque(there)[0])
     taken = with_drag.spectrum((short.torque_nm - with_drag.torque_nm)[short.kept])
     truth = short.spectrum(torque_nm)

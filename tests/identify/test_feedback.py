@@ -110,7 +110,7 @@ def test_a_drift_does_not_keep_the_reference_from_being_followed(controlled):
     measured = controlled("III", 2)
     drift = np.linspace(0.0, 0.2, measured.angle_rad.size)
     comparison = Comparison.of(replace(measured, angle_rad=measured.angle_rad + drift), (0.0, 50.0))
-    assert comparison.followed_rad() is not comparison.angle_rad
+    assert comparison.coherent_rad() is not comparison.angle_rad
 
 
 def test_unknown_torques_do_not_count_under_a_controller_either(controlled):
@@ -207,9 +207,11 @@ def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
     other = first.renewed(
         replace(plant, beam=replace(LINK, density_kg_per_m=5.2e-3)), found.noise
     ).renewed(plant, found.noise)
-    assert other.angle_rad + other.rest_rad == pytest.approx(first.angle_rad + first.rest_rad)
+    assert other.angle_rad + other.incoherent_rad == pytest.approx(
+        first.angle_rad + first.incoherent_rad
+    )
     for each in (first, other):
-        kept = each.torque_nm[each.kept] + each.rest_nm
+        kept = each.torque_nm[each.kept] + each.incoherent_nm
         assert kept == pytest.approx(comparison.torque_nm[comparison.kept])
     # Nothing was taken out there.
     assert comparison.renewed(plant, found.noise) is comparison
@@ -223,5 +225,5 @@ def test_what_rings_in_narrow_bands_is_followed_with_the_torque_it_makes(in_narr
     wrong = first.renewed(Plant(LINK, DAMPED), noise)
     told = wrong.renewed(plant, noise)
     assert loaded.tip_mass_kg == plant.tip_mass_kg
-    rest, told_rest = (np.std(each.rest_rad[each.kept]) for each in (first, told))
+    rest, told_rest = (np.std(each.incoherent_rad[each.kept]) for each in (first, told))
     assert told_rest < 0.2 * rest

@@ -8,11 +8,11 @@ import pytest
 from analysis.identify import Quantity
 from analysis.identify._candidates import CandidateSet
 from analysis.identify._headline import structures
-from analysis.identify._profile_likelihood import Profile
+from analysis.identify._profile_likelihood import LikelihoodProfile
 from analysis.identify._verdict import NOT_DETERMINED, order_verdict
 from analysis.models import STRUCTURES
 
-ALPHA = Profile(
+ALPHA = LikelihoodProfile(
     "alpha", "VI", (0.8, 0.9, 1.0), (9.0, 0.0, 12.0), 0.9, (0.9,), (0.85, 0.95), False, False, 0.0
 )
 

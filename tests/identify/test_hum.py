@@ -12,7 +12,7 @@ from cases import further
 from analysis.identify import Plant, fit_record
 from analysis.identify._comparison import Comparison
 from analysis.identify._free_decay import Pole
-from analysis.identify._hum import hum_beside_modes
+from analysis.identify._hum import hum_near_modes
 from analysis.identify._noise import noise_of
 from analysis.models import STRUCTURES
 from rigd.beam import Damping
@@ -85,7 +85,7 @@ def test_a_mode_that_a_fit_has_beyond_the_band(sessions):
     pole = Pole(3, complex(-2.0, 2 * np.pi * 80), np.zeros(0))
     plant, nothing = Plant(comparison.measurement.beam, Damping()), np.zeros(comparison.samples)
     noise = noise_of(comparison.spectrum(nothing) + 1.0, comparison.frequency_hz, nothing.size)
-    assert hum_beside_modes(comparison, plant, (pole,), noise, nothing) == ()
+    assert hum_near_modes(comparison, plant, (pole,), noise, nothing) == ()
 
 
 @pytest.mark.parametrize("structure", ["II", "VI"])

@@ -3,7 +3,7 @@ import pytest
 
 from analysis.identify import SETTINGS, Plant
 from analysis.identify._comparison import Comparison
-from analysis.identify._noise import Noise
+from analysis.identify._noise import NoiseSpectrum
 from analysis.identify._parametrization import NEXT_TO_NOTHING, Steps, Unknowns
 from analysis.identify._problem import Objective
 from analysis.identify._refit import Refit
@@ -33,7 +33,7 @@ def test_the_gradient_is_that_of_the_cost(objective):
 def test_a_descent_goes_on_as_one_begun_there_but_evaluates_once_less(objective, monkeypatch):
     comparison, unknowns = objective.comparison, objective.unknowns
     bins = comparison.frequency_hz.size
-    noise = Noise(np.full(bins, 1e-2), np.ones(bins, dtype=bool), ())
+    noise = NoiseSpectrum(np.full(bins, 1e-2), np.ones(bins, dtype=bool), ())
     evaluated = []
     linearise = Objective._linearise
     monkeypatch.setattr(

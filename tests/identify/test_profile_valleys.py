@@ -5,12 +5,12 @@ import pytest
 
 from analysis.identify._profile_likelihood import (
     CHI_SQUARE_95,
-    Profile,
+    LikelihoodProfile,
     admitted,
     crossing,
     dips,
     gaps,
-    valleys,
+    local_minima,
 )
 
 VALUES = np.linspace(0.1, 1.9, 361)
@@ -23,9 +23,9 @@ def double(depth):
 
 
 def profile_of(values, deviance):
-    bottoms = valleys(values, deviance)
+    bottoms = local_minima(values, deviance)
     interval, below, above = admitted(values, deviance)
-    return Profile(
+    return LikelihoodProfile(
         "lambda", "VII", tuple(values), tuple(deviance), bottoms[0], bottoms, interval, below,
         above, 0.0,
     )  # fmt: skip
@@ -34,14 +34,14 @@ def profile_of(values, deviance):
 def test_one_valley():
     found = profile_of(VALUES, double(30.0))
     half = 0.05 * CHI_SQUARE_95**0.5
-    assert found.valleys == pytest.approx([0.6])
+    assert found.local_minima == pytest.approx([0.6])
     assert found.interval == pytest.approx((0.6 - half, 0.6 + half), abs=2e-3)
     assert found.identifiable
 
 
 def test_a_second_valley_within_the_limit_leaves_the_order_open():
     found = profile_of(VALUES, double(0.8))
-    assert found.valleys == pytest.approx([0.6, 1.3])  # the lower one first
+    assert found.local_minima == pytest.approx([0.6, 1.3])  # the lower one first
     reach = 0.08 * (CHI_SQUARE_95 - 0.8) ** 0.5
     assert found.interval == pytest.approx((0.6 - 0.05 * CHI_SQUARE_95**0.5, 1.3 + reach), abs=2e-3)
     assert not found.identifiable
@@ -50,17 +50,17 @@ def test_a_second_valley_within_the_limit_leaves_the_order_open():
 def test_narrow_valleys_close_together_are_two_all_the_same():
     deviance = np.minimum(((VALUES - 0.9) / 0.01) ** 2, ((VALUES - 1.1) / 0.01) ** 2 + 1)
     found = profile_of(VALUES, deviance)
-    assert found.share < 0.15
+    assert found.relative_width < 0.15
     assert not found.identifiable
 
 
 def test_a_valley_beyond_the_limit_does_not_count():
-    assert valleys(VALUES, double(CHI_SQUARE_95 + 0.1)) == pytest.approx((0.6,))
+    assert local_minima(VALUES, double(CHI_SQUARE_95 + 0.1)) == pytest.approx((0.6,))
 
 
 def test_ripples_part_no_valley():
     ripples = ((VALUES - 0.8) / 0.2) ** 2 + 0.1 * np.sin(VALUES * 200)
-    assert len(valleys(VALUES, ripples - ripples.min())) == 1
+    assert len(local_minima(VALUES, ripples - ripples.min())) == 1
 
 
 def test_a_curve_that_never_reaches_the_limit_is_open():

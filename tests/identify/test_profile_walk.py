@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify._profile_likelihood import Walk, admitted, valleys
+from analysis.identify._profile_likelihood import Walk, admitted, local_minima
 from analysis.models import STRUCTURES
 from analysis.optimizer import NormalEquations
 
@@ -28,9 +28,9 @@ class DoubleWell(Walk):
 
     def __init__(self, start):
         self.order, self.structure = "lambda", None
-        self._values, self._place = COUNT, 0
+        self._values, self._index = COUNT, 0
         self.costs, self._at = {}, {}
-        self._stand_at(self._descend(np.array([start]), 1))
+        self._start_at(self._descend(np.array([start]), 1))
 
     def _descend(self, start, max_evaluations, *, hold=(), hopeless=None):
         order = float(start[0])
@@ -47,10 +47,10 @@ class DoubleWell(Walk):
 def test_both_valleys_are_found_from_either(start):
     walk = DoubleWell(start)
     walk.both_ways()
-    assert len(valleys(*walk.curve())) == 1
+    assert len(local_minima(*walk.curve())) == 1
     walk.elsewhere()
     values, found = walk.curve()
-    assert valleys(values, found) == pytest.approx((0.6, 1.4))
+    assert local_minima(values, found) == pytest.approx((0.6, 1.4))
     (low, high), *is_open = admitted(values, found)
     limit = 3.841458820694124
     assert low == pytest.approx(0.6 - WIDTH * limit**0.5, abs=3e-3)
@@ -72,7 +72,7 @@ def test_a_special_case_that_is_as_good_begins_a_walk(behind, found):
     walk._field = SimpleNamespace(candidates=[special])
     walk.both_ways()
     walk.from_candidates()
-    assert (len(valleys(*walk.curve())) == 2) == found
+    assert (len(local_minima(*walk.curve())) == 2) == found
 
 
 class Astray(DoubleWell):

@@ -314,5 +314,5 @@ def test_the_profile_crosses_where_a_fit_with_the_order_held_says(type_iii, sess
     deviance = field.best.values * np.log(np.array(costs) / costs[0])
     assert deviance[1:] == pytest.approx(CHI_SQUARE_95, rel=0.05)
     assert profile.identifiable
-    assert profile.share < 0.02
+    assert profile.relative_width < 0.02
     assert min(profile.deviance) == 0

@@ -134,7 +134,7 @@ def test_white_noise_has_no_lines():
 
 def test_what_is_not_known_is_no_less_noise():
     half = np.where(np.arange(SAMPLES) % 2 == 0, white(3), 0)
-    noise = noise_of(spectrum(half), FREQUENCY_HZ, SAMPLES, share=0.5)
+    noise = noise_of(spectrum(half), FREQUENCY_HZ, SAMPLES, known_fraction=0.5)
     assert np.mean(noise.power) == pytest.approx(SAMPLES * 4e-3**2, rel=0.06)
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from analysis.identify import select
 from analysis.identify._candidates import CandidateSet
-from analysis.identify._profile_likelihood import Profile
+from analysis.identify._profile_likelihood import LikelihoodProfile
 from analysis.identify._sentences import order as order_sentence
 from analysis.identify._verdict import order_verdict
 
@@ -32,12 +32,12 @@ def test_a_profile_looks_for_no_valley_where_there_is_none(without_delay):
     from analysis.identify._profile_likelihood import profiled
 
     field, alpha, _ = profiled(without_delay)
-    assert len(alpha.valleys) == 1
+    assert len(alpha.local_minima) == 1
     assert alpha.estimate == pytest.approx(field.best.fit.parameters["alpha"], abs=1e-4)
 
 
 def test_two_values_that_explain_a_record_equally_are_both_named(without_delay):
-    found = Profile(
+    found = LikelihoodProfile(
         "lambda", "VII", (0.5, 0.657, 0.9, 1.235, 1.4), (9.0, 0.0, 8.0, 0.8, 9.0), 0.657,
         (0.657, 1.235), (0.58, 1.3), False, False, 0.0,
     )  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 
 from analysis.identify import fit_record
 from analysis.identify._comparison import Comparison
-from analysis.identify._noise import Noise
+from analysis.identify._noise import NoiseSpectrum
 from analysis.identify._sentences import experiments
 from analysis.identify._visible_modes import driven, visible_modes
 from analysis.models import STRUCTURES
@@ -26,7 +26,7 @@ def seen(sessions):
         analysis = fit_record(measured, [STRUCTURES["III"]], band_hz=band_hz)
         comparison = analysis.comparison
         scale = comparison.samples * comparison.decimation.rate_hz / 2
-        noise = Noise(analysis.noise_nm2_per_hz * scale, analysis.compared, analysis.lines)
+        noise = NoiseSpectrum(analysis.noise_nm2_per_hz * scale, analysis.compared, analysis.lines)
         return visible_modes(comparison, noise, analysis.fits[0])
 
     return of
