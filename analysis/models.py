@@ -14,7 +14,7 @@ the damping's size at one frequency, and the order:
 * ``ln(gamma omega_1^lambda / (rho/EI omega_1²))``: external damping relative to the inertia at the
   undamped first mode, and ``lambda``.
 
-The whole-record fits have their own parametrization (`analysis.identify.Unknowns`), in which
+The whole-record fits have their own parametrization (`analysis.identify.parametrization`), in which
 beam and rig are free as well.
 """
 

@@ -30,15 +30,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from analysis.identify import (
-        Finding,
-        Headline,
-        OrderVerdict,
-        Plant,
-        RecordAnalysis,
-        RecordFit,
-        Selection,
-    )
+    from analysis.identify import Finding, Plant, RecordAnalysis, RecordFit, Selection
+    from analysis.identify.headline import Headline
+    from analysis.identify.verdict import OrderVerdict
     from analysis.record import Record
     from rigd.session.online_fit import StreamStart
 

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from analysis.identify import Finding, Headline, Mode
+    from analysis.identify import Finding
+    from analysis.identify.headline import Headline, Mode
     from analysis.record import Record
     from rigd.spectral import RunningEstimate, Segmentation
 

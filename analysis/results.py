@@ -15,16 +15,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from analysis.identify import (
-        Headline,
-        OrderVerdict,
-        Quantity,
-        RecordAnalysis,
-        RecordFit,
-        Selection,
-        Setting,
-        Verdict,
-    )
+    from analysis.identify import RecordAnalysis, RecordFit, Selection, Setting
+    from analysis.identify.headline import Headline, Quantity
+    from analysis.identify.verdict import OrderVerdict, Verdict
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
@@ -155,7 +148,7 @@ class WholeRecord:
 
         Their standard uncertainties and intervals include that of the scale.
         """
-        from analysis.identify import scales_absorbed, with_scales
+        from analysis.identify.scales import scales_absorbed, with_scales
 
         if not scales_absorbed(self.fit):
             return {}

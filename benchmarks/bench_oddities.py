@@ -19,15 +19,8 @@ import oddities_figures as draw
 from exact_sessions import LINK, Session, session
 from numpy.typing import NDArray
 
-from analysis.identify import (
-    Plant,
-    RecordFit,
-    ResponseGrid,
-    Selection,
-    fit_record,
-    mode_poles,
-    select,
-)
+from analysis.identify import Plant, RecordFit, ResponseGrid, Selection, fit_record, select
+from analysis.identify.free_decay import mode_poles
 from analysis.models import STRUCTURES
 from analysis.paper import fit_many
 from rigd.beam import Beam, Damping, modes

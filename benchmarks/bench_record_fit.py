@@ -32,11 +32,10 @@ from analysis.identify import (
     Plant,
     RecordAnalysis,
     RecordFit,
-    Steps,
-    Unknowns,
     fit_record,
-    mode_poles,
 )
+from analysis.identify.free_decay import mode_poles
+from analysis.identify.parametrization import Steps, Unknowns
 from analysis.models import STRUCTURES
 from analysis.optimizer import descend
 from rigd.beam import Beam, Damping, transfer

@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import Plant, mode_poles
+from analysis.identify import Plant
+from analysis.identify.free_decay import mode_poles
 from rigd.beam import Beam, Damping, LoadedBeam, modes
 from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
 from rigd.excitation import BeamEstimate, chirp

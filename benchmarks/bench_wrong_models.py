@@ -18,7 +18,8 @@ from dataclasses import dataclass
 
 from wrong_models import DEFECTS, RIGS, Record
 
-from analysis.identify import Quantity, Selection, select
+from analysis.identify import Selection, select
+from analysis.identify.headline import Quantity
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.identify import Mode
+    from analysis.identify.headline import Mode
     from rigd.spectral import FrequencyResponse
 
     Parameters = dict[tuple[str, str], dict[str, NDArray[np.float64]]]

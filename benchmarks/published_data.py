@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.identify import Measurement
-from analysis.identify._comparison import Comparison
+from analysis.identify import Comparison, Measurement
 from analysis.identify._modal_fit import fit_modes
-from analysis.identify._noise import NoiseSpectrum
+from analysis.identify.noise import NoiseSpectrum
 from rigd.beam import Beam
 
 if TYPE_CHECKING:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from analysis.campaigns.sentences import in_single_sessions, probability
-from analysis.identify import EXACT_CONDITION, LOSSES, slope_of_loss
+from analysis.identify.headline import EXACT_CONDITION
+from analysis.identify.sentences import LOSSES, slope_of_loss
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
 from rigd.units import to_uncertainty
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
-    from analysis.identify import TolerantEstimate
+    from analysis.identify.uniform_beam import TolerantEstimate
 
 _BASES: Final = {
     "losses": "damping ratios and residue phases alone",

@@ -5,16 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from analysis.identify import (
-    STRONG,
-    Mode,
-    Numbers,
-    Quantity,
-    Simpler,
-    Size,
-    headline_json,
-    with_modal_model,
-)
+from analysis.identify import headline_json, with_modal_model
+from analysis.identify.headline import Mode, Numbers, Quantity, Simpler, Size
+from analysis.identify.verdict import STRONG
 from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 from analysis.statistics import student_t_quantile
 
@@ -25,7 +18,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._statistics import RankedStructure
     from analysis.campaigns.pooling import PooledEstimate
-    from analysis.identify import StructureStatus
+    from analysis.identify.headline import StructureStatus
 
 _UNEXPLAINED: Final = "part of the records is unexplained"
 _MIXTURE: Final = "the mean of a mixture: sessions differ significantly"

@@ -16,10 +16,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns.pooling import PooledMode, random_effects
-from analysis.identify import (
-    CONSTANTS,
-    ModalEstimate,
-    ModalModel,
+from analysis.identify import CONSTANTS, ModalEstimate, ModalModel
+from analysis.identify.uniform_beam import (
     TolerantEstimate,
     UniformBeamTest,
     tolerant_estimate,

@@ -13,7 +13,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns.pooling import by_structure
-from analysis.identify import STRONG, WIDEST_SHARE, tolerant_status, too_few_modes
+from analysis.identify import tolerant_status
+from analysis.identify.profile_likelihood import WIDEST_SHARE
+from analysis.identify.verdict import STRONG, too_few_modes
 from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import student_t_quantile
 
@@ -24,7 +26,9 @@ if TYPE_CHECKING:
     from analysis.campaigns._homogeneity import Homogeneity
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate, PooledParameter
-    from analysis.identify import Order, TolerantEstimate, Verdict
+    from analysis.identify.profile_likelihood import Order
+    from analysis.identify.uniform_beam import TolerantEstimate
+    from analysis.identify.verdict import Verdict
 
 
 # Common structure

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import Candidate, ModalEstimate, Plant, Setting, Verdict
+    from analysis.identify import Candidate, ModalEstimate, Plant, Setting
+    from analysis.identify.verdict import Verdict
     from analysis.paper import Peak
     from analysis.results import WholeRecord
     from rigd.beam import Beam

@@ -19,7 +19,9 @@ from analysis.campaigns._orders import (
     rivals,
     tolerant_pooled_order,
 )
-from analysis.identify import EVEN, STRONG, refused_reason, tolerant_sizes, uniformity
+from analysis.identify import refused_reason, tolerant_sizes
+from analysis.identify.sentences import uniformity
+from analysis.identify.verdict import EVEN, STRONG
 from rigd.units import interval_text
 
 if TYPE_CHECKING:
@@ -31,7 +33,8 @@ if TYPE_CHECKING:
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import WelchBias
     from analysis.campaigns.pooling import PooledEstimate
-    from analysis.identify import Finding, Verdict
+    from analysis.identify import Finding
+    from analysis.identify.verdict import Verdict
 
 
 # Findings in common

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify import LOGARITHMIC, SETTINGS, Plant, Quantity, Size, damping_size
+from analysis.identify import LOGARITHMIC, SETTINGS, Plant, damping_size
+from analysis.identify.headline import Quantity, Size
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_p_value, student_t_quantile
 from rigd.beam import Beam, undamped_frequencies_rad_s
@@ -32,7 +33,8 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._session import SessionAnalysis
-    from analysis.identify import Damping, Order
+    from analysis.identify.headline import Damping
+    from analysis.identify.profile_likelihood import Order
 
 
 # Random effects

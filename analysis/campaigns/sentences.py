@@ -9,7 +9,7 @@ import numpy as np
 from analysis.campaigns._experiment import fact_text, in_dispute
 from analysis.campaigns._statistics import BEST
 from analysis.campaigns._welch_bias import LARGEST_MISFIT
-from analysis.identify import LOSSES
+from analysis.identify.sentences import LOSSES
 from analysis.models import COEFFICIENT_OF, QUANTITIES, STRUCTURES
 from analysis.statistics import student_t_quantile
 from rigd.printable import listed
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
     from analysis.campaigns.pooling import PooledEstimate, PooledMode
-    from analysis.identify import Order, Size
+    from analysis.identify.headline import Size
+    from analysis.identify.profile_likelihood import Order
 
 
 # Names and numbers

@@ -13,11 +13,11 @@ from analysis.identify._channel_checks import wrong_scale
 from analysis.identify._comparison import Comparison
 from analysis.identify._fit import fit_record, refit_record
 from analysis.identify._leakage import without_leakage
-from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import free_settings
 from analysis.identify._refit import FEW, MANY, MISSED, Refit
-from analysis.identify._residual_tests import whiteness
 from analysis.identify._search import RENEWALS
+from analysis.identify.parametrization import Unknowns
+from analysis.identify.residual_tests import whiteness
 from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from analysis.identify._data import Measurement
     from analysis.identify._drag import DragEstimate
     from analysis.identify._finding import Finding
-    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._result import RecordAnalysis, RecordFit
+    from analysis.identify.noise import NoiseSpectrum
     from analysis.models import Structure
 
 

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._data import Decimation, MeasurementError, fast_length_below
-from analysis.identify._drag_torque import DragExpansion, DragResponse
-from analysis.identify._free_decay import (
+from analysis.identify._instrument import following
+from analysis.identify._predictor import Prediction
+from analysis.identify.drag_torque import DragExpansion, DragResponse
+from analysis.identify.free_decay import (
     DecaySpectra,
     LaterDecaySpectra,
     decay_columns,
     mode_poles,
 )
-from analysis.identify._instrument import following
-from analysis.identify._predictor import Prediction
 from analysis.models import LARGEST_FRACTION_OF_RATE
 from rigd.beam import undamped_frequencies_rad_s
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._data import Measurement
-    from analysis.identify._drag_torque import DragLaw
-    from analysis.identify._free_decay import Pole
     from analysis.identify._hum import Hum
     from analysis.identify._modal_model import ModalModel
-    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
+    from analysis.identify.drag_torque import DragLaw
+    from analysis.identify.free_decay import Pole
+    from analysis.identify.noise import NoiseSpectrum
 
 _FEWEST_BINS: Final = 50
 _LARGEST_CHANGE: Final = 0.1

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from analysis.identify._channel_checks import clipping, drift_of_zero, stops
 from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
-from analysis.identify._residual_tests import SIGNIFICANT_STD
+from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.statistics import NORMAL_95, chi_square_deviate
 from rigd.units import interval_text, to_uncertainty
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from analysis.identify._candidates import CandidateSet
-    from analysis.identify._headline import Headline
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Setting
-    from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
     from analysis.identify._result import ModeEstimate
+    from analysis.identify.headline import Headline
+    from analysis.identify.residual_tests import Harmonic, InputRelation, Whiteness
 
 
 def findings(

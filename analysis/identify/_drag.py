@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
 from analysis.identify._refit import MISSED, Refit
+from analysis.identify.drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
-    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
+    from analysis.identify.noise import NoiseSpectrum
     from analysis.models import Structure
 
 

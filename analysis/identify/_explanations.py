@@ -15,7 +15,7 @@ import numpy as np
 from analysis.identify._altered_beam import Alteration, mode_terms
 from analysis.identify._causes import CAUSES, RELAXATION
 from analysis.identify._finding import Finding
-from analysis.identify._uniform_beam import REFUSED_BELOW, ConstantsProblem
+from analysis.identify.uniform_beam import REFUSED_BELOW, ConstantsProblem
 from analysis.statistics import chi_square_p_value
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._plant import Plant
     from analysis.identify._step_in_time import Step
-    from analysis.identify._uniform_beam import UniformBeamTest
+    from analysis.identify.uniform_beam import UniformBeamTest
 
 _TOLERANCES: Final = (0.03, 1e-3, 0.0)
 """Tolerances of all constants, one after the other.

@@ -10,10 +10,8 @@ import numpy as np
 
 from analysis.identify._candidate import FAR_BEHIND
 from analysis.identify._comparison import Comparison
-from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import SETTINGS, free_settings
 from analysis.identify._problem import Objective
-from analysis.identify._residual_tests import whiteness
 from analysis.identify._result import RecordAnalysis, RecordFit
 from analysis.identify._search import CoarseResponse, Descent, StructureSearch
 from analysis.identify._uncertainty import (
@@ -23,6 +21,8 @@ from analysis.identify._uncertainty import (
     parameter_uncertainty,
     ringing,
 )
+from analysis.identify.parametrization import Unknowns
+from analysis.identify.residual_tests import whiteness
 from analysis.models import RECORD_BAND_HZ, STRUCTURES
 
 if TYPE_CHECKING:
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._data import Measurement
-    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._problem import Projected
+    from analysis.identify.noise import NoiseSpectrum
     from analysis.models import Structure
 
 BAND_HZ: Final[tuple[float, float]] = RECORD_BAND_HZ

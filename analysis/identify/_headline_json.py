@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol
 
-from analysis.identify._headline import EXACT_CONDITION
+from analysis.identify.headline import EXACT_CONDITION
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from analysis.identify._finding import Finding
-    from analysis.identify._headline import Mode, Numbers
+    from analysis.identify.headline import Mode, Numbers
     from rigd.session import Validity
 
 

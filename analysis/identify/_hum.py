@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._noise import Line
+from analysis.identify.noise import Line
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._free_decay import Pole
-    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
+    from analysis.identify.free_decay import Pole
+    from analysis.identify.noise import NoiseSpectrum
 
 _RESONANCE: Final = 3.0
 """Half-widths of a resonance (damping ratio times frequency) that count as the resonance."""

@@ -19,9 +19,9 @@ import numpy as np
 from analysis.identify._data import MeasurementError, RecordedImpact
 from analysis.identify._finding import Finding
 from analysis.identify._fit import fit_record
-from analysis.identify._parametrization import Unknowns
 from analysis.identify._refit import FEW, Refit
-from analysis.identify._residual_tests import largest_of, whiteness
+from analysis.identify.parametrization import Unknowns
+from analysis.identify.residual_tests import largest_of, whiteness
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_deviate
 

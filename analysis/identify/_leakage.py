@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._noise import NoiseSpectrum, noise_of, smooth_power
+from analysis.identify.noise import NoiseSpectrum, noise_of, smooth_power
 
 if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison

@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._free_decay import Pole, mode_poles
 from analysis.identify._modal_model import BACKGROUND, ModalEstimate, ModalModel
-from analysis.identify._noise import smooth_power, with_peaks
-from analysis.identify._residual_tests import input_relation, whiteness
 from analysis.identify._result import Ringing
+from analysis.identify.free_decay import Pole, mode_poles
+from analysis.identify.noise import smooth_power, with_peaks
+from analysis.identify.residual_tests import input_relation, whiteness
 from analysis.optimizer import Box, NormalEquations, Recent, descend
 from rigd.beam import LoadedBeam
 
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
-    from analysis.identify._residual_tests import InputRelation, Whiteness
+    from analysis.identify.noise import NoiseSpectrum
+    from analysis.identify.residual_tests import InputRelation, Whiteness
 
 _TOLERANCE: Final = 1e-8
 _NARROWEST: Final = 1e-5

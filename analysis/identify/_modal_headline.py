@@ -11,20 +11,20 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from analysis.identify._headline import NAMES, Mode, Numbers, Quantity, size_of, symmetric
 from analysis.identify._plant import OF_BEAM
-from analysis.identify._profile_likelihood import WIDEST_SHARE
 from analysis.identify._uncertainty import damping_size
-from analysis.identify._uniform_beam import PARAMETERS
-from analysis.identify._verdict import EXCLUDED, NOT_DETERMINED, OrderVerdict, Status
+from analysis.identify.headline import NAMES, Mode, Numbers, Quantity, size_of, symmetric
+from analysis.identify.profile_likelihood import WIDEST_SHARE
+from analysis.identify.uniform_beam import PARAMETERS
+from analysis.identify.verdict import EXCLUDED, NOT_DETERMINED, OrderVerdict, Status
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
-    from analysis.identify._headline import Size, StructureStatus
     from analysis.identify._modal_model import ModalEstimate
-    from analysis.identify._profile_likelihood import LikelihoodProfile, Order
-    from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
+    from analysis.identify.headline import Size, StructureStatus
+    from analysis.identify.profile_likelihood import LikelihoodProfile, Order
+    from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
 
 NOT_UNIFORM: Final = (
     "an effective value: the modes are not those of a uniform beam, and what makes them differ may "

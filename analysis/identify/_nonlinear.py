@@ -29,8 +29,8 @@ from analysis.identify._candidates import INTEGER_INTERNAL
 from analysis.identify._data import fast_length
 from analysis.identify._predictor import torque_channel
 from analysis.identify._refit import Refit
-from analysis.identify._residual_tests import SIGNIFICANT_STD
-from analysis.identify._verdict import STRONG
+from analysis.identify.residual_tests import SIGNIFICANT_STD
+from analysis.identify.verdict import STRONG
 from rigd.beam import clamped_free_eigenvalues, participation
 
 if TYPE_CHECKING:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._free_decay import Pole
+from analysis.identify.free_decay import Pole
 from analysis.optimizer import NormalEquations, Recent, descend
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._parametrization import Unknowns
+    from analysis.identify.parametrization import Unknowns
     from analysis.optimizer import Minimum, Region
 
 

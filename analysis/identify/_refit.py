@@ -13,9 +13,9 @@ import numpy as np
 
 from analysis.identify._candidate import Candidate
 from analysis.identify._fit import summary
-from analysis.identify._noise import NoiseSpectrum, smooth_power
-from analysis.identify._parametrization import NEXT_TO_NOTHING, Steps
 from analysis.identify._problem import Objective
+from analysis.identify.noise import NoiseSpectrum, smooth_power
+from analysis.identify.parametrization import NEXT_TO_NOTHING, Steps
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._parametrization import Unknowns
     from analysis.identify._plant import Plant
     from analysis.identify._result import RecordFit
+    from analysis.identify.parametrization import Unknowns
     from analysis.optimizer import NormalEquations
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._noise import NoiseSpectrum
+from analysis.identify.noise import NoiseSpectrum
 from analysis.statistics import chi_square_p_value, nrmse_percent
 
 if TYPE_CHECKING:
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._modal_fit import ModalFit
-    from analysis.identify._noise import Line
     from analysis.identify._plant import Plant
+    from analysis.identify.noise import Line
     from analysis.models import Structure
 
 _RARE: Final = 1e-4

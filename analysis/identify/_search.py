@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._free_decay import decay_columns
 from analysis.identify._hum import hum_near_modes, resonance_reach_hz
-from analysis.identify._noise import NoiseSpectrum, noise_of
-from analysis.identify._parametrization import Steps
 from analysis.identify._predictor import ResponseGrid
 from analysis.identify._problem import Objective
+from analysis.identify.free_decay import decay_columns
+from analysis.identify.noise import NoiseSpectrum, noise_of
+from analysis.identify.parametrization import Steps
 from analysis.optimizer import NormalEquations, descend
 from analysis.paper import thinned
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._hum import Hum
-    from analysis.identify._parametrization import Unknowns
     from analysis.identify._plant import Plant
+    from analysis.identify.parametrization import Unknowns
     from analysis.optimizer import Minimum
 
 

@@ -1,6 +1,6 @@
 """Verdict on one record: modal model, test of uniformity, orders with a tolerance, candidates.
 
-Sentences are in `analysis.identify._sentences`.
+Sentences are in `analysis.identify.sentences`.
 """
 
 from __future__ import annotations
@@ -24,26 +24,27 @@ from analysis.identify._explanations import explanations
 from analysis.identify._explanations import finding as explanation_finding
 from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
-from analysis.identify._headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
 from analysis.identify._knock import MAX_KNOCKS, knocks_in, of_knocks, with_knock
 from analysis.identify._modal_fit import fit_modes
 from analysis.identify._modal_headline import tolerant_order, with_modal_model
 from analysis.identify._nonlinear import nonlinear_forces
-from analysis.identify._profile_likelihood import WIDEST_SHARE, profiled
-from analysis.identify._residual_tests import (
+from analysis.identify._result import RecordAnalysis
+from analysis.identify._small_effects import LARGE, small_effect
+from analysis.identify._step_in_time import step_score
+from analysis.identify._time_varying import along_time, changing, established
+from analysis.identify._visible_modes import visible_modes
+from analysis.identify.headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
+from analysis.identify.profile_likelihood import WIDEST_SHARE, profiled
+from analysis.identify.residual_tests import (
     InputRelation,
     Whiteness,
     harmonics,
     input_relation,
     whiteness,
 )
-from analysis.identify._result import RecordAnalysis
-from analysis.identify._sentences import experiments, of_headline
-from analysis.identify._small_effects import LARGE, small_effect
-from analysis.identify._step_in_time import step_score
-from analysis.identify._time_varying import along_time, changing, established
-from analysis.identify._uniform_beam import tolerant_estimate, uniform_beam_test
-from analysis.identify._verdict import (
+from analysis.identify.sentences import experiments, of_headline
+from analysis.identify.uniform_beam import tolerant_estimate, uniform_beam_test
+from analysis.identify.verdict import (
     EVEN,
     NOT_DETERMINED,
     CandidateRow,
@@ -52,7 +53,6 @@ from analysis.identify._verdict import (
     order_verdict,
     rivals,
 )
-from analysis.identify._visible_modes import visible_modes
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
 
@@ -67,11 +67,11 @@ if TYPE_CHECKING:
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Setting
-    from analysis.identify._profile_likelihood import Order
-    from analysis.identify._residual_tests import Harmonic
     from analysis.identify._result import RecordFit
     from analysis.identify._time_varying import TemporalChange
-    from analysis.identify._uniform_beam import UniformBeamTest
+    from analysis.identify.profile_likelihood import Order
+    from analysis.identify.residual_tests import Harmonic
+    from analysis.identify.uniform_beam import UniformBeamTest
 
 
 _MODES_TO_TEST: Final = 2

@@ -31,8 +31,8 @@ from analysis.identify._data import fast_length
 from analysis.identify._finding import Finding
 from analysis.identify._predictor import ResponseGrid, eigenvalues, torque_channel
 from analysis.identify._refit import MANY, Refit
-from analysis.identify._residual_tests import SIGNIFICANT_STD
-from analysis.identify._verdict import STRONG
+from analysis.identify.residual_tests import SIGNIFICANT_STD
+from analysis.identify.verdict import STRONG
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 

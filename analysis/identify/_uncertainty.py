@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._free_decay import decay_columns
 from analysis.identify._plant import LOGARITHMIC
 from analysis.identify._result import DampingSize, ModeEstimate, Ringing
+from analysis.identify.free_decay import decay_columns
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify._free_decay import Pole
-    from analysis.identify._parametrization import Unknowns
     from analysis.identify._problem import Projected
+    from analysis.identify.free_decay import Pole
+    from analysis.identify.parametrization import Unknowns
 
 _WORST_CONDITION: Final = 1e13
 

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._result import RecordFit
+    from analysis.identify.noise import NoiseSpectrum
 
 _EVIDENCE: Final = 400.0
 """Deviance by which a response with a resonance must be better than a smooth one: the resonance is

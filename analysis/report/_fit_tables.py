@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify import EXACT_CONDITION
+from analysis.identify.headline import EXACT_CONDITION
 from analysis.models import QUANTITIES
 from analysis.paper import LARGEST_SHIFT
 from analysis.report._document import response_fit_percent

@@ -15,7 +15,7 @@ from analysis.campaigns.sentences import (
     title,
     with_unit,
 )
-from analysis.identify import EXACT_CONDITION
+from analysis.identify.headline import EXACT_CONDITION
 from analysis.models import STRUCTURES
 from analysis.report.table import (
     MARK,

@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.identify import Headline, ModeEstimate, RecordAnalysis
+    from analysis.identify import ModeEstimate, RecordAnalysis
+    from analysis.identify.headline import Headline
     from analysis.report.bands import Estimate, ResponseBand
     from analysis.results import WholeRecord
     from rigd.spectral import FrequencyResponse

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify import EXACT_CONDITION
+from analysis.identify.headline import EXACT_CONDITION
 from analysis.models import QUANTITIES
 from analysis.report._scales import scale_notes
 from analysis.report._shown_model import ShownModel
@@ -28,7 +28,7 @@ from rigd.printable import listed
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from analysis.identify import Headline, Mode, Numbers, Quantity, Size
+    from analysis.identify.headline import Headline, Mode, Numbers, Quantity, Size
     from analysis.results import WholeRecord
 
 _STRONG_CORRELATION: Final = 0.9

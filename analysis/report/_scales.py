@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify import SCALE_EXPONENTS, density_check, scales_absorbed
+from analysis.identify.scales import SCALE_EXPONENTS, density_check, scales_absorbed
 from analysis.models import QUANTITIES
 from analysis.report.table import estimate
 

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from analysis.identify import Headline, ModalFit, ModalModel, Plant, RecordFit
+    from analysis.identify import ModalFit, ModalModel, Plant, RecordFit
+    from analysis.identify.headline import Headline
     from analysis.record import Record
     from analysis.report.bands import ResponseBand
 

@@ -10,7 +10,7 @@ from rich.console import Console, Group
 from rich.padding import Padding
 from rich.text import Text
 
-from analysis.identify import EXACT_CONDITION, MISREAD
+from analysis.identify.headline import EXACT_CONDITION, MISREAD
 from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
 from analysis.report.table import MARK, estimate, terminal_table
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from analysis.identify import Headline, Mode, Quantity, Size
+    from analysis.identify.headline import Headline, Mode, Quantity, Size
     from analysis.report.table import Table
     from analysis.results import RecordResult, WholeRecord
 

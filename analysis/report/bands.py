@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
-from analysis.identify import LOGARITHMIC, PARAMETERS, ResponseGrid
+from analysis.identify import LOGARITHMIC, ResponseGrid
+from analysis.identify.uniform_beam import PARAMETERS
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import ModalFit, Plant, RecordAnalysis, TolerantEstimate
+    from analysis.identify import ModalFit, Plant, RecordAnalysis
+    from analysis.identify.uniform_beam import TolerantEstimate
     from analysis.models import Structure
     from analysis.record import Record
     from analysis.results import WholeRecord

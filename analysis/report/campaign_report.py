@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.text import Text
 
 from analysis.campaigns.sentences import lost_trials, specimens
-from analysis.identify import EXACT_CONDITION
+from analysis.identify.headline import EXACT_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
 from analysis.report._document import document_text

@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import Measurement
-from analysis.identify._comparison import Comparison
+from analysis.identify import Comparison, Measurement
 from analysis.models import WelchSettings
 from analysis.paper import EstimateError, SettingsError
 from analysis.record import load_record

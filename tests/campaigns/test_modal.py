@@ -10,7 +10,8 @@ from cauchy_residues import modal_constants
 
 from analysis.campaigns import _geometry_sentences as sentences
 from analysis.campaigns._modal import opposite_sweeps
-from analysis.identify import CONSTANTS, ModalEstimate, ModalModel, Plant, uniformity
+from analysis.identify import CONSTANTS, ModalEstimate, ModalModel, Plant
+from analysis.identify.sentences import uniformity
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING
 
 PLANT = Plant(PAPER_BEAM, PAPER_DAMPING)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.identify._drag import by_law
-from analysis.identify._drag_torque import HALF_DENSITY
+from analysis.identify.drag_torque import HALF_DENSITY
 from rigd.beam import mode_shape
 
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Measurement, Plant
-from analysis.identify._comparison import Comparison
-from analysis.identify._drag_torque import DragError, DragLaw, DragResponse
-from analysis.identify._free_decay import mode_poles
+from analysis.identify import Comparison, Measurement, Plant
+from analysis.identify.drag_torque import DragError, DragLaw, DragResponse
+from analysis.identify.free_decay import mode_poles
 from rigd.beam import Beam, Damping
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)

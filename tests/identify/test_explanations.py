@@ -15,7 +15,7 @@ from analysis.identify._altered_beam import GRAVITY_M_S2
 from analysis.identify._causes import CAUSES
 from analysis.identify._explanations import explanations, finding
 from analysis.identify._step_in_time import Step
-from analysis.identify._uniform_beam import uniform_beam_test
+from analysis.identify.uniform_beam import uniform_beam_test
 from rigd.beam import Beam, Damping
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)

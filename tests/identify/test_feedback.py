@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Measurement, Plant, fit_record, select
-from analysis.identify._comparison import Comparison
+from analysis.identify import Comparison, Measurement, Plant, fit_record, select
 from analysis.identify._instrument import following
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues, transfer

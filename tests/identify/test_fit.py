@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import SETTINGS, MeasurementError, Plant, fit_record
-from analysis.identify._comparison import Comparison
-from analysis.identify._parametrization import Steps, Unknowns
-from analysis.identify._problem import Objective
-from analysis.identify._residual_tests import whiteness
+from analysis.identify import SETTINGS, Comparison, MeasurementError, Objective, Plant, fit_record
+from analysis.identify.parametrization import Steps, Unknowns
+from analysis.identify.residual_tests import whiteness
 from analysis.models import STRUCTURES
 from analysis.optimizer import descend
 from rigd.beam import Beam, Damping, modes

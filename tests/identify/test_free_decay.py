@@ -3,7 +3,7 @@ import pytest
 
 from analysis.identify import Plant
 from analysis.identify._data import Decimation
-from analysis.identify._free_decay import DecaySpectra, LaterDecaySpectra, Pole, mode_poles
+from analysis.identify.free_decay import DecaySpectra, LaterDecaySpectra, Pole, mode_poles
 from rigd.beam import Beam, Damping, poles
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)

@@ -5,11 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from analysis.identify import Quantity
 from analysis.identify._candidates import CandidateSet
-from analysis.identify._headline import structures
-from analysis.identify._profile_likelihood import LikelihoodProfile
-from analysis.identify._verdict import NOT_DETERMINED, order_verdict
+from analysis.identify.headline import Quantity, structures
+from analysis.identify.profile_likelihood import LikelihoodProfile
+from analysis.identify.verdict import NOT_DETERMINED, order_verdict
 from analysis.models import STRUCTURES
 
 ALPHA = LikelihoodProfile(

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Plant, fit_record
-from analysis.identify._comparison import Comparison
-from analysis.identify._free_decay import Pole
+from analysis.identify import Comparison, Plant, fit_record
 from analysis.identify._hum import hum_near_modes
-from analysis.identify._noise import noise_of
+from analysis.identify.free_decay import Pole
+from analysis.identify.noise import noise_of
 from analysis.models import STRUCTURES
 from rigd.beam import Damping
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.identify import Measurement, Plant
-from analysis.identify._comparison import Comparison
+from analysis.identify import Comparison, Measurement, Plant
 from analysis.identify._nonlinear import ModalForces, Term
 
 MODE_1 = Term("cubic stiffness", 1)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper._estimate import EstimateError
-from analysis.paper._route import analyse
+from analysis.paper import EstimateError, analyse
 
 
 @pytest.mark.parametrize(

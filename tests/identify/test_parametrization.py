@@ -3,9 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from analysis.identify import SETTINGS, Plant
-from analysis.identify._parametrization import Unknowns
-from analysis.identify._plant import LOGARITHMIC
+from analysis.identify import LOGARITHMIC, SETTINGS, Plant
+from analysis.identify.parametrization import Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, undamped_frequencies_rad_s
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.identify import SETTINGS, Plant
-from analysis.identify._parametrization import NEXT_TO_NOTHING, Steps, Unknowns
+from analysis.identify.parametrization import NEXT_TO_NOTHING, Steps, Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 

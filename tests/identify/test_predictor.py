@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from analysis.identify import Plant
-from analysis.identify._comparison import Comparison
+from analysis.identify import Comparison, Plant, Prediction
 from analysis.identify._data import Decimation
-from analysis.identify._predictor import Prediction
 from rigd.beam import PARAMETERS, Beam, Damping
 
 OFFSETS = (0.03, -0.05)

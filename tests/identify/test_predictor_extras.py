@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import SETTINGS, Plant
-from analysis.identify._free_decay import mode_poles
-from analysis.identify._parametrization import Unknowns
-from analysis.identify._predictor import Prediction
+from analysis.identify import SETTINGS, Plant, Prediction
+from analysis.identify.free_decay import mode_poles
+from analysis.identify.parametrization import Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import PARAMETERS, Beam, Damping
 

@@ -1,12 +1,10 @@
 import numpy as np
 import pytest
 
-from analysis.identify import SETTINGS, Plant
-from analysis.identify._comparison import Comparison
-from analysis.identify._noise import NoiseSpectrum
-from analysis.identify._parametrization import NEXT_TO_NOTHING, Steps, Unknowns
-from analysis.identify._problem import Objective
+from analysis.identify import SETTINGS, Comparison, Objective, Plant
 from analysis.identify._refit import Refit
+from analysis.identify.noise import NoiseSpectrum
+from analysis.identify.parametrization import NEXT_TO_NOTHING, Steps, Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.identify._profile_likelihood import (
+from analysis.identify.profile_likelihood import (
     CHI_SQUARE_95,
     LikelihoodProfile,
     admitted,

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify._profile_likelihood import Walk, admitted, local_minima
+from analysis.identify.profile_likelihood import Walk, admitted, local_minima
 from analysis.models import STRUCTURES
 from analysis.optimizer import NormalEquations
 

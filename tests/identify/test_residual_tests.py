@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from analysis.identify import cumulative_periodogram
-from analysis.identify._residual_tests import (
+from analysis.identify.residual_tests import (
+    cumulative_periodogram,
     harmonics,
     input_relation,
     whiteness,

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Measurement, select
+from analysis.identify import Comparison, Measurement, select
 from analysis.identify._candidates import CandidateSet
 from analysis.identify._channel_checks import clipping, stops, wrong_scale
-from analysis.identify._comparison import Comparison
 from analysis.identify._drag import with_evident_drag
-from analysis.identify._headline import MISREAD
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify._time_varying import along_time
+from analysis.identify.headline import MISREAD
 from analysis.report._text import damping_sentences
 from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues
 

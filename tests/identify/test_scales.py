@@ -5,17 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from analysis.identify import (
-    SCALE_EXPONENTS,
-    Plant,
-    Quantity,
-    ResponseGrid,
-    density_check,
-    fit_record,
-    scales_absorbed,
-    with_scales,
-)
-from analysis.identify._drag_torque import DragLaw, DragResponse
+from analysis.identify import Plant, ResponseGrid, fit_record
+from analysis.identify.drag_torque import DragLaw, DragResponse
+from analysis.identify.headline import Quantity
+from analysis.identify.scales import SCALE_EXPONENTS, density_check, scales_absorbed, with_scales
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 

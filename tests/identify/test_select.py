@@ -5,11 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from analysis.identify import SETTINGS, headline_json, select
+from analysis.identify import SETTINGS, Comparison, headline_json, select
 from analysis.identify._candidates import CandidateSet
-from analysis.identify._comparison import Comparison
-from analysis.identify._profile_likelihood import CHI_SQUARE_95
-from analysis.identify._verdict import ANOTHER_DAMPING, EVEN
+from analysis.identify.profile_likelihood import CHI_SQUARE_95
+from analysis.identify.verdict import ANOTHER_DAMPING, EVEN
 from analysis.models import STRUCTURES, Structure
 from rigd.beam import Beam, LoadedBeam, clamped_free_eigenvalues
 from rigd.session import Validity

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.identify._data import Decimation, bridged, fast_length, fast_length_below
-from analysis.identify._noise import noise_of, smooth_power
+from analysis.identify.noise import noise_of, smooth_power
 
 
 def test_gaps_of_a_band_limited_signal_are_closed():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from analysis.identify import BAND_HZ
 from analysis.identify._candidates import CandidateSet
-from analysis.identify._fit import BAND_HZ
 from analysis.identify._modal_fit import fit_modes
 from analysis.identify._step_in_time import step_score
 from rigd.beam import clamped_free_eigenvalues

@@ -4,9 +4,9 @@ import pytest
 
 from analysis.identify import select
 from analysis.identify._candidates import CandidateSet
-from analysis.identify._profile_likelihood import LikelihoodProfile
-from analysis.identify._sentences import order as order_sentence
-from analysis.identify._verdict import order_verdict
+from analysis.identify.profile_likelihood import LikelihoodProfile
+from analysis.identify.sentences import order as order_sentence
+from analysis.identify.verdict import order_verdict
 
 BAND_HZ = (0.0, 50.0)
 
@@ -29,7 +29,7 @@ def test_a_delay_that_is_there_is_named_in_a_step(steps):
 
 
 def test_a_profile_looks_for_no_valley_where_there_is_none(without_delay):
-    from analysis.identify._profile_likelihood import profiled
+    from analysis.identify.profile_likelihood import profiled
 
     field, alpha, _ = profiled(without_delay)
     assert len(alpha.local_minima) == 1

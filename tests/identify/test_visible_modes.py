@@ -5,11 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify import fit_record
-from analysis.identify._comparison import Comparison
-from analysis.identify._noise import NoiseSpectrum
-from analysis.identify._sentences import experiments
+from analysis.identify import Comparison, fit_record
 from analysis.identify._visible_modes import driven, visible_modes
+from analysis.identify.noise import NoiseSpectrum
+from analysis.identify.sentences import experiments
 from analysis.models import STRUCTURES
 
 STRONG_NM = 0.05

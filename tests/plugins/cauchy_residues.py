@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import CONSTANTS, Plant, ResponseGrid, mode_poles
+from analysis.identify import CONSTANTS, Plant, ResponseGrid
+from analysis.identify.free_decay import mode_poles
 
 _CIRCLE = np.exp(2j * np.pi * np.arange(8) / 8)
 _RADIUS = 0.2

@@ -5,15 +5,9 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from analysis.identify import (
-    Candidate,
-    Measurement,
-    OrderVerdict,
-    Selection,
-    Verdict,
-    fit_record,
-    of_fit,
-)
+from analysis.identify import Candidate, Measurement, Selection, fit_record
+from analysis.identify.headline import of_fit
+from analysis.identify.verdict import OrderVerdict, Verdict
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper import analyse
 from analysis.record import load_record

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify import Simpler, of_fit
+from analysis.identify.headline import Simpler, of_fit
 from analysis.report import FIGURES, document, illustrations
 from analysis.report.folder import OutputExistsError
 from analysis.report.record_report import record_page, report_tables, write_report

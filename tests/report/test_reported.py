@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify import of_fit
+from analysis.identify.headline import of_fit
 from analysis.models import STRUCTURES
 from analysis.report import document, illustrations, result_text
 from analysis.report.bands import excited_band_hz, supported_band_hz

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import with_scales
+from analysis.identify.scales import with_scales
 from analysis.report import document
 from analysis.report.record_report import report_tables
 from analysis.results import RecordResult

@@ -7,7 +7,7 @@ import pytest
 from shipped_profile import load_shipped
 
 from analysis.identify import Comparison, Measurement, Plant
-from analysis.identify._drag_torque import DragLaw, DragResponse
+from analysis.identify.drag_torque import DragLaw, DragResponse
 from rigd.beam import Damping, PointForceGrid
 from rigd.sim import SimulatedPlant
 

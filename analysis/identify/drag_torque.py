@@ -48,9 +48,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._data import fast_length
-from analysis.identify._free_decay import mode_poles
 from analysis.identify._plant import OF_BEAM
 from analysis.identify._predictor import eigenvalues, torque_channel
+from analysis.identify.free_decay import mode_poles
 from rigd.beam import AIR_DENSITY_KG_PER_M3, DragGrid, poles_for_eigenvalues
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     Complex = NDArray[np.complex128]
     from collections.abc import Callable
 
-    from analysis.identify._free_decay import Pole
+    from analysis.identify.free_decay import Pole
 
 MODES: Final = 5
 POINTS: Final = 16

@@ -138,7 +138,7 @@ def cumulative_periodogram(residual: NDArray[np.complex128]) -> NDArray[np.float
     Examples
     --------
     >>> import numpy as np
-    >>> from analysis.identify import cumulative_periodogram
+    >>> from analysis.identify.residual_tests import cumulative_periodogram
     >>> print(cumulative_periodogram(np.array([1, 1j, -1, 1])))
     [0.25 0.5  0.75 1.  ]
     """

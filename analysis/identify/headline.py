@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from analysis.identify._plant import OF_BEAM
-from analysis.identify._verdict import ANOTHER_DAMPING, EXCLUDED, STRONG, WITH_DRAG
+from analysis.identify.verdict import ANOTHER_DAMPING, EXCLUDED, STRONG, WITH_DRAG
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
-    from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
-    from analysis.identify._verdict import OrderVerdict
+    from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
+    from analysis.identify.verdict import OrderVerdict
 
 EXACT_CONDITION: Final = "if the beam is uniform to 1e-5"
 UNEXPLAINED: Final = "part of the record is unexplained"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._headline import EXACT_CONDITION, ONE_MODE
-from analysis.identify._verdict import ANOTHER_DAMPING, deviance_of_one
 from analysis.identify._visible_modes import driven
+from analysis.identify.headline import EXACT_CONDITION, ONE_MODE
+from analysis.identify.verdict import ANOTHER_DAMPING, deviance_of_one
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
 from rigd.units import decimals, to_uncertainty
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
-    from analysis.identify._headline import Headline, Quantity, Simpler
-    from analysis.identify._profile_likelihood import Order
-    from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
-    from analysis.identify._verdict import OrderVerdict, Status
+    from analysis.identify.headline import Headline, Quantity, Simpler
+    from analysis.identify.profile_likelihood import Order
+    from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
+    from analysis.identify.verdict import OrderVerdict, Status
 
 # Sentences
 

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._drag import DampingAt
     from analysis.identify._finding import Finding
-    from analysis.identify._profile_likelihood import LikelihoodProfile, Order
-    from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
+    from analysis.identify.profile_likelihood import LikelihoodProfile, Order
+    from analysis.identify.residual_tests import Harmonic, InputRelation, Whiteness
     from analysis.models import Structure
 
 Status = Literal["compatible", "fractional", "open", "not identifiable", "absent"]

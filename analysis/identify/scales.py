@@ -27,8 +27,8 @@ from analysis.statistics import NORMAL_95
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from analysis.identify._headline import Quantity
     from analysis.identify._result import RecordFit
+    from analysis.identify.headline import Quantity
 
 _RATIO: Final = "density_over_stiffness"
 _STIFFNESS: Final = "bending_stiffness_n_m2"
