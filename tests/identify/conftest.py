@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.identify import Measurement
+from analysis.identify import Comparison, Measurement
+from analysis.identify._candidates import CandidateSet
 from rigd.beam import Beam, Damping, clamped_free_eigenvalues, participation, transfer
 
 RATE_HZ = 1000.0
+BAND_HZ = (0.0, 50.0)
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 PLANTS = {
     "VI": Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
@@ -266,3 +268,26 @@ def brake():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="session")
+def candidates_of():
+    """Fit all structures to a measurement, in the usual band: its candidate set."""
+    return lambda measurement: CandidateSet.of(measurement, (), BAND_HZ)
+
+
+@pytest.fixture(scope="session")
+def candidates():
+    """Make a candidate set of candidates that a test made up, without a record."""
+
+    def of(*made_up):
+        ranked = tuple(sorted(made_up, key=lambda each: each.bic))
+        return CandidateSet(comparison=None, noise=None, free=(), candidates=ranked, columns=())
+
+    return of
+
+
+@pytest.fixture(scope="session")
+def decimation():
+    """Decimation of a record at 1 kHz to the usual band."""
+    return Comparison.of(session("VI").measured(), BAND_HZ).decimation

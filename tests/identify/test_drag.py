@@ -2,13 +2,15 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from wrong_models import RIGS, Drag, drags
 
 from analysis.identify import select
-from analysis.identify._candidates import CandidateSet
-from analysis.identify._drag import with_air_drag, with_evident_drag
+from analysis.identify._drag import by_law, with_air_drag, with_evident_drag
+from analysis.identify.drag_torque import HALF_DENSITY
 from analysis.models import STRUCTURES
+from rigd.beam import mode_shape
 
 NOISE_NM = 5e-3
 DRAG_M = 2.3e-3
@@ -58,9 +60,9 @@ def test_the_beam_beside_the_drag_is_that_without_air(selection, plants, link):
         assert abs(value - middle) < 3 / 1.96 * half, name
 
 
-def test_evident_drag_needs_nothing_else_to_be_tried(braked):
+def test_evident_drag_needs_nothing_else_to_be_tried(braked, candidates_of):
     measured = braked.measured(noise_nm=NOISE_NM, seed=61)
-    uniform = CandidateSet.of(measured, (), (0.0, 50.0))
+    uniform = candidates_of(measured)
     assert not uniform.all_but_white(uniform.likeliest)
     found = with_evident_drag(uniform)
     assert abs(found.drag.value_m - DRAG_M) < 3 * found.drag.std_m
@@ -69,9 +71,9 @@ def test_evident_drag_needs_nothing_else_to_be_tried(braked):
     assert sorted(names) == sorted(STRUCTURES)
 
 
-def test_without_drag_nothing_is_fitted_for_it(sessions):
+def test_without_drag_nothing_is_fitted_for_it(sessions, candidates_of):
     measured = sessions("VI").measured(noise_nm=NOISE_NM, seed=62)
-    field = CandidateSet.of(measured, (), (0.0, 50.0))
+    field = candidates_of(measured)
     assert with_air_drag(field) is field
     assert field.drag is None
 
@@ -99,3 +101,24 @@ def test_drag_without_external_damping_is_as_large_as_it_is():
     assert abs(drag.value - wire.true_m(speed_m_s)) < 3.5 * drag.std
     for mode, ratio in zip(told.modes, wire.rig.damping_ratios.tolist(), strict=True):
         assert abs(mode.damping_ratio.value - ratio) < 3.5 * mode.damping_ratio.std
+
+
+# Equivalent damping of a mode in air, against the energy that the air takes in a cycle
+
+
+@pytest.mark.parametrize("mode", [1, 2])
+@pytest.mark.parametrize(("number", "power"), [(0, 2.0), (1, 4 / 3)])
+def test_the_air_takes_as_much_as_linear_damping_of_that_ratio(mode, number, power):
+    omega, amplitude, density = 16.0, 0.05, 4.7e-3
+    x = (np.arange(2000) + 0.5) / 2000
+    turn = 2 * np.pi * (np.arange(720) + 0.5) / 720
+    shape = mode_shape(mode, x) / mode_shape(mode, 1.0)
+    speed = omega * amplitude * np.outer(shape, np.sin(turn))
+    taken = np.mean(HALF_DENSITY * np.abs(speed) ** (power + 1))
+    ratio = by_law(mode, omega, amplitude, density)[number]
+    linear = np.mean(2 * ratio * omega * density * speed**2)
+    assert taken == pytest.approx(linear, rel=1e-3)
+
+
+def test_at_rest_the_air_takes_nothing():
+    assert by_law(1, 16.0, 0.0, 4.7e-3) == pytest.approx([0.0, 0.0])

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from analysis.identify import Plant
-from analysis.identify._data import Decimation
 from analysis.identify.free_decay import DecaySpectra, LaterDecaySpectra, Pole, mode_poles
 from rigd.beam import Beam, Damping, poles
 
@@ -78,9 +77,8 @@ def assert_gradient(spectra, some):
         assert gradient[k] == pytest.approx(numeric, rel=1e-5, abs=1e-5)
 
 
-def test_spectra_of_decays_that_begin_within_a_filtered_record():
+def test_spectra_of_decays_that_begin_within_a_filtered_record(decimation):
     rate_hz, begin = 1000.0, 2345
-    decimation = Decimation.to_band(rate_hz, 50.0)
     inside = decimation.inside(7000)
     samples = inside.stop - inside.start
     hz = np.fft.rfftfreq(samples, 1 / decimation.rate_hz)

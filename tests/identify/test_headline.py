@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from analysis.identify._candidates import CandidateSet
 from analysis.identify.headline import Quantity, structures
 from analysis.identify.profile_likelihood import LikelihoodProfile
 from analysis.identify.verdict import NOT_DETERMINED, order_verdict
@@ -31,11 +30,6 @@ class Fitted:
         object.__setattr__(self, "structure", STRUCTURES[self.name])
 
 
-def field_of(*fitted):
-    ranked = tuple(sorted(fitted, key=lambda each: each.bic))
-    return CandidateSet(comparison=None, noise=None, free=(), candidates=ranked, columns=())
-
-
 def test_the_first_flag_stays():
     number = Quantity(0.98, 0.01, (0.96, 1.0))
     assert number.flagged(None) is number
@@ -45,13 +39,13 @@ def test_the_first_flag_stays():
 
 
 @pytest.mark.parametrize(("doubt", "status"), [(None, "fractional"), ("it rains", "open")])
-def test_a_doubt_leaves_an_order_open(doubt, status):
-    found = order_verdict(field_of(Fitted("VI", 0.0, -71.0)), ALPHA, (1, 2, 3), doubt=doubt)
+def test_a_doubt_leaves_an_order_open(candidates, doubt, status):
+    found = order_verdict(candidates(Fitted("VI", 0.0, -71.0)), ALPHA, (1, 2, 3), doubt=doubt)
     assert (found.status, found.reason) == (status, doubt)
 
 
-def test_what_fixes_an_order_that_is_excluded_is_excluded_with_it():
+def test_what_fixes_an_order_that_is_excluded_is_excluded_with_it(candidates):
     """By all that it lacks, type III would still do: two orders at once may cost more than one."""
-    rig = field_of(Fitted("VI", 0.0, -71.0), Fitted("III", -1.0, -58.0, parameters=6))
+    rig = candidates(Fitted("VI", 0.0, -71.0), Fitted("III", -1.0, -58.0, parameters=6))
     assert dict(structures(rig, frozenset()))["III"] == "compatible"
     assert dict(structures(rig, frozenset({"alpha"})))["III"] == "excluded"

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from analysis.identify import Comparison, Plant, Prediction
-from analysis.identify._data import Decimation
 from rigd.beam import PARAMETERS, Beam, Damping
 
 OFFSETS = (0.03, -0.05)
@@ -64,9 +63,9 @@ def test_derivatives(plant, name):
     assert np.abs((after - before) / (2 * step) - analytic).max() < 1e-6 * np.abs(analytic).max()
 
 
-def test_between_the_samples_it_is_the_same(plant):
+def test_between_the_samples_it_is_the_same(plant, decimation):
     noise = np.random.default_rng(1).normal(size=3200)
-    angle = Decimation.to_band(1000.0, 50.0).apply(noise)
+    angle = decimation.apply(noise)
     prediction = Prediction(angle, 125.0, slice(0, 400))
     torque, gradient = prediction.torque(plant, WRT)
     at, gradient_at = prediction.torque_between(plant, 8, np.arange(0, 3200, 8), WRT)

@@ -8,7 +8,6 @@ import pytest
 from cases import further
 
 from analysis.identify import Comparison, Measurement, select
-from analysis.identify._candidates import CandidateSet
 from analysis.identify._channel_checks import clipping, stops, wrong_scale
 from analysis.identify._drag import with_evident_drag
 from analysis.identify._leakage import repeats_after_s
@@ -106,16 +105,16 @@ def test_a_rig_that_is_otherwise_has_its_cause_named_and_no_fact(more, ends, wor
         ({}, False),
     ],
 )
-def test_nothing_else_is_evident_drag(more, hidden):
-    uniform = CandidateSet.of(record(**more), (), (0.0, 50.0))
+def test_nothing_else_is_evident_drag(candidates_of, more, hidden):
+    uniform = candidates_of(record(**more))
     assert uniform.all_but_white(uniform.likeliest) != hidden
     assert with_evident_drag(uniform) is uniform
 
 
 @pytest.mark.parametrize("clock", [1e-5, further(-1e-5), further(1e-4)])
-def test_clocks_of_different_rates_are_found_with_their_difference(clock):
+def test_clocks_of_different_rates_are_found_with_their_difference(candidates_of, clock):
     """A positive difference: the torque with a time stamp is that of a later time."""
-    uniform = CandidateSet.of(record(clock=clock), (), (0.0, 50.0))
+    uniform = candidates_of(record(clock=clock))
     with_clock, (change,) = along_time(uniform)
     assert change.what == "clock"
     assert abs(change.size - clock) < 3.5 * change.std
@@ -275,8 +274,8 @@ def changing(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, back=False):
     )  # fmt: skip
 
 
-def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted():
-    uniform = CandidateSet.of(changing(damping=0.2), (), (0.0, 50.0))
+def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted(candidates_of):
+    uniform = candidates_of(changing(damping=0.2))
     assert with_evident_drag(uniform) is uniform
     with_change, (change,) = along_time(uniform)
     assert change.what == "damping"

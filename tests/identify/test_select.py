@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from analysis.identify import SETTINGS, Comparison, headline_json, select
-from analysis.identify._candidates import CandidateSet
+from analysis.identify import fit_record, headline_json, select
 from analysis.identify.profile_likelihood import CHI_SQUARE_95
 from analysis.identify.verdict import ANOTHER_DAMPING, EVEN
 from analysis.models import STRUCTURES, Structure
@@ -249,9 +248,9 @@ def test_hum_and_a_stiffness_that_rises_become_neither_mode_nor_order(sessions, 
 
 
 @pytest.fixture(scope="module")
-def field(sessions):
+def field(sessions, candidates_of):
     made = sessions("III", offsets=(0.006, -0.013))
-    return CandidateSet.of(made.measured(noise_nm=NOISE_NM, seed=46), (), (0.0, 50.0))
+    return candidates_of(made.measured(noise_nm=NOISE_NM, seed=46))
 
 
 def test_a_beam_that_is_not_uniform_is_no_fractional_order(sessions, link, plants):
@@ -301,16 +300,14 @@ def test_a_refit_at_the_minimum_stays_there(field):
 
 
 def test_the_profile_crosses_where_a_fit_with_the_order_held_says(type_iii, sessions):
-    profile, analysis = type_iii.verdict.alpha.profile, type_iii.analysis
-    comparison = Comparison.of(sessions("III").measured(noise_nm=NOISE_NM, seed=41), (0.0, 50.0))
-    nothing = np.zeros((0, comparison.frequency_hz.size), dtype=complex)
-    field = CandidateSet(comparison, analysis.noise, SETTINGS, type_iii.candidates, nothing)
-    costs = []
-    for value in (profile.estimate, *profile.interval):
-        held = Structure("VI", ("zeta", "gamma", "lambda"), {"alpha": value})
-        unknowns = field.unknowns(held)
-        costs.append(field.descent(unknowns, unknowns.vector(type_iii.fit.plant), 40).cost)
-    deviance = field.best.values * np.log(np.array(costs) / costs[0])
+    profile = type_iii.verdict.alpha.profile
+    held = [
+        Structure("VI", ("zeta", "gamma", "lambda"), {"alpha": value})
+        for value in (profile.estimate, *profile.interval)
+    ]
+    analysis = fit_record(sessions("III").measured(noise_nm=NOISE_NM, seed=41), held)
+    costs = np.array([each.cost for each in analysis.fits])
+    deviance = type_iii.candidates[0].values * np.log(costs / costs[0])
     assert deviance[1:] == pytest.approx(CHI_SQUARE_95, rel=0.05)
     assert profile.identifiable
     assert profile.relative_width < 0.02

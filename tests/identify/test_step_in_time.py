@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from analysis.identify import BAND_HZ
-from analysis.identify._candidates import CandidateSet
 from analysis.identify._modal_fit import fit_modes
 from analysis.identify._step_in_time import step_score
 from rigd.beam import clamped_free_eigenvalues
@@ -42,15 +40,20 @@ def slipped_torque(angle_rad, beam, damping):
     return total
 
 
-def score_of(session):
-    field = CandidateSet.of(session.measured(noise_nm=5e-3, seed=4), (), BAND_HZ)
+@pytest.fixture
+def score_of(candidates_of):
+    """Score a step of the stiffness in a session."""
+    return lambda session: _score(candidates_of(session.measured(noise_nm=5e-3, seed=4)))
+
+
+def _score(field):
     starts = [(m.number, m.frequency_hz, m.damping_ratio) for m in field.likeliest.modes]
     fit = fit_modes(field.comparison, field.noise, starts, field.columns)
     assert fit.visible == (1, 2, 3)
     return step_score(field.comparison, fit)
 
 
-def test_step_of_the_stiffness_is_found(sessions, plants, link):
+def test_step_of_the_stiffness_is_found(score_of, sessions, plants, link):
     still = sessions("III")
     more = slipped_torque(still.angle_rad, link, plants["III"])
     step = score_of(replace(still, torque_nm=still.torque_nm + more))
@@ -59,7 +62,7 @@ def test_step_of_the_stiffness_is_found(sessions, plants, link):
     assert step.relative_change == pytest.approx(CHANGE, rel=0.5)
 
 
-def test_none_is_named_where_nothing_changes(sessions):
+def test_none_is_named_where_nothing_changes(score_of, sessions):
     step = score_of(sessions("III"))
     assert not step.named
     assert step.score < 13

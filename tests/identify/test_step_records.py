@@ -3,18 +3,15 @@
 import pytest
 
 from analysis.identify import select
-from analysis.identify._candidates import CandidateSet
-from analysis.identify.profile_likelihood import LikelihoodProfile
+from analysis.identify.profile_likelihood import LikelihoodProfile, profiled
 from analysis.identify.sentences import order as order_sentence
 from analysis.identify.verdict import order_verdict
 
-BAND_HZ = (0.0, 50.0)
-
 
 @pytest.fixture(scope="module")
-def without_delay(steps):
+def without_delay(steps, candidates_of):
     """Candidates on a step that the beam still rings from, loudly, when the record ends."""
-    return CandidateSet.of(steps("IV", 0.1).measured(noise_nm=0.01, seed=8), (), BAND_HZ)
+    return candidates_of(steps("IV", 0.1).measured(noise_nm=0.01, seed=8))
 
 
 def test_a_step_without_a_delay_names_nothing(without_delay):
@@ -29,8 +26,6 @@ def test_a_delay_that_is_there_is_named_in_a_step(steps):
 
 
 def test_a_profile_looks_for_no_valley_where_there_is_none(without_delay):
-    from analysis.identify.profile_likelihood import profiled
-
     field, alpha, _ = profiled(without_delay)
     assert len(alpha.local_minima) == 1
     assert alpha.estimate == pytest.approx(field.best.fit.parameters["alpha"], abs=1e-4)
