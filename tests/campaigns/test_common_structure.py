@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.campaigns._orders import common_structure
-
 FREE = {"zeta": 7.1e-5, "alpha": 0.996, "gamma": 0.055, "lambda": 0.594}
 FREQUENCY_HZ = 44.8132
 STD_HZ = 3e-4
@@ -63,9 +61,8 @@ def test_another_beam_among_them_is_still_told_apart(sessions, campaign_of):
     assert sorted(map(len, found.leading.groups)) == [20, 20]
 
 
-def test_a_structure_that_some_sessions_lack_compares_none(sessions):
-    assert common_structure(sessions) == "VI"
+def test_a_structure_that_some_sessions_lack_compares_none(sessions, make_session, campaign_of):
     first, *others = sessions
     without_six = replace(first, record_estimates=first.record_estimates[1:])
-    assert common_structure([without_six, *others]) == "VII"
-    assert common_structure([]) is None
+    assert campaign_of([without_six, *others]).homogeneity.structure == "VII"
+    assert campaign_of([make_session("a.mcap")]).homogeneity.structure is None

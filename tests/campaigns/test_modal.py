@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from cauchy_residues import modal_constants
 
-from analysis.campaigns import _geometry_sentences as sentences
-from analysis.campaigns._modal import opposite_sweeps
 from analysis.identify import CONSTANTS, ModalEstimate, ModalModel, Plant
 from analysis.identify.sentences import uniformity
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING
@@ -91,13 +89,13 @@ def test_a_uniform_beam_passes_and_an_uneven_one_does_not(sessions_of, pooled_mo
             assert low < true < high
 
 
-def test_the_largest_stated_uniformity_counts_and_is_named(sessions_of, pooled_modal):
+def test_the_largest_stated_uniformity_counts_and_is_named(sessions_of, pooled_modal, verdict_of):
     zero = pooled_modal(sessions_of(4, uniformity=0.0))
     assert zero.tolerant is None
     assert not zero.leads
-    mixed = pooled_modal([*sessions_of(3, uniformity=0.0), *sessions_of(3, first=3)])
-    assert mixed.tolerant.uniformity == 1e-3
-    said = sentences.tolerance(mixed, mixed.tolerant)
+    every = [*sessions_of(3, uniformity=0.0), *sessions_of(3, first=3)]
+    assert pooled_modal(every).tolerant.uniformity == 1e-3
+    said = " ".join(verdict_of(every).sentences)
     assert "to 0.1 %, the largest of the 0 and 0.1 % that the files state" in said
     # An uneven beam stated to be exact: nothing is said of orders on that condition.
     uneven = pooled_modal(sessions_of(4, TRUE + UNEVEN, uniformity=0.0))
@@ -146,38 +144,41 @@ def test_a_falling_sweep_is_the_same_experiment(make_experiment):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_opposite_sweeps_that_agree_say_that_nothing_changed(sessions_of, count):
-    rising, falling = sessions_of(count, **UP), sessions_of(count, first=50, **DOWN)
-    found = opposite_sweeps([*rising, *falling])
-    assert (found.rising, found.falling, found.changed) == (count, count, ())
-    assert sentences.sweeps(found)[0].startswith("Nothing changed along the records")
-    assert sentences.experiments(found, None, [*rising, *falling]) == []
-    assert opposite_sweeps(rising) is None
-    assert sentences.sweeps(None) == []
+def test_opposite_sweeps_that_agree_say_that_nothing_changed(sessions_of, verdict_of, count):
+    found = verdict_of([*sessions_of(count, **UP), *sessions_of(count, first=50, **DOWN)])
+    sweeps = found.sweeps
+    assert (sweeps.rising, sweeps.falling, sweeps.changed) == (count, count, ())
+    assert any(each.startswith("Nothing changed along the records") for each in found.sentences)
+    assert found.experiments == ()
+
+
+def test_sweeps_of_one_direction_say_nothing_of_changes(sessions_of, verdict_of):
+    found = verdict_of(sessions_of(3, **UP))
+    assert found.sweeps is None
+    assert not any("changed along" in each for each in found.sentences)
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_opposite_sweeps_name_the_mode_that_changed(sessions_of, count):
+def test_opposite_sweeps_name_the_mode_that_changed(sessions_of, verdict_of, count):
     """The stiffness of mode 2 falls by 0.4 % after the rising sweep has passed it."""
     later = TRUE.copy()
     later[len(CONSTANTS)] -= 2e-3
     every = [*sessions_of(count, **UP), *sessions_of(count, later, first=50, **DOWN)]
-    found = opposite_sweeps(every)
-    (changed,) = found.changed
+    found = verdict_of(every)
+    (changed,) = found.sweeps.changed
     assert changed.mode == 2
     assert abs(changed.frequency + 2e-3) < 4 * changed.frequency_std
-    (said,) = sentences.sweeps(found)
+    said = " ".join(found.sentences)
     assert re.search(r"mode 2 \(falling: frequency 0\.(19|20)\d* ± 0\.0\d+ % lower", said)
-    (advice,) = sentences.experiments(found, None, every)
+    (advice,) = found.experiments
     assert "half the amplitude" in advice
 
 
-def test_a_refused_beam_in_sweeps_of_one_direction_asks_for_the_other(sessions_of, pooled_modal):
+def test_a_refused_beam_in_sweeps_of_one_direction_asks_for_the_other(sessions_of, verdict_of):
     every = sessions_of(4, TRUE + UNEVEN, uniformity=0.0, **UP)
-    refused = pooled_modal(every)
-    (advice,) = sentences.experiments(None, refused, every)
+    (advice,) = verdict_of(every).experiments
     assert advice.startswith("Add falling sweeps")
-    assert sentences.experiments(None, refused, sessions_of(4)) == []
+    assert verdict_of(sessions_of(4, TRUE + UNEVEN, uniformity=0.0)).experiments == ()
 
 
 # Verdict

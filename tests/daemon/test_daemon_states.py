@@ -5,9 +5,14 @@ from cases import further
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
-from operated_daemons import CommandError, Peer
+from operated_daemons import (
+    CommandError,
+    DaemonState,
+    DaemonStateMachine,
+    IllegalTransitionError,
+    Peer,
+)
 
-from rigd.daemon._states import DaemonState, DaemonStateMachine, IllegalTransitionError
 from rigd.devices.contracts import DeviceError
 
 MOST_CALLS = 3000

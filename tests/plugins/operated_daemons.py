@@ -1,7 +1,7 @@
 """The daemon's service on a rig whose processes are threads: everything else is the real thing.
 
 Tests of the daemon take its requests and refusals from here: `parse_request`, `RequestError`,
-`CommandError`, `Peer`.
+`CommandError`, `Peer`, and its states.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from rich.console import Console
 from rigd.cli.status_view import status_table
 from rigd.daemon._protocol import CommandError, RequestError, StartRequest, parse_request
 from rigd.daemon._service import Service
-from rigd.daemon._states import Peer
+from rigd.daemon._states import DaemonState, DaemonStateMachine, IllegalTransitionError, Peer
 from rigd.devices import WhatMoves, open_devices
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.engine import control_process as control
@@ -27,7 +27,10 @@ from rigd.runner import _rig as rig_module
 from rigd.runtime import StopRequest
 from rigd.session import SessionError, SessionWriter
 
-__all__ = ["CommandError", "Operated", "Peer", "RequestError", "StartRequest", "parse_request"]
+__all__ = [
+    "CommandError", "DaemonState", "DaemonStateMachine", "IllegalTransitionError", "Operated", "Peer",
+    "RequestError", "StartRequest", "parse_request",
+]  # fmt: skip
 
 _ENDED = object()
 
