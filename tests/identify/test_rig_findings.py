@@ -13,7 +13,6 @@ from analysis.identify._drag import with_evident_drag
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify._time_varying import along_time
 from analysis.identify.headline import MISREAD
-from analysis.report._text import damping_sentences
 from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues
 
 RATE_HZ = 500.0
@@ -168,7 +167,6 @@ def test_a_wrong_sign_comes_first():
     assert not verdict.adequate
     quantities = [*told.parameters.values(), *(mode.frequency_hz for mode in told.modes)]
     assert {each.flag for each in quantities} == {MISREAD}
-    assert damping_sentences(told) == ()
 
 
 def test_a_clipped_torque_leaves_no_number_without_a_flag():

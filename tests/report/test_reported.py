@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify.headline import of_fit
+from analysis.identify.headline import MISREAD, of_fit
 from analysis.models import STRUCTURES
 from analysis.report import document, illustrations, result_text
 from analysis.report.bands import excited_band_hz, supported_band_hz
@@ -148,6 +148,8 @@ def test_of_modes_that_do_not_show_no_damping_is_told(careful, retold, as_text):
     none = of_fit("VI", careful.whole.fit, ())
     assert "damping ratio is" in told
     assert "damping ratio" not in verdict(retold(careful, headline=none))
+    misread = careful.whole.headline.doubted(MISREAD)
+    assert "damping ratio" not in verdict(retold(careful, headline=misread))
 
 
 def loss_axes(result):
