@@ -1,6 +1,7 @@
 """Every trial of the validation is accounted for: done, or lost and why."""
 
 import os
+import xml.etree.ElementTree as ET
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,8 +12,7 @@ from analysis.campaigns.workers import process_pool
 from analysis.cli.campaign import campaign_command
 from analysis.cli.sessions import Outputs
 from analysis.report import campaign_document
-from analysis.report._campaign_figures import validation_figure
-from analysis.report.campaign_report import campaign_page, campaign_text
+from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 
 
 def ends_at_one(function, path, *arguments):
@@ -79,8 +79,15 @@ def test_terminal_page_and_files_account_for_it(shaken):
     assert trials["lost"][0]["file"].endswith("1.mcap")
     (lost,) = (row for row in content["validation"] if row["lost"])
     assert (Path(lost["file"]).name, lost.get("error")) == ("1.mcap", None)
-    texts = [text.get_text() for text in validation_figure(shaken).texts]
-    assert any(text.startswith("3 of 4 sessions") for text in texts)
+
+
+@pytest.mark.further  # as terminal and page
+def test_the_figure_accounts_for_it(shaken, tmp_path):
+    write_campaign(shaken, tmp_path / "report", with_paper=False)
+    texts = ET.parse(tmp_path / "report" / "figures" / "validation.svg").iter(
+        "{http://www.w3.org/2000/svg}text"
+    )
+    assert any("".join(text.itertext()).strip().startswith("3 of 4 sessions") for text in texts)
 
 
 def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tmp_path, capsys):

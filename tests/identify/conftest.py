@@ -277,6 +277,12 @@ def candidates_of():
 
 
 @pytest.fixture(scope="session")
+def freest_of():
+    """Fit the freest structure alone to a measurement, in the usual band: its candidate set."""
+    return lambda measurement: CandidateSet.of_freest(measurement, (), BAND_HZ)
+
+
+@pytest.fixture(scope="session")
 def candidates():
     """Make a candidate set of candidates that a test made up, without a record."""
 
