@@ -130,7 +130,15 @@ class DecaySpectra:
     def gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        """Differentiate ``amplitudes @ columns(poles)`` through the poles, shape (k, K)."""
+        """Differentiate ``amplitudes @ columns(poles)`` through the poles, shape (k, K).
+
+        Parameters
+        ----------
+        poles : sequence of Pole
+            Poles with their derivatives by k unknowns.
+        amplitudes : ndarray of float, shape (m,)
+            Amplitude of each column, in N·m.
+        """
         turned = []
         index = 0
         for pole in poles:

@@ -294,8 +294,16 @@ def headline(
 ) -> Headline:
     """Return the headline from the freest structure of a candidate set.
 
-    `orders` are the verdicts on alpha and lambda in that structure, `visible` the modes that the
-    record shows, and `unexplained` the reason against every number; None if only noise remains.
+    Parameters
+    ----------
+    candidate_set : CandidateSet
+        Candidates of the record.
+    orders : tuple of OrderVerdict
+        Verdicts on alpha and lambda.
+    visible : tuple of int
+        Numbers of the visible modes.
+    unexplained : str or None
+        Reason against every number; None if only noise remains.
     """
     freest = candidate_set.freest
     fractional = frozenset(each.order for each in orders if each.status == "fractional")
@@ -404,6 +412,13 @@ def structures(
     is excluded if its likelihood is lower by as much and its BIC exceeds the lowest by 10. A
     structure that explains the record with unnecessary parameters is not excluded. A structure that
     fixes an order at 1 is excluded if the order is in `fractional`: the record excludes 1 for it.
+
+    Parameters
+    ----------
+    candidate_set : CandidateSet
+        Candidates of the record.
+    fractional : frozenset of str
+        Orders for which the record excludes 1.
     """
     return tuple(
         (each.name, _status(candidate_set, each, fractional)) for each in candidate_set.candidates

@@ -140,6 +140,17 @@ def profile(
     tangent of the last, and each step goes to the value at which a parabolic deviance would reach
     the next level. If much of the range is admitted and `elsewhere` is set, the remaining range is
     searched for another local minimum, and a walk starts there as well.
+
+    Parameters
+    ----------
+    candidate_set : CandidateSet
+        Candidates of the record.
+    candidate : Candidate
+        Candidate at whose fit the walk begins.
+    order : {"alpha", "lambda"}
+        Order that is held at each value.
+    elsewhere : bool
+        Whether to search for further local minima.
     """
     walk = Walk(candidate_set, candidate, order)
     walk.both_ways()
@@ -181,9 +192,18 @@ def profiled(
     """Profile alpha and lambda in the freest structure.
 
     If a walk finds a lower cost than the candidates, or another local minimum, all candidates start
-    there once more, so that the selected fit and the profile agree. Orders in `determined` need no
-    search for another local minimum, and `walk` states whether the orders can be determined.
+    there once more, so that the selected fit and the profile agree.
+
     Returns the ranked candidates and both profiles.
+
+    Parameters
+    ----------
+    candidate_set : CandidateSet
+        Candidates of the record.
+    determined : collection of str
+        Orders that need no search for another local minimum.
+    walk : bool
+        Whether the orders can be determined; if not, none is profiled.
     """
     for round_ in range(1, _ROUNDS + 1):
         freest = candidate_set.freest
@@ -253,6 +273,13 @@ def with_order(structure: Structure, order: Order) -> Structure:
     """Return a structure with one order of its damping free.
 
     A missing damping is added, with a free coefficient.
+
+    Parameters
+    ----------
+    structure : analysis.models.Structure
+        Structure that fixes the order or lacks the damping.
+    order : {"alpha", "lambda"}
+        Order to be free.
     """
     coefficient = COEFFICIENT_OF[order]
     fixed = {name: at for name, at in structure.fixed.items() if name not in (coefficient, order)}
@@ -261,7 +288,17 @@ def with_order(structure: Structure, order: Order) -> Structure:
 
 
 class Walk:
-    """Refits with one order held, and their costs."""
+    """Refits with one order held, and their costs.
+
+    Parameters
+    ----------
+    candidate_set : CandidateSet
+        Candidates of the record.
+    candidate : Candidate
+        Candidate at whose fit the walk begins.
+    order : {"alpha", "lambda"}
+        Order that is held.
+    """
 
     def __init__(self, candidate_set: CandidateSet, candidate: Candidate, order: Order) -> None:
         self.order = order
@@ -472,6 +509,13 @@ def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> 
     """Return the local minima within the 95 % limit, the lowest first.
 
     `values`, shape (n,), increase; `deviance`, shape (n,), is above the lowest.
+
+    Parameters
+    ----------
+    values : ndarray of float, shape (n,)
+        Values of the order, rising.
+    deviance : ndarray of float, shape (n,)
+        Deviance at each value, above the lowest.
     """
     padded = np.concatenate([[np.inf], deviance, [np.inf]])
     lows = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] < padded[2:]))
@@ -488,6 +532,13 @@ def admitted(
     values: NDArray[np.float64], deviance: NDArray[np.float64]
 ) -> tuple[tuple[float, float], bool, bool]:
     """Return the interval of all values within the 95 % limit, barriers included.
+
+    Parameters
+    ----------
+    values : ndarray of float, shape (n,)
+        Values of the order, rising.
+    deviance : ndarray of float, shape (n,)
+        Deviance at each value, above the lowest.
 
     Returns
     -------
@@ -507,6 +558,13 @@ def crossing(inside: float, outside: float, below: float, above: float) -> float
 
     `inside` and `outside` are values on either side of the limit, `below` and `above` their
     deviances.
+
+    Parameters
+    ----------
+    inside, outside : float
+        Values on either side of the limit.
+    below, above : float
+        Their deviances.
     """
     low, high = math.sqrt(max(below, 0.0)), math.sqrt(max(above, 0.0))
     fraction = (math.sqrt(CHI_SQUARE_95) - low) / (high - low)
@@ -514,7 +572,17 @@ def crossing(inside: float, outside: float, below: float, above: float) -> float
 
 
 def gaps(known: list[float], span: tuple[float, float], spacing: float) -> list[float]:
-    """Return equally spaced values within a span that lie outside of all known ones."""
+    """Return equally spaced values within a span that lie outside of all known ones.
+
+    Parameters
+    ----------
+    known : list of float
+        Values at which the profile is known.
+    span : tuple of float
+        Ends of the span.
+    spacing : float
+        Distance between neighbouring values.
+    """
     grid = np.arange(span[0] + spacing / 2, span[1], spacing).tolist()
     low, high = min(known), max(known)
     return [value for value in grid if value < low - spacing / 4 or value > high + spacing / 4]

@@ -48,8 +48,14 @@ def of_headline(
 ) -> list[str]:
     """Return sentences on the modes, the damping and the conditions of these numbers.
 
-    `orders` are those of alpha and lambda; `alone` states that nothing else explains the record as
-    well.
+    Parameters
+    ----------
+    headline : Headline
+        Headline of the record.
+    orders : tuple of OrderVerdict
+        Verdicts on alpha and lambda.
+    alone : bool
+        Whether nothing else explains the record as well.
     """
     if len(headline.visible_modes) < _SEVERAL:
         sentences = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
@@ -110,7 +116,15 @@ def _of_damping(headline: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -
 
 
 def slope(headline: Headline, verdict: OrderVerdict) -> str:
-    """Return the sentence on one order: the slope of a loss over the visible modes."""
+    """Return the sentence on one order: the slope of a loss over the visible modes.
+
+    Parameters
+    ----------
+    headline : Headline
+        Headline with an estimate that tolerates deviations of the geometry.
+    verdict : OrderVerdict
+        Verdict on the order.
+    """
     estimate = headline.tolerant
     assert estimate is not None
     name, of = verdict.order, _OF[verdict.order]
@@ -280,7 +294,21 @@ def experiments(
     found: tuple[Finding, ...],
     close: tuple[Candidate, ...],
 ) -> list[str]:
-    """Return experiments that would clarify the verdict, in addition to the findings' remedies."""
+    """Return experiments that would clarify the verdict, in addition to the findings' remedies.
+
+    Parameters
+    ----------
+    candidate_set : CandidateSet
+        Candidates of the record.
+    orders : tuple of OrderVerdict
+        Verdicts on alpha and lambda.
+    visible : tuple of int
+        Numbers of the visible modes.
+    found : tuple of Finding
+        Findings on the record.
+    close : tuple of Candidate
+        Candidates that explain the record about as well as the selected one.
+    """
     advice = []
     unknown = [o for o in orders if o.status == "not identifiable"]
     if unknown:

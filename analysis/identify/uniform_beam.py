@@ -196,7 +196,12 @@ class ConstantsProblem:
     ) -> NDArray[np.float64]:
         """Return the modal constants of beams, (m, 4 n), for unknowns of shape (m, 7).
 
-        `terms` are those of a beam other than the stated one.
+        Parameters
+        ----------
+        x : ndarray of float
+            Vector of unknowns.
+        terms : ModeTerms, optional
+            Terms of a beam other than the stated one.
         """
         terms = self.terms if terms is None else terms
         zeta, alpha, gamma, lambda_, ratio, stiffness, delay = self.parameters(x).T[..., None]
@@ -246,7 +251,12 @@ class ConstantsProblem:
     ) -> NDArray[np.float64]:
         """Return the differences from the measured constants, (m, 4 n).
 
-        `terms` are those of a beam other than the stated one.
+        Parameters
+        ----------
+        x : ndarray of float
+            Vector of unknowns.
+        terms : ModeTerms, optional
+            Terms of a beam other than the stated one.
         """
         with np.errstate(all="ignore"):  # a mode without a pole gives NaN
             off = self.constants(x, terms) - self.measured
@@ -304,7 +314,12 @@ class ConstantsProblem:
     def held_at_edge(self, index: int, x: NDArray[np.float64]) -> Minimum:
         """Descend from `x` with a damping at the lower edge of its size, where it has no effect.
 
-        `index` is that of its coefficient among `PARAMETERS`.
+        Parameters
+        ----------
+        index : int
+            Index of its coefficient among `PARAMETERS`.
+        x : ndarray of float
+            Vector of unknowns.
         """
         high = self.upper.copy()
         high[index] = self.lower[index]
@@ -313,7 +328,14 @@ class ConstantsProblem:
     def held(self, index: int, value: float, x: NDArray[np.float64]) -> Minimum:
         """Descend from `x` with one of `PARAMETERS` held; the result's `x` are the unknowns.
 
-        `value` is as in `parameters`.
+        Parameters
+        ----------
+        index : int
+            Index among `PARAMETERS`.
+        value : float
+            Value at which it is held, as in `parameters`.
+        x : ndarray of float
+            Vector of unknowns to begin with.
         """
         # The parameter replaces the unknown that contributes to it with factor 1.
         forward = np.eye(x.size)

@@ -88,8 +88,16 @@ def order_verdict(
 ) -> OrderVerdict:
     """Assess one order in the freest structure.
 
-    `profile` is that of the order on the selected beam, `visible` the visible modes, and `doubt`
-    the reason against that structure; None if it is valid.
+    Parameters
+    ----------
+    candidate_set : CandidateSet
+        Candidates of the record.
+    profile : LikelihoodProfile
+        Profile of the order on the selected beam.
+    visible : tuple of int
+        Numbers of the visible modes.
+    doubt : str or None
+        Reason against the structure; None if it is valid.
     """
     status, reason = _status(candidate_set, profile, visible, doubt=doubt)
     known = status not in ("not identifiable", "absent")
@@ -104,7 +112,15 @@ def order_verdict(
 
 
 def not_reported_reason(candidate_set: CandidateSet, visible: tuple[int, ...]) -> str | None:
-    """Return why a record determines no order, whatever its likelihood; None if it may."""
+    """Return why a record determines no order, whatever its likelihood; None if it may.
+
+    Parameters
+    ----------
+    candidate_set : CandidateSet
+        Candidates of the record.
+    visible : tuple of int
+        Numbers of the visible modes.
+    """
     return too_few_modes(candidate_set.freest.structure, len(visible))
 
 
@@ -245,7 +261,15 @@ class Verdict:
 
 
 def rivals(candidate_set: CandidateSet, within: float) -> tuple[Candidate, ...]:
-    """Return the candidates whose BIC is within a limit above that of the first."""
+    """Return the candidates whose BIC is within a limit above that of the first.
+
+    Parameters
+    ----------
+    candidate_set : CandidateSet
+        Candidates of the record.
+    within : float
+        Largest difference of BIC.
+    """
     limit = candidate_set.best.bic + within
     return tuple(c for c in candidate_set.candidates[1:] if c.bic < limit)
 

@@ -28,8 +28,8 @@ from rigd.runtime import StopRequest
 from rigd.session import SessionError, SessionWriter
 
 __all__ = [
-    "CommandError", "DaemonState", "DaemonStateMachine", "IllegalTransitionError", "Operated", "Peer",
-    "RequestError", "StartRequest", "parse_request",
+    "CommandError", "DaemonState", "DaemonStateMachine", "IllegalTransitionError", "Operated",
+    "Peer", "RequestError", "StartRequest", "parse_request",
 ]  # fmt: skip
 
 _ENDED = object()
