@@ -17,7 +17,7 @@ from rigd.devices import unknown_values
 from rigd.devices.parameters import Selection
 from rigd.engine.messages import Finished, SessionJob
 from rigd.engine.reference import put_reference
-from rigd.engine.shared_state import Phase, Stop, Word
+from rigd.engine.shared_state import Phase, StateField, Stop
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
@@ -105,18 +105,18 @@ def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> M
     """Measure the loop alone, with only a reader that empties the ring; raise LoopError."""
     rate_hz, excitation = profile.rig.rate_hz, _excitation(profile, seconds)
     with connected(profile) as (_, group):
-        channels, shared_state = group.channels, group.channels.board
+        channels, shared_state = group.channels, group.channels.shared_state
         meter = UsageMeter(group.control.pid)
-        shared_state[Word.STOP] = Stop.NO
-        shared_state[Word.GO] = 1
+        shared_state[StateField.STOP] = Stop.NO
+        shared_state[StateField.GO] = 1
         reference = put_reference(channels.reference_fd, excitation.reference_rad)
         group.control.send(SessionJob(profile, reference))
         blocks = []
         finished = None
         while not isinstance(finished, Finished):
             finished = group.control.poll(_POLL_S)
-            shared_state.beat(Word.SUPERVISOR_BEAT)
-            meter.look(Phase(shared_state[Word.PHASE]))
+            shared_state.beat(StateField.SUPERVISOR_BEAT)
+            meter.look(Phase(shared_state[StateField.PHASE]))
             while block := channels.samples.take(_BLOCK):
                 blocks.append(block)
             channels.controls.discard()

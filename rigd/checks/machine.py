@@ -23,12 +23,12 @@ from rigd.runtime import OWN_PYTHON
 _PATIENCE_S = 20.0
 _TRY = """
 import json, sys
-from rigd.engine.realtime import Precedence, obtain
+from rigd.engine.realtime import Precedence, apply_realtime
 priority, below, cpu = map(int, sys.argv[1:])
 other = Precedence(below, cpu)
 supervision = other.take()
 other.release()
-print(json.dumps([obtain(priority=priority, cpu=cpu), supervision]))
+print(json.dumps([apply_realtime(priority=priority, cpu=cpu), supervision]))
 """
 _ROWS = {"supervision": "supervisor and recorder"}
 _WANTED = {

@@ -79,7 +79,7 @@ def serve(
         fast=fast,
         page=web or web_port is not None,
         page_port=web_port,
-        look=not no_quick_look,
+        quick_looks=not no_quick_look,
     )
     if number is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)

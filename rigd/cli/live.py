@@ -299,9 +299,9 @@ def _as_recording(path: Path, scratch: Path) -> Path:
 
 
 def _open_window(recording: Path, scratch: Path, path: Path) -> None:
-    from rigd.live import Window
+    from rigd.live import FileWindow
 
-    with Window(recording, scratch) as window:
+    with FileWindow(recording, scratch) as window:
         typer.echo(f"{path.name} is shown; close the window, or press Ctrl-C, to end.", err=True)
         if window.wait():
             fail(

@@ -47,7 +47,7 @@ def _print(report: "StopReport") -> None:
             lines.append(f"All {len(report.stopped)} sessions have ended; the torque is off.")
         elif not report.quiet:
             whose = " of yours" if report.others else ""
-            lines.append(f"No session{whose} is running. Searched: {', '.join(report.places)}.")
+            lines.append(f"No session{whose} is running. Searched: {', '.join(report.searched)}.")
     problems = [
         f"Not stopped: {text}; only that user or root can stop it." for text in report.others
     ]

@@ -31,7 +31,7 @@ def run_daemon(
     group: str | None,
     live: bool,
     fast: bool,
-    look: bool,
+    quick_looks: bool,
     page: bool = False,
     page_port: int | None = None,
 ) -> signal.Signals:
@@ -47,7 +47,7 @@ def run_daemon(
         Group whose members may command the daemon, in addition to this user.
     live, fast
         See :class:`rigd.runner._rig.Rig`.
-    look
+    quick_looks
         Whether to make a quick look of each session.
     page
         Whether to serve the operator's page.
@@ -87,7 +87,7 @@ def run_daemon(
             partial(reality, profile.rig),
             fast=fast,
             live=live,
-            quick_looks=look,
+            quick_looks=quick_looks,
         )
         _log.info("%s Listening on %s", what_moves(profile.rig, moving), path)
         for difference in simulated_differently(profile.rig):

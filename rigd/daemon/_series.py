@@ -9,7 +9,7 @@ from typing import Any, Final
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._log import NAME
 from rigd.daemon._states import DaemonState, Document, fit_document
-from rigd.engine.shared_state import Event
+from rigd.engine.shared_state import LogEvent
 from rigd.runner import RigError, Series, result_line
 from rigd.runner.session import SessionProgress, SessionResult
 from rigd.runtime import StopRequest
@@ -123,7 +123,7 @@ class SeriesReporter:
     def shown(self, where: str) -> None:
         self._report("info", where)
 
-    def update(self, progress: SessionProgress, events: list[Event]) -> None:
+    def update(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         for event in events:
             if event.level in _LOGGED:
                 self._report(event.level, event.message, notable=event.notable)

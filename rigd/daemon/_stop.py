@@ -58,7 +58,7 @@ class StopReport:
         Folders and tables that could not be examined, and replies that are not trusted.
     others
         Sessions of other users, which this user cannot stop.
-    places
+    searched
         Tables and folders that were searched.
     """
 
@@ -68,7 +68,7 @@ class StopReport:
     running: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
-    places: list[str] = field(default_factory=list)
+    searched: list[str] = field(default_factory=list)
 
     @property
     def found(self) -> bool:
@@ -136,15 +136,15 @@ class _Stop:
     def _find_daemons(self) -> "list[_Daemon]":
         """Return the listening daemons, in the order of their sockets."""
         report = self._report
-        report.places.append("the listening sockets (/proc/net/unix)")
-        report.places.append(f"{tempfile.gettempdir()}/rigd-{self._uid or ''}*")
+        report.searched.append("the listening sockets (/proc/net/unix)")
+        report.searched.append(f"{tempfile.gettempdir()}/rigd-{self._uid or ''}*")
         try:
             paths = set(own_sockets())
         except OSError as error:
             report.doubts.append(f"The list of sockets cannot be read ({error.strerror}).")
             paths = set()
         for folder in [*known_folders(self._uid or None), COMMON]:
-            report.places.append(str(folder))
+            report.searched.append(str(folder))
             fault = folder_fault(folder, shared=folder == COMMON)
             if fault:
                 report.doubts.append(fault)
@@ -175,7 +175,7 @@ class _Stop:
 
     def _follow(self, daemons: "list[_Daemon]") -> "list[_Supervisor]":
         """Stop supervisors without a socket; return those whose session did not end in time."""
-        self._report.places.insert(0, "the process table (/proc)")
+        self._report.searched.insert(0, "the process table (/proc)")
         while True:
             try:
                 table = read_processes()

@@ -13,7 +13,7 @@ from rigd.engine.channels import Channels
 from rigd.engine.cycle import Cycle, Standstill
 from rigd.engine.messages import Ending
 from rigd.engine.processes import Parent
-from rigd.engine.shared_state import Phase, Word
+from rigd.engine.shared_state import Phase, StateField
 from rigd.engine.timing import Clock, TickScheduler
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
@@ -61,7 +61,7 @@ class ProbeSequence(SessionSequence):
         SessionEnd
             If the operator or an interlock ends it.
         """
-        self._shared_state[Word.PHASE] = Phase.PROBING
+        self._shared_state[StateField.PHASE] = Phase.PROBING
         self._standstill.forget()
         cycle = self._cycle
         start_rad = cycle.angle_rad

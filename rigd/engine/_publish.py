@@ -8,8 +8,8 @@ from rigd.devices.contracts import Devices, LineHealth
 from rigd.engine._ring import Ring
 from rigd.engine.channels import CONTROL, Channels
 from rigd.engine.cycle import Cycle
-from rigd.engine.processes import Pulse
-from rigd.engine.shared_state import UNKNOWN, SharedState, Word
+from rigd.engine.processes import Heartbeat
+from rigd.engine.shared_state import UNKNOWN, SharedState, StateField
 from rigd.engine.timing import Clock, TickScheduler
 from rigd.session.layout import Status, pack_control_into, pack_sample_into, pack_timing_into
 
@@ -50,11 +50,11 @@ class Display:
             Time of the engine's clock. The load of a line is the mean since the call before.
         """
         shared_state = self._shared_state
-        shared_state.beat(Word.CONTROL_BEAT)
+        shared_state.beat(StateField.CONTROL_BEAT)
         for field, value in (
-            (Word.ANGLE_NRAD, cycle.angle_rad),
-            (Word.COUPLING_TORQUE_NNM, cycle.coupling_torque_nm),
-            (Word.TORQUE_COMMAND_NNM, cycle.torque_command_nm),
+            (StateField.ANGLE_NRAD, cycle.angle_rad),
+            (StateField.COUPLING_TORQUE_NNM, cycle.coupling_torque_nm),
+            (StateField.TORQUE_COMMAND_NNM, cycle.torque_command_nm),
         ):
             if isfinite(value):
                 shared_state[field] = round(value * 1e9)
@@ -62,15 +62,15 @@ class Display:
         self.doubts = [line.doubt for line in (drive, sensor) if line.doubt]
         self.doubt_counts = [line.doubt_count for line in (drive, sensor) if line.doubt_count]
         known = [line.errors for line in (drive, sensor) if line.errors is not None]
-        shared_state[Word.BUS_ERRORS] = sum(known) if known else UNKNOWN
-        shared_state[Word.SENSOR_STATUS] = UNKNOWN if sensor.status is None else sensor.status
+        shared_state[StateField.BUS_ERRORS] = sum(known) if known else UNKNOWN
+        shared_state[StateField.SENSOR_STATUS] = UNKNOWN if sensor.status is None else sensor.status
         self._show_load((drive, sensor), now_ns)
 
     def _show_load(self, lines: tuple[LineHealth, ...], now_ns: int) -> None:
         """Publish the load of the busiest line since the last call."""
         bits = tuple(line.bits or 0 for line in lines)
         if self._before is None:
-            self._shared_state[Word.BUS_LOAD_PPM] = UNKNOWN
+            self._shared_state[StateField.BUS_LOAD_PPM] = UNKNOWN
         else:
             then_ns, before = self._before
             if now_ns <= then_ns:
@@ -81,7 +81,7 @@ class Display:
                 for line, now, then in zip(lines, bits, before, strict=True)
                 if line.bit_rate_bit_s
             ]
-            self._shared_state[Word.BUS_LOAD_PPM] = round(max(loads)) if loads else UNKNOWN
+            self._shared_state[StateField.BUS_LOAD_PPM] = round(max(loads)) if loads else UNKNOWN
         self._before = now_ns, bits
 
 
@@ -149,7 +149,7 @@ class SampleLog:
         self._terms_ring = channels.controls
         # Under the virtual clock no reading has an age.
         self._timing_ring = None if clock.virtual else channels.timings
-        self._shared_state = channels.board
+        self._shared_state = channels.shared_state
         self._late_ns = late_ns
         self.counts = Counts()
 
@@ -178,12 +178,12 @@ class SampleLog:
         offset = ring.slot()
         if offset < 0 and (not wait or (offset := self._wait_for_room()) < 0):
             self.counts.lost += 1
-            self._shared_state[Word.LOST] = self.counts.lost
+            self._shared_state[StateField.LOST] = self.counts.lost
             return
         if lateness_ns > self._late_ns:
             flags |= _LATE
             self.counts.late += 1
-            self._shared_state[Word.LATE] = self.counts.late
+            self._shared_state[StateField.LATE] = self.counts.late
         if flags & _STALE:
             self._count_stale(flags)
         t_ns = metronome.t_ns
@@ -217,10 +217,10 @@ class SampleLog:
         counts, shared_state = self.counts, self._shared_state
         if flags & _ANGLE_STALE:
             counts.stale_angles += 1
-            shared_state[Word.STALE_ANGLES] = counts.stale_angles
+            shared_state[StateField.STALE_ANGLES] = counts.stale_angles
         if flags & _WRENCH_STALE:
             counts.stale_wrenches += 1
-            shared_state[Word.STALE_WRENCHES] = counts.stale_wrenches
+            shared_state[StateField.STALE_WRENCHES] = counts.stale_wrenches
 
     def _write_ages(self, ring: Ring, tick: int, t_ns: int) -> None:
         offset = ring.slot()
@@ -258,9 +258,9 @@ class SampleLog:
 
     def _wait_for_room(self) -> int:
         """Return the next offset once the recorder makes room, or -1 if it stopped reading."""
-        ring, recorder = self._ring, Pulse()
+        ring, recorder = self._ring, Heartbeat()
         while (offset := ring.slot()) < 0:
-            if recorder.look(ring.read, time.monotonic()) > _ROOM_PATIENCE_S:
+            if recorder.stalled_for(ring.read, time.monotonic()) > _ROOM_PATIENCE_S:
                 break
             time.sleep(_ROOM_POLL_S)
         return offset

@@ -20,8 +20,8 @@ from rigd.engine.cycle import Cycle, Rest, Standstill, observe_rest
 from rigd.engine.messages import Ending
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import page_faults
-from rigd.engine.reference import PieceReader
-from rigd.engine.shared_state import Event, Level, Phase, Stop, Word, write_event
+from rigd.engine.reference import ReferenceReader
+from rigd.engine.shared_state import Level, LogEvent, Phase, StateField, Stop, write_event
 from rigd.engine.timing import SIGN_OF_LIFE_S, SUSPENDED_S, Clock, SuspendWatch, TickScheduler
 from rigd.excitation.moves import quintic, still_path
 from rigd.profile import Profile
@@ -128,7 +128,7 @@ class SessionSequence:
         stop: StopRequest,
         ending: Ending,
         touch: "TouchWatch | None" = None,
-        reader: PieceReader | None = None,
+        reader: ReferenceReader | None = None,
     ) -> None:
         self._touch = touch
         self._reader = reader
@@ -137,7 +137,7 @@ class SessionSequence:
         self._cycle = cycle
         self._clock = clock
         self._channels = channels
-        self._shared_state = channels.board
+        self._shared_state = channels.shared_state
         self._parent = parent
         self._stop = stop
         self._rate_hz = profile.rig.rate_hz
@@ -223,7 +223,7 @@ class SessionSequence:
     def _wait_for_rest(self) -> Rest:
         """Return the first interval of readings in which neither motor nor beam moves."""
         settings = self._profile.session
-        self._shared_state[Word.PHASE] = Phase.TARING
+        self._shared_state[StateField.PHASE] = Phase.TARING
         patience_s = settings.rest_timeout_s
         while True:
             self._cycle.sensor_watch.learn()
@@ -238,8 +238,8 @@ class SessionSequence:
                     f"{moving} It did not come to rest within session.rest_timeout_s = "
                     f"{settings.rest_timeout_s:g} s; wait until it is at rest and start again.",
                 )
-            if self._shared_state[Word.PHASE] != Phase.WAITING:
-                self._shared_state[Word.PHASE] = Phase.WAITING
+            if self._shared_state[StateField.PHASE] != Phase.WAITING:
+                self._shared_state[StateField.PHASE] = Phase.WAITING
                 self._log_event("info", f"Waiting until the rig is at rest. {moving}")
 
     def _motion_reason(self, rest: Rest) -> str:
@@ -259,7 +259,7 @@ class SessionSequence:
 
     def hold(self) -> None:
         """Hold the motor at its angle after the drive has been enabled."""
-        self._shared_state[Word.PHASE] = Phase.SETTLING
+        self._shared_state[StateField.PHASE] = Phase.SETTLING
         self._standstill.forget()
         # The last reading, not the mean: the controller must start without a step.
         self._start_angle_rad = self._cycle.angle_rad
@@ -276,9 +276,9 @@ class SessionSequence:
         SessionEnd
             If the supervisor does not report this in time, although its process may exist.
         """
-        self._shared_state[Word.PHASE] = Phase.READY
+        self._shared_state[StateField.PHASE] = Phase.READY
         deadline = time.monotonic() + _GO_PATIENCE_S
-        while not self._shared_state[Word.GO]:
+        while not self._shared_state[StateField.GO]:
             if time.monotonic() > deadline:
                 raise SessionEnd(
                     "fault",
@@ -311,15 +311,18 @@ class SessionSequence:
         )
         counts, virtual, signals = self.counts, self._clock.virtual, self._stop
         touch, reader = self._touch, self._reader
-        stop, scheduled = shared_state.view(Word.STOP), shared_state.view(Word.SCHEDULED)
+        stop, scheduled = (
+            shared_state.view(StateField.STOP),
+            shared_state.view(StateField.SCHEDULED),
+        )
         metronome.restart()
         self._recording = True
         self._page_faults = page_faults()
         wall_ns, before_ns = time.time_ns(), time.monotonic_ns()
         # With the real clock tick 0 is still ahead, or up to one period in the past.
         ahead_ns = 0 if virtual else metronome.start_ns - before_ns
-        shared_state[Word.START_UTC_NS] = wall_ns + ahead_ns
-        shared_state[Word.PHASE] = Phase.RUNNING
+        shared_state[StateField.START_UTC_NS] = wall_ns + ahead_ns
+        shared_state[StateField.PHASE] = Phase.RUNNING
         self._log_event("info", f"Record starts: {total} ticks at {self._rate_hz:g} Hz.")
         last = -1
         first_ns = last_ns = 0
@@ -336,7 +339,7 @@ class SessionSequence:
             if missed:
                 missed = min(tick, total) - last - 1
                 counts.missed += missed
-                shared_state[Word.MISSED] = counts.missed
+                shared_state[StateField.MISSED] = counts.missed
                 end = self._missed_too_many(missed, min(tick, total))
                 if tick >= total:
                     last, reference_rad = total - 1, start_rad + reference[-1]
@@ -374,7 +377,7 @@ class SessionSequence:
         if end is not None:
             raise end
 
-    def _await_segment(self, reader: PieceReader, tick: int) -> None:
+    def _await_segment(self, reader: ReferenceReader, tick: int) -> None:
         """Stop virtual time until a tick has its reference.
 
         With devices on lines, a tick now and then holds the last angle and shows a sign of life.
@@ -393,7 +396,7 @@ class SessionSequence:
         if contact is None:
             return None
         if contact.detected:
-            self._shared_state[Word.TOUCHES] += 1
+            self._shared_state[StateField.TOUCHES] += 1
         if contact.ends:
             self._cycle.torque_off()  # before this tick's sample is written
             return SessionEnd(contact.ends, contact.message)
@@ -402,7 +405,7 @@ class SessionSequence:
 
     def damp(self) -> None:
         """Damp the beam actively around the final angle of the record."""
-        self._shared_state[Word.PHASE] = Phase.RETURNING
+        self._shared_state[StateField.PHASE] = Phase.RETURNING
         end_rad = self._end_angle_rad
         if self._ending.damper is None:
             return
@@ -536,7 +539,7 @@ class SessionSequence:
         return None if reason is None else SessionEnd("fault", str(self._cycle.with_cause(reason)))
 
     def _stop_reason(self) -> SessionEnd | None:
-        stop = self._shared_state[Word.STOP]
+        stop = self._shared_state[StateField.STOP]
         if self._stop.requested or stop == Stop.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")
         if stop == Stop.NO_RECORDER:
@@ -558,7 +561,7 @@ class SessionSequence:
             self._metronome.due_ns,
             # With the virtual clock the loop waits for the recorder.
             0.0 if self._clock.virtual else self._channels.samples.waiting / self._rate_hz,
-            self._shared_state[Word.DISK_FREE_MB] or inf,
+            self._shared_state[StateField.DISK_FREE_MB] or inf,
         )
         self._report_warnings()
         if violation is not None:
@@ -571,7 +574,7 @@ class SessionSequence:
                     f"The computer was suspended for {suspended_s:.1f} s and the motor was not "
                     "controlled; disable its power management.",
                 )
-            beat = self._shared_state[Word.SUPERVISOR_BEAT]
+            beat = self._shared_state[StateField.SUPERVISOR_BEAT]
             self._unanswered_polls = (
                 self._unanswered_polls + 1 if beat == self._supervisor_beat else 0
             )
@@ -626,7 +629,7 @@ class SessionSequence:
     def _log_event(self, level: Level, message: str) -> None:
         # Events before tick 0 have no time in the file yet.
         t_ns = self._clock.now_ns() - self._metronome.start_ns if self._recording else 0
-        write_event(self._channels.events, Event(t_ns, level, message))
+        write_event(self._channels.events, LogEvent(t_ns, level, message))
 
 
 def _return_path(profile: Profile, ending: Ending) -> list[float]:

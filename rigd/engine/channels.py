@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from math import ceil
 
 from rigd.engine._ring import Ring, RingSpec
-from rigd.engine.shared_state import EVENT_SIZE, SharedState, Stop, Word
+from rigd.engine.shared_state import EVENT_SIZE, SharedState, StateField, Stop
 from rigd.safety.limits import BUFFERED_S
 from rigd.session.layout import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
 # Topics
 
-HURRIED_BUFFERED_S = 160.0
+VIRTUAL_BUFFERED_S = 160.0
 """Time that the rings hold under the virtual clock, instead of `BUFFERED_S`: there a session takes
 about a second, and observers lag behind."""
 _EVENTS = 256
@@ -90,7 +90,7 @@ class Channels:
     """Ages of the readings."""
     samples: Ring
     """Samples."""
-    board: SharedState
+    shared_state: SharedState
     """State that every process can read."""
     reference_fd: int = -1
     """Descriptor of the memory for the reference of a session."""
@@ -103,12 +103,12 @@ class Channels:
     @property
     def specs(self) -> ChannelSpecs:
         """Descriptors and layout to hand to a child process."""
-        return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.board.fd)
+        return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.shared_state.fd)
 
     def ask_to_stop(self) -> None:
         """Request a stop of the control process, unless a stop was requested before."""
-        if self.board[Word.STOP] == Stop.NO:
-            self.board[Word.STOP] = Stop.OPERATOR
+        if self.shared_state[StateField.STOP] == Stop.NO:
+            self.shared_state[StateField.STOP] = Stop.OPERATOR
 
     def clear(self) -> None:
         """Discard the records of the last session; only while no recorder runs."""
@@ -119,7 +119,7 @@ class Channels:
         """Unmap the memory; the descriptors stay open."""
         for ring in self.rings:
             ring.close()
-        self.board.close()
+        self.shared_state.close()
 
 
 def create_channels(rate_hz: float, fds: Sequence[int], buffered_s: float = BUFFERED_S) -> Channels:

@@ -41,9 +41,9 @@ from rigd.engine.messages import (
     Zero,
 )
 from rigd.engine.processes import Parent
-from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
-from rigd.engine.reference import PieceReader, map_reference
-from rigd.engine.shared_state import Event, Phase, Word, write_event
+from rigd.engine.realtime import REFUSED, apply_realtime, collect_no_garbage
+from rigd.engine.reference import ReferenceReader, map_reference
+from rigd.engine.shared_state import LogEvent, Phase, StateField, write_event
 from rigd.engine.timing import SIGN_OF_LIFE_S, Clock, RealClock, TickScheduler, VirtualClock
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
@@ -70,7 +70,7 @@ def main() -> None:
     if job.fast:
         obtained = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
     else:
-        obtained = {"clock": "real"} | obtain(priority=realtime.priority, cpu=realtime.cpu)
+        obtained = {"clock": "real"} | apply_realtime(priority=realtime.priority, cpu=realtime.cpu)
     try:
         devices = open_devices(job.profile.rig, job.moving)
     except DeviceError as error:
@@ -110,7 +110,7 @@ def run_control(
         drive = devices.drive
         drive.connect()
         server = _ControlServer(profile, devices, clock, channels, parent, stop, obtained)
-        channels.board[Word.PHASE] = Phase.OFF
+        channels.shared_state[StateField.PHASE] = Phase.OFF
         server.observe_standstill()
         name_this_process(IDLE_NAME)
         parent.send(
@@ -126,7 +126,7 @@ def run_control(
         failure = str(error)
     finally:
         devices.drive.disable()
-        channels.board[Word.PHASE] = Phase.OFF
+        channels.shared_state[StateField.PHASE] = Phase.OFF
         devices.drive.close()
         devices.sensor.close()
     parent.send(Ended(f"{failure} {devices.drive.off_doubt}".strip()))
@@ -150,7 +150,7 @@ class _ControlServer:
         self._clock = clock
         self._metronome = TickScheduler(clock, profile.rig.rate_hz)
         self._channels = channels
-        self._shared_state = channels.board
+        self._shared_state = channels.shared_state
         self._parent = parent
         self._stop = stop
         self._obtained = obtained
@@ -161,7 +161,7 @@ class _ControlServer:
         warm = not devices.simulated
         self._watch = make_watch(profile, recalled_heat_nm2(profile) if warm else 0.0)
         self._standstill = Standstill(profile)
-        self._display = Display(channels.board, devices)
+        self._display = Display(channels.shared_state, devices)
         self._cycle = self._make_cycle(profile)
 
     def store_heat(self) -> None:
@@ -258,17 +258,17 @@ class _ControlServer:
         """
         shared_state, devices = self._shared_state, self._devices
         for field in (
-            Word.START_UTC_NS,
-            Word.SCHEDULED,
-            Word.MISSED,
-            Word.LATE,
-            Word.LOST,
-            Word.STALE_ANGLES,
-            Word.STALE_WRENCHES,
-            Word.TOUCHES,
-            Word.HELD,
-            Word.HELD_BEFORE,
-            Word.BEGUN,
+            StateField.START_UTC_NS,
+            StateField.SCHEDULED,
+            StateField.MISSED,
+            StateField.LATE,
+            StateField.LOST,
+            StateField.STALE_ANGLES,
+            StateField.STALE_WRENCHES,
+            StateField.TOUCHES,
+            StateField.HELD,
+            StateField.HELD_BEFORE,
+            StateField.BEGUN,
         ):
             shared_state[field] = 0
         self._warn_of_refusals(job)
@@ -282,7 +282,7 @@ class _ControlServer:
             touch = TouchWatch(job.touch, cycle, reference, job.profile.rig.rate_hz)
         reader = None
         if job.reference.planned is not None:
-            reader = PieceReader(reference, job.reference.planned, shared_state)
+            reader = ReferenceReader(reference, job.reference.planned, shared_state)
         procedure = SessionSequence(
             job.profile,
             reference,
@@ -321,7 +321,7 @@ class _ControlServer:
         finally:
             devices.drive.disable()
             cycle.torque_off()
-            shared_state[Word.PHASE] = Phase.OFF
+            shared_state[StateField.PHASE] = Phase.OFF
             self._show()
         doubt = devices.drive.off_doubt
         if doubt:
@@ -391,7 +391,7 @@ class _ControlServer:
         finally:
             self._devices.drive.disable()
             cycle.torque_off()
-            self._shared_state[Word.PHASE] = Phase.OFF
+            self._shared_state[StateField.PHASE] = Phase.OFF
             self._show()
         failure = f"{failure} {self._devices.drive.off_doubt}".strip()
         if failure:
@@ -489,12 +489,12 @@ class _ControlServer:
             if refused:
                 names = ", ".join(f"{name} ({text})" for name, text in refused.items())
                 message = f"The system did not grant {names}: {consequence}."
-                write_event(self._channels.events, Event(0, "warning", message))
+                write_event(self._channels.events, LogEvent(0, "warning", message))
 
     def _log_accepted(self, job: SessionJob) -> None:
         for text in job.accepted:
             message = f"Accepted by the operator, though rigd check fails: {text}"
-            write_event(self._channels.events, Event(0, "warning", message))
+            write_event(self._channels.events, LogEvent(0, "warning", message))
 
 
 def _controller(profile: Profile) -> PidController:

@@ -261,7 +261,7 @@ class Failed:
     """Description of the failure, for the operator."""
     taken: bool = False
     """Whether the file exists already and belongs to something else."""
-    kept: Path | None = None
+    saved_path: Path | None = None
     """Path of the record, if it was not saved under its own name."""
 
 
@@ -292,7 +292,7 @@ class TouchReady:
 
 
 @dataclass(frozen=True, slots=True)
-class TouchTold:
+class TouchReport:
     """Estimate of a touch."""
 
     number: int
@@ -340,7 +340,7 @@ class FitReady:
 
 
 @dataclass(frozen=True, slots=True)
-class FitTold:
+class FitReport:
     """Estimate from the record so far."""
 
     document: Mapping[str, Any]
@@ -350,7 +350,7 @@ class FitTold:
 
 
 @dataclass(frozen=True, slots=True)
-class PieceTold:
+class PlannedSegment:
     """Segment of excitation that was appended to the reference."""
 
     name: str

@@ -21,7 +21,7 @@ from typing import Any
 
 from rigd.engine._control_names import CONTROL_MODULE
 from rigd.engine.messages import MessageReader, encode, is_ready
-from rigd.engine.shared_state import Word
+from rigd.engine.shared_state import StateField
 from rigd.errors import FailureError
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, held_back, signal_when_orphaned
 
@@ -249,7 +249,7 @@ class Process:
     """Name in messages to the operator."""
     module: str
     """Run as ``python -m module``; empty for the process that starts the others."""
-    beat: Word
+    beat: StateField
     """Field of its heartbeat in the shared state."""
     hung_after_s: float | None
     """Longest time without a heartbeat; None: its results are checked instead."""
@@ -264,7 +264,7 @@ class Process:
 CONTROL = Process(
     "control",
     CONTROL_MODULE,
-    Word.CONTROL_BEAT,
+    StateField.CONTROL_BEAT,
     hung_after_s=3.0,
     grace_s=5.0,
     for_one_session=False,
@@ -273,7 +273,7 @@ CONTROL = Process(
 RECORDER = Process(
     "recorder",
     "rigd.engine.recorder",
-    Word.RECORDER_BEAT,
+    StateField.RECORDER_BEAT,
     # A disk may stall for seconds; the number of waiting samples is checked instead.
     hung_after_s=None,
     grace_s=5.0,
@@ -283,7 +283,7 @@ RECORDER = Process(
 LIVE = Process(
     "live",
     "rigd.live.publisher",
-    Word.LIVE_BEAT,
+    StateField.LIVE_BEAT,
     hung_after_s=5.0,
     grace_s=2.0,
     for_one_session=False,
@@ -292,7 +292,7 @@ LIVE = Process(
 TOUCH = Process(
     "touch",
     "rigd.engine.touch_estimator",
-    Word.TOUCH_BEAT,
+    StateField.TOUCH_BEAT,
     # An estimate may take long; a missing estimate is reported as such.
     hung_after_s=None,
     grace_s=1.0,
@@ -302,7 +302,7 @@ TOUCH = Process(
 FIT = Process(
     "fit",
     "rigd.runner.fit_process",
-    Word.FIT_BEAT,
+    StateField.FIT_BEAT,
     # A decision may take long on a busy computer; the loop holds the angle meanwhile.
     hung_after_s=15.0,
     grace_s=1.0,
@@ -312,7 +312,7 @@ FIT = Process(
 SUPERVISOR = Process(
     "supervisor",
     "",
-    Word.SUPERVISOR_BEAT,
+    StateField.SUPERVISOR_BEAT,
     hung_after_s=2.0,
     grace_s=0.0,
     for_one_session=False,
@@ -323,7 +323,7 @@ PROCESSES = (CONTROL, RECORDER, LIVE, TOUCH, FIT, SUPERVISOR)
 """All processes in the order in which they are ended: the process with the torque first."""
 
 
-class Pulse:
+class Heartbeat:
     """Heartbeat of a process, polled by another one.
 
     Only time in which the polling process itself ran counts: a computer that stalls for a second
@@ -337,7 +337,7 @@ class Pulse:
         self._polled_s = 0.0
         self.still_s = 0.0
 
-    def look(self, beat: int, now_s: float) -> float:
+    def stalled_for(self, beat: int, now_s: float) -> float:
         """Return the time in s for which the count has not changed.
 
         Parameters

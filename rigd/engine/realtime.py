@@ -1,6 +1,6 @@
 """Real-time settings of a rig's processes: each is requested, and the result is recorded.
 
-The control process gets all settings for a 1 kHz loop (:func:`obtain`). Supervisor and
+The control process gets all settings for a 1 kHz loop (:func:`apply_realtime`). Supervisor and
 recorder get a priority below the loop's and above that of every ordinary program
 (:class:`Precedence`), so that a session can be stopped even if a viewer occupies the processor.
 """
@@ -41,7 +41,7 @@ def collect_no_garbage() -> str:
     return "off"
 
 
-def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]:
+def apply_realtime(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]:
     """Apply the real-time settings of a 1 kHz loop, and return which were granted.
 
     Parameters
@@ -72,7 +72,7 @@ def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]
     return {name: _attempt(setting) for name, setting in wanted.items()}
 
 
-def keep_off_loop(loop_cpu: int) -> None:
+def pin_off_loop_core(loop_cpu: int) -> None:
     """Restrict this process to cores other than the loop's, if it may use any.
 
     The loop has the higher priority in any case, but not over the kernel that clears or compacts

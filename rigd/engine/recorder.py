@@ -28,7 +28,7 @@ from rigd.engine.messages import Armed, Close, Closed, Failed, FileHeader, Opene
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import Precedence
 from rigd.engine.reference import is_whole
-from rigd.engine.shared_state import Phase, SharedState, Word, read_events
+from rigd.engine.shared_state import Phase, SharedState, StateField, read_events
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import SessionError, SessionExistsError, SessionWriter, segments_until
 from rigd.session.layout import SAMPLE_SIZE
@@ -53,13 +53,13 @@ def main() -> None:
     except SessionError as error:
         parent.send(Failed(str(error), taken=isinstance(error, SessionExistsError)))
         raise SystemExit(1) from None
-    _show_free_space(channels.board, job.path.parent)
+    _show_free_space(channels.shared_state, job.path.parent)
     parent.send(Opened(obtained))
     try:
         _record(parent, channels, writer, job.path.parent)
     except SessionError as error:
         text, saved = _abandoned(writer)
-        parent.send(Failed(f"{error}{text}", kept=saved))
+        parent.send(Failed(f"{error}{text}", saved_path=saved))
         raise SystemExit(1) from None
 
 
@@ -87,7 +87,7 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
         moved = recorder.transfer()
         if time.monotonic() - polled_s > _DISK_POLL_S:
             polled_s = time.monotonic()
-            _show_free_space(channels.board, folder)
+            _show_free_space(channels.shared_state, folder)
         try:
             message = parent.poll(0.0 if moved else _IDLE_S)
         except EOFError:
@@ -111,7 +111,7 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
 def _show_free_space(shared_state: SharedState, folder: Path) -> None:
     """Publish the free disk space; the next write reports a folder that is gone."""
     with contextlib.suppress(OSError):
-        shared_state[Word.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))
+        shared_state[StateField.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))
 
 
 class Recorder:
@@ -151,15 +151,15 @@ class Recorder:
 
     def _begin(self, header: FileHeader) -> None:
         attachments = {name: text.encode() for name, text in header.attachments.items()}
-        start_utc_ns = self._channels.board[Word.START_UTC_NS]
+        start_utc_ns = self._channels.shared_state[StateField.START_UTC_NS]
         self._writer.begin(start_utc_ns, header.metadata, header.segments, attachments)
         self.begun = True
 
     def transfer(self) -> bool:
         """Write the available records to the file; return whether there were any."""
-        self._channels.board.beat(Word.RECORDER_BEAT)
+        self._channels.shared_state.beat(StateField.RECORDER_BEAT)
         if not self.begun:
-            if self.header is None or not self._channels.board[Word.START_UTC_NS]:
+            if self.header is None or not self._channels.shared_state[StateField.START_UTC_NS]:
                 return False
             self._begin(self.header)
         moved = False
@@ -209,9 +209,9 @@ class Recorder:
                 "reason": "Samples were lost before the recorder.",
             }
         counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
-        shared_state = self._channels.board
+        shared_state = self._channels.shared_state
         if self.header is not None and (
-            shared_state[Word.PLANNED] or shared_state[Word.LAST_PIECE]
+            shared_state[StateField.PLANNED] or shared_state[StateField.LAST_SEGMENT]
         ):
             # Segments of a growing reference end with the record.
             segments = segments_until({**self.header.segments, **segments}, scheduled)
@@ -220,17 +220,17 @@ class Recorder:
 
     def finish_orphaned(self) -> None:
         """Close the file after the loop has stopped, because the supervisor is gone."""
-        shared_state = self._channels.board
+        shared_state = self._channels.shared_state
         self.transfer()  # all of the record may still be in the rings
         deadline = time.monotonic() + _ORPHAN_PATIENCE_S
-        while shared_state[Word.PHASE] != Phase.OFF and time.monotonic() < deadline:
+        while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < deadline:
             if self.transfer():
                 deadline = time.monotonic() + _ORPHAN_PATIENCE_S
             time.sleep(_IDLE_S)
         if self.header is None or not self.begun:
             self._writer.discard()
             return
-        scheduled = shared_state[Word.SCHEDULED]
+        scheduled = shared_state[StateField.SCHEDULED]
         whole = is_whole(
             shared_state, scheduled, max(end for _, end in self.header.segments.values())
         )
@@ -241,10 +241,10 @@ class Recorder:
                 if whole
                 else "The supervising process ended during the session.",
                 "scheduled": str(scheduled),
-                "missed": str(shared_state[Word.MISSED]),
-                "late": str(shared_state[Word.LATE]),
-                "stale_angles": str(shared_state[Word.STALE_ANGLES]),
-                "stale_wrenches": str(shared_state[Word.STALE_WRENCHES]),
+                "missed": str(shared_state[StateField.MISSED]),
+                "late": str(shared_state[StateField.LATE]),
+                "stale_angles": str(shared_state[StateField.STALE_ANGLES]),
+                "stale_wrenches": str(shared_state[StateField.STALE_WRENCHES]),
             }
         )
 

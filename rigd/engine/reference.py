@@ -4,7 +4,7 @@ It is in shared memory so that the control process does not pause to receive it.
 session is, a drive that monitors the loop's heartbeat sees no gap.
 
 One process appends segments, and another follows them. As in a ring, the angles are written
-before the field that announces them (`Word.PLANNED`). The follower never waits for a
+before the field that announces them (`StateField.PLANNED`). The follower never waits for a
 segment: it holds the last angle until the next segment arrives.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rigd.engine._ring import reserve
-from rigd.engine.shared_state import SharedState, Word
+from rigd.engine.shared_state import SharedState, StateField
 
 if TYPE_CHECKING:
     import numpy as np
@@ -88,12 +88,12 @@ def is_whole(shared_state: SharedState, scheduled: int, ticks: int) -> bool:
     if scheduled == ticks:
         return True
     return (
-        bool(shared_state[Word.LAST_PIECE])
-        and scheduled >= shared_state[Word.PLANNED] + shared_state[Word.HELD] > 0
+        bool(shared_state[StateField.LAST_SEGMENT])
+        and scheduled >= shared_state[StateField.PLANNED] + shared_state[StateField.HELD] > 0
     )
 
 
-class PieceWriter:
+class ReferenceWriter:
     """Writer that appends segments to a reference while it is followed.
 
     Parameters
@@ -101,7 +101,7 @@ class PieceWriter:
     spec
         Reference whose first segment is written.
     shared_state
-        State that announces the planned ticks (`Word.PLANNED`).
+        State that announces the planned ticks (`StateField.PLANNED`).
     """
 
     def __init__(self, spec: ReferenceSpec, shared_state: SharedState) -> None:
@@ -137,10 +137,10 @@ class PieceWriter:
         self._memory[start : start + _SIZE * size] = reference_rad.astype("float64").tobytes()
         self.ticks += size
         self.room -= size
-        self._shared_state[Word.PLANNED] = self.ticks
+        self._shared_state[StateField.PLANNED] = self.ticks
 
 
-class PieceReader:
+class ReferenceReader:
     """Reader of a growing reference, which holds the last angle until the next segment.
 
     A segment that would extend beyond the record does not begin, because the motor would have to
@@ -153,10 +153,10 @@ class PieceReader:
     planned
         Ticks that are planned at the start.
     shared_state
-        `Word.PLANNED` announces the planned ticks, and `Word.LAST_PIECE` the last
-        segment. The reader writes the number of held ticks to `Word.HELD`, the number before
-        the segment that began last to `Word.HELD_BEFORE`, and the end of that segment to
-        `Word.BEGUN`.
+        `StateField.PLANNED` announces the planned ticks, and `StateField.LAST_SEGMENT` the last
+        segment. The reader writes the number of held ticks to `StateField.HELD`, the number before
+        the segment that began last to `StateField.HELD_BEFORE`, and the end of that segment to
+        `StateField.BEGUN`.
     """
 
     def __init__(
@@ -164,11 +164,11 @@ class PieceReader:
     ) -> None:
         self._reference_rad = reference_rad
         self._planned = planned
-        self._announced = shared_state.view(Word.PLANNED)
-        self._last_segment = shared_state.view(Word.LAST_PIECE)
-        self._held_view = shared_state.view(Word.HELD)
-        self._before_view = shared_state.view(Word.HELD_BEFORE)
-        self._begun_view = shared_state.view(Word.BEGUN)
+        self._announced = shared_state.view(StateField.PLANNED)
+        self._last_segment = shared_state.view(StateField.LAST_SEGMENT)
+        self._held_view = shared_state.view(StateField.HELD)
+        self._before_view = shared_state.view(StateField.HELD_BEFORE)
+        self._begun_view = shared_state.view(StateField.BEGUN)
         self._held = 0
 
     def at(self, tick: int) -> float:

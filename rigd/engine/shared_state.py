@@ -74,14 +74,14 @@ class Activity(StrEnum):
 
 
 class Stop(IntEnum):
-    """Reason for which the supervisor requests a stop: the values of :attr:`Word.STOP`."""
+    """Reason for which the supervisor requests a stop: the values of :attr:`StateField.STOP`."""
 
     NO = 0
     OPERATOR = 1
     NO_RECORDER = 2
 
 
-class Word(IntEnum):
+class StateField(IntEnum):
     """Index of each field of the :class:`SharedState`."""
 
     # Written by the supervisor
@@ -136,7 +136,7 @@ class Word(IntEnum):
     PLANNED = 27
     """Planned ticks of a reference that grows during the session."""
     # Written by the supervisor
-    LAST_PIECE = 28
+    LAST_SEGMENT = 28
     """The record ends with the segments that are planned."""
 
 
@@ -145,7 +145,7 @@ UNKNOWN = -1
 
 
 class SharedState:
-    """Array of signed 64-bit integers in shared memory, indexed by :class:`Word`.
+    """Array of signed 64-bit integers in shared memory, indexed by :class:`StateField`.
 
     Parameters
     ----------
@@ -155,30 +155,30 @@ class SharedState:
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
-        self._memory = mmap.mmap(fd, 8 * len(Word))
+        self._memory = mmap.mmap(fd, 8 * len(StateField))
         self._fields = memoryview(self._memory).cast("q")
 
     @classmethod
     def create(cls, fd: int) -> Self:
         """Reserve shared memory for the fields, all of them 0."""
-        reserve(fd, 8 * len(Word))
+        reserve(fd, 8 * len(StateField))
         return cls(fd)
 
-    def __getitem__(self, field: Word) -> int:
+    def __getitem__(self, field: StateField) -> int:
         return self._fields[field]
 
-    def __setitem__(self, field: Word, value: int) -> None:
+    def __setitem__(self, field: StateField, value: int) -> None:
         self._fields[field] = value
 
-    def known(self, field: Word) -> int | None:
+    def known(self, field: StateField) -> int | None:
         """Return a field, or None if it says that this is not known."""
         return None if (value := self._fields[field]) == UNKNOWN else value
 
-    def view(self, field: Word) -> "memoryview[int]":
+    def view(self, field: StateField) -> "memoryview[int]":
         """Return a view of one field, the quickest way to it: ``view[0]``."""
         return self._fields[field : field + 1]
 
-    def beat(self, field: Word) -> None:
+    def beat(self, field: StateField) -> None:
         """Give the heartbeat of the process that this field belongs to."""
         self._fields[field] += 1
 
@@ -200,7 +200,7 @@ _TEXT_SIZE = EVENT_SIZE - _HEADER.size
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class LogEvent:
     """One line of the session's log."""
 
     t_ns: int
@@ -213,7 +213,7 @@ class Event:
     """Show it to the operator at once, whatever the level; not stored in the file."""
 
 
-def write_event(ring: Ring, event: Event) -> None:
+def write_event(ring: Ring, event: LogEvent) -> None:
     """Append an event; it is dropped if the ring is full.
 
     Parameters
@@ -233,14 +233,14 @@ def write_event(ring: Ring, event: Event) -> None:
     ring.publish()
 
 
-def read_events(block: bytes) -> list[Event]:
+def read_events(block: bytes) -> list[LogEvent]:
     """Return the events in a block that :meth:`Ring.take` returned."""
     events = []
     for offset in range(0, len(block), EVENT_SIZE):
         t_ns, level, size = _HEADER.unpack_from(block, offset)
         start = offset + _HEADER.size
         text = block[start : start + size].decode(errors="replace")
-        events.append(Event(t_ns, LEVELS[level], text))
+        events.append(LogEvent(t_ns, LEVELS[level], text))
     return events
 
 
@@ -261,12 +261,12 @@ def activity(shared_state: SharedState) -> Activity:
     >>> activity(shared_state)
     <Activity.PREPARING: 'preparing'>
     """
-    phase = Phase(shared_state[Word.PHASE])
-    if shared_state[Word.STOP] != Stop.NO:
+    phase = Phase(shared_state[StateField.PHASE])
+    if shared_state[StateField.STOP] != Stop.NO:
         return Activity.STOPPING
     if phase is Phase.RUNNING:
         return Activity.RUNNING
     # Until tick 0 the phase may be that of the session before.
-    if shared_state[Word.GO] and phase is not Phase.READY:
+    if shared_state[StateField.GO] and phase is not Phase.READY:
         return Activity.FINISHING if phase is Phase.OFF else Activity.RETURNING
     return Activity.PREPARING

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from rigd.engine._ring import Observer
 from rigd.engine.channels import attach_channels
-from rigd.engine.messages import TouchJob, TouchReady, TouchTold
+from rigd.engine.messages import TouchJob, TouchReady, TouchReport
 from rigd.engine.processes import Parent
-from rigd.engine.realtime import keep_off_loop
-from rigd.engine.shared_state import Word
+from rigd.engine.realtime import pin_off_loop_core
+from rigd.engine.shared_state import StateField
 from rigd.runtime import ignore as ignore_signals
 from rigd.session.layout import Status, decode_samples
 from rigd.touch import GrowingEstimate, TouchEstimator, TouchRecord
@@ -43,14 +43,14 @@ def main() -> None:
     parent = Parent()
     job: TouchJob = parent.receive_job()
     if job.realtime is not None:
-        keep_off_loop(job.realtime.cpu)
+        pin_off_loop_core(job.realtime.cpu)
     channels = attach_channels(job.channels)
     reader = Observer(channels.samples, job.first)
     estimator = TouchEstimator(job.model, job.rate_hz)
     parent.send(TouchReady())
     touches = TouchFollower(estimator, job)
     while True:
-        channels.board.beat(Word.TOUCH_BEAT)
+        channels.shared_state.beat(StateField.TOUCH_BEAT)
         block = reader.take(_BLOCK)
         if block:
             touches.take(decode_samples(block))
@@ -126,7 +126,7 @@ class TouchFollower:
         if not self._waiting:
             self._samples = self._samples[-self._history_ticks :]
 
-    def reports(self) -> list[TouchTold]:
+    def reports(self) -> list[TouchReport]:
         """Return the estimates for which there are enough samples."""
         if self._samples is None or not self._waiting:
             return []
@@ -147,11 +147,11 @@ class TouchFollower:
             touch.estimate.look(record)
         return []
 
-    def _estimate(self, touch: _Waiting, after: int, *, final: bool) -> TouchTold:
+    def _estimate(self, touch: _Waiting, after: int, *, final: bool) -> TouchReport:
         record, start_s = self._record(touch, after)
         found = touch.estimate.told(record, scan=False, first=not final)
         document = found.as_dict(start_s)
-        return TouchTold(touch.number, touch.tick, final, document)
+        return TouchReport(touch.number, touch.tick, final, document)
 
     def _record(self, touch: _Waiting, after: int) -> tuple[TouchRecord, float]:
         """Return the record up to `after` ticks from the detection, and its start in s."""

@@ -1,6 +1,6 @@
 """The live view: a process that shows the samples in Rerun, and for which nothing waits.
 
-The public interface is the viewer's window (`Viewer`, `Window`), the page for browsers
+The public interface is the viewer's window (`Viewer`, `FileWindow`), the page for browsers
 (`PageOfFile`), the running views (`LiveAddress`, `running`) and the jobs of the publisher
 (`LiveJob`, `LiveSession`). The publisher, `rigd.live.publisher`, only observes the rings, so it
 affects neither the loop nor the recorder. `rigd.view` has the drawings.

@@ -82,7 +82,7 @@ class _Window(_Playback):
         return f"The window was closed by a fault ({self._program.last_words})."
 
 
-class Window(_Window):
+class FileWindow(_Window):
     """The viewer's window for a file.
 
     Parameters

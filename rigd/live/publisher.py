@@ -18,8 +18,8 @@ import numpy as np
 
 from rigd.engine.channels import SAMPLE, TOPICS, Channels, attach_channels
 from rigd.engine.messages import Failed
-from rigd.engine.processes import Parent, Pulse
-from rigd.engine.shared_state import Activity, Phase, Word, activity
+from rigd.engine.processes import Heartbeat, Parent
+from rigd.engine.shared_state import Activity, Phase, StateField, activity
 from rigd.live._feed import Feed
 from rigd.live._program import RerunError
 from rigd.live._ring_reader import Intake
@@ -156,12 +156,12 @@ class _Publisher:
 
     def _show_orphaned(self) -> None:
         """Show a session without supervisor until its torque is off."""
-        shown, shared_state = self._shown, self._channels.board
+        shown, shared_state = self._shown, self._channels.shared_state
         if shown is None or shown.over:
             return
         shown.lost = True
         end = time.monotonic() + _ORPHANED_S
-        while shared_state[Word.PHASE] != Phase.OFF and time.monotonic() < end:
+        while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < end:
             _arm_watchdog()
             self._step()
             time.sleep(_PERIOD_S)
@@ -169,7 +169,7 @@ class _Publisher:
 
     def _step(self) -> None:
         """Show the new records, and count those that cannot be shown."""
-        self._channels.board.beat(Word.LIVE_BEAT)
+        self._channels.shared_state.beat(StateField.LIVE_BEAT)
         if self._shown is not None:
             self._shown.gather()
         before = self._feed.connections
@@ -189,10 +189,10 @@ class _ShownSession:
     """The session that is shown, or was shown last."""
 
     def __init__(self, session: LiveSession, channels: Channels, last: LastResponse | None) -> None:
-        shared_state = self._shared_state = channels.board
-        begin, seen = session.begins[TOPICS.index(SAMPLE)], shared_state[Word.LIVE_SEEN]
+        shared_state = self._shared_state = channels.shared_state
+        begin, seen = session.begins[TOPICS.index(SAMPLE)], shared_state[StateField.LIVE_SEEN]
         # Continue the count of an earlier publisher of the same session.
-        self._dropped_before = shared_state[Word.LIVE_DROPPED] if seen > begin else 0
+        self._dropped_before = shared_state[StateField.LIVE_DROPPED] if seen > begin else 0
         self.intake = Intake(session, channels, seen, last)
         self.backlog = Backlog(round(_WAITING_S * session.subject.rate_hz))
         self.over = False
@@ -229,9 +229,9 @@ class _ShownSession:
     def _store_counts(self) -> None:
         """Write the counts to the shared state, for a publisher that takes over."""
         shared_state = self._shared_state
-        shared_state[Word.LIVE_DROPPED] = self.dropped
+        shared_state[StateField.LIVE_DROPPED] = self.dropped
         shown = self.intake.next - self.backlog.samples
-        shared_state[Word.LIVE_SEEN] = max(shared_state[Word.LIVE_SEEN], shown)
+        shared_state[StateField.LIVE_SEEN] = max(shared_state[StateField.LIVE_SEEN], shown)
 
     def touched(self, touches: "Sequence[Mapping[str, Any]]") -> None:
         """Draw touches, with a log line for each."""
@@ -252,7 +252,7 @@ class _ShownSession:
         picture, t_ns = self.intake.picture, self.intake.t_ns
         state = ended(end.outcome, end.reason)
         if self.lost:
-            off = self._shared_state[Word.PHASE] == Phase.OFF
+            off = self._shared_state[StateField.PHASE] == Phase.OFF
             state = SUPERVISOR_LOST_TORQUE_OFF if off else SUPERVISOR_LOST
             self.backlog.put_required(picture.events([Note(t_ns, "error", state.reason)]))
         elif end.outcome:
@@ -421,8 +421,8 @@ class StateWatch:
     """
 
     def __init__(self, channels: Channels) -> None:
-        self._shared_state = channels.board
-        self._supervisor = Pulse()
+        self._shared_state = channels.shared_state
+        self._supervisor = Heartbeat()
 
     def read(self, now_s: float) -> BannerState:
         """Return the state of the session; call it several times per second.
@@ -433,12 +433,12 @@ class StateWatch:
             Time of a monotonic clock.
         """
         shared_state = self._shared_state
-        phase = Phase(shared_state[Word.PHASE])
-        still_s = self._supervisor.look(shared_state[Word.SUPERVISOR_BEAT], now_s)
+        phase = Phase(shared_state[StateField.PHASE])
+        still_s = self._supervisor.stalled_for(shared_state[StateField.SUPERVISOR_BEAT], now_s)
         if still_s > _SILENT_S:
             if phase in _TORQUE_PHASES:
                 return SUPERVISOR_SILENT
-            if shared_state[Word.GO] and phase is Phase.OFF:
+            if shared_state[StateField.GO] and phase is Phase.OFF:
                 return SUPERVISOR_SILENT_TORQUE_OFF
         now = activity(shared_state)
         if now is Activity.PREPARING:
@@ -462,7 +462,7 @@ class Vitals:
     """
 
     def __init__(self, channels: Channels) -> None:
-        self._shared_state = channels.board
+        self._shared_state = channels.shared_state
         self._samples = channels.samples
         self._ticks: collections.deque[tuple[float, int]] = collections.deque(
             maxlen=_RATE_POLLS + 1
@@ -486,22 +486,22 @@ class Vitals:
         shared_state = self._shared_state
         self._due_s = now_s + POLL_S
         # Until tick 0 the shared state has the counts of the session before.
-        began = bool(shared_state[Word.GO])
+        began = bool(shared_state[StateField.GO])
         scheduled, missed, late, lost = (
             shared_state[field] if began else 0
-            for field in (Word.SCHEDULED, Word.MISSED, Word.LATE, Word.LOST)
+            for field in (StateField.SCHEDULED, StateField.MISSED, StateField.LATE, StateField.LOST)
         )
-        load_ppm = shared_state.known(Word.BUS_LOAD_PPM)
+        load_ppm = shared_state.known(StateField.BUS_LOAD_PPM)
         return Health(
             missed_ticks=missed,
             late_ticks=late,
             lost_ticks=lost,
             recorder_lag_ticks=self._samples.waiting,
-            disk_free_mb=shared_state[Word.DISK_FREE_MB] or None,
+            disk_free_mb=shared_state[StateField.DISK_FREE_MB] or None,
             view_dropped=view_dropped,
             bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
-            bus_errors=shared_state.known(Word.BUS_ERRORS),
-            sensor_status=shared_state.known(Word.SENSOR_STATUS),
+            bus_errors=shared_state.known(StateField.BUS_ERRORS),
+            sensor_status=shared_state.known(StateField.SENSOR_STATUS),
             rate_hz=self._rate_hz(now_s, scheduled),
         )
 

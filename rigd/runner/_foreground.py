@@ -11,7 +11,7 @@ import typer
 
 from rigd.checks import check_on_paper
 from rigd.devices import WhatMoves, simulated_differently, what_moves
-from rigd.engine.shared_state import Event
+from rigd.engine.shared_state import LogEvent
 from rigd.errors import FailureError, RigdError
 from rigd.excitation import Excitation
 from rigd.profile import Profile, with_specimen
@@ -218,7 +218,7 @@ class _Operator:
             self._print(where)
             self._where = where
 
-    def update(self, progress: SessionProgress, events: list[Event]) -> None:
+    def update(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         assert self._line is not None
         for event in events:
             if event.level in ("warning", "error", "fatal"):

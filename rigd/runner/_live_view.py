@@ -10,8 +10,8 @@ import numpy as np
 
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.engine.messages import Failed
-from rigd.engine.processes import LIVE, ChildError, Pulse
-from rigd.engine.shared_state import Event, Level, Word
+from rigd.engine.processes import LIVE, ChildError, Heartbeat
+from rigd.engine.shared_state import Level, LogEvent, StateField
 from rigd.live.address import LiveAddress
 from rigd.live.messages import LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
 from rigd.profile import Profile
@@ -43,7 +43,7 @@ class LiveView:
         self._group = group
         self._job = LiveJob(rig, group.channels.specs)
         self._session: LiveSession | None = None
-        self._unreported: list[Event] = []
+        self._unreported: list[LogEvent] = []
         self._restarts = 0
         self._lost = ""
         self._shown = False
@@ -76,7 +76,7 @@ class LiveView:
         if not self._lost:
             self._feel_pulse()
 
-    def poll(self) -> list[Event]:
+    def poll(self) -> list[LogEvent]:
         """Check the publisher, and return the events for the operator."""
         self.check()
         events, self._unreported = self._unreported, []
@@ -109,7 +109,7 @@ class LiveView:
         """Start a new process."""
         self._answered = False
         self._lost = ""
-        self._pulse = Pulse()
+        self._pulse = Heartbeat()
         try:
             self._group.fresh(LIVE)
         except ChildError as error:
@@ -154,8 +154,8 @@ class LiveView:
     def _feel_pulse(self) -> None:
         assert LIVE.hung_after_s is not None
         patience_s = LIVE.hung_after_s if self._answered else _START_PATIENCE_S
-        beat = self._group.channels.board[Word.LIVE_BEAT]
-        if self._pulse.look(beat, time.monotonic()) > patience_s:
+        beat = self._group.channels.shared_state[StateField.LIVE_BEAT]
+        if self._pulse.stalled_for(beat, time.monotonic()) > patience_s:
             self._restart(f"The live process was killed: no response for {patience_s:g} s.")
 
     def _restart(self, why: str) -> None:
@@ -169,7 +169,7 @@ class LiveView:
         self._start()
 
     def _note(self, level: Level, message: str) -> None:
-        self._unreported.append(Event(0, level, message))
+        self._unreported.append(LogEvent(0, level, message))
 
 
 def subject_of(order: Order, *, fast: bool = False) -> Subject:

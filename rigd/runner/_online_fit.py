@@ -9,13 +9,13 @@ from rigd.engine.messages import (
     FileHeader,
     FitJob,
     FitReady,
-    FitTold,
-    PieceTold,
+    FitReport,
+    PlannedSegment,
     RecordEnded,
     SearchEnded,
 )
-from rigd.engine.processes import FIT, ChildError, Pulse
-from rigd.engine.shared_state import Event, Stop, Word
+from rigd.engine.processes import FIT, ChildError, Heartbeat
+from rigd.engine.shared_state import LogEvent, StateField, Stop
 from rigd.runner._precision_search import TargetEstimate, in_words, target_estimates, targets_json
 from rigd.runner._process_group import await_ready
 
@@ -54,17 +54,17 @@ class FitSupervisor:
         realtime: "RealtimeSettings | None" = None,
     ) -> None:
         self._group = group
-        self._shared_state = group.channels.board
+        self._shared_state = group.channels.shared_state
         self._search = search
-        self._events: list[Event] = []
+        self._events: list[LogEvent] = []
         self._news: list[Mapping[str, Any]] = []
         self._planned: list[Mapping[str, Any]] = []
-        self._last_report: FitTold | None = None
+        self._last_report: FitReport | None = None
         self._ended: SearchEnded | None = None
         self._ready = self._begun = False
         self._lost = ""
         self._skipped = ""
-        self._pulse = Pulse()
+        self._pulse = Heartbeat()
         self.segments: Mapping[str, tuple[int, int]] = {}
         self.shortcoming = ""
         first = group.channels.samples.written
@@ -86,7 +86,7 @@ class FitSupervisor:
         self._begun = True
         self._send(header)
 
-    def poll(self) -> list[Event]:
+    def poll(self) -> list[LogEvent]:
         """Read the received messages, and return the events for the operator."""
         self._listen(0.0)
         if self._ready and not self._lost:
@@ -97,7 +97,7 @@ class FitSupervisor:
     def _feel_pulse(self) -> None:
         """End the process if it hangs."""
         assert FIT.hung_after_s is not None
-        still_s = self._pulse.look(self._shared_state[Word.FIT_BEAT], time.monotonic())
+        still_s = self._pulse.stalled_for(self._shared_state[StateField.FIT_BEAT], time.monotonic())
         if still_s > FIT.hung_after_s:
             self._group[FIT].kill()
             self._lose(f"The fit process hung for {FIT.hung_after_s:g} s and was ended.")
@@ -117,7 +117,7 @@ class FitSupervisor:
             self._listen(_POLL_S)
             meanwhile()
             if (
-                self._shared_state[Word.STOP] != Stop.NO
+                self._shared_state[StateField.STOP] != Stop.NO
                 and time.monotonic() > begun_s + _STOP_PATIENCE_S
             ):
                 self._skipped = "A stop skipped the fit of the whole record."
@@ -203,17 +203,19 @@ class FitSupervisor:
         match message:
             case FitReady():
                 self._ready = True
-            case FitTold(document):
+            case FitReport(document):
                 self._last_report = message
                 self._news.append(document)
-                self._events += [Event(0, "info", line, notable=True) for line in document["text"]]
-            case PieceTold(name, document):
+                self._events += [
+                    LogEvent(0, "info", line, notable=True) for line in document["text"]
+                ]
+            case PlannedSegment(name, document):
                 self._planned.append({"name": name, **document})
-                self._events.append(Event(0, "info", f"Next: {name}."))
+                self._events.append(LogEvent(0, "info", f"Next: {name}."))
             case SearchEnded(_, reason, segments):
                 self._ended, self.segments = message, segments
-                self._shared_state[Word.LAST_PIECE] = 1
-                self._events.append(Event(0, "info", reason, notable=True))
+                self._shared_state[StateField.LAST_SEGMENT] = 1
+                self._events.append(LogEvent(0, "info", reason, notable=True))
             case Failed(reason):
                 self._lose(reason)
 
@@ -222,6 +224,6 @@ class FitSupervisor:
         self._lost = why
         follows = "The session continues without fits."
         if self._search is not None and self._ended is None:
-            self._shared_state[Word.LAST_PIECE] = 1
+            self._shared_state[StateField.LAST_SEGMENT] = 1
             follows = "The session ends with what is planned."
-        self._events.append(Event(0, "warning", f"{why} {follows}"))
+        self._events.append(LogEvent(0, "warning", f"{why} {follows}"))

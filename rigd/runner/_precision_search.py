@@ -14,8 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.engine.messages import FitTold, PieceTold, SearchEnded
-from rigd.engine.reference import PieceWriter
+from rigd.engine.messages import FitReport, PlannedSegment, SearchEnded
+from rigd.engine.reference import ReferenceWriter
 from rigd.errors import RigdError
 from rigd.excitation import BAND_HZ, PAUSE_S, SHORTEST_S, BeamEstimate, Piece, PrecisionSearch
 from rigd.excitation.experiment_design import expected_precisions, next_piece
@@ -164,7 +164,7 @@ class ExcitationPlanner:
         self,
         search: PrecisionSearch,
         profile: Profile,
-        writer: PieceWriter,
+        writer: ReferenceWriter,
         *,
         start_rad: float = 0.0,
     ) -> None:
@@ -305,7 +305,7 @@ class ExcitationPlanner:
         self.due = self._intervals[-1].reference_tick
         # Another structure, such as a compliant clamp, may explain what a uniform beam does not.
         self.may_be_last = bool(doubt) and not self.may_be_last
-        yield PieceTold(segment.name, self._document(segment, found))
+        yield PlannedSegment(segment.name, self._document(segment, found))
 
     def _aims(
         self, estimate: BeamEstimate, angle_rad: Real, found: Sequence[TargetEstimate]
@@ -342,7 +342,7 @@ class ExcitationPlanner:
             return
         self._scans += 1
         self.may_be_last = False
-        yield PieceTold("the scan once more", {"why": why})
+        yield PlannedSegment("the scan once more", {"why": why})
 
     def _scan(self, name: str, held: int) -> bool:
         """Append the scan under another name; return whether there was time for it."""
@@ -377,12 +377,12 @@ class ExcitationPlanner:
         time_s: float,
         *,
         quietly: bool,
-    ) -> FitTold:
+    ) -> FitReport:
         """Return a report of an estimate, with a row of the table of requested quantities."""
         state = {"left_s": self._course.left_s, "targets": targets_json(found)}
         validity = Validity.of_document(document.get("validity"))
         text = [] if quietly else self._rows(found, time_s, validity)
-        return FitTold({**document, "search": state, "text": text})
+        return FitReport({**document, "search": state, "text": text})
 
     def _rows(
         self, found: Sequence[TargetEstimate], time_s: float, validity: Validity

@@ -147,12 +147,12 @@ class ProcessGroup:
         OSError
             If there is not enough shared memory.
         """
-        from rigd.engine.channels import HURRIED_BUFFERED_S, create_channels
+        from rigd.engine.channels import VIRTUAL_BUFFERED_S, create_channels
         from rigd.safety.limits import BUFFERED_S
 
         # Observers of samples, such as a live view or a fit, are slower than the virtual clock.
         hurried = fast and (self.live or self._also or watched)
-        buffered_s = HURRIED_BUFFERED_S if hurried else BUFFERED_S
+        buffered_s = VIRTUAL_BUFFERED_S if hurried else BUFFERED_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
 
     def _start(self, process: Process) -> None:

@@ -11,9 +11,9 @@ from typing import Any
 from rigd.devices import WhatMoves, describe_unknown_values
 from rigd.devices.contracts import DeviceError
 from rigd.engine.messages import Connected, ControlJob, Ended, Measured, Probe, Refused, Tare, Zero
-from rigd.engine.processes import CONTROL, LIVE, ChildError, Pulse
+from rigd.engine.processes import CONTROL, LIVE, ChildError, Heartbeat
 from rigd.engine.realtime import Precedence
-from rigd.engine.shared_state import SharedState, Stop, Word
+from rigd.engine.shared_state import SharedState, StateField, Stop
 from rigd.errors import FailureError
 from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
@@ -78,7 +78,7 @@ class Rig:
         self._connection: Connected | None = None
         self._view: LiveView | None = None
         self._zero_set = False
-        self._pulse = Pulse()
+        self._pulse = Heartbeat()
         self._precedence: Precedence | None = None
         self._status_lock = threading.Lock()
         self._statuses = StatusWatch(profile.rig.rate_hz)
@@ -100,7 +100,7 @@ class Rig:
         RigError
             If the rig is not connected.
         """
-        return self._require().channels.board[Word.ANGLE_NRAD] * 1e-9
+        return self._require().channels.shared_state[StateField.ANGLE_NRAD] * 1e-9
 
     @property
     def calibration(self) -> Mapping[str, Any] | None:
@@ -190,7 +190,7 @@ class Rig:
             )
         if self._precedence is not None:
             self._precedence.cover()
-        _wipe(group.channels.board)
+        _wipe(group.channels.shared_state)
         group.channels.clear()
         session = SessionRun(order, group, self._connection, self._view, watcher, listens)
         outcome = reason = ""
@@ -227,7 +227,7 @@ class Rig:
         group = self._require()
         if self._view is None:
             return "No live view was requested."
-        _wipe(group.channels.board)
+        _wipe(group.channels.shared_state)
         return self._view.show(order, stop)
 
     def tare(self) -> dict[str, Any]:
@@ -284,13 +284,13 @@ class Rig:
             If the move is stopped, an interlock ends it, or the rig is lost.
         """
         group = self._require()
-        shared_state = group.channels.board
+        shared_state = group.channels.shared_state
         if self._precedence is not None:
             self._precedence.cover()
         _wipe(shared_state)
 
         def request_stop() -> None:
-            shared_state[Word.STOP] = Stop.OPERATOR
+            shared_state[StateField.STOP] = Stop.OPERATOR
 
         stop.on_request = request_stop
         if stop.requested:
@@ -311,19 +311,19 @@ class Rig:
 
     def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
         """Wait for the result of a probing move while monitoring the control process."""
-        shared_state, pulse = group.channels.board, Pulse()
+        shared_state, pulse = group.channels.shared_state, Heartbeat()
         assert CONTROL.hung_after_s is not None
         hung_after_s = _SLOW_PATIENCE_S if self._fast else CONTROL.hung_after_s + _ENABLE_PATIENCE_S
         until_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_PATIENCE_S
         while True:
             answer = group.control.poll(_POLL_S)
-            shared_state.beat(Word.SUPERVISOR_BEAT)
+            shared_state.beat(StateField.SUPERVISOR_BEAT)
             if isinstance(answer, Ended):
                 raise RigError(answer.reason or "It was stopped.")
             if answer is not None:
                 return answer
             now_s = time.monotonic()
-            still_s = pulse.look(shared_state[Word.CONTROL_BEAT], now_s)
+            still_s = pulse.stalled_for(shared_state[StateField.CONTROL_BEAT], now_s)
             if still_s > hung_after_s or now_s > until_s:
                 group.control.kill()
                 raise RigError(
@@ -346,10 +346,10 @@ class Rig:
             message = group.control.poll(0.0)
         except ChildError as error:
             message = Ended(str(error))
-        shared_state = group.channels.board
-        shared_state.beat(Word.SUPERVISOR_BEAT)
+        shared_state = group.channels.shared_state
+        shared_state.beat(StateField.SUPERVISOR_BEAT)
         assert CONTROL.hung_after_s is not None
-        still_s = self._pulse.look(shared_state[Word.CONTROL_BEAT], time.monotonic())
+        still_s = self._pulse.stalled_for(shared_state[StateField.CONTROL_BEAT], time.monotonic())
         if message is None and still_s > CONTROL.hung_after_s:
             group.control.kill()
             message = Ended(
@@ -463,11 +463,11 @@ def _nothing() -> None:
 
 def _wipe(shared_state: SharedState) -> None:
     """Clear the fields of the shared state that belong to one session."""
-    shared_state[Word.STOP] = Stop.NO
-    shared_state[Word.GO] = 0
-    shared_state[Word.LIVE_DROPPED] = 0
-    shared_state[Word.PLANNED] = 0
-    shared_state[Word.LAST_PIECE] = 0
+    shared_state[StateField.STOP] = Stop.NO
+    shared_state[StateField.GO] = 0
+    shared_state[StateField.LIVE_DROPPED] = 0
+    shared_state[StateField.PLANNED] = 0
+    shared_state[StateField.LAST_SEGMENT] = 0
 
 
 def _lay_out(group: ProcessGroup, rate_hz: float, *, fast: bool, watched: bool) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
 from rigd.devices import session_seed
-from rigd.engine.shared_state import Event
+from rigd.engine.shared_state import LogEvent
 from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
 from rigd.runner._rig import Rig, RigError
@@ -39,7 +39,7 @@ class SeriesWatcher(Protocol):
     def shown(self, where: str) -> None:
         """Receive the address of the live view, or why there is none."""
 
-    def update(self, progress: SessionProgress, events: list[Event]) -> None:
+    def update(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         """Receive progress and events, about fifty times a second."""
 
     def ended(self, result: SessionResult, *, look_follows: bool) -> None:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rigd.devices.parameters import RigParameters
-from rigd.engine.messages import TouchJob, TouchOrder, TouchReady, TouchTold
+from rigd.engine.messages import TouchJob, TouchOrder, TouchReady, TouchReport
 from rigd.engine.processes import TOUCH, ChildError
-from rigd.engine.shared_state import Event
+from rigd.engine.shared_state import LogEvent
 from rigd.excitation import Excitation
 from rigd.profile import Profile
 from rigd.runner._process_group import await_ready
@@ -106,11 +106,11 @@ class TouchEstimates:
     ) -> None:
         self._group = group
         self._rate_hz = rate_hz
-        self._events: list[Event] = []
+        self._events: list[LogEvent] = []
         self._news: list[dict[str, Any]] = []
         self._lost = ""
         self._ready = False
-        self._reports: dict[int, TouchTold] = {}
+        self._reports: dict[int, TouchReport] = {}
         job = TouchJob(
             group.channels.specs,
             group.channels.samples.written,
@@ -135,7 +135,7 @@ class TouchEstimates:
         self._listen(patience_s)
         return not self._lost
 
-    def poll(self) -> list[Event]:
+    def poll(self) -> list[LogEvent]:
         """Read the received messages, and return the events for the operator."""
         self._listen(0.0)
         events, self._events = self._events, []
@@ -175,24 +175,24 @@ class TouchEstimates:
             for message in self._group[TOUCH].messages(patience_s):
                 if isinstance(message, TouchReady):
                     self._ready = True
-                elif isinstance(message, TouchTold):
+                elif isinstance(message, TouchReport):
                     self._reports[message.number] = message
                     self._note(message)
         except ChildError as error:
             self._lose(str(error))
 
-    def _note(self, report: TouchTold) -> None:
+    def _note(self, report: TouchReport) -> None:
         touch = _document(report.number, report)
         self._news.append(touch)
-        self._events.append(Event(0, "info", touch_line(touch), notable=True))
+        self._events.append(LogEvent(0, "info", touch_line(touch), notable=True))
 
     def _lose(self, why: str) -> None:
         self._lost = why
         text = f"{why} Touches are detected but not estimated; the session continues."
-        self._events.append(Event(0, "warning", text))
+        self._events.append(LogEvent(0, "warning", text))
 
 
-def _document(number: int, report: TouchTold | None) -> dict[str, Any]:
+def _document(number: int, report: TouchReport | None) -> dict[str, Any]:
     if report is None:
         return {"number": number}
     # A first estimate may be the only one.

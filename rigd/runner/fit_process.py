@@ -17,11 +17,11 @@ from typing import Any, BinaryIO, Final, Self, cast
 
 from rigd.engine import Observer
 from rigd.engine.channels import Channels, attach_channels
-from rigd.engine.messages import Failed, FileHeader, FitJob, FitReady, FitTold, RecordEnded
+from rigd.engine.messages import Failed, FileHeader, FitJob, FitReady, FitReport, RecordEnded
 from rigd.engine.processes import Parent
-from rigd.engine.realtime import keep_off_loop
-from rigd.engine.reference import PieceWriter
-from rigd.engine.shared_state import Word
+from rigd.engine.realtime import pin_off_loop_core
+from rigd.engine.reference import ReferenceWriter
+from rigd.engine.shared_state import StateField
 from rigd.runner._precision_search import ExcitationPlanner
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED
 from rigd.runtime import ignore as ignore_signals
@@ -55,7 +55,7 @@ def main() -> None:
     parent = Parent()
     job: FitJob = parent.receive_job()
     if job.realtime is not None:
-        keep_off_loop(job.realtime.cpu)
+        pin_off_loop_core(job.realtime.cpu)
     try:
         with FitProgram() as program:
             follower = _Follower(job, parent, program, attach_channels(job.channels))
@@ -132,7 +132,7 @@ class _Follower:
     ) -> None:
         self._parent = parent
         self._program = program
-        self._shared_state = channels.board
+        self._shared_state = channels.shared_state
         self._reader = Observer(channels.samples, job.first)
         self._job = job
         self._search: ExcitationPlanner | None = None
@@ -146,7 +146,7 @@ class _Follower:
         """Run until the whole record is fitted, or the supervisor has ended."""
         self._parent.send(FitReady())
         while True:
-            self._shared_state.beat(Word.FIT_BEAT)
+            self._shared_state.beat(StateField.FIT_BEAT)
             moved = self._feed()
             answer = self._program.answer()
             if answer is not None and self._answered(answer):
@@ -163,8 +163,8 @@ class _Follower:
                     self._ended_after = ticks
                     if self._search is not None and self._search.due is not None:
                         before, begun = (
-                            self._shared_state[Word.HELD_BEFORE],
-                            self._shared_state[Word.BEGUN],
+                            self._shared_state[StateField.HELD_BEFORE],
+                            self._shared_state[StateField.BEGUN],
                         )
                         self._parent.send(self._search.ended(ticks, before, begun))
 
@@ -172,7 +172,7 @@ class _Follower:
         """Start the fits with the header of the session file."""
         job = self._job
         if job.search is not None:
-            writer = PieceWriter(job.reference, self._shared_state)
+            writer = ReferenceWriter(job.reference, self._shared_state)
             start_rad = float(header.metadata["start_angle_rad"])
             self._search = ExcitationPlanner(job.search, job.profile, writer, start_rad=start_rad)
         every_s = _EVERY_S if job.search is None else None
@@ -199,10 +199,10 @@ class _Follower:
         elif (
             search is not None
             and search.due is not None
-            and search.is_begun(self._shared_state[Word.BEGUN])
+            and search.is_begun(self._shared_state[StateField.BEGUN])
         ):
             # Read after the samples: the loop counts a held tick before it publishes the sample.
-            tick = search.due + self._shared_state[Word.HELD]
+            tick = search.due + self._shared_state[StateField.HELD]
             if self._ticks >= tick:
                 self._request(tick, whole=search.may_be_last, from_last=True)
 
@@ -230,14 +230,17 @@ class _Follower:
             self._before = answer
         else:
             answer["search"] = search.state(answer)
-        self._parent.send(FitTold(answer, final=final))
+        self._parent.send(FitReport(answer, final=final))
         return final
 
     def _decide(
         self, search: ExcitationPlanner, request: EstimateRequest, answer: dict[str, Any]
     ) -> None:
         """Plan the next segment from an estimate."""
-        held, before = self._shared_state[Word.HELD], self._shared_state[Word.HELD_BEFORE]
+        held, before = (
+            self._shared_state[StateField.HELD],
+            self._shared_state[StateField.HELD_BEFORE],
+        )
         for message in search.decide(answer, held, before):
             self._parent.send(message)
         if search.needs_early_fit:

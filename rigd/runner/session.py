@@ -27,10 +27,10 @@ from rigd.engine.messages import (
     RecorderJob,
     SessionJob,
 )
-from rigd.engine.processes import CONTROL, RECORDER, ChildError, Pulse
+from rigd.engine.processes import CONTROL, RECORDER, ChildError, Heartbeat
 from rigd.engine.realtime import REFUSED
 from rigd.engine.reference import is_whole, put_reference
-from rigd.engine.shared_state import Event, Phase, Stop, Word, read_events
+from rigd.engine.shared_state import LogEvent, Phase, StateField, Stop, read_events
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
 from rigd.runner._online_fit import FitSupervisor
@@ -50,11 +50,11 @@ _MOST_NAMES = 100
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
 _COUNTED = {
-    "scheduled": Word.SCHEDULED,
-    "missed": Word.MISSED,
-    "late": Word.LATE,
-    "stale_angles": Word.STALE_ANGLES,
-    "stale_wrenches": Word.STALE_WRENCHES,
+    "scheduled": StateField.SCHEDULED,
+    "missed": StateField.MISSED,
+    "late": StateField.LATE,
+    "stale_angles": StateField.STALE_ANGLES,
+    "stale_wrenches": StateField.STALE_WRENCHES,
 }
 """Counters of the control process in the shared state, by their names in the result."""
 _NO_TICKS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTED, 0))
@@ -193,7 +193,7 @@ class SessionProgress:
     """Fits of the record since the last call, as in JSON documents."""
 
 
-Watcher = Callable[[SessionProgress, list[Event]], None]
+Watcher = Callable[[SessionProgress, list[LogEvent]], None]
 T = TypeVar("T")
 
 
@@ -235,12 +235,12 @@ class SessionRun:
         self._group = group
         self._connected = connected
         self._live = live
-        self._shared_state = group.channels.board
+        self._shared_state = group.channels.shared_state
         self._events = Observer(group.channels.events)
         self._watcher = watcher
         self._listens = listens
         self._virtual = connected.realtime["clock"] == "virtual"
-        self._pulse = Pulse()
+        self._pulse = Heartbeat()
         self._recorder_lost: str | None = None
         self._control_at_work = False
         # The drive is off until it is enabled; afterwards only the control process can confirm it.
@@ -267,7 +267,7 @@ class SessionRun:
         except (ChildError, SessionFailedError) as error:
             self._recorder_lost = self._recorder_lost or str(error)
             if self._control_at_work:
-                self._shared_state[Word.STOP] = Stop.NO_RECORDER
+                self._shared_state[StateField.STOP] = Stop.NO_RECORDER
                 self._listen_to_control()
             failure = SessionFailedError(f"{self._recorder_lost} {self._drive_at_end}")
             failure.path, failure.saved_path = self._opened, self._saved_path
@@ -277,7 +277,7 @@ class SessionRun:
             stop.on_request = _nothing
 
     def _stop(self) -> None:
-        self._shared_state[Word.STOP] = Stop.OPERATOR
+        self._shared_state[StateField.STOP] = Stop.OPERATOR
 
     def _run(self) -> SessionResult:
         group, search = self._group, self._order.excitation.search
@@ -324,7 +324,7 @@ class SessionRun:
             if self._fit is not None:
                 self._fit.begin(header)
             self._ask_recorder(Armed)
-            self._shared_state[Word.GO] = 1
+            self._shared_state[StateField.GO] = 1
             answer = self._listen_to_control()
         if self._recorder_lost is not None:
             raise SessionFailedError(self._recorder_lost)
@@ -334,7 +334,7 @@ class SessionRun:
     def _reports(self) -> bool:
         """Report before any motion; return whether the session is still requested."""
         self._report()
-        return self._shared_state[Word.STOP] == Stop.NO
+        return self._shared_state[StateField.STOP] == Stop.NO
 
     def _open_file(self) -> None:
         """Have the file created, under another name if the chosen name is already taken."""
@@ -377,16 +377,19 @@ class SessionRun:
             self._report()
             now_s = time.monotonic()
             # In lock-step with a simulated rig, a tick may wait for missing replies.
-            torque = self._shared_state[Word.PHASE] in _TORQUE_PHASES and not self._virtual
-            if self._shared_state[Word.STOP] == Stop.NO or self._shared_state[Word.PHASE] != phase:
-                phase = self._shared_state[Word.PHASE]
+            torque = self._shared_state[StateField.PHASE] in _TORQUE_PHASES and not self._virtual
+            if (
+                self._shared_state[StateField.STOP] == Stop.NO
+                or self._shared_state[StateField.PHASE] != phase
+            ):
+                phase = self._shared_state[StateField.PHASE]
                 patience_s = _PATIENCE_S if torque else _SLOW_PATIENCE_S
                 deadline = now_s + patience_s
             elif answer is None and now_s > deadline:
                 return self._kill_control(f"did not stop within {patience_s:g} s")
             assert CONTROL.hung_after_s is not None
             hung_after_s = CONTROL.hung_after_s if torque else _SLOW_PATIENCE_S
-            still_s = self._pulse.look(self._shared_state[Word.CONTROL_BEAT], now_s)
+            still_s = self._pulse.stalled_for(self._shared_state[StateField.CONTROL_BEAT], now_s)
             if answer is None and still_s > hung_after_s:
                 return self._kill_control(f"hung for {hung_after_s:g} s (check CPU load)")
             if answer is not None:
@@ -394,7 +397,7 @@ class SessionRun:
             if self._recorder_lost is None:
                 self._recorder_lost = self._recorder_trouble()
                 if self._recorder_lost is not None:
-                    self._shared_state[Word.STOP] = Stop.NO_RECORDER
+                    self._shared_state[StateField.STOP] = Stop.NO_RECORDER
 
     def _understood(self, answer: object) -> Ready | Finished:
         match answer:
@@ -447,7 +450,7 @@ class SessionRun:
         shared_state = self._shared_state
         # Before the record of this session the counters are those of the previous one.
         return {
-            name: shared_state[word] if shared_state[Word.GO] else 0
+            name: shared_state[word] if shared_state[StateField.GO] else 0
             for name, word in _COUNTED.items()
         }
 
@@ -457,7 +460,7 @@ class SessionRun:
         except ChildError as error:
             return str(error)
         if isinstance(message, Failed):
-            self._saved_path = message.kept
+            self._saved_path = message.saved_path
             return message.reason
         return None if message is None else str(message)
 
@@ -474,7 +477,7 @@ class SessionRun:
                 "disk."
             )
         if isinstance(message, Failed):
-            self._saved_path = message.kept
+            self._saved_path = message.saved_path
             raise (_NameTakenError if message.taken else SessionFailedError)(message.reason)
         if not isinstance(message, expected):
             raise SessionFailedError(f"The recorder process answers {message}.")
@@ -483,7 +486,7 @@ class SessionRun:
     def _report(self) -> None:
         shared_state = self._shared_state
         if self._listens():
-            shared_state.beat(Word.SUPERVISOR_BEAT)
+            shared_state.beat(StateField.SUPERVISOR_BEAT)
         events = read_events(self._events.take(16))
         if self._live is not None:
             events += self._live.poll()
@@ -499,10 +502,10 @@ class SessionRun:
                 self._live.fitted(fits)
         self._watcher(
             SessionProgress(
-                Phase(shared_state[Word.PHASE]),
-                shared_state[Word.SCHEDULED],
-                shared_state[Word.MISSED],
-                shared_state[Word.LATE],
+                Phase(shared_state[StateField.PHASE]),
+                shared_state[StateField.SCHEDULED],
+                shared_state[StateField.MISSED],
+                shared_state[StateField.LATE],
                 tuple(fits),
             ),
             events,
@@ -518,7 +521,7 @@ class SessionRun:
             **finished.results,
         }
         if self._touches is not None:
-            touches = self._touches.finish(self._shared_state[Word.TOUCHES], self._report)
+            touches = self._touches.finish(self._shared_state[StateField.TOUCHES], self._report)
             outcome["touches"] = json.dumps(touches)
             self._report()
         fit: dict[str, Any] | None = None
@@ -558,7 +561,7 @@ class SessionRun:
             fault=finished.fault
             or ended == "fault"
             or (self._fit is not None and bool(self._fit.failure)),
-            live_dropped=self._shared_state[Word.LIVE_DROPPED],
+            live_dropped=self._shared_state[StateField.LIVE_DROPPED],
             touches=None if touches is None else tuple(touches),
             fit=fit,
         )

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rigd.engine import Observer, Ring
 from rigd.engine.channels import Channels
-from rigd.engine.shared_state import Phase, Word
+from rigd.engine.shared_state import Phase, StateField
 from rigd.profile import Profile
 from rigd.runner._live_view import gauge_limits
 from rigd.session.layout import decode_samples
@@ -83,7 +83,7 @@ class SignalReader:
             Rings and shared state of the rig's processes.
         """
         now_s = time.monotonic()
-        ring, shared_state = channels.samples, channels.board
+        ring, shared_state = channels.samples, channels.shared_state
         if self._seen is None or self._seen[0] is not ring or now_s > self._read_s + _ABANDONED_S:
             self._seen = ring, Observer(ring)
             self._last = None
@@ -96,14 +96,14 @@ class SignalReader:
         self._gauged_s = now_s
         gauges = self._take_gauges()
         if not blocks:
-            at_work = shared_state[Word.PHASE] != Phase.PREPARING
+            at_work = shared_state[StateField.PHASE] != Phase.PREPARING
             peaks = {
-                "angle": abs(shared_state[Word.ANGLE_NRAD]) * 1e-9 if at_work else None,
-                "torque_command": abs(shared_state[Word.TORQUE_COMMAND_NNM]) * 1e-9,
+                "angle": abs(shared_state[StateField.ANGLE_NRAD]) * 1e-9 if at_work else None,
+                "torque_command": abs(shared_state[StateField.TORQUE_COMMAND_NNM]) * 1e-9,
                 "i2t": self._cool(0.0),
             }
             nothing = dict.fromkeys(_FIELDS, np.empty(0, dtype=np.float32))
-            gauges = gauges or self._gauges.beside(peaks)
+            gauges = gauges or self._gauges.with_limits(peaks)
             return [SignalBlock(0, 0, nothing, gauges)]
         blocks[-1] = replace(blocks[-1], gauges=gauges)
         return blocks

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from rigd.engine import Observer, Ring
 from rigd.engine.channels import TOPICS
-from rigd.engine.processes import PROCESSES, SUPERVISOR, Pulse
-from rigd.engine.shared_state import Activity, Phase, Word, activity
+from rigd.engine.processes import PROCESSES, SUPERVISOR, Heartbeat
+from rigd.engine.shared_state import Activity, Phase, StateField, activity
 from rigd.live.address import LiveAddress
 from rigd.runner._process_group import ProcessGroup
 from rigd.session.layout import decode_samples
@@ -199,29 +199,29 @@ class StatusWatch:
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
-        self._pulses = {process: Pulse() for process in PROCESSES}
+        self._pulses = {process: Heartbeat() for process in PROCESSES}
         self._written: tuple[float, tuple[int, ...]] | None = None
         self._signals = SignalWatch(rate_hz)
 
     def read(self, group: ProcessGroup) -> RigStatus:
         """Return the present status."""
-        shared_state = group.channels.board
-        load_ppm = shared_state.known(Word.BUS_LOAD_PPM)
+        shared_state = group.channels.shared_state
+        load_ppm = shared_state.known(StateField.BUS_LOAD_PPM)
         return RigStatus(
-            phase=Phase(shared_state[Word.PHASE]),
+            phase=Phase(shared_state[StateField.PHASE]),
             activity=activity(shared_state),
-            angle_rad=shared_state[Word.ANGLE_NRAD] * 1e-9,
-            coupling_torque_nm=shared_state[Word.COUPLING_TORQUE_NNM] * 1e-9,
-            torque_command_nm=shared_state[Word.TORQUE_COMMAND_NNM] * 1e-9,
-            tick=shared_state[Word.SCHEDULED],
-            missed=shared_state[Word.MISSED],
-            late=shared_state[Word.LATE],
-            lost=shared_state[Word.LOST],
+            angle_rad=shared_state[StateField.ANGLE_NRAD] * 1e-9,
+            coupling_torque_nm=shared_state[StateField.COUPLING_TORQUE_NNM] * 1e-9,
+            torque_command_nm=shared_state[StateField.TORQUE_COMMAND_NNM] * 1e-9,
+            tick=shared_state[StateField.SCHEDULED],
+            missed=shared_state[StateField.MISSED],
+            late=shared_state[StateField.LATE],
+            lost=shared_state[StateField.LOST],
             bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
-            bus_errors=shared_state.known(Word.BUS_ERRORS),
-            sensor_status=shared_state.known(Word.SENSOR_STATUS),
-            disk_free_mb=shared_state[Word.DISK_FREE_MB] or None,
-            view_dropped=shared_state[Word.LIVE_DROPPED],
+            bus_errors=shared_state.known(StateField.BUS_ERRORS),
+            sensor_status=shared_state.known(StateField.SENSOR_STATUS),
+            disk_free_mb=shared_state[StateField.DISK_FREE_MB] or None,
+            view_dropped=shared_state[StateField.LIVE_DROPPED],
             signals=self._signals.poll(group.channels.samples),
             processes=tuple(self._processes(group)),
             topics=tuple(self._topics(group)),
@@ -240,9 +240,9 @@ class StatusWatch:
             yield TopicStatus(topic.name, now, rate_hz, expected_hz, ring.waiting)
 
     def _processes(self, group: ProcessGroup) -> Iterator[ProcessStatus]:
-        shared_state, now_s = group.channels.board, time.monotonic()
+        shared_state, now_s = group.channels.shared_state, time.monotonic()
         for process in PROCESSES:
-            still_s = self._pulses[process].look(shared_state[process.beat], now_s)
+            still_s = self._pulses[process].stalled_for(shared_state[process.beat], now_s)
             if process is SUPERVISOR:
                 yield ProcessStatus(process.name, os.getpid(), "running", still_s)
                 continue

@@ -90,9 +90,9 @@ class Gauges:
             "torque_command": _peak(torque_nm),
             "i2t": self._rms_nm(torque_nm),
         } | {field.partition("_")[0]: _peak(samples[field]) for field in WRENCH_FIELDS}
-        return self.beside(peaks)
+        return self.with_limits(peaks)
 
-    def beside(self, values: Mapping[str, float | None]) -> dict[str, Gauge]:
+    def with_limits(self, values: Mapping[str, float | None]) -> dict[str, Gauge]:
         """Return values with their limits, by the names of ``UNITS``.
 
         Parameters

@@ -11,7 +11,7 @@ from rigd.engine import shared_memory_fd
 from rigd.engine.channels import DESCRIPTORS, create_channels
 from rigd.engine.messages import FileHeader
 from rigd.engine.recorder import Recorder
-from rigd.engine.shared_state import Phase, Word
+from rigd.engine.shared_state import Phase, StateField
 from rigd.excitation import hold
 from rigd.runner import Rig
 from rigd.runner.request import Order
@@ -38,16 +38,16 @@ def channels():
     ],
 )
 def test_a_recorder_alone_knows_a_whole_record(channels, tmp_path, ticks, outcome, reason):
-    board, ring = channels.board, channels.samples
+    shared_state, ring = channels.shared_state, channels.samples
     recorder = Recorder(channels, SessionWriter(tmp_path / "alone.mcap"))
     segments = {"rest": (0, 100), "sweep": (100, 300)}
     recorder.header = FileHeader({"rate_hz": "1000.0"}, segments, attachments={})
     for tick in range(ticks):
         pack_sample_into(ring.buffer, ring.slot(), tick * 10**6, tick, *[0.0] * 10, 0, 0, 0)
         ring.publish()
-    board[Word.START_UTC_NS] = 10**18
-    board[Word.SCHEDULED] = ticks
-    board[Word.PHASE] = Phase.OFF
+    shared_state[StateField.START_UTC_NS] = 10**18
+    shared_state[StateField.SCHEDULED] = ticks
+    shared_state[StateField.PHASE] = Phase.OFF
     recorder.finish_orphaned()  # which finds all of it in the rings
     session = read_session(tmp_path / "alone.mcap")
     assert len(session.samples) == ticks

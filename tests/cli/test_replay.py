@@ -591,11 +591,11 @@ def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
     """In Rerun's own viewer, without a screen: opened as the window is, and as browsers do."""
     from rerun.experimental import ViewerClient
 
-    from rigd.live import PageOfFile, Viewer, Window
+    from rigd.live import FileWindow, PageOfFile, Viewer
 
     headless = ("--headless", "--window-size", "960x600")
     if way == "window":
-        program, page = Window(recording, tmp_path, headless).program, None
+        program, page = FileWindow(recording, tmp_path, headless).program, None
     else:
         page = PageOfFile(recording, tmp_path)
         program = Viewer(page.address, tmp_path, headless).program

@@ -8,7 +8,7 @@ from online_fits import online_fit
 from operated_daemons import parse_request
 
 from rigd.daemon._series import SeriesReporter, ServedSeries
-from rigd.engine.shared_state import Event, Phase
+from rigd.engine.shared_state import LogEvent, Phase
 from rigd.runner.session import SessionProgress, SessionResult
 
 
@@ -54,7 +54,7 @@ def test_what_clients_are_told_of_a_fit_is_bounded(told):
 def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
     series, reporter, events = told
     assert series.as_document()["fit"] is None
-    row = Event(0, "info", "  8.0 s 0.910 ± 0.010 %", notable=True)
+    row = LogEvent(0, "info", "  8.0 s 0.910 ± 0.010 %", notable=True)
     fits = (online_fit(6.0, 2.0), online_fit(8.0))
     reporter.update(SessionProgress(Phase.RUNNING, 9, 0, 0, fits), [row])
     assert [event["event"] for event in events] == ["message", "fit", "fit"]

@@ -10,7 +10,7 @@ from operated_daemons import CommandError, Peer, parse_request, shown_status
 from rigd.devices import WhatMoves
 from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.engine.processes import ChildError
-from rigd.engine.shared_state import Word
+from rigd.engine.shared_state import StateField
 from rigd.session import read_session
 from rigd.view._recorded import subject_of_session
 
@@ -475,15 +475,15 @@ def test_a_session_whose_daemon_hears_nobody_is_given_no_sign_of_life(operated, 
     monkeypatch.setattr(operated.service, "_listens", lambda: next(heard, False))
     beats = []
     operated.world.countdown = 1200
-    operated.world.then = lambda _: beats.append(board(operated)[Word.SUPERVISOR_BEAT])
+    operated.world.then = lambda _: beats.append(shared_state(operated)[StateField.SUPERVISOR_BEAT])
     operated.ask("start", **SHORT, repeat=2)
-    assert board(operated)[Word.SUPERVISOR_BEAT] == beats[0]
+    assert shared_state(operated)[StateField.SUPERVISOR_BEAT] == beats[0]
     assert len(operated.last["sessions"]) == 1
     assert "does not respond" in operated.last["reason"]
 
 
-def board(operated):
-    return operated.rig._group.channels.board
+def shared_state(operated):
+    return operated.rig._group.channels.shared_state
 
 
 def test_the_end_of_the_daemon_stops_a_session_safely(operated):

@@ -13,7 +13,7 @@ from rigd.engine.channels import DESCRIPTORS, create_channels
 from rigd.engine.control_process import run_control
 from rigd.engine.messages import Finished, SessionJob
 from rigd.engine.reference import put_reference
-from rigd.engine.shared_state import Phase, Word, read_events
+from rigd.engine.shared_state import Phase, StateField, read_events
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp
 from rigd.runtime import StopRequest
@@ -92,8 +92,8 @@ class WatchedDrive:
 class FakeParent:
     """A supervisor that gives its orders, notes what it is told, and can die or hang."""
 
-    def __init__(self, board):
-        self.board = board
+    def __init__(self, shared_state):
+        self.shared_state = shared_state
         self.hangs = False
         self.orders = []
         self.messages = []
@@ -113,7 +113,7 @@ class FakeParent:
 
     def alive(self):
         if not self.hangs:
-            self.board.beat(Word.SUPERVISOR_BEAT)
+            self.shared_state.beat(StateField.SUPERVISOR_BEAT)
         return self.living
 
 
@@ -143,15 +143,15 @@ class Session:
         self.channels = create_channels(
             self.profile.rig.rate_hz, [shared_memory_fd() for _ in range(DESCRIPTORS)]
         )
-        self.board = self.channels.board
-        self.parent = FakeParent(self.board)
+        self.shared_state = self.channels.shared_state
+        self.parent = FakeParent(self.shared_state)
         self.stop = StopRequest()
         self.obtained = {}
         devices = open_devices(self.profile.rig)
         self.drive = WatchedDrive(devices.drive)
         self.devices = Devices(self.drive, devices.sensor, True, devices.renew_noise)
         self.clock = clock or VirtualClock()
-        self.board[Word.GO] = 1
+        self.shared_state[StateField.GO] = 1
 
     def run(self):
         return self.obey(self.order())
@@ -194,7 +194,7 @@ class Session:
     def assert_safe(self):
         assert not self.drive.enabled
         assert self.drive.torque_nm == 0.0
-        assert self.board[Word.PHASE] == Phase.OFF
+        assert self.shared_state[StateField.PHASE] == Phase.OFF
 
     def close(self):
         self.channels.close()

@@ -7,7 +7,7 @@ import pytest
 
 from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.engine.messages import Ended, Finished, Measured, Ready, Refused, Tare, Zero
-from rigd.engine.shared_state import Phase, Word
+from rigd.engine.shared_state import Phase, StateField
 from rigd.engine.timing import SuspendWatch, VirtualClock
 from rigd.excitation import hold, step
 from rigd.session.layout import Status
@@ -181,8 +181,11 @@ def test_a_supervisor_that_hangs_ends_the_session(make_session):
 
     def alive():
         looks.append(1)
-        if session.board[Word.PHASE] != Phase.RUNNING or session.board[Word.SCHEDULED] < 1000:
-            session.board.beat(Word.SUPERVISOR_BEAT)
+        if (
+            session.shared_state[StateField.PHASE] != Phase.RUNNING
+            or session.shared_state[StateField.SCHEDULED] < 1000
+        ):
+            session.shared_state.beat(StateField.SUPERVISOR_BEAT)
         return True
 
     session.parent.alive = alive
@@ -207,7 +210,7 @@ def test_a_suspend_of_the_computer_ends_the_session(make_session, monkeypatch):
     read_angle = session.drive.read_angle
 
     def suspended():
-        if session.board[Word.SCHEDULED] == 1000:
+        if session.shared_state[StateField.SCHEDULED] == 1000:
             boot_ns[0] = 90_000_000_000
         return read_angle()
 
@@ -226,7 +229,7 @@ def test_the_board_shows_what_is_read_and_that_somebody_reads(make_session):
     orders = [None] * 5
 
     def poll(timeout_s):
-        beats.append(session.board[Word.CONTROL_BEAT])
+        beats.append(session.shared_state[StateField.CONTROL_BEAT])
         if not orders:
             raise EOFError
         return orders.pop()
@@ -234,8 +237,8 @@ def test_the_board_shows_what_is_read_and_that_somebody_reads(make_session):
     session.parent.poll = poll
     session.obey()
     assert beats == sorted(set(beats))
-    assert session.board[Word.ANGLE_NRAD] == pytest.approx(0.25e9, abs=3e5)
-    assert session.board[Word.TORQUE_COMMAND_NNM] == 0
+    assert session.shared_state[StateField.ANGLE_NRAD] == pytest.approx(0.25e9, abs=3e5)
+    assert session.shared_state[StateField.TORQUE_COMMAND_NNM] == 0
 
 
 def jump_between(session, n, counts=8000):

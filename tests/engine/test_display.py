@@ -8,7 +8,7 @@ import pytest
 from rigd.devices.contracts import LineHealth
 from rigd.engine import shared_memory_fd
 from rigd.engine._publish import Display
-from rigd.engine.shared_state import SharedState, Word
+from rigd.engine.shared_state import SharedState, StateField
 
 CYCLE = SimpleNamespace(angle_rad=0.1, coupling_torque_nm=float("nan"), torque_command_nm=-0.2)
 
@@ -22,33 +22,33 @@ class Line:
 
 
 @pytest.fixture
-def board():
+def shared_state():
     fd = shared_memory_fd()
     yield SharedState.create(fd)
     os.close(fd)
 
 
-def shown(board, drive, sensor, *times_ns):
-    display = Display(board, SimpleNamespace(drive=drive, sensor=sensor))
+def shown(shared_state, drive, sensor, *times_ns):
+    display = Display(shared_state, SimpleNamespace(drive=drive, sensor=sensor))
     for now_ns in times_ns:
         display.show(CYCLE, now_ns)
-    words = (Word.BUS_LOAD_PPM, Word.BUS_ERRORS, Word.SENSOR_STATUS)
-    return tuple(board[word] for word in words)
+    words = (StateField.BUS_LOAD_PPM, StateField.BUS_ERRORS, StateField.SENSOR_STATUS)
+    return tuple(shared_state[word] for word in words)
 
 
-def test_without_a_line_nothing_is_known_of_one(board):
-    assert shown(board, Line(LineHealth()), Line(LineHealth()), 0, 10**9) == (-1, -1, -1)
-    assert board[Word.ANGLE_NRAD] == 10**8
-    assert board[Word.COUPLING_TORQUE_NNM] == 0  # what is not a number is not shown
-    assert board[Word.CONTROL_BEAT] == 2
+def test_without_a_line_nothing_is_known_of_one(shared_state):
+    assert shown(shared_state, Line(LineHealth()), Line(LineHealth()), 0, 10**9) == (-1, -1, -1)
+    assert shared_state[StateField.ANGLE_NRAD] == 10**8
+    assert shared_state[StateField.COUPLING_TORQUE_NNM] == 0  # what is not a number is not shown
+    assert shared_state[StateField.CONTROL_BEAT] == 2
 
 
-def test_the_busiest_line_counts_and_the_errors_of_all(board):
+def test_the_busiest_line_counts_and_the_errors_of_all(shared_state):
     can = Line(LineHealth(0, 1e6, 1), LineHealth(300_000, 1e6, 1))
     serial = Line(LineHealth(0, 2e6, 2, 8), LineHealth(400_000, 2e6, 2, 8))
-    assert shown(board, can, serial, 0, 10**9) == (300_000, 3, 8)
+    assert shown(shared_state, can, serial, 0, 10**9) == (300_000, 3, 8)
 
 
-def test_while_time_stands_still_the_load_is_what_it_was(board):
+def test_while_time_stands_still_the_load_is_what_it_was(shared_state):
     can = Line(*(LineHealth(bits, 1e6) for bits in (0, 1000, 5000, 9000)))
-    assert shown(board, can, Line(LineHealth()), 0, 10**6 * 2, 10**6 * 2)[0] == 500_000
+    assert shown(shared_state, can, Line(LineHealth()), 0, 10**6 * 2, 10**6 * 2)[0] == 500_000

@@ -11,7 +11,7 @@ from rigd.control import close_loop
 from rigd.devices.contracts import Devices
 from rigd.engine.cycle import make_watch
 from rigd.engine.messages import Finished, Tare
-from rigd.engine.shared_state import Word
+from rigd.engine.shared_state import StateField
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp, hold
 from rigd.profile import load_profile
@@ -136,7 +136,7 @@ def drop_sto(session):
 
 
 def fill_disk(session):
-    session.clock = Clock(lambda: session.board.__setitem__(Word.DISK_FREE_MB, 40))
+    session.clock = Clock(lambda: session.shared_state.__setitem__(StateField.DISK_FREE_MB, 40))
 
 
 def miss(session, *late_ns):

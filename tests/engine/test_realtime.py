@@ -23,9 +23,9 @@ from rigd.profile import load_profile
 CODE = """
 import json, os, resource, sys
 from pathlib import Path
-from rigd.engine.realtime import obtain
+from rigd.engine.realtime import apply_realtime
 {before}
-obtained = obtain(priority={priority}, cpu={cpu}, root=Path({root!r}))
+obtained = apply_realtime(priority={priority}, cpu={cpu}, root=Path({root!r}))
 print(json.dumps([obtained, sorted(os.sched_getaffinity(0)), os.sched_getscheduler(0)]))
 """
 NO_RIGHTS = """

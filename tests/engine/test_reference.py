@@ -13,14 +13,14 @@ from rigd.devices.contracts import LineHealth
 from rigd.engine import shared_memory_fd
 from rigd.engine.messages import SessionJob
 from rigd.engine.reference import (
-    PieceReader,
-    PieceWriter,
+    ReferenceReader,
     ReferenceSpec,
+    ReferenceWriter,
     is_whole,
     map_reference,
     put_reference,
 )
-from rigd.engine.shared_state import SharedState, Stop, Word
+from rigd.engine.shared_state import SharedState, StateField, Stop
 
 UNIT_RAD = 1e-7
 """Unit of the angles here: pieces begin and end at rest."""
@@ -36,90 +36,90 @@ class InUnits:
 
 
 def growing(planned=3, room=40):
-    board = SharedState.create(shared_memory_fd())
+    shared_state = SharedState.create(shared_memory_fd())
     reference_rad = np.zeros(planned + room)
     reference_rad[:planned] = UNIT_RAD * np.arange(1, planned + 1)
     spec = put_reference(shared_memory_fd(), reference_rad, planned)
-    reader = PieceReader(map_reference(spec), planned, board)
-    both = InUnits(PieceWriter(spec, board), reader)
-    return both, both, board
+    reader = ReferenceReader(map_reference(spec), planned, shared_state)
+    both = InUnits(ReferenceWriter(spec, shared_state), reader)
+    return both, both, shared_state
 
 
 def test_pieces_follow_each_other_without_a_gap():
-    writer, reader, board = growing()
+    writer, reader, shared_state = growing()
     writer.append(np.array([10.0, 11.0]))
     writer.append(np.array([20.0]))
     assert [reader.at(tick) for tick in range(6)] == [1, 2, 3, 10, 11, 20]
-    assert board[Word.HELD] == 0
+    assert shared_state[StateField.HELD] == 0
 
 
 def test_a_record_is_whole_with_the_last_piece_and_all_ticks_held():
-    writer, reader, board = growing(planned=3, room=40)
+    writer, reader, shared_state = growing(planned=3, room=40)
     assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
     writer.append(np.array([10.0, 11.0]))
     assert [reader.at(tick) for tick in range(5, 7)] == [10, 11]
-    assert not is_whole(board, 7, 43)  # there may come more
-    board[Word.LAST_PIECE] = 1
+    assert not is_whole(shared_state, 7, 43)  # there may come more
+    shared_state[StateField.LAST_SEGMENT] = 1
     assert reader.over(7)
-    assert is_whole(board, 7, 43)
-    assert not is_whole(board, 6, 43)
-    assert not is_whole(board, 0, 43)
+    assert is_whole(shared_state, 7, 43)
+    assert not is_whole(shared_state, 6, 43)
+    assert not is_whole(shared_state, 0, 43)
 
 
 def test_a_record_of_what_was_given_is_whole_at_its_end():
-    board = SharedState.create(shared_memory_fd())
-    assert [is_whole(board, scheduled, 9) for scheduled in (0, 8, 9)] == [False, False, True]
+    shared_state = SharedState.create(shared_memory_fd())
+    assert [is_whole(shared_state, scheduled, 9) for scheduled in (0, 8, 9)] == [False, False, True]
 
 
 def test_the_last_angle_is_held_until_the_next_piece():
-    writer, reader, board = growing()
+    writer, reader, shared_state = growing()
     assert [reader.at(tick) for tick in range(6)] == [1, 2, 3, 3, 3, 3]
-    assert board[Word.HELD] == 3
+    assert shared_state[StateField.HELD] == 3
     writer.append(np.array([10.0, 11.0, 12.0]))
     assert [reader.at(tick) for tick in range(6, 10)] == [10, 11, 12, 12]
-    assert board[Word.HELD] == 4
+    assert shared_state[StateField.HELD] == 4
 
 
 def test_it_is_told_before_which_piece_the_angle_was_held():
-    writer, reader, board = growing()
+    writer, reader, shared_state = growing()
     before = []
     for tick in range(12):
         if tick in (2, 6):
             writer.append(np.array([10.0, 11.0]))
         reader.at(tick)
-        before.append(board[Word.HELD_BEFORE])
+        before.append(shared_state[StateField.HELD_BEFORE])
     assert before == [0] * 6 + [1] * 6  # the first piece at tick 3, the second at tick 6
-    assert board[Word.BEGUN] == 7
-    assert board[Word.HELD] == 5
+    assert shared_state[StateField.BEGUN] == 7
+    assert shared_state[StateField.HELD] == 5
 
 
 @pytest.mark.parametrize(("room", "played"), [(4, [10, 11]), (3, [3])])
 def test_a_piece_that_would_not_end_with_the_record_is_not_begun(room, played):
     """The motor would have to stop at full swing."""
-    writer, reader, board = growing(room=room)
+    writer, reader, shared_state = growing(room=room)
     assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
     writer.append(np.array([10.0, 11.0]))
     assert not reader.waits(5)
     assert [reader.at(tick) for tick in range(5, 3 + room)] == played
-    assert board[Word.BEGUN] == (5 if len(played) > 1 else 0)
+    assert shared_state[StateField.BEGUN] == (5 if len(played) > 1 else 0)
 
 
 def test_missed_ticks_are_played_by_as_in_a_given_reference():
-    writer, reader, board = growing()
+    writer, reader, shared_state = growing()
     writer.append(np.array([10.0, 11.0, 12.0]))
     assert [reader.at(tick) for tick in (0, 4)] == [1, 11]
     assert reader.at(8) == 12  # three ticks after the end
     writer.append(np.array([20.0, 21.0]))
     assert [reader.at(tick) for tick in (9, 10)] == [20, 21]
-    assert board[Word.HELD] == 3
+    assert shared_state[StateField.HELD] == 3
 
 
 def test_the_end_comes_after_all_that_is_planned():
-    writer, reader, board = growing()
+    writer, reader, shared_state = growing()
     assert reader.waits(3)
     writer.append(np.array([10.0]))
     assert not reader.waits(3)
-    board[Word.LAST_PIECE] = 1
+    shared_state[StateField.LAST_SEGMENT] = 1
     over = []
     for tick in range(4):
         over.append(reader.over(tick))
@@ -130,10 +130,10 @@ def test_the_end_comes_after_all_that_is_planned():
 
 
 def test_a_piece_without_room_is_refused():
-    writer, _, board = growing(room=2)
+    writer, _, shared_state = growing(room=2)
     with pytest.raises(ValueError, match="room for 2"):
         writer.append(np.zeros(3))
-    assert board[Word.PLANNED] == 0
+    assert shared_state[StateField.PLANNED] == 0
 
 
 @pytest.mark.parametrize(
@@ -141,10 +141,10 @@ def test_a_piece_without_room_is_refused():
     [[0.01, 0.0], [0.0, 0.01], [0.0, np.nan, 0.0], [np.nan, 0.0], [0.0, np.inf], [0.0, 7.0, 0.0]],
 )
 def test_a_piece_that_does_not_begin_and_end_at_rest_is_refused(piece_rad):
-    writer, _, board = growing()
+    writer, _, shared_state = growing()
     with pytest.raises(ValueError, match="a segment from"):
         writer.append(np.array(piece_rad) / UNIT_RAD)
-    assert board[Word.PLANNED] == 0
+    assert shared_state[StateField.PLANNED] == 0
 
 
 @given(
@@ -155,7 +155,7 @@ def test_a_piece_that_does_not_begin_and_end_at_rest_is_refused(piece_rad):
 )
 def test_every_angle_of_a_piece_comes_in_its_order(pieces, missed):
     """Whatever is late: the pieces are followed, held in between, without what was missed."""
-    writer, reader, board = growing(room=100)
+    writer, reader, shared_state = growing(room=100)
     arrivals = sorted(pieces, key=lambda piece: piece[1])
     told, tick, followed = 3, -1, []
     for skipped in missed:
@@ -166,7 +166,7 @@ def test_every_angle_of_a_piece_comes_in_its_order(pieces, missed):
             writer.append(np.arange(told + 1, told + length + 1))
             told += length
         followed.append((tick, reader.at(tick)))
-        held = board[Word.HELD]
+        held = shared_state[StateField.HELD]
         assert followed[-1][1] == min(tick - held + 1, told)
     values = [value for _, value in followed]
     assert values == sorted(values)
@@ -181,13 +181,13 @@ def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
     pieces_rad = [0.01 * np.sin(np.linspace(0, 2 * np.pi, 301)) ** 3, np.zeros(100)]
     whole = np.concatenate([begun, np.zeros(2000)])
     spec = put_reference(shared_memory_fd(), whole, begun.size)
-    writer = PieceWriter(spec, session.board)
+    writer = ReferenceWriter(spec, session.shared_state)
 
     def plan():
         for piece_rad in pieces_rad:
             time.sleep(0.3)
             writer.append(piece_rad)
-        session.board[Word.LAST_PIECE] = 1
+        session.shared_state[StateField.LAST_SEGMENT] = 1
 
     planner = threading.Thread(target=plan)
     planner.start()
@@ -199,7 +199,7 @@ def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
     assert session.finished.counts["scheduled"] == len(samples) == expected.size
     reference_rad = samples["angle_reference_rad"]
     assert reference_rad - reference_rad[0] == pytest.approx(expected, abs=1e-12)
-    assert session.board[Word.HELD] == 0
+    assert session.shared_state[StateField.HELD] == 0
     session.assert_safe()
 
 
@@ -212,17 +212,17 @@ def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_sign
     session = make_session()
     session.drive.health = lambda: LineHealth(bits)
     spec = put_reference(shared_memory_fd(), np.zeros(2000), 300)
-    writer = PieceWriter(spec, session.board)
+    writer = ReferenceWriter(spec, session.shared_state)
 
     def plan():
         writer.append(np.zeros(100))
-        session.board[Word.LAST_PIECE] = 1
+        session.shared_state[StateField.LAST_SEGMENT] = 1
 
     planner = threading.Timer(1.0, plan)
     planner.start()
     session.obey(SessionJob(session.profile, spec))
     planner.join()
-    ticks_held = session.board[Word.HELD]
+    ticks_held = session.shared_state[StateField.HELD]
     assert (ticks_held > 0) == held
     assert ticks_held < 12
     assert session.finished.outcome == "complete"
@@ -233,7 +233,9 @@ def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_sign
 def test_a_stop_ends_the_wait_for_a_piece(make_session):
     session = make_session()
     spec = ReferenceSpec(put_reference(shared_memory_fd(), np.zeros(900)).fd, 900, 300)
-    stopping = threading.Timer(0.5, lambda: session.board.__setitem__(Word.STOP, Stop.OPERATOR))
+    stopping = threading.Timer(
+        0.5, lambda: session.shared_state.__setitem__(StateField.STOP, Stop.OPERATOR)
+    )
     stopping.start()
     session.obey(SessionJob(session.profile, spec))
     assert session.finished.outcome == "stopped"

@@ -11,7 +11,7 @@ import pytest
 from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
 from rigd.engine.messages import Connected, Finished, Ready
-from rigd.engine.shared_state import Phase, Stop, Word
+from rigd.engine.shared_state import Phase, StateField, Stop
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import hold
 from rigd.session.layout import Status, decode_samples
@@ -116,8 +116,16 @@ class StopAt(VirtualClock):
 @pytest.mark.parametrize(
     ("action", "outcome", "words"),
     [
-        (lambda s: s.board.__setitem__(Word.STOP, Stop.OPERATOR), "stopped", "operator"),
-        (lambda s: s.board.__setitem__(Word.STOP, Stop.NO_RECORDER), "fault", "recorder"),
+        (
+            lambda s: s.shared_state.__setitem__(StateField.STOP, Stop.OPERATOR),
+            "stopped",
+            "operator",
+        ),
+        (
+            lambda s: s.shared_state.__setitem__(StateField.STOP, Stop.NO_RECORDER),
+            "fault",
+            "recorder",
+        ),
         (lambda s: setattr(s.parent, "living", False), "fault", "supervising"),
         (lambda s: s.stop.request(), "stopped", "operator"),
     ],
@@ -227,7 +235,7 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
     assert session.finished.outcome == "complete"
     assert np.flatnonzero(session.samples["status"] & Status.ANGLE_STALE).size == len(stale)
     assert session.finished.counts == books(scheduled=5000, stale_angles=len(stale))
-    assert session.board[Word.STALE_ANGLES] == len(stale)
+    assert session.shared_state[StateField.STALE_ANGLES] == len(stale)
     # Six per cent of ten seconds, of which there may be ten: said once, and past the half of it.
     [warning] = [event.message for event in session.events if event.level == "warning"]
     assert warning.startswith("Share of ticks without a new angle 5 % above warning level")
@@ -541,7 +549,7 @@ def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session)
 def test_a_supervisor_that_does_nothing_does_not_keep_the_torque_on(make_session, monkeypatch):
     monkeypatch.setattr("rigd.engine._session_sequence._GO_PATIENCE_S", 0.2)
     session = make_session()
-    session.board[Word.GO] = 0
+    session.shared_state[StateField.GO] = 0
     session.run()
     session.assert_safe()
     assert session.finished.outcome == "fault"
@@ -571,12 +579,12 @@ def test_a_drive_that_may_still_be_on_is_told(make_session):
 class StallOnTheWayBack(VirtualClock):
     """Stands still for 60 periods, once, after the record."""
 
-    board = None
+    shared_state = None
 
     def wait_until(self, deadline_ns):
         late_ns = super().wait_until(deadline_ns)
-        if self.board is not None and self.board[Word.PHASE] == Phase.RETURNING:
-            self.board = None
+        if self.shared_state is not None and self.shared_state[StateField.PHASE] == Phase.RETURNING:
+            self.shared_state = None
             return late_ns + 60_000_000
         return late_ns
 
@@ -584,7 +592,7 @@ class StallOnTheWayBack(VirtualClock):
 def test_standing_still_on_the_way_back_has_its_limit_too(make_session):
     clock = StallOnTheWayBack()
     session = make_session(clock=clock)
-    clock.board = session.board
+    clock.shared_state = session.shared_state
     finished = session.run().finished
     assert "stalled for 60 ticks" in finished.reason
     session.assert_safe()
@@ -595,8 +603,8 @@ def test_a_doubt_about_the_age_of_readings_is_told_once_in_each_session(make_ses
     health = session.devices.sensor.health
 
     def doubtful():
-        late = session.board[Word.SCHEDULED] > 1000 or session.parent.said(Finished)
-        count = f"Late so far: {session.board[Word.SCHEDULED]}." if late else ""
+        late = session.shared_state[StateField.SCHEDULED] > 1000 or session.parent.said(Finished)
+        count = f"Late so far: {session.shared_state[StateField.SCHEDULED]}." if late else ""
         return replace(health(), doubt="Records are late." if late else "", doubt_count=count)
 
     session.devices.sensor.health = doubtful

@@ -17,7 +17,7 @@ from rigd.beam import Beam, Damping
 from rigd.engine import Ring, shared_memory_fd
 from rigd.engine.channels import TOPICS, Channels, create_channels
 from rigd.engine.messages import Failed, MessageReader, encode
-from rigd.engine.shared_state import Event, SharedState, Word, write_event
+from rigd.engine.shared_state import LogEvent, SharedState, StateField, write_event
 from rigd.live.address import LiveAddress
 from rigd.live.messages import LiveEnd, LiveJob, LiveSession, LiveShown
 from rigd.session.layout import pack_sample_into, pack_timing_into
@@ -57,7 +57,7 @@ class Producer(threading.Thread):
             for topic, fd in zip(TOPICS, for_rings, strict=True)
         ]
         self.channels = Channels(*rings, SharedState.create(for_board))
-        self.channels.board[Word.GO] = 1
+        self.channels.shared_state[StateField.GO] = 1
         self.written = [0] * len(rings)
         self.tick = 0
         self.refused = 0
@@ -65,13 +65,13 @@ class Producer(threading.Thread):
 
     @property
     def dropped(self) -> int:
-        return self.channels.board[Word.LIVE_DROPPED]
+        return self.channels.shared_state[StateField.LIVE_DROPPED]
 
     def run(self) -> None:
-        write_event(self.channels.events, Event(0, "info", "Record starts"))
+        write_event(self.channels.events, LogEvent(0, "info", "Record starts"))
         start = time.monotonic()
         while not self._halt.wait(0.005):
-            self.channels.board.beat(Word.SUPERVISOR_BEAT)
+            self.channels.shared_state.beat(StateField.SUPERVISOR_BEAT)
             while self.tick < (time.monotonic() - start) * self.speed * RATE_HZ:
                 self._write()
                 for ring in self.channels.rings:  # what the recorder does
@@ -110,7 +110,7 @@ class Producer(threading.Thread):
             )  # fmt: skip
             samples.publish()
         self.tick += 1
-        self.channels.board[Word.SCHEDULED] = self.tick
+        self.channels.shared_state[StateField.SCHEDULED] = self.tick
 
 
 def reference_rad(t_s):

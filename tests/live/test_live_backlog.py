@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 
-from rigd.engine.shared_state import Word
+from rigd.engine.shared_state import StateField
 from rigd.live.publisher import POLL_S, Backlog, Vitals
 
 
@@ -55,18 +55,18 @@ def test_what_a_new_connection_is_given_anyway_is_not_sent_twice():
 
 
 def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
-    board = channels.board
+    shared_state = channels.shared_state
     for word, value in {
-        Word.GO: 1,
-        Word.MISSED: 3,
-        Word.LATE: 7,
-        Word.LOST: 2,
-        Word.DISK_FREE_MB: 12_000,
-        Word.BUS_LOAD_PPM: 345_000,
-        Word.BUS_ERRORS: 4,
-        Word.SENSOR_STATUS: 0x8001,
+        StateField.GO: 1,
+        StateField.MISSED: 3,
+        StateField.LATE: 7,
+        StateField.LOST: 2,
+        StateField.DISK_FREE_MB: 12_000,
+        StateField.BUS_LOAD_PPM: 345_000,
+        StateField.BUS_ERRORS: 4,
+        StateField.SENSOR_STATUS: 0x8001,
     }.items():
-        board[word] = value
+        shared_state[word] = value
     for _ in range(5):
         channels.samples.publish()
     health = Vitals(channels).read(0.0, view_dropped=11)
@@ -77,8 +77,8 @@ def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
 
 
 def test_vitals_of_what_there_is_not_are_not_known(channels):
-    for word in (Word.BUS_LOAD_PPM, Word.BUS_ERRORS, Word.SENSOR_STATUS):
-        channels.board[word] = -1
+    for word in (StateField.BUS_LOAD_PPM, StateField.BUS_ERRORS, StateField.SENSOR_STATUS):
+        channels.shared_state[word] = -1
     health = Vitals(channels).read(0.0, view_dropped=0)
     assert health.disk_free_mb is None
     assert (health.bus_load_percent, health.bus_errors, health.sensor_status) == (None, None, None)
@@ -86,24 +86,26 @@ def test_vitals_of_what_there_is_not_are_not_known(channels):
 
 
 def test_counts_of_the_session_before_are_not_taken_for_this_ones(channels):
-    channels.board[Word.MISSED] = 5
+    channels.shared_state[StateField.MISSED] = 5
     vitals = Vitals(channels)
     assert vitals.read(0.0, view_dropped=0).missed_ticks == 0
-    channels.board[Word.GO] = 1
+    channels.shared_state[StateField.GO] = 1
     assert vitals.read(1.0, view_dropped=0).missed_ticks == 5
 
 
 def test_the_rate_is_that_of_the_last_second(channels):
-    vitals, board = Vitals(channels), channels.board
-    board[Word.GO] = 1
+    vitals, shared_state = Vitals(channels), channels.shared_state
+    shared_state[StateField.GO] = 1
     rates = []
     for look in range(20):
         now_s = look * POLL_S
         assert vitals.due(now_s)
-        board[Word.SCHEDULED] = round(1000 * now_s if look < 10 else 1250 + 500 * now_s)
+        shared_state[StateField.SCHEDULED] = round(
+            1000 * now_s if look < 10 else 1250 + 500 * now_s
+        )
         rates.append(vitals.read(now_s, view_dropped=0).rate_hz)
         assert not vitals.due(now_s + 0.9 * POLL_S)
     assert rates[9] == pytest.approx(1000.0, abs=2.0)
     assert rates[-1] == pytest.approx(500.0, abs=2.0)
-    board[Word.SCHEDULED] = 10
+    shared_state[StateField.SCHEDULED] = 10
     assert vitals.read(6.0, view_dropped=0).rate_hz is None, "another session has begun"

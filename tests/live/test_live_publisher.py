@@ -16,7 +16,7 @@ from online_fits import online_fit
 from processes import eventually, has_ended, listeners, sockets
 
 from rigd.engine.messages import Failed
-from rigd.engine.shared_state import Word
+from rigd.engine.shared_state import StateField
 from rigd.live.address import LiveAddress, find
 from rigd.live.messages import LiveFit, LiveJob
 
@@ -290,16 +290,16 @@ def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer, star
 def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, start_publisher):
     producer = start_producer(capacity=4000)
     first = start_publisher(producer)
-    board = producer.channels.board
+    shared_state = producer.channels.shared_state
     assert eventually(lambda: producer.tick > 5000)
     producer.stop()
-    assert eventually(lambda: board[Word.LIVE_SEEN] == producer.tick)
+    assert eventually(lambda: shared_state[StateField.LIVE_SEEN] == producer.tick)
     before = producer.dropped
     first.process.kill()
     first.process.wait()
     producer.go_on(3000)
     second = start_publisher(producer)
-    assert eventually(lambda: board[Word.LIVE_SEEN] == producer.tick)
+    assert eventually(lambda: shared_state[StateField.LIVE_SEEN] == producer.tick)
     # An observer reads half of what a ring has; the half before it is gone.
     assert second.dropped == before + 3000 - 4000 // 2
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from processes import eventually
 
-from rigd.engine.shared_state import Word
+from rigd.engine.shared_state import StateField
 from rigd.excitation import make_excitation
 from rigd.live.address import find
 from rigd.profile import load_profile
@@ -105,10 +105,10 @@ def test_a_view_that_does_not_begin_holds_no_stop_up(rig, order):
 @pytest.mark.further  # as test_live_backlog.py
 def test_the_counts_of_one_session_are_not_shown_in_the_next(rig, run, order):
     run("first")
-    board = rig._group.channels.board
-    assert board[Word.GO]
+    shared_state = rig._group.channels.shared_state
+    assert shared_state[StateField.GO]
     rig.show(order("second"), StopRequest())
-    assert board[Word.GO] == 0
+    assert shared_state[StateField.GO] == 0
 
 
 @pytest.mark.further  # as a fault in test_live_state.py
@@ -202,8 +202,8 @@ class StillGroup:
     """A group whose publisher is there and says and does nothing."""
 
     def __init__(self):
-        board = {Word.LIVE_BEAT: 0}
-        self.channels = SimpleNamespace(specs=None, board=board, rings=())
+        shared_state = {StateField.LIVE_BEAT: 0}
+        self.channels = SimpleNamespace(specs=None, shared_state=shared_state, rings=())
         self.started = 0
 
     def fresh(self, process):

@@ -10,7 +10,7 @@ from cases import further
 from processes import eventually
 
 from rigd.beam import Beam
-from rigd.engine.shared_state import Phase, Stop, Word
+from rigd.engine.shared_state import Phase, StateField, Stop
 from rigd.live.messages import LiveSession
 from rigd.live.publisher import StateWatch, last_response
 from rigd.view import Subject
@@ -30,12 +30,12 @@ PERIOD_S = 1 / 15
 
 
 def test_the_board_tells_every_state_of_a_session(channels):
-    board, states = channels.board, StateWatch(channels)
+    shared_state, states = channels.shared_state, StateWatch(channels)
 
     def state(**words):
         for name, value in words.items():
-            board[Word[name]] = value
-        board.beat(Word.SUPERVISOR_BEAT)
+            shared_state[StateField[name]] = value
+        shared_state.beat(StateField.SUPERVISOR_BEAT)
         return states.read(0.0)
 
     assert state(PHASE=Phase.OFF) == preparing()
@@ -49,24 +49,24 @@ def test_the_board_tells_every_state_of_a_session(channels):
 
 
 def test_a_supervisor_that_hangs_is_told_within_a_second(channels):
-    board, states, now_s = channels.board, StateWatch(channels), 100.0
-    board[Word.GO], board[Word.PHASE] = 1, Phase.RUNNING
+    shared_state, states, now_s = channels.shared_state, StateWatch(channels), 100.0
+    shared_state[StateField.GO], shared_state[StateField.PHASE] = 1, Phase.RUNNING
     for _ in range(100):
         now_s += PERIOD_S
-        board.beat(Word.SUPERVISOR_BEAT)
+        shared_state.beat(StateField.SUPERVISOR_BEAT)
         assert states.read(now_s) == RUNNING
     hung_s = now_s
     while states.read(now_s) != SUPERVISOR_SILENT:
         now_s += PERIOD_S
     assert now_s - hung_s < 0.8
-    board.beat(Word.SUPERVISOR_BEAT)
+    shared_state.beat(StateField.SUPERVISOR_BEAT)
     assert states.read(now_s + PERIOD_S) == RUNNING
-    board[Word.PHASE] = Phase.OFF
+    shared_state[StateField.PHASE] = Phase.OFF
     for _ in range(20):
         now_s += PERIOD_S
         state = states.read(now_s)
     assert state == SUPERVISOR_SILENT_TORQUE_OFF
-    board[Word.GO] = 0  # before a record nobody need be there at once
+    shared_state[StateField.GO] = 0  # before a record nobody need be there at once
     assert states.read(now_s + PERIOD_S) == preparing()
 
 
@@ -83,13 +83,13 @@ def first_sent_s(columns, word: str) -> float:
 
 
 def test_running_and_fault_are_shown_within_a_second(publisher, producer, receive):
-    board, told_s = producer.channels.board, {"RUNNING": [], "FAULT": []}
+    shared_state, told_s = producer.channels.shared_state, {"RUNNING": [], "FAULT": []}
     received = receive(publisher)
     for number in range(3):  # what else happens on this computer only makes it slower
         begins = tuple(ring.written for ring in producer.channels.rings)
         publisher.show(f"session {number}", begins)
         told_s["RUNNING"].append(time.time())
-        board[Word.PHASE] = Phase.RUNNING
+        shared_state[StateField.PHASE] = Phase.RUNNING
         time.sleep(0.5)
         told_s["FAULT"].append(time.time())
         publisher.finish("fault", "The drive was lost.")
@@ -112,12 +112,12 @@ def test_a_lost_supervisor_is_named_and_whether_the_torque_is_off(
     producer, start_publisher, save, off
 ):
     publisher = start_publisher(first="from rigd.live import publisher as p; p._ORPHANED_S = 0.5")
-    board = producer.channels.board
-    board[Word.PHASE] = Phase.RUNNING
+    shared_state = producer.channels.shared_state
+    shared_state[StateField.PHASE] = Phase.RUNNING
     saver = save(publisher.address)
     assert eventually(saver.has_begun)
     if off:
-        board[Word.PHASE] = Phase.OFF
+        shared_state[StateField.PHASE] = Phase.OFF
     publisher.end()
     (columns,) = saver.recordings().values()
     assert words(columns)[-1] == "SUPERVISOR LOST"

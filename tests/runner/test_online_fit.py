@@ -5,9 +5,9 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from rigd.engine.messages import FitTold, SearchEnded
+from rigd.engine.messages import FitReport, SearchEnded
 from rigd.engine.processes import ChildError
-from rigd.engine.shared_state import Stop, Word
+from rigd.engine.shared_state import StateField, Stop
 from rigd.excitation.targets import parse_target
 from rigd.runner._online_fit import FitSupervisor
 
@@ -15,7 +15,7 @@ REACHED = SearchEnded(True, "Reached: damping of mode 1 0.009, standard deviatio
 NOT_REACHED = SearchEnded(False, "Not reached within 20 s (--at-most).", {})
 
 
-def of_whole_record(std: float, *, final: bool = True) -> FitTold:
+def of_whole_record(std: float, *, final: bool = True) -> FitReport:
     damping = {"value": 0.01, "std": std, "flag": None}
     mode = {
         "mode": 1,
@@ -23,7 +23,7 @@ def of_whole_record(std: float, *, final: bool = True) -> FitTold:
         "damping_ratio": damping,
         "shown": True,
     }
-    return FitTold({"modes": [mode], "parameters": {}, "text": []}, final=final)
+    return FitReport({"modes": [mode], "parameters": {}, "text": []}, final=final)
 
 
 @pytest.mark.parametrize(
@@ -49,9 +49,9 @@ def test_reason_and_result_agree(ended, std, reached, reason):
     assert (fit.shortcoming == "") == reached
 
 
-STOPPED = {Word.STOP: Stop.OPERATOR}
+STOPPED = {StateField.STOP: Stop.OPERATOR}
 ON_THE_WAY = of_whole_record(0.9e-4, final=False)
-FAILED = FitTold({"problem": "The sensor stands still.", "modes": [], "text": []}, final=True)
+FAILED = FitReport({"problem": "The sensor stands still.", "modes": [], "text": []}, final=True)
 NOT_A_NUMBER = of_whole_record(float("nan"))
 
 
@@ -73,7 +73,7 @@ NOT_A_NUMBER = of_whole_record(float("nan"))
 def test_no_answer_of_the_whole_record_is_not_a_no(told, board, reached, words, monkeypatch):
     monkeypatch.setattr("rigd.runner._online_fit._STOP_PATIENCE_S", 0.0)
     group = MagicMock()
-    group.channels.board.__getitem__.side_effect = lambda word: board.get(word, 0)
+    group.channels.shared_state.__getitem__.side_effect = lambda word: board.get(word, 0)
 
     def messages(_):
         for message in told:

@@ -7,9 +7,9 @@ import pytest
 
 from rigd.beam import modes
 from rigd.engine import shared_memory_fd
-from rigd.engine.messages import FitTold, PieceTold, SearchEnded
-from rigd.engine.reference import PieceWriter, put_reference
-from rigd.engine.shared_state import SharedState, Word
+from rigd.engine.messages import FitReport, PlannedSegment, SearchEnded
+from rigd.engine.reference import ReferenceWriter, put_reference
+from rigd.engine.shared_state import SharedState, StateField
 from rigd.excitation import ExcitationError, Forecast, Piece, until
 from rigd.excitation.targets import Precision, parse_target
 from rigd.profile import load_profile
@@ -89,8 +89,8 @@ class Bench:
         )
         planned = excitation.search.planned_ticks
         spec = put_reference(shared_memory_fd(), excitation.reference_rad, planned)
-        self.board = SharedState.create(shared_memory_fd())
-        self.writer = PieceWriter(spec, self.board)
+        self.shared_state = SharedState.create(shared_memory_fd())
+        self.writer = ReferenceWriter(spec, self.shared_state)
         self.search = ExcitationPlanner(excitation.search, profile, self.writer)
 
     def told(self, share, held=0, before=None, **more):
@@ -145,11 +145,11 @@ def test_a_piece_follows_where_more_is_to_be_known(bench):
     planned = bench.writer.ticks
     assert bench.search.due == planned - 500  # the end of the scan, not that of the pause
     fit, piece = bench.told(ON_THE_WAY)
-    assert isinstance(fit, FitTold)
-    assert isinstance(piece, PieceTold)
+    assert isinstance(fit, FitReport)
+    assert isinstance(piece, PlannedSegment)
     assert bench.search.due == planned
     assert bench.writer.ticks - planned == round(RATE_HZ * piece.document["duration_s"])
-    assert bench.board[Word.PLANNED] == bench.writer.ticks
+    assert bench.shared_state[StateField.PLANNED] == bench.writer.ticks
     assert not bench.search.may_be_last
     heads, row = fit.document["text"]
     assert heads.split()[:5] == ["time", "damping", "of", "mode", "1"]
@@ -163,7 +163,7 @@ def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench):
     while not bench.search.may_be_last:
         *_, last = bench.told(CERTAIN)
         assert bench.writer.ticks < 60 * RATE_HZ
-    assert isinstance(last, FitTold | PieceTold)
+    assert isinstance(last, FitReport | PlannedSegment)
     assert bench.search.due == bench.writer.ticks >= planned + 500
     _, end = bench.told(CERTAIN)
     assert isinstance(end, SearchEnded)

@@ -25,7 +25,7 @@ def close():
         profile = load_shipped("sim")
         order = Order(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
         group = MagicMock()
-        group.channels.board.__getitem__.return_value = 0
+        group.channels.shared_state.__getitem__.return_value = 0
         group.channels.events = MagicMock(
             oldest=0, written=0, capacity=16, record_size=1, buffer=bytes(1000)
         )

@@ -8,7 +8,7 @@ import pytest
 from shipped_profile import load_shipped
 
 from rigd.engine import Ring, shared_memory_fd
-from rigd.engine.shared_state import Phase, Word
+from rigd.engine.shared_state import Phase, StateField
 from rigd.runner import signal_blocks
 from rigd.runner.signal_blocks import SignalReader
 from rigd.session.layout import SAMPLE_SIZE, pack_sample_into
@@ -38,8 +38,8 @@ def profile():
 @pytest.fixture
 def channels():
     fd = shared_memory_fd()
-    board = dict.fromkeys(Word, 0)
-    yield SimpleNamespace(samples=Ring.create(SAMPLE_SIZE, 8000, fd), board=board)
+    shared_state = dict.fromkeys(StateField, 0)
+    yield SimpleNamespace(samples=Ring.create(SAMPLE_SIZE, 8000, fd), shared_state=shared_state)
     os.close(fd)
 
 
@@ -63,7 +63,7 @@ def put(channels, ticks, angle_rad=0.0, *, command_nm=0.0, wrench=(0.0,) * 6):
 
 
 def test_between_records_there_are_gauges_but_no_ticks(reader, channels):
-    channels.board |= {Word.PHASE: Phase.OFF, Word.ANGLE_NRAD: -314_000_000}
+    channels.shared_state |= {StateField.PHASE: Phase.OFF, StateField.ANGLE_NRAD: -314_000_000}
     (block,) = reader.take(channels)
     assert block.count == 0
     assert {name: values.size for name, values in block.signals.items()} == {

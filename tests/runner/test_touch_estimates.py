@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from rigd.engine.messages import TouchReady, TouchTold
+from rigd.engine.messages import TouchReady, TouchReport
 from rigd.runner._touch_search import TouchEstimates
 from rigd.session.touches import touch_line, touches_of
 
@@ -54,7 +54,7 @@ def test_the_session_waits_until_it_is_ready_or_late(monkeypatch, messages, word
 def test_a_first_estimate_that_no_better_one_followed_is_called_that(monkeypatch):
     monkeypatch.setattr("rigd.runner._touch_search._LAST_PATIENCE_S", 0.0)
     x = {"value": 0.6, "std": 0.01, "interval_95": [0.58, 0.62]}
-    told = [TouchTold(1, 900, True, {"x_m": x}), TouchTold(2, 2900, False, {"x_m": x})]
+    told = [TouchReport(1, 900, True, {"x_m": x}), TouchReport(2, 2900, False, {"x_m": x})]
     touches = estimates(lambda _: told)
     touches.poll()
     found = touches.finish(3, lambda: None)
