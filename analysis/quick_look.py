@@ -25,7 +25,12 @@ from rigd.printable import listed
 from rigd.runtime import begin_background, raise_on
 from rigd.session import SessionError, Validity
 from rigd.session.online_fit import mode_line
-from rigd.session.quick_look import LOOK_VERSION, last_look, look_path, read_look
+from rigd.session.quick_look import (
+    QUICK_LOOK_VERSION,
+    last_quick_look,
+    quick_look_path,
+    read_quick_look,
+)
 from rigd.units import decimals
 
 if TYPE_CHECKING:
@@ -118,7 +123,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
     if before is not None and any(mode["shown"] for mode in modes):
         compared = _against(modes, before)
     document = {
-        "version": LOOK_VERSION,
+        "version": QUICK_LOOK_VERSION,
         "file": path.name,
         "session_id": session_id,
         "start_utc_ns": start_utc_ns,
@@ -313,7 +318,7 @@ def _no_coherence() -> dict[str, Any]:
 
 
 def _quick_look_of(last: Path) -> dict[str, Any]:
-    look = read_look(look_path(last))
+    look = read_quick_look(quick_look_path(last))
     if look is None:
         raise LookError(
             f"--last {last}: there is no readable quick look beside it; make one with "
@@ -324,7 +329,7 @@ def _quick_look_of(last: Path) -> dict[str, Any]:
 
 def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
     """Return the last quick look of a specimen before a time, from the folder of the file."""
-    found = last_look(
+    found = last_quick_look(
         path.parent,
         specimen,
         before_utc_ns=before_utc_ns,
@@ -448,8 +453,8 @@ def write_look(document: Mapping[str, Any], path: Path) -> Path:
     LookError
         It cannot be written, or another file has its name.
     """
-    target = look_path(path)
-    there = read_look(target)
+    target = quick_look_path(path)
+    there = read_quick_look(target)
     if there is not None and there["made_utc_ns"] > document["made_utc_ns"]:
         return target
     new = target.with_name(f".{target.name}.{os.getpid()}")

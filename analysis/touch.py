@@ -30,9 +30,9 @@ from rigd.beam import Damping
 from rigd.session import Session, SessionError, Validity, read_session, readable_texts
 from rigd.session.layout import Status
 from rigd.touch import (
+    ChannelNoise,
     DetectorSettings,
     FreeBeam,
-    Noise,
     SensorFilter,
     TouchDetector,
     TouchEstimator,
@@ -401,7 +401,7 @@ def _detections(
     rest = session.segments.get("rest", (0, 0))[1]
     judged = max(rest, int(ticks[0]) + round(_LEAST_REST_S * rate_hz))
     resting = ticks < judged
-    noise = Noise(
+    noise = ChannelNoise(
         _noise(torque_nm[resting]),
         None if shear is None else _noise(shear_n[resting]),
         _angle_noise(samples["angle_rad"], resting),

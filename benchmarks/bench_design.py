@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from analysis.identify import Measurement, Plant, fit_record
 from analysis.models import STRUCTURES
 from rigd.beam.tip import tip_motion
-from rigd.excitation import BeamEstimate, Piece, chirp, information, modes
+from rigd.excitation import BeamEstimate, Segment, chirp, information, modes
 from rigd.excitation._beam_estimate import OF_UNIFORM
 from rigd.excitation._fisher_information import RecordSoFar, covariance_of
-from rigd.excitation._piece_search import PieceSearch
-from rigd.excitation.experiment_design import next_piece
+from rigd.excitation._segment_search import SegmentSearch
+from rigd.excitation.experiment_design import next_segment
 from rigd.excitation.targets import Precision, Quantities, Target, parse_target
 from rigd.profile import load_profile
 from rigd.runner.planning import LoopPreview
@@ -52,15 +52,15 @@ def precisions(angle_rad: Real, targets: list[Target]) -> tuple[Precision, ...]:
 
 def designed(
     rig: LoopPreview, targets: list[Target], longest_s: float, tip_slope_rad: float
-) -> tuple[Real, Real, list[Piece], float]:
+) -> tuple[Real, Real, list[Segment], float]:
     """Scan and pieces until everything is reached: reference, angle, pieces, slowest decision."""
     reference_rad = SCAN.reference_rad
     angle_rad = rig.plant_with(LINK, DAMPING).respond(reference_rad).angle_rad
-    pieces: list[Piece] = []
+    pieces: list[Segment] = []
     slowest_s, left_s = 0.0, longest_s
     while left_s > 1.0:
         started_s = time.process_time()
-        piece = next_piece(ESTIMATE, angle_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad)
+        piece = next_segment(ESTIMATE, angle_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad)
         slowest_s = max(slowest_s, time.process_time() - started_s)
         pieces.append(piece)
         reference_rad = np.concatenate([reference_rad, piece.reference_rad])
@@ -77,7 +77,7 @@ def steady_s(rig: LoopPreview, targets: list[Target], tip_slope_rad: float) -> f
     plant = rig.plant_with(LINK, DAMPING)
     quantities = Quantities.of(targets, ESTIMATE)
     return float(
-        PieceSearch(ESTIMATE, quantities, plant, 0.0, record, tip_slope_rad).mixture.times_s.sum()
+        SegmentSearch(ESTIMATE, quantities, plant, 0.0, record, tip_slope_rad).mixture.times_s.sum()
     )
 
 

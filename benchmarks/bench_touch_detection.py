@@ -21,7 +21,7 @@ from rigd.identified_beam import TOUCH
 from rigd.profile import Profile, load_profile
 from rigd.runner.planning import LoopPreview
 from rigd.sim import SimulatedRig
-from rigd.touch import DetectorSettings, Noise, TouchDetector, TouchModel, watched_beam
+from rigd.touch import ChannelNoise, DetectorSettings, TouchDetector, TouchModel, watched_beam
 
 Real = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ def detector_of(profile: Profile) -> TouchDetector:
     """Return a detector for the beam of a profile."""
     rig, simulation = profile.rig, profile.rig.simulation
     assert simulation is not None
-    noise = Noise(simulation.torque_noise_nm, simulation.force_noise_n, 2e-5)
+    noise = ChannelNoise(simulation.torque_noise_nm, simulation.force_noise_n, 2e-5)
     beam = watched_beam(TouchModel(rig.beam, rig.damping), rig.rate_hz, noise)
     return TouchDetector(beam, rig.rate_hz, DetectorSettings())
 

@@ -84,12 +84,12 @@ def touch_figure(touch: Touch, estimate: TouchEstimate) -> Figure:
 
 def _likelihood(axes: Axes, estimate: TouchEstimate) -> None:
     relative = estimate.log_likelihood - estimate.log_likelihood.max()
-    axes.plot(estimate.places_m, relative, color=style.BLUE)
+    axes.plot(estimate.positions_m, relative, color=style.BLUE)
     if estimate.x_m is not None:
         low, high = estimate.x_m.interval_95
         axes.axvspan(low, high, color=style.SHADE, linewidth=0, zorder=0)
         axes.axvline(estimate.x_m.value, color=style.VERMILION, linewidth=0.9)
-    axes.set_xlim(0.0, float(estimate.places_m[-1]))
+    axes.set_xlim(0.0, float(estimate.positions_m[-1]))
     axes.set_ylim(-max(_LEAST_LOG, float(np.quantile(-relative, 0.75))), 2.0)
     axes.set_title("Point of contact")
     axes.set_ylabel("Relative log-likelihood")

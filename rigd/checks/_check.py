@@ -63,7 +63,7 @@ def default_session_rows(profile: Profile) -> Iterator[Row]:
     """
     try:
         chirp = excitation_for(profile, "chirp", {})
-        percent = 100 * LoopPreview(profile).share_of_limits(chirp.reference_rad)
+        percent = 100 * LoopPreview(profile).fraction_of_limits(chirp.reference_rad)
     except UserError:  # an unstable loop or an unknown value, which have rows of their own
         return
     beyond = not percent <= 100

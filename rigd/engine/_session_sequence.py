@@ -26,7 +26,7 @@ from rigd.engine.timing import SIGN_OF_LIFE_S, SUSPENDED_S, Clock, SuspendWatch,
 from rigd.excitation.moves import quintic, still_path
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
-from rigd.safety import LOOK_EVERY
+from rigd.safety import SLOW_CHECK_TICKS
 from rigd.safety.limits import BY_NAME, OVERLOADED
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ class SessionSequence:
                 "back first (rigd run move 0; rigd start move 0 with a daemon), or lower the "
                 "amplitude.",
             )
-        failed = self._cycle.sensor_watch.judge()
+        failed = self._cycle.sensor_watch.finish_learning()
         self._report_warnings()
         if failed is not None:
             raise SessionEnd("fault", str(failed))
@@ -347,7 +347,7 @@ class SessionSequence:
             if end is None and cycle.stale:  # in the tick before
                 end = self._stale_too_many(tick)
             if end is None and (
-                stop[0] or counts.lost or signals.requested or tick % LOOK_EVERY == 0
+                stop[0] or counts.lost or signals.requested or tick % SLOW_CHECK_TICKS == 0
             ):
                 end = self._poll()
             reference_rad = start_rad + (reference[tick] if reader is None else reader.at(tick))
@@ -533,7 +533,7 @@ class SessionSequence:
 
     def _stale_too_many(self, scheduled: int) -> SessionEnd | None:
         counts = self.counts
-        reason = self._cycle.watch.check_stale_share(
+        reason = self._cycle.watch.check_stale_fraction(
             counts.stale_angles, counts.stale_wrenches, scheduled
         )
         return None if reason is None else SessionEnd("fault", str(self._cycle.with_cause(reason)))
@@ -579,7 +579,7 @@ class SessionSequence:
                 self._unanswered_polls + 1 if beat == self._supervisor_beat else 0
             )
             self._supervisor_beat = beat
-            if self._unanswered_polls * LOOK_EVERY > _SUPERVISOR_PATIENCE_S * self._rate_hz:
+            if self._unanswered_polls * SLOW_CHECK_TICKS > _SUPERVISOR_PATIENCE_S * self._rate_hz:
                 return SessionEnd(
                     "fault",
                     f"Supervisor watchdog timeout ({_SUPERVISOR_PATIENCE_S:g} s); session aborted. "
@@ -588,7 +588,7 @@ class SessionSequence:
         return self._stop_reason()
 
     def _switch_off_if_stopped(self) -> None:
-        poll_due = self._metronome.tick % LOOK_EVERY == 0
+        poll_due = self._metronome.tick % SLOW_CHECK_TICKS == 0
         end = self._poll() if poll_due else self._stop_reason()
         if end is not None:
             self._cycle.torque_off()

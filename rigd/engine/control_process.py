@@ -48,7 +48,7 @@ from rigd.engine.timing import SIGN_OF_LIFE_S, Clock, RealClock, TickScheduler, 
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.runtime.processes import name_this_process
-from rigd.safety import LOOK_EVERY
+from rigd.safety import SLOW_CHECK_TICKS
 from rigd.session.layout import WRENCH_FIELDS
 
 _SILENCE_S = 1.0
@@ -233,7 +233,7 @@ class _ControlServer:
     def _observe(self) -> None:
         """Read the devices for some ticks with the torque off."""
         cycle = self._cycle
-        for _ in range(LOOK_EVERY):
+        for _ in range(SLOW_CHECK_TICKS):
             self._metronome.wait()
             self._read_at_rest()
             self._silent = self._silent + 1 if cycle.stale else 0
@@ -410,7 +410,7 @@ class _ControlServer:
         """Average the sensor for display; each session tares for itself."""
         self._cycle.sensor_watch.learn()
         rest = self._rest(self._profile.session.tare_s)
-        failed = self._cycle.sensor_watch.judge()
+        failed = self._cycle.sensor_watch.finish_learning()
         if failed is not None:
             raise SessionEnd("fault", str(failed))
         self._cycle.tare = rest.mean
@@ -459,7 +459,7 @@ class _ControlServer:
         )
 
     def _check_reading(self) -> None:
-        if self._metronome.tick % LOOK_EVERY == 0:
+        if self._metronome.tick % SLOW_CHECK_TICKS == 0:
             self._show()
         if self._stop.requested or not self._parent.alive():
             raise SessionEnd("stopped", "The rig is being shut down.")

@@ -399,7 +399,7 @@ class Cycle:
     def check_slow_limits(
         self, due_ns: int, recorder_lag_s: float = 0.0, disk_free_mb: float = inf
     ) -> Violation | None:
-        """Check the quantities that change slowly, every `LOOK_EVERY` ticks.
+        """Check the quantities that change slowly, every `SLOW_CHECK_TICKS` ticks.
 
         Parameters
         ----------
@@ -416,7 +416,7 @@ class Cycle:
             The violated limit, if any; the torque is then off.
         """
         squares_nm2, self._torque_squares_nm2 = self._torque_squares_nm2, 0.0
-        violation = self.watch.look(due_ns, squares_nm2, recorder_lag_s, disk_free_mb)
+        violation = self.watch.check_slow(due_ns, squares_nm2, recorder_lag_s, disk_free_mb)
         if violation is not None:
             self.torque_off()
         return violation

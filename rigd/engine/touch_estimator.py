@@ -27,7 +27,7 @@ from rigd.touch.samples import (
     FINAL_S,
     FIRST_S,
     HISTORY_S,
-    LOOK_S,
+    PREVIEW_S,
     around_touch,
     touch_record,
 )
@@ -100,7 +100,7 @@ class TouchFollower:
             self._contact_ticks,
         ) = (
             round(seconds * job.rate_hz)
-            for seconds in (HISTORY_S, LOOK_S, FIRST_S, FINAL_S, CONTACT_S)
+            for seconds in (HISTORY_S, PREVIEW_S, FIRST_S, FINAL_S, CONTACT_S)
         )
         self._samples: NDArray[np.void] | None = None
         self._waiting: deque[_Waiting] = deque()
@@ -144,12 +144,12 @@ class TouchFollower:
         if there >= self._preview_ticks and not touch.previewed:
             touch.previewed = True
             record, _ = self._record(touch, self._preview_ticks)
-            touch.estimate.look(record)
+            touch.estimate.preview(record)
         return []
 
     def _estimate(self, touch: _Waiting, after: int, *, final: bool) -> TouchReport:
         record, start_s = self._record(touch, after)
-        found = touch.estimate.told(record, scan=False, first=not final)
+        found = touch.estimate.update(record, scan=False, first=not final)
         document = found.as_dict(start_s)
         return TouchReport(touch.number, touch.tick, final, document)
 

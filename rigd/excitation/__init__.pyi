@@ -7,9 +7,9 @@ from ._named import KINDS as KINDS
 from ._named import Value as Value
 from ._named import make_excitation as make_excitation
 from ._narrow_sweeps import modes as modes
-from ._piece_search import SHORTEST_S as SHORTEST_S
-from ._piece_search import Forecast as Forecast
-from ._piece_search import Piece as Piece
+from ._segment_search import SHORTEST_S as SHORTEST_S
+from ._segment_search import PrecisionForecast as PrecisionForecast
+from ._segment_search import Segment as Segment
 from ._shortest_move import MovePlant as MovePlant
 from ._shortest_move import move as move
 from ._shortest_move import shortest_braking as shortest_braking
@@ -22,7 +22,7 @@ from ._signals import multisine as multisine
 from ._signals import present_frequency_hz as present_frequency_hz
 from ._signals import step as step
 from ._touch_passes import Approach as Approach
-from ._touch_passes import Pass as Pass
+from ._touch_passes import TouchPass as TouchPass
 from ._touch_passes import after_touch as after_touch
 from ._touch_passes import touch as touch
 from ._until import PAUSE_S as PAUSE_S

@@ -238,7 +238,7 @@ class SweepRig(Protocol):
     def tracking(self, frequency_hz: Real) -> Complex:
         """Return angle over reference, in the shape of the frequencies."""
 
-    def share_of_limits(self, reference_rad: Real) -> float:
+    def fraction_of_limits(self, reference_rad: Real) -> float:
         """Return the largest predicted fraction of a limit for a reference (n,)."""
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
@@ -481,7 +481,7 @@ def _within_limits(
         for _ in range(_EASINGS):
             so_far_rad = np.concatenate([before_rad, eased_rad * sweep])
             fraction = max(
-                rig.share_of_limits(so_far_rad), rig.tip_slope_rad(so_far_rad) / tip_slope_rad
+                rig.fraction_of_limits(so_far_rad), rig.tip_slope_rad(so_far_rad) / tip_slope_rad
             )
             if fraction <= LIMIT_FRACTION * _CLOSE_ENOUGH:
                 break

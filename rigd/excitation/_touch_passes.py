@@ -35,7 +35,7 @@ _PEAK_SPEED = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Pass:
+class TouchPass:
     """Ticks of one pass."""
 
     begins: int
@@ -50,7 +50,7 @@ class Pass:
 class Approach:
     """Passes in search of an obstacle, as the control loop needs them."""
 
-    passes: tuple[Pass, ...]
+    passes: tuple[TouchPass, ...]
     """In their order."""
     braking: Braking
     """Table of the braking path."""
@@ -158,7 +158,7 @@ def touch(
     first = segments["sweep"][0]
     approach = Approach(
         passes=tuple(
-            Pass(
+            TouchPass(
                 begins=start + settle.size,
                 returns=start + single_pass.size - back.size,
                 ends=start + single_pass.size,

@@ -52,7 +52,7 @@ _EXAMPLE: Final = "--damping 1%"
 class ScanRig(DesignRig, Protocol):
     """Interface to a rig for which a scan is planned."""
 
-    def share_of_limits(self, reference_rad: Real) -> float:
+    def fraction_of_limits(self, reference_rad: Real) -> float:
         """Return the largest predicted fraction of a limit for a reference (n,)."""
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
@@ -186,7 +186,9 @@ def until(
     if rig is not None:
         uniformity = rig.uniformity if uniformity_percent is None else uniformity_percent / 100.0
         _refuse_below_floor(rig, requested, uniformity, at_most_s, tip_slope_rad)
-        fraction = max(rig.share_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad)
+        fraction = max(
+            rig.fraction_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad
+        )
         if fraction > _SCAN_FRACTION:
             amplitude_rad *= _SCAN_FRACTION / fraction
             scan_rad *= _SCAN_FRACTION / fraction

@@ -25,11 +25,11 @@ from rigd.beam import LoadedBeam
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
 from rigd.excitation._fisher_information import RecordSoFar, covariance_of, information
-from rigd.excitation._piece_search import (
+from rigd.excitation._segment_search import (
     HORIZON_S,
     SHORTEST_S,
-    Piece,
-    PieceSearch,
+    Segment,
+    SegmentSearch,
     least_deviations,
 )
 from rigd.excitation._shortest_move import MovePlant
@@ -64,7 +64,7 @@ class DesignRig(Protocol):
 class Design:
     """A session of designed segments, one after the other."""
 
-    segments: tuple[Piece, ...]
+    segments: tuple[Segment, ...]
     """In the order of play."""
     reference_rad: Real
     """Shape (n,): reference of all segments."""
@@ -78,7 +78,7 @@ class Design:
     """Precision of each target expected at the end."""
 
 
-def next_piece(
+def next_segment(
     estimate: BeamEstimate,
     angle_rad_so_far: Real,
     targets: Iterable[Target],
@@ -87,7 +87,7 @@ def next_piece(
     *,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
     through: Collection[int] = (),
-) -> Piece:
+) -> Segment:
     """Design the segment that reduces the deviations of the targets most per second.
 
     Parameters
@@ -96,7 +96,7 @@ def next_piece(
         Present estimate of beam, damping and noise.
     angle_rad_so_far
         Shape (n,): angle from the beginning of the record to that of the segment, at the rig's
-        rate: measured, or predicted (`Piece.angle_rad`) for segments that are not played yet. The
+        rate: measured, or predicted (`Segment.angle_rad`) for segments that are not played yet. The
         beam is at rest at the first tick.
     targets
         Targets of the session.
@@ -120,7 +120,7 @@ def next_piece(
         raise ExcitationError("No precision is requested; give for example --damping 1%.")
     plant = rig.plant_with(estimate.loaded_beam)
     record = RecordSoFar.of(angle_rad_so_far, estimate, plant.rate_hz, HORIZON_S)
-    decision = PieceSearch(
+    decision = SegmentSearch(
         estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
     )
     return decision.segment(decision.best(time_left_s, driven), time_left_s)
@@ -186,7 +186,7 @@ def geometry_floors(
     plant = rig.plant_with(estimate.loaded_beam)
     rest = RecordSoFar.of(np.zeros(1), estimate, plant.rate_hz, SHORTEST_S)
     quantities = Quantities.of(targets, estimate)
-    decision = PieceSearch(estimate, quantities, plant, rig.start_rad, rest, tip_slope_rad)
+    decision = SegmentSearch(estimate, quantities, plant, rig.start_rad, rest, tip_slope_rad)
     tolerant = estimate.with_tolerance(uniformity)
     floors = [
         least_deviations(
@@ -284,12 +284,12 @@ def design_excitation(
     before_rad = np.zeros(1) if angle_rad_so_far is None else angle_rad_so_far
     reference_rad = angle_rad = np.zeros(0)
     left_s = duration_s
-    segments: list[Piece] = []
+    segments: list[Segment] = []
     while not segments or (
         left_s >= SHORTEST_S and not all(each.reached for each in segments[-1].expected)
     ):
         so_far_rad = np.concatenate([before_rad, angle_rad])
-        segment = next_piece(
+        segment = next_segment(
             estimate, so_far_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad
         )
         segments.append(segment)

@@ -131,7 +131,7 @@ class Precision:
     """Estimated value."""
     std: float
     """Its standard deviation."""
-    asked_std: float
+    target_std: float
     """Target standard deviation, in the same unit; 0 for a percentage of a value of 0."""
     impossible: str = ""
     """Why no record can determine the quantity; empty if one can."""
@@ -141,7 +141,7 @@ class Precision:
         """Standard deviation over its target: reached at 1 and below."""
         if self.impossible:
             return inf
-        return self.std / self.asked_std if self.asked_std > 0.0 else inf
+        return self.std / self.target_std if self.target_std > 0.0 else inf
 
     @property
     def reached(self) -> bool:
@@ -190,7 +190,7 @@ class Quantities:
             Shape (k, k), of the free parameters.
         """
         variance = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
-        target_std = np.array([inf if each.impossible else each.asked_std for each in self.items])
+        target_std = np.array([inf if each.impossible else each.target_std for each in self.items])
         ratios: Real = np.sqrt(np.maximum(variance, 0.0)) / target_std
         return ratios
 

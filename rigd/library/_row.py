@@ -11,7 +11,7 @@ from typing import Any, Final
 from rigd.printable import printable
 from rigd.runtime import read_plain_file
 from rigd.session import Validity
-from rigd.session.quick_look import modes_of, read_look
+from rigd.session.quick_look import modes_of, read_quick_look
 
 SUFFIX: Final = ".mcap"
 TORN_SUFFIX: Final = ".mcap.part"
@@ -201,7 +201,7 @@ def _modes(quick_look: Path | None, report: Path | None) -> Document:
         for headline in _list(_document(report / NUMBERS), "headlines"):
             if modes := usable_modes(_list(headline, "modes")):
                 return _with_validity(modes, headline)
-    found = None if quick_look is None else read_look(quick_look)
+    found = None if quick_look is None else read_quick_look(quick_look)
     return {} if found is None else _with_validity(usable_modes(found["modes"]), found)
 
 

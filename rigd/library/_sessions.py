@@ -17,7 +17,7 @@ from rigd.library._row import (
     SessionRow,
     read_row,
 )
-from rigd.session.quick_look import LOOK_SUFFIX
+from rigd.session.quick_look import QUICK_LOOK_SUFFIX
 
 _NS_PER_S: Final = 1_000_000_000
 _DATE_CHARACTERS: Final = len("2026-11-20")
@@ -195,8 +195,8 @@ def _scan(folder: Path) -> dict[str, _Found]:
                 name = entry.name
                 if name.endswith((SUFFIX, TORN_SUFFIX)):
                     found[name] = _Found(entry)
-                elif name.endswith(LOOK_SUFFIX):
-                    quick_looks[name.removesuffix(LOOK_SUFFIX)] = Path(entry.path)
+                elif name.endswith(QUICK_LOOK_SUFFIX):
+                    quick_looks[name.removesuffix(QUICK_LOOK_SUFFIX)] = Path(entry.path)
                 elif match := REPORT_FOLDER.fullmatch(name):
                     number = int((match[2] or "1")[:9])
                     if number >= reports.get(match[1], (0, None))[0]:

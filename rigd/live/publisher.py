@@ -26,7 +26,7 @@ from rigd.live._ring_reader import Intake
 from rigd.live._server import Outlet
 from rigd.live.messages import LiveEnd, LiveFit, LiveSession, LiveShown, LiveTouches
 from rigd.runtime import ignore as ignore_signals
-from rigd.session.quick_look import last_look, look_path, read_look
+from rigd.session.quick_look import last_quick_look, quick_look_path, read_quick_look
 from rigd.session.touches import touch_line
 from rigd.view import Health, Note, outcome_note
 from rigd.view.banner import (
@@ -201,7 +201,7 @@ class _ShownSession:
         self._states = StateWatch(channels)
         self._unsent = 0
         folder, name = session.folder, session.subject.name
-        self._quick_look_path = None if folder is None else look_path(folder / f"{name}.mcap")
+        self._quick_look_path = None if folder is None else quick_look_path(folder / f"{name}.mcap")
 
     @property
     def dropped(self) -> int:
@@ -267,7 +267,7 @@ class _ShownSession:
         if self._quick_look_path is None or not self._quick_look_path.exists():
             return
         # Only once: the file gets its name when it is complete, and an invalid one stays invalid.
-        quick_look, self._quick_look_path = read_look(self._quick_look_path), None
+        quick_look, self._quick_look_path = read_quick_look(self._quick_look_path), None
         if quick_look is None:
             return
         picture, t_ns = self.intake.picture, self.intake.t_ns
@@ -383,7 +383,7 @@ def last_response(session: "LiveSession", own: LastResponse | None) -> LastRespo
         own = None
     if session.folder is None:
         return own
-    found = last_look(
+    found = last_quick_look(
         session.folder, specimen, but=session.subject.name, usable=itemgetter("response")
     )
     if found is None:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rigd.engine.messages import FitReport, PlannedSegment, SearchEnded
 from rigd.engine.reference import ReferenceWriter
 from rigd.errors import RigdError
-from rigd.excitation import BAND_HZ, PAUSE_S, SHORTEST_S, BeamEstimate, Piece, PrecisionSearch
-from rigd.excitation.experiment_design import expected_precisions, next_piece
+from rigd.excitation import BAND_HZ, PAUSE_S, SHORTEST_S, BeamEstimate, PrecisionSearch, Segment
+from rigd.excitation.experiment_design import expected_precisions, next_segment
 from rigd.excitation.targets import Target
 from rigd.profile import Profile
 from rigd.runner.planning import LoopPreview
@@ -63,7 +63,7 @@ class TargetEstimate:
     """Estimated value; None: not estimated."""
     std: float
     """Standard deviation; infinite if the value is doubtful."""
-    asked_std: float
+    target_std: float
     """Requested standard deviation, in the same unit."""
     doubt: str = ""
     """Why the value is doubtful; else empty."""
@@ -78,7 +78,7 @@ class TargetEstimate:
     @property
     def ratio(self) -> float:
         """Ratio of the standard deviation to the requested one."""
-        return self.std / self.asked_std if self.asked_std > 0.0 else inf
+        return self.std / self.target_std if self.target_std > 0.0 else inf
 
 
 def target_estimates(
@@ -113,8 +113,10 @@ def _read(target: Target, found: Mapping[str, Any] | None) -> TargetEstimate:
     if found is None or found["value"] is None:
         return TargetEstimate(*of, None, inf, target.std, "it is not part of what was found")
     value, std, doubt = float(found["value"]), found["std"], found["flag"] or ""
-    asked_std = target.std * (abs(value) if target.relative else 1.0)
-    return TargetEstimate(*of, value, inf if doubt or std is None else float(std), asked_std, doubt)
+    target_std = target.std * (abs(value) if target.relative else 1.0)
+    return TargetEstimate(
+        *of, value, inf if doubt or std is None else float(std), target_std, doubt
+    )
 
 
 def beam_estimate(
@@ -280,7 +282,7 @@ class ExcitationPlanner:
             return
         plant = self._rig.plant_with(estimate.loaded_beam)
         angle_rad = plant.respond(reference_rad).angle_rad
-        segment = next_piece(
+        segment = next_segment(
             estimate,
             angle_rad,
             self._aims(estimate, angle_rad[:tick], found),
@@ -403,7 +405,7 @@ class ExcitationPlanner:
         """Return the estimates of the requested quantities for JSON."""
         return {"targets": targets_json(target_estimates(document, self._targets))}
 
-    def _document(self, segment: Piece, found: Sequence[TargetEstimate]) -> dict[str, Any]:
+    def _document(self, segment: Segment, found: Sequence[TargetEstimate]) -> dict[str, Any]:
         """Return the expected result of a segment and the estimate from which it was planned."""
         return {
             "duration_s": segment.reference_rad.size / self._rate_hz,
@@ -413,13 +415,13 @@ class ExcitationPlanner:
                     "name": each.target.name,
                     "std": self._factors[each.target.name] * each.std,
                     "asked_std": self._factors[each.target.name]
-                    * each.asked_std
+                    * each.target_std
                     / self._tightening,
                 }
                 for each in segment.expected
                 if isfinite(each.std)
             ],
-            "share_of_limits": segment.share_of_limits,
+            "share_of_limits": segment.fraction_of_limits,
             "left_s": self._course.left_s,
         }
 
@@ -492,7 +494,7 @@ def targets_json(found: Sequence[TargetEstimate]) -> list[dict[str, Any]]:
             "mode": each.mode,
             "value": each.value,
             "std": each.std if isfinite(each.std) else None,
-            "asked_std": each.asked_std if isfinite(each.asked_std) else None,
+            "asked_std": each.target_std if isfinite(each.target_std) else None,
             "doubt": each.doubt,
         }
         for each in found

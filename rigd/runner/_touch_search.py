@@ -24,7 +24,7 @@ from rigd.session.touches import packed_touches, touch_line
 if TYPE_CHECKING:
     from rigd.profile import RealtimeSettings
     from rigd.runner._process_group import ProcessGroup
-    from rigd.touch import Noise, SensorFilter, TouchModel
+    from rigd.touch import ChannelNoise, SensorFilter, TouchModel
 
 _STEP_STD: Final = 1 / sqrt(12)
 """Standard deviation of the rounding error for steps of 1."""
@@ -79,9 +79,9 @@ def _sensor_filter(rig: RigParameters) -> "SensorFilter":
     return SensorFilter.of_records(*low_pass, serial.filter, records, 1 / serial.stream_hz)
 
 
-def _noise(profile: Profile) -> "Noise":
+def _noise(profile: Profile) -> "ChannelNoise":
     """Return the noise of the readings; only the ratio matters, its size is measured at rest."""
-    from rigd.touch import Noise
+    from rigd.touch import ChannelNoise
 
     rig = profile.rig
     axes = np.array(rig.sensor.resolution)
@@ -91,7 +91,7 @@ def _noise(profile: Profile) -> "Noise":
         float(np.linalg.norm(np.array(projection) * axes))
         for projection in (rig.sensor.projection, rig.sensor.shear_projection)
     )
-    return Noise(torque_nm, shear_n or None, _STEP_STD * rig.encoder.resolution_rad)
+    return ChannelNoise(torque_nm, shear_n or None, _STEP_STD * rig.encoder.resolution_rad)
 
 
 class TouchEstimates:

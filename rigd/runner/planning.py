@@ -137,7 +137,7 @@ class LoopPreview:
         """Return the frequency response from reference to angle, in the shape of the input."""
         return self._loop.response(frequency_hz)
 
-    def share_of_limits(self, reference_rad: Real) -> float:
+    def fraction_of_limits(self, reference_rad: Real) -> float:
         """Return the largest predicted peak of a reference (n,) as a fraction of its limit.
 
         Raises

@@ -20,7 +20,7 @@ from typing import Any, Final
 from rigd.printable import printable
 from rigd.runner.session import SessionResult
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, processor_use
-from rigd.session.quick_look import look_path, read_look
+from rigd.session.quick_look import quick_look_path, read_quick_look
 
 _PROGRAM: Final = "analysis.quick_look"
 _LONGEST_S: Final = 60.0
@@ -63,7 +63,7 @@ class QuickLook:
         """Return the quick look of an event of the daemon."""
         session, content = Path(event["path"]), event["look"]
         return cls(
-            session, None if content is None else look_path(session), content, event["error"]
+            session, None if content is None else quick_look_path(session), content, event["error"]
         )
 
     @property
@@ -216,8 +216,8 @@ class QuickLooks:
             )
 
     def _done(self) -> QuickLook:
-        path = look_path(self._session)
-        content = read_look(path)
+        path = quick_look_path(self._session)
+        content = read_quick_look(path)
         if content is None:
             return QuickLook.failed(self._session, f"{path} cannot be read.")
         return QuickLook(self._session, path, content, "")

@@ -6,7 +6,7 @@ from math import exp, inf, isfinite, sqrt
 
 from rigd.safety.limits import BY_NAME, OVERLOADED, Limits, Violation
 
-LOOK_EVERY = 64
+SLOW_CHECK_TICKS = 64
 """Ticks between two checks of slowly changing quantities."""
 
 FRACTION_WINDOW_S = 10.0
@@ -127,7 +127,7 @@ class LimitWatch:
         self._wrench_limits = tuple(limits.sensor_range_percent / 100 * r for r in sensor_range)
         self._wrench_warnings = tuple(_part("wrench range") * w for w in self._wrench_limits)
         self._fraction_window = FRACTION_WINDOW_S * rate_hz
-        self._rearm_checks = max(1, round(REARM_S * rate_hz / LOOK_EVERY))
+        self._rearm_checks = max(1, round(REARM_S * rate_hz / SLOW_CHECK_TICKS))
         self._heat_nm2 = 0.0
         self._last_slow_check_ns: int | None = None
         self._slow_checks = 0
@@ -347,7 +347,7 @@ class LimitWatch:
             ),
         )
 
-    def check_stale_share(
+    def check_stale_fraction(
         self, stale_angles: int, stale_wrenches: int, scheduled: int
     ) -> Violation | None:
         """Check the fraction of missing readings, after a tick with one.
@@ -378,14 +378,14 @@ class LimitWatch:
         self.warning = before or self.warning
         return violation
 
-    def look(
+    def check_slow(
         self,
         due_ns: int,
         torque_squares_nm2: float = 0.0,
         recorder_lag_s: float = 0.0,
         disk_free_mb: float = inf,
     ) -> Violation | None:
-        """Check slowly changing quantities; called every `LOOK_EVERY` ticks, at rest too.
+        """Check slowly changing quantities; called every `SLOW_CHECK_TICKS` ticks, at rest too.
 
         Parameters
         ----------

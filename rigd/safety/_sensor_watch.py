@@ -82,7 +82,7 @@ class SensorWatch:
         self._fractions: list[float] = []
         self._warned: set[str] = set()
 
-    def judge(self) -> Violation | None:
+    def finish_learning(self) -> Violation | None:
         """End learning: derive the limits of the runs, and check the readings at rest."""
         n = max(1, self._learned)
         if n < _LEARNED:

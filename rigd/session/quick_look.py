@@ -18,9 +18,9 @@ from rigd.units import finite_number
 
 Document = dict[str, Any]
 
-LOOK_SUFFIX: Final = ".look.json"
+QUICK_LOOK_SUFFIX: Final = ".look.json"
 """Ending of a quick look's file, instead of the session file's."""
-LOOK_VERSION: Final = 1
+QUICK_LOOK_VERSION: Final = 1
 """Version of the file's layout."""
 
 _MOST_BYTES: Final = 1 << 20
@@ -39,26 +39,26 @@ _CURVES: Final = ("frequency_hz", "magnitude", "phase_rad")
 _BAND: Final = ("magnitude_low_95", "magnitude_high_95")
 
 
-def look_path(path: Path) -> Path:
+def quick_look_path(path: Path) -> Path:
     """Return the path of a session's quick look, in the same folder as its file.
 
     Examples
     --------
     >>> from pathlib import Path
-    >>> from rigd.session.quick_look import look_path
-    >>> print(look_path(Path("sessions/20261120-101500-chirp.mcap")))
+    >>> from rigd.session.quick_look import quick_look_path
+    >>> print(quick_look_path(Path("sessions/20261120-101500-chirp.mcap")))
     sessions/20261120-101500-chirp.look.json
     """
-    return path.with_suffix(LOOK_SUFFIX)
+    return path.with_suffix(QUICK_LOOK_SUFFIX)
 
 
-def read_look(path: Path) -> Document | None:
+def read_quick_look(path: Path) -> Document | None:
     """Read the file of a quick look.
 
     Parameters
     ----------
     path
-        Path of the quick look, from `look_path`.
+        Path of the quick look, from `quick_look_path`.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def read_look(path: Path) -> Document | None:
     """
     try:
         found = json.loads(_content(path), parse_constant=lambda _: None, parse_float=_parsed)
-        if found["version"] != LOOK_VERSION:
+        if found["version"] != QUICK_LOOK_VERSION:
             return None
         return dict(found) | {
             **{name: _text(found.get(name) or "") for name in _TEXTS},
@@ -84,7 +84,7 @@ def read_look(path: Path) -> Document | None:
         return None
 
 
-def last_look(
+def last_quick_look(
     folder: Path,
     specimen: str,
     *,
@@ -110,17 +110,17 @@ def last_look(
     Returns
     -------
     tuple of Path and dict, or None
-        Path of the session file, and the quick look as `read_look` returns it.
+        Path of the session file, and the quick look as `read_quick_look` returns it.
     """
     for path in sorted(_newest(folder), key=_start_utc_ns, reverse=True):
         if (
-            path.name != but + LOOK_SUFFIX
-            and (report := read_look(path)) is not None
+            path.name != but + QUICK_LOOK_SUFFIX
+            and (report := read_quick_look(path)) is not None
             and report["specimen"] == specimen
             and (before_utc_ns is None or report["start_utc_ns"] < before_utc_ns)
             and usable(report)
         ):
-            return path.with_name(path.name.removesuffix(LOOK_SUFFIX) + ".mcap"), report
+            return path.with_name(path.name.removesuffix(QUICK_LOOK_SUFFIX) + ".mcap"), report
     return None
 
 
@@ -128,7 +128,7 @@ def _newest(folder: Path) -> list[Path]:
     """Return the newest quick looks of a folder."""
     made: list[tuple[float, Path]] = []
     with suppress(OSError):
-        for path in folder.glob(f"*{LOOK_SUFFIX}"):
+        for path in folder.glob(f"*{QUICK_LOOK_SUFFIX}"):
             with suppress(OSError):
                 made.append((path.stat().st_mtime, path))
     return [path for _, path in sorted(made, reverse=True)[:_MOST_READ]]
@@ -204,7 +204,7 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
         `Validity.as_json`, ``modes`` as of `modes_of`,
         ``parameters`` by name, ``findings``, and ``search`` of a session that ended when a
         precision was reached: ``reason`` of its end, and ``targets`` with ``name``,
-        ``quantity``, ``mode``, ``value``, ``std`` and ``asked_std``. None without a valid fit.
+        ``quantity``, ``mode``, ``value``, ``std`` and ``target_std``. None without a valid fit.
     """
     try:
         text = (outcome or {})["fit"]

@@ -5,8 +5,8 @@ from ._estimate import TouchEstimator as TouchEstimator
 from ._estimate import estimate_touch as estimate_touch
 from ._free_motion import FreeBeam as FreeBeam
 from ._free_motion import TouchRecord as TouchRecord
+from ._innovations import ChannelNoise as ChannelNoise
 from ._innovations import InnovationFilter as InnovationFilter
-from ._innovations import Noise as Noise
 from ._innovations import observed_beam as observed_beam
 from ._model import TouchModel as TouchModel
 from ._results import Estimated as Estimated

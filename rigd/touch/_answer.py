@@ -86,7 +86,7 @@ def answer(explainer: Explainer, explained: Explained, *, scan: bool) -> TouchEs
         channels=explainer.motion.noise.size,
         samples=window.end - explainer.detected,
         chi2_per_degree=best.chi2 / (window.data.size - best.parameters.size),
-        places_m=explainer.blind.x_m if scan else np.zeros(0),
+        positions_m=explainer.blind.x_m if scan else np.zeros(0),
         log_likelihood=explainer.blind.log_likelihood if scan else np.zeros(0),
         innovations=explainer.motion.innovations / explainer.motion.noise[:, None],
         innovation_times_s=explainer.motion.t + offset,

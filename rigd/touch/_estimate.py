@@ -60,7 +60,7 @@ class TouchEstimator:
         scan
             Whether to return the likelihood of all positions; else it is empty.
         """
-        return self.follow().told(record, scan=scan)
+        return self.follow().update(record, scan=scan)
 
     def follow(self) -> "GrowingEstimate":
         """Return an estimate of one touch that is updated while its record grows."""
@@ -85,13 +85,13 @@ class GrowingEstimate:
         self._earlier: dict[float, Explainer] = {}
         self._explained_by: float | None = None
 
-    def look(self, record: TouchRecord) -> None:
+    def preview(self, record: TouchRecord) -> None:
         """Search the possible positions in advance, as part of the first estimate.
 
         Parameters
         ----------
         record
-            Samples until `LOOK_S` after the detection, or some more.
+            Samples until `PREVIEW_S` after the detection, or some more.
         """
         for noticed_s in NOTICED_S[:-1]:  # the last one takes long, and is hardly ever needed
             if not self._reaches(record, noticed_s):
@@ -99,7 +99,9 @@ class GrowingEstimate:
             if not self._explainer(record, noticed_s).begins_too_late:
                 return
 
-    def told(self, record: TouchRecord, *, scan: bool = True, first: bool = False) -> TouchEstimate:
+    def update(
+        self, record: TouchRecord, *, scan: bool = True, first: bool = False
+    ) -> TouchEstimate:
         """Estimate the touch from the samples so far.
 
         Parameters
@@ -172,7 +174,7 @@ class GrowingEstimate:
             channels=channels,
             samples=record.angle_rad.size - record.detected,
             chi2_per_degree=np.nan,
-            places_m=nothing,
+            positions_m=nothing,
             log_likelihood=nothing,
             innovations=np.zeros((channels, 0)),
             innovation_times_s=nothing,

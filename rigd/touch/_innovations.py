@@ -78,7 +78,7 @@ class ObservedBeam:
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
+class ChannelNoise:
     """Noise of one sample of each channel."""
 
     torque_nm: float
@@ -93,7 +93,7 @@ def observed_beam(
     beam: Beam,
     damping: Damping,
     rate_hz: float,
-    noise: Noise,
+    noise: ChannelNoise,
     *,
     tool_inertia_kg_m2: float = 0.0,
     torque_after_angle_s: float = 0.0,
@@ -368,7 +368,7 @@ class _Observer:
 
 
 def _observer(
-    beam: Beam, damping: Damping, rate_hz: float, noise: Noise, noise_gain: Real
+    beam: Beam, damping: Damping, rate_hz: float, noise: ChannelNoise, noise_gain: Real
 ) -> _Observer:
     """Return the stationary Kalman filter of ringing modes and drifting zeros."""
     from scipy.linalg import solve_discrete_are

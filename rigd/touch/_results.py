@@ -47,7 +47,7 @@ class TouchEstimate:
     """Number of samples used after the detection."""
     chi2_per_degree: float
     """Sum of squared residuals over that of noise: about 1 if explained."""
-    places_m: Real
+    positions_m: Real
     """Positions of the likelihood, shape (m,); empty if not requested."""
     log_likelihood: Real
     """Log-likelihood at each position for any force, shape (m,)."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping
 from rigd.touch._contact import march, responses
-from rigd.touch._innovations import InnovationFilter, Noise, ObservedBeam, observed_beam
+from rigd.touch._innovations import ChannelNoise, InnovationFilter, ObservedBeam, observed_beam
 from rigd.touch._kernels import contact_kernels
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
@@ -47,7 +47,7 @@ class WatchedBeam:
     """Signatures of touches, from `signatures`."""
 
 
-def watched_beam(model: "TouchModel", rate_hz: float, noise: Noise) -> WatchedBeam:
+def watched_beam(model: "TouchModel", rate_hz: float, noise: ChannelNoise) -> WatchedBeam:
     """Prepare the detection of touches.
 
     Parameters

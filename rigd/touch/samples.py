@@ -13,7 +13,7 @@ HISTORY_S: Final = 1.5
 """Time before a detection that an estimate uses."""
 CONTACT_S: Final = 0.8
 """Time after a detection for which the beam of a search may still touch the obstacle."""
-LOOK_S: Final = 0.025
+PREVIEW_S: Final = 0.025
 """Time after a detection for the advance search of the position."""
 FIRST_S: Final = 0.05
 """Time after a detection that the first estimate uses."""

@@ -15,7 +15,7 @@ from typing import Any, Final
 from aiohttp import web
 
 from rigd.library import REPORT_PAGE, SessionRow, list_sessions
-from rigd.session.quick_look import LOOK_SUFFIX, last_look, read_look
+from rigd.session.quick_look import QUICK_LOOK_SUFFIX, last_quick_look, read_quick_look
 from rigd.web._access import REPORT_POLICY, WebAccess, object_of, refused
 from rigd.web._jobs import JobError, Jobs
 
@@ -93,7 +93,7 @@ class Library:
             Session to exclude, because it is running.
         """
         found = await asyncio.to_thread(
-            partial(last_look, self._folder, specimen, but=but, usable=itemgetter("response"))
+            partial(last_quick_look, self._folder, specimen, but=but, usable=itemgetter("response"))
         )
         if found is None:
             return None
@@ -269,7 +269,7 @@ class Library:
     def _read_quick_look(self, name: str) -> Document | None:
         """Return the quick look of a session; None if there is none or it is unreadable."""
         with suppress(web.HTTPNotFound):
-            return read_look(self._inside(f"{name}{LOOK_SUFFIX}"))
+            return read_quick_look(self._inside(f"{name}{QUICK_LOOK_SUFFIX}"))
         return None
 
 

@@ -17,7 +17,7 @@ from analysis.quick_look import LookError, look_at, write_look
 from analysis.record import load_record
 from analysis.results import whole_record
 from rigd.beam import transfer
-from rigd.session.quick_look import look_path
+from rigd.session.quick_look import quick_look_path
 
 
 @pytest.fixture(scope="module")
@@ -154,9 +154,9 @@ def test_a_change_counts_from_three_standard_deviations_on():
     ],
 )
 def test_the_last_look_is_found_by_start_and_specimen(tmp_path, name, content, file):
-    last = look_path(tmp_path / "last.mcap")
+    last = quick_look_path(tmp_path / "last.mcap")
     last.write_text(json.dumps(look_with(2.5, start_utc_ns=4, file="last.mcap")))
-    look_path(tmp_path / f"{name}.mcap").write_text(json.dumps(content))
+    quick_look_path(tmp_path / f"{name}.mcap").write_text(json.dumps(content))
     found = quick_look._last_quick_look(tmp_path / "now.mcap", "a", 8)
     assert found["file"] == file
 
@@ -231,7 +231,7 @@ def test_the_text_is_for_a_terminal(chirps):
 
 def test_a_look_is_written_whole_and_replaces_an_older_one_only(tmp_path):
     path = tmp_path / "a.mcap"
-    place = look_path(path)
+    place = quick_look_path(path)
     write_look(look_with(2.5, made_utc_ns=6), path)
     write_look(look_with(2.6, made_utc_ns=7), path)
     assert json.loads(place.read_text())["made_utc_ns"] == 7
@@ -257,7 +257,7 @@ def test_the_program_writes_the_look_and_prints_it(short_chirps, tmp_path):
     path = Path(shutil.copy(short_chirps[0], tmp_path))
     done = look(path)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines() == json.loads(look_path(path).read_text())["text"]
+    assert done.stdout.splitlines() == json.loads(quick_look_path(path).read_text())["text"]
     assert done.stderr == ""
 
 
@@ -295,4 +295,4 @@ def test_it_runs_at_a_low_priority_and_ends_with_its_parent(short_chirps, tmp_pa
     parent.kill()
     parent.communicate()
     assert eventually(lambda: has_ended(pid))
-    assert not look_path(path).exists()
+    assert not quick_look_path(path).exists()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rigd.engine._touch_watch import TouchWatch
 from rigd.engine.messages import TouchOrder
-from rigd.excitation import Approach, Pass, after_touch
+from rigd.excitation import Approach, TouchPass, after_touch
 from rigd.excitation.moves import braking_path, quintic
 from rigd.session.layout import Status
 
@@ -27,7 +27,7 @@ def one_pass(first):
     reference = np.concatenate([np.zeros(200), out, np.full(300, out[-1]), out[-1] * (1 - BACK)])
     begins = first + 200
     returns = begins + OUT_TICKS + 300
-    return reference, Pass(begins, returns, first + reference.size)
+    return reference, TouchPass(begins, returns, first + reference.size)
 
 
 class ScriptedDetector:

@@ -9,7 +9,7 @@ from beam_estimates import ESTIMATE, UNIFORM, covariance_of
 from rigd.beam import Beam, Damping
 from rigd.beam.tip import tip_motion
 from rigd.excitation import ExcitationError, chirp, information
-from rigd.excitation.experiment_design import design_excitation, next_piece
+from rigd.excitation.experiment_design import design_excitation, next_segment
 from rigd.excitation.targets import parse_target
 
 RATE_HZ = 1000.0
@@ -95,7 +95,7 @@ def test_pieces_add_up_at_whatever_tick_the_record_ends(rig, scanned):
 @pytest.mark.further  # as the limits are kept
 def test_a_tighter_limit_lowers_the_amplitude(rig, scanned):
     free, held = (
-        next_piece(ESTIMATE, np.zeros(1000), DAMPING, rig, 10.0, tip_slope_rad=slope)
+        next_segment(ESTIMATE, np.zeros(1000), DAMPING, rig, 10.0, tip_slope_rad=slope)
         for slope in (0.14, 0.07)
     )
     slopes = [
@@ -108,17 +108,17 @@ def test_a_tighter_limit_lowers_the_amplitude(rig, scanned):
 
 
 def test_it_takes_no_longer_than_is_left(rig, scanned):
-    piece = next_piece(ESTIMATE, scanned, DAMPING, rig, 1.2)
+    piece = next_segment(ESTIMATE, scanned, DAMPING, rig, 1.2)
     assert piece.reference_rad.size <= 1200
     with pytest.raises(ExcitationError, match=r"fits into 0\.4 s"):
-        next_piece(ESTIMATE, scanned, DAMPING, rig, 0.4)
+        next_segment(ESTIMATE, scanned, DAMPING, rig, 0.4)
 
 
 def test_what_cannot_be_reached_is_said_with_the_reason(rig, scanned):
-    hard = next_piece(ESTIMATE, scanned, [parse_target("damping", "0.01%")], rig, 60.0).forecast
+    hard = next_segment(ESTIMATE, scanned, [parse_target("damping", "0.01%")], rig, 60.0).forecast
     assert hard.seconds > 1000
     assert "60 s are left" in hard.reason
-    easy = next_piece(ESTIMATE, scanned, DAMPING, rig, 60.0).forecast
+    easy = next_segment(ESTIMATE, scanned, DAMPING, rig, 60.0).forecast
     assert 0 < easy.seconds < 20
     assert not easy.reason
     internal = replace(
@@ -126,11 +126,11 @@ def test_what_cannot_be_reached_is_said_with_the_reason(rig, scanned):
         damping=Damping(zeta=7.1e-5),
         names=tuple(name for name in UNIFORM if name not in ("gamma", "lambda")),
     )
-    absent = next_piece(internal, scanned, [parse_target("gamma", "5%")], rig, 60.0)
+    absent = next_segment(internal, scanned, [parse_target("gamma", "5%")], rig, 60.0)
     assert absent.forecast.seconds == np.inf
     assert "external damping is absent" in absent.forecast.reason
     assert not any(each.reached for each in absent.expected)
-    beyond = next_piece(ESTIMATE, scanned, [parse_target("damping", "7:1%")], rig, 60.0)
+    beyond = next_segment(ESTIMATE, scanned, [parse_target("damping", "7:1%")], rig, 60.0)
     assert "mode 7 is not below 50 Hz" in beyond.forecast.reason
 
 
@@ -140,7 +140,9 @@ def test_the_forecast_is_about_what_a_design_takes(design):
 
 
 def test_one_mode_asked_for_is_the_one_that_is_driven(rig):
-    piece = next_piece(ESTIMATE, np.zeros(1000), [parse_target("frequency", "3:0.01%")], rig, 10.0)
+    piece = next_segment(
+        ESTIMATE, np.zeros(1000), [parse_target("frequency", "3:0.01%")], rig, 10.0
+    )
     power = np.abs(np.fft.rfft(piece.angle_rad, 8000)) ** 2
     hz = np.fft.rfftfreq(8000, 1 / RATE_HZ)
     assert power[np.abs(hz - 44.8) < 4].sum() > 0.5 * power.sum()
@@ -148,7 +150,7 @@ def test_one_mode_asked_for_is_the_one_that_is_driven(rig):
 
 def test_a_mode_that_has_to_be_driven_is_driven_whatever_else_tells_more(rig, scanned):
     names = [
-        next_piece(ESTIMATE, scanned, DAMPING, rig, 10.0, through=through).name
+        next_segment(ESTIMATE, scanned, DAMPING, rig, 10.0, through=through).name
         for through in ((), (1,), (2,), (3,))
     ]
     driven = [name.partition(",")[0].split() for name in names]
@@ -160,7 +162,7 @@ def test_a_mode_that_has_to_be_driven_is_driven_whatever_else_tells_more(rig, sc
 
 def test_nothing_asked_and_nothing_to_drive_are_refused(rig, scanned):
     with pytest.raises(ExcitationError, match="No precision is requested"):
-        next_piece(ESTIMATE, scanned, [], rig, 10.0)
+        next_segment(ESTIMATE, scanned, [], rig, 10.0)
     stiff = replace(ESTIMATE, beam=Beam(0.1, 4.7e-3, 0.090275))
     with pytest.raises(ExcitationError, match="no mode below 50 Hz"):
-        next_piece(stiff, scanned, [parse_target("zeta", "5%")], rig, 10.0)
+        next_segment(stiff, scanned, [parse_target("zeta", "5%")], rig, 10.0)

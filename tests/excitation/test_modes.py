@@ -231,6 +231,6 @@ def test_without_a_rig_the_bands_get_equal_times_and_the_full_amplitude(document
 def test_foresight_agrees_with_the_plan(document, profile):
     made = excitation_for(profile, "modes", {"path": document(), "duration_s": 30.0})
     predicted = plan_session(profile, made).prediction
-    assert LoopPreview(profile).share_of_limits(made.reference_rad) == pytest.approx(
+    assert LoopPreview(profile).fraction_of_limits(made.reference_rad) == pytest.approx(
         predicted.peak_torque_nm / profile.rig.motor.peak_torque_nm
     )

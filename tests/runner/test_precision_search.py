@@ -10,7 +10,7 @@ from rigd.engine import shared_memory_fd
 from rigd.engine.messages import FitReport, PlannedSegment, SearchEnded
 from rigd.engine.reference import ReferenceWriter, put_reference
 from rigd.engine.shared_state import SharedState, StateField
-from rigd.excitation import ExcitationError, Forecast, Piece, until
+from rigd.excitation import ExcitationError, PrecisionForecast, Segment, until
 from rigd.excitation.targets import Precision, parse_target
 from rigd.profile import load_profile
 from rigd.runner._precision_search import (
@@ -119,9 +119,11 @@ def designed_at_once(monkeypatch, std):
     def design(estimate, angle_rad, targets, rig, time_left_s, **_):
         k = len(estimate.names)
         now = (Precision(targets[0], 1.0, std, 0.1),)
-        return Piece("rest", rest, rest, estimate.names, np.eye(k), now, now, Forecast(1e4, ""), 0)
+        return Segment(
+            "rest", rest, rest, estimate.names, np.eye(k), now, now, PrecisionForecast(1e4, ""), 0
+        )
 
-    monkeypatch.setattr("rigd.runner._precision_search.next_piece", design)
+    monkeypatch.setattr("rigd.runner._precision_search.next_segment", design)
 
 
 @pytest.fixture
@@ -396,5 +398,5 @@ def test_an_absolute_deviation_is_not_a_share(profile):
     found = frequency, damping = target_estimates(answer(profile, 1, 0.02), targets)
     told = [(each["name"], each["quantity"], each["mode"]) for each in targets_json(found)]
     assert told == [("frequency of mode 1", "frequency", 1), ("damping of mode 2", "damping", 2)]
-    assert frequency.asked_std == 0.002
+    assert frequency.target_std == 0.002
     assert damping.ratio == pytest.approx(2.0)

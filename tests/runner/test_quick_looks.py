@@ -17,7 +17,7 @@ from rigd.runner import quick_looks
 from rigd.runner.quick_looks import QuickLook, QuickLooks
 from rigd.runner.session import SessionResult
 from rigd.runtime import processor_use
-from rigd.session.quick_look import look_path
+from rigd.session.quick_look import quick_look_path
 
 PROGRAM = """
 import json, pathlib, sys, time
@@ -81,7 +81,7 @@ def test_sessions_are_looked_at_one_after_the_other(looks, tmp_path, started):
         assert len(started()) == 1
     first, second = done(looks)
     assert [first.session, second.session] == paths
-    assert first.path == look_path(paths[0])
+    assert first.path == quick_look_path(paths[0])
     assert first.lines == ["Look at a"]
     assert first.error == ""
 
@@ -203,7 +203,7 @@ def test_closing_ends_one_that_is_suspended(looks, tmp_path, started):
 
 def test_a_look_is_noted_and_told_as_an_event():
     path = Path("out/a.mcap")
-    look = QuickLook(path, look_path(path), {"text": ["Look\x1b[2J"]}, "")
+    look = QuickLook(path, quick_look_path(path), {"text": ["Look\x1b[2J"]}, "")
     result = SessionResult(path, "complete", "", 1, 1, 0, 0, 0, fault=False)
     other = replace(result, path=Path("out/b.mcap"))
     results = [other, result]

@@ -14,7 +14,7 @@ from rigd.excitation import hold
 from rigd.profile import load_profile
 from rigd.runner import Series
 from rigd.runner.planning import RefusedError
-from rigd.safety import LOOK_EVERY
+from rigd.safety import SLOW_CHECK_TICKS
 
 PROFILE = load_profile("antenna_can")
 LIMITS = PROFILE.limits
@@ -104,9 +104,9 @@ def test_angles_that_are_missing_make_no_jump(watch):
 
 def heat(watch, torque_nm, seconds, start_s=0.0):
     """Exert a torque; return when that ends the session."""
-    for look in range(round(seconds * 1000 / LOOK_EVERY)):
-        now_ns = round(start_s * 1e9) + look * LOOK_EVERY * PERIOD_NS
-        if watch.look(now_ns, LOOK_EVERY * torque_nm**2) is not None:
+    for look in range(round(seconds * 1000 / SLOW_CHECK_TICKS)):
+        now_ns = round(start_s * 1e9) + look * SLOW_CHECK_TICKS * PERIOD_NS
+        if watch.check_slow(now_ns, SLOW_CHECK_TICKS * torque_nm**2) is not None:
             return (now_ns * 1e-9) - start_s
     return None
 
@@ -127,13 +127,13 @@ def test_the_motor_bears_its_continuous_torque_for_ever_and_cools_down_meanwhile
 
 
 def test_heat_lag_and_disk_mark_the_samples_until_they_are_well_again(watch):
-    assert watch.look(0, 0.0, 0.6 * LIMITS.recorder_lag_s) is None
+    assert watch.check_slow(0, 0.0, 0.6 * LIMITS.recorder_lag_s) is None
     assert watch.check(0.0, 0.0, REST) is None
     assert watch.warning
-    assert watch.look(LOOK_EVERY * PERIOD_NS, 0.0, 0.1 * LIMITS.recorder_lag_s) is None
+    assert watch.check_slow(SLOW_CHECK_TICKS * PERIOD_NS, 0.0, 0.1 * LIMITS.recorder_lag_s) is None
     assert watch.check(0.0, 0.0, REST) is None
     assert not watch.warning
-    assert watch.look(2 * LOOK_EVERY * PERIOD_NS, disk_free_mb=400.0) is None
+    assert watch.check_slow(2 * SLOW_CHECK_TICKS * PERIOD_NS, disk_free_mb=400.0) is None
     assert watch.check(0.0, 0.0, REST) is None
     assert watch.warning
     lag, disk = watch.take_notices()
@@ -148,7 +148,7 @@ def test_a_channel_is_told_anew_after_a_second_clear_of_its_limit(watch):
         for _ in range(looks):
             watch.reset(angle_rad)
             assert watch.check(angle_rad, angle_rad, REST) is None
-            assert watch.look(0) is None
+            assert watch.check_slow(0) is None
         return len(watch.take_notices())
 
     assert be_at(near, 50) == 1
@@ -175,9 +175,9 @@ def test_missed_ticks_near_their_limit_mark_the_next_sample(watch):
 
 
 def test_many_old_readings_near_their_limit_mark_the_next_sample(watch):
-    assert watch.check_stale_share(49, 49, 10_000) is None
+    assert watch.check_stale_fraction(49, 49, 10_000) is None
     assert watch.take_notices() == []
-    assert watch.check_stale_share(51, 60, 10_000) is None
+    assert watch.check_stale_fraction(51, 60, 10_000) is None
     assert watch.check(0.0, 0.0, REST) is None
     # No angle was old in this tick or the one before: the check of what is old carries it.
     assert watch.check_stale(angle_stale=False, wrench_stale=False) is None
@@ -194,11 +194,11 @@ def test_many_old_readings_near_their_limit_mark_the_next_sample(watch):
 
 @pytest.mark.parametrize(("angles", "wrenches", "which"), [(101, 0, "angle"), (3, 101, "wrench")])
 def test_too_many_old_readings_end_a_session(watch, angles, wrenches, which):
-    assert watch.check_stale_share(100, 100, 10_000) is None
-    violation = watch.check_stale_share(angles, wrenches, 5)  # as if ten seconds had passed
+    assert watch.check_stale_fraction(100, 100, 10_000) is None
+    violation = watch.check_stale_fraction(angles, wrenches, 5)  # as if ten seconds had passed
     assert violation.channel == f"share of ticks without a new {which}"
     assert (violation.value, violation.limit) == (pytest.approx(1.01), 1.0)
-    assert watch.check_stale_share(400, 400, 40_000) is None
+    assert watch.check_stale_fraction(400, 400, 40_000) is None
 
 
 def test_a_torque_that_is_no_number_is_never_commanded(watch):
@@ -257,16 +257,16 @@ def test_a_tick_or_two_do_not_acquit_the_beam(watch):
 
 def test_missed_ticks_are_forgotten_after_two_looks(watch):
     watch.skip(20)
-    watch.look(0)
+    watch.check_slow(0)
     assert watch.after_missed
-    watch.look(LOOK_EVERY * PERIOD_NS)
+    watch.check_slow(SLOW_CHECK_TICKS * PERIOD_NS)
     assert watch.after_missed == ""
     assert "amplitude" in left_behind(watch)
 
 
 def test_missed_ticks_are_not_to_blame_for_what_they_cannot_do(watch):
     watch.skip(20)
-    violation = watch.look(0, disk_free_mb=0.5 * LIMITS.disk_free_mb)
+    violation = watch.check_slow(0, disk_free_mb=0.5 * LIMITS.disk_free_mb)
     assert "missed" not in str(violation)
 
 

@@ -11,7 +11,13 @@ from library_folders import mode, quantity
 from online_fits import online_fit
 
 from rigd.session import BeamUniformity, Validity
-from rigd.session.quick_look import fit_of, last_look, look_path, modes_of, read_look
+from rigd.session.quick_look import (
+    fit_of,
+    last_quick_look,
+    modes_of,
+    quick_look_path,
+    read_quick_look,
+)
 from rigd.view._fits import fit_table
 
 RESPONSE = {
@@ -32,7 +38,7 @@ OF_MODAL_MODEL = {"participation": quantity(1.4e-3, 2e-6), "source": "modal"}
 
 
 def write(folder, name, **members) -> Path:
-    path = look_path(folder / f"{name}.mcap")
+    path = quick_look_path(folder / f"{name}.mcap")
     path.write_text(json.dumps({"version": 1} | members))
     return path
 
@@ -46,7 +52,7 @@ def test_what_is_written_is_read(tmp_path):
         "response": RESPONSE, "model": MODEL, "text": ["Quick look"],
         "validity": Validity(0.6, 0.12, BeamUniformity("refused", 2e-18)).as_json(),
     }  # fmt: skip
-    assert read_look(write(tmp_path, "a", **written)) == written
+    assert read_quick_look(write(tmp_path, "a", **written)) == written
 
 
 @pytest.mark.parametrize(
@@ -56,7 +62,7 @@ def test_what_is_written_is_read(tmp_path):
      {"predicted_peak_tip_slope_rad": 10**400, "linear_model_error": 0.1}],
 )  # fmt: skip
 def test_a_validity_that_is_none_is_unknown_and_not_good(tmp_path, stated):
-    look = read_look(write(tmp_path, "a", modes=[mode(2.5)], validity=stated))
+    look = read_quick_look(write(tmp_path, "a", modes=[mode(2.5)], validity=stated))
     assert look["validity"] == Validity().as_json()
     assert "unknown" in look["validity"]["sentence"]
 
@@ -67,7 +73,9 @@ def test_a_validity_that_is_none_is_unknown_and_not_good(tmp_path, stated):
      {"status": "refused", "p_value": -1.0}, {"status": "passed", "p_value": "0.5"}],
 )  # fmt: skip
 def test_a_test_of_uniformity_that_is_none_is_unknown(tmp_path, stated):
-    look = read_look(write(tmp_path, "a", modes=[mode(2.5)], validity={"uniform_beam": stated}))
+    look = read_quick_look(
+        write(tmp_path, "a", modes=[mode(2.5)], validity={"uniform_beam": stated})
+    )
     assert look["validity"]["uniform_beam"] is None
 
 
@@ -90,7 +98,7 @@ def test_a_test_of_uniformity_is_stated_in_words(found, sentence, short):
 
 
 def test_what_is_missing_is_empty(tmp_path):
-    look = read_look(write(tmp_path, "a"))
+    look = read_quick_look(write(tmp_path, "a"))
     assert (look["specimen"], look["start_utc_ns"], look["modes"], look["text"]) == ("", 0, [], [])
     assert look["response"] is None
 
@@ -103,11 +111,11 @@ def test_what_is_missing_is_empty(tmp_path):
      b'{"version": 1, "flags": "' + b"a" * (1 << 20) + b'"}'],
 )  # fmt: skip
 def test_a_file_that_is_none_is_not_read(tmp_path, content):
-    path = look_path(tmp_path / "a.mcap")
+    path = quick_look_path(tmp_path / "a.mcap")
     path.write_bytes(content)
-    assert read_look(path) is None
-    assert read_look(tmp_path) is None
-    assert read_look(tmp_path / "missing.look.json") is None
+    assert read_quick_look(path) is None
+    assert read_quick_look(tmp_path) is None
+    assert read_quick_look(tmp_path / "missing.look.json") is None
 
 
 @pytest.mark.parametrize(
@@ -121,7 +129,7 @@ def test_a_file_that_is_none_is_not_read(tmp_path, content):
 def test_modes_without_their_numbers_are_left_out(tmp_path, modes):
     whole = mode(16.0) | {"mode": 2, "shown": True} | OF_MODAL_MODEL
     given = [*modes, whole] if isinstance(modes, list) else modes
-    found = read_look(write(tmp_path, "a", modes=given))["modes"]
+    found = read_quick_look(write(tmp_path, "a", modes=given))["modes"]
     assert found == ([whole] if isinstance(modes, list) else [])
     assert modes_of(given) == found
 
@@ -137,15 +145,15 @@ def test_an_interval_without_two_numbers_is_none():
      {"magnitude": [3.0, float("inf")]}],
 )  # fmt: skip
 def test_a_response_is_whole_or_none(tmp_path, wrong):
-    assert read_look(write(tmp_path, "a", response=RESPONSE | wrong))["response"] is None
-    without = read_look(write(tmp_path, "b", response=RESPONSE | {"coherence": None}))
+    assert read_quick_look(write(tmp_path, "a", response=RESPONSE | wrong))["response"] is None
+    without = read_quick_look(write(tmp_path, "b", response=RESPONSE | {"coherence": None}))
     assert without["response"] == RESPONSE | {"coherence": None}
 
 
 def test_numbers_beyond_all_floats_are_unknown(tmp_path):
-    path = look_path(tmp_path / "a.mcap")
+    path = quick_look_path(tmp_path / "a.mcap")
     path.write_text('{"version": 1, "took_s": 1e999, "coherence": {"mean": NaN}}')
-    look = read_look(path)
+    look = read_quick_look(path)
     assert (look["took_s"], look["coherence"]) == (None, {"mean": None})
 
 
@@ -161,7 +169,7 @@ def test_numbers_beyond_all_floats_are_unknown(tmp_path):
 def test_anything_is_read_as_json_or_not_at_all(tmp_path_factory, found):
     folder = tmp_path_factory.getbasetemp()
     members = found if isinstance(found, dict) else {"modes": found, "response": found}
-    look = read_look(write(folder, f"any-{os.getpid()}", **members | {"version": 1}))
+    look = read_quick_look(write(folder, f"any-{os.getpid()}", **members | {"version": 1}))
     if look is not None:
         json.dumps(look, allow_nan=False)
 
@@ -174,10 +182,10 @@ def test_the_last_look_is_that_of_the_latest_session(tmp_path):
     write(tmp_path, "late", start_utc_ns=9, specimen="A")
     write(tmp_path, "other", start_utc_ns=8, specimen="B")
     write(tmp_path, "none", start_utc_ns=7)
-    look_path(tmp_path / "torn.mcap").write_text("{")
+    quick_look_path(tmp_path / "torn.mcap").write_text("{")
 
     def last(specimen, usable=bool, **but):
-        found = last_look(tmp_path, specimen, usable=usable, **but)
+        found = last_quick_look(tmp_path, specimen, usable=usable, **but)
         return None if found is None else found[0].name
 
     assert last("A") == "late.mcap"
@@ -185,7 +193,7 @@ def test_the_last_look_is_that_of_the_latest_session(tmp_path):
     assert last("A", usable=lambda look: look["response"]) == "early.mcap"
     assert last("") == "none.mcap"
     assert last("C") is None
-    assert last_look(tmp_path / "missing", "A", usable=bool) is None
+    assert last_quick_look(tmp_path / "missing", "A", usable=bool) is None
 
 
 def test_the_fit_of_a_file_is_read_as_far_as_it_can_be_used():

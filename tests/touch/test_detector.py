@@ -9,9 +9,9 @@ from touch_records import DAMPED, LINK
 
 from rigd.beam import Beam, Damping, PointForceGrid, transfer
 from rigd.touch import (
+    ChannelNoise,
     DetectorSettings,
     InnovationFilter,
-    Noise,
     SensorFilter,
     TouchDetector,
     WatchedBeam,
@@ -24,7 +24,7 @@ BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090
 DAMPING = Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
 RATE_HZ = 1000.0
 REST = 1000
-NOISE = Noise(torque_nm=5e-3, shear_n=0.02, angle_rad=7e-5 / 12**0.5)
+NOISE = ChannelNoise(torque_nm=5e-3, shear_n=0.02, angle_rad=7e-5 / 12**0.5)
 SHIFT_PER_S = 1.5
 """Of the line along which the transform is taken back: what it wraps round has died away by
 exp(-16 · 1.5), or could not be told from noise."""
@@ -159,7 +159,7 @@ def test_torque_alone_detects_as_well():
 
 
 def test_the_threshold_rises_with_the_noise_at_rest(model):
-    noise = Noise(2 * NOISE.torque_nm, 2 * NOISE.shear_n)
+    noise = ChannelNoise(2 * NOISE.torque_nm, 2 * NOISE.shear_n)
     tick, detector = detection(model, record(slewed(1.0), noise=noise))
     assert tick is None
     assert detector.noise == pytest.approx((2.0, 2.0), rel=0.1)

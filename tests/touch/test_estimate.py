@@ -131,9 +131,9 @@ def test_one_that_is_like_two_is_one(estimator, alike, after):
 def grown(estimator, struck, *, noticed=NOTICED):
     """First and last answer, as the touch process asks for them."""
     growing = estimator.follow()
-    growing.look(cut(struck, 25, noticed=noticed))
-    first = growing.told(cut(struck, 50, noticed=noticed), scan=False, first=True)
-    return first, growing.told(cut(struck, 190, noticed=noticed), scan=False)
+    growing.preview(cut(struck, 25, noticed=noticed))
+    first = growing.update(cut(struck, 50, noticed=noticed), scan=False, first=True)
+    return first, growing.update(cut(struck, 190, noticed=noticed), scan=False)
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,9 @@ def test_the_first_answer_leaves_open_what_an_obstacle_at_rest_does_not_explain(
 
 def test_a_record_that_does_not_grow_is_told_again(estimator, struck):
     growing = estimator.follow()
-    told = [growing.told(cut(struck["middle"], after), scan=False) for after in (50, 50, 200, 250)]
+    told = [
+        growing.update(cut(struck["middle"], after), scan=False) for after in (50, 50, 200, 250)
+    ]
     assert [each.samples for each in told] == [50, 50, 100, 100]
     assert {each.kind for each in told} == {"rigid"}
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rigd.engine.shared_state import Event, Phase
+from rigd.engine.shared_state import LogEvent, Phase
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 from rigd.runner import Rig
@@ -60,7 +60,7 @@ def run_order(tmp_path):
     ) -> SessionResult:
         noted = [] if injected is None else injected
 
-        def watch(progress: SessionProgress, _: list[Event]) -> None:
+        def watch(progress: SessionProgress, _: list[LogEvent]) -> None:
             if progress.phase != Phase.RUNNING or len(noted) == len(faults):
                 return
             if progress.tick > (noted[-1] if noted else 0) + 200:

@@ -59,7 +59,7 @@ _THINNED: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Forecast:
+class PrecisionForecast:
     """Expected time until the targets are reached."""
 
     seconds: float
@@ -69,7 +69,7 @@ class Forecast:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Piece:
+class Segment:
     """A segment of excitation; begins and ends at angle, speed and acceleration zero."""
 
     name: str
@@ -86,9 +86,9 @@ class Piece:
     """Precision of each target expected at the beginning of the segment."""
     expected: tuple[Precision, ...]
     """Precision of each target expected at its end."""
-    forecast: Forecast
+    forecast: PrecisionForecast
     """When all targets are expected to be reached, from the beginning of the segment."""
-    share_of_limits: float
+    fraction_of_limits: float
     """Largest predicted fraction of a limit, or of the range of small slopes, with the remaining
     vibration included."""
 
@@ -160,7 +160,7 @@ class _GoingOn:
     """(2, 2): factors that hold the amplitude of the mode constant, real and imaginary."""
 
 
-class PieceSearch:
+class SegmentSearch:
     """Search for the best segment, with the quantities common to all candidates of one decision."""
 
     def __init__(
@@ -472,7 +472,7 @@ class PieceSearch:
             self._going_on[band.middle_hz] = _GoingOn(weighted, per_amplitude)
         return self._going_on[band.middle_hz]
 
-    def segment(self, chosen: _Candidate, time_left_s: float) -> Piece:
+    def segment(self, chosen: _Candidate, time_left_s: float) -> Segment:
         """Return a candidate as a segment, with the precisions expected of it."""
         estimate, quantities = self.estimate, self.quantities
         samples = self.model_samples(chosen.duration_s)
@@ -482,7 +482,7 @@ class PieceSearch:
         fraction = min(1.0, largest_factor(ringing, channels))
         now = covariance_of(self.record.after(None, 0), estimate)
         after = covariance_of(self.record.after(fraction * chosen.total("rows"), samples), estimate)
-        return Piece(
+        return Segment(
             name=_in_words(chosen),
             reference_rad=fraction * chosen.total("reference_rad"),
             angle_rad=fraction * chosen.total("angle_rad"),
@@ -491,7 +491,7 @@ class PieceSearch:
             now=quantities.precisions(now),
             expected=quantities.precisions(after),
             forecast=self.forecast(time_left_s),
-            share_of_limits=LIMIT_FRACTION * float(np.abs(ringing + fraction * channels).max()),
+            fraction_of_limits=LIMIT_FRACTION * float(np.abs(ringing + fraction * channels).max()),
         )
 
     def with_ring_up(self) -> float:
@@ -513,17 +513,17 @@ class PieceSearch:
                 )
         return needed_s
 
-    def forecast(self, time_left_s: float) -> Forecast:
+    def forecast(self, time_left_s: float) -> PrecisionForecast:
         """Forecast the time until all targets are reached."""
         impossible = [each.impossible for each in self.quantities.items if each.impossible]
         if impossible:
-            return Forecast(inf, impossible[0])
+            return PrecisionForecast(inf, impossible[0])
         seconds = self.needed_s
         if not seconds < _NEVER_S:
-            return Forecast(inf, "the motor cannot excite the modes that determine it")
+            return PrecisionForecast(inf, "the motor cannot excite the modes that determine it")
         if seconds <= time_left_s:
-            return Forecast(seconds, "")
-        return Forecast(
+            return PrecisionForecast(seconds, "")
+        return PrecisionForecast(
             seconds, f"about {seconds:.0f} s are needed, and {time_left_s:.0f} s are left"
         )
 
@@ -572,7 +572,7 @@ def best_mixture(
     """
     rates = _information_rates(estimate, frequency_hz, angle_rad)
     target_stds = np.array(
-        [inf if each.impossible else each.asked_std for each in quantities.items]
+        [inf if each.impossible else each.target_std for each in quantities.items]
     )
     wanted = quantities.gradients / (missed * target_stds[:, None])
     if not wanted.any():
