@@ -32,7 +32,7 @@ from rigd.excitation._segment_search import SegmentSearch
 from rigd.excitation.experiment_design import next_segment
 from rigd.excitation.targets import Precision, Quantities, Target, parse_target
 from rigd.profile import load_profile
-from rigd.runner.planning import LoopPreview
+from rigd.runner.planning import RigPreview
 
 NOISE_NM = 5e-3
 DAMPING = PLANTS["VI"]
@@ -51,7 +51,7 @@ def precisions(angle_rad: Real, targets: list[Target]) -> tuple[Precision, ...]:
 
 
 def designed(
-    rig: LoopPreview, targets: list[Target], longest_s: float, tip_slope_rad: float
+    rig: RigPreview, targets: list[Target], longest_s: float, tip_slope_rad: float
 ) -> tuple[Real, Real, list[Segment], float]:
     """Scan and pieces until everything is reached: reference, angle, pieces, slowest decision."""
     reference_rad = SCAN.reference_rad
@@ -71,7 +71,7 @@ def designed(
     return reference_rad, angle_rad, pieces, slowest_s
 
 
-def steady_s(rig: LoopPreview, targets: list[Target], tip_slope_rad: float) -> float:
+def steady_s(rig: RigPreview, targets: list[Target], tip_slope_rad: float) -> float:
     """Time of the best steady sines from nothing: below it no session can be."""
     record = RecordSoFar.of(np.zeros(8), ESTIMATE, RATE_HZ, 8.0)
     plant = rig.plant_with(LINK, DAMPING)
@@ -81,7 +81,7 @@ def steady_s(rig: LoopPreview, targets: list[Target], tip_slope_rad: float) -> f
     )
 
 
-def table(rig: LoopPreview, slopes_rad: list[float]) -> None:
+def table(rig: RigPreview, slopes_rad: list[float]) -> None:
     """Print times to what is asked."""
     asked = {
         "damping 1 %": [parse_target("damping", "1%")],
@@ -114,7 +114,7 @@ def worst_percent(angle_rad: Real) -> float:
     return max(100 * each.std / each.value for each in precisions(angle_rad, targets))
 
 
-def curves(rig: LoopPreview, slope_rad: float) -> dict[str, tuple[Real, Real]]:
+def curves(rig: RigPreview, slope_rad: float) -> dict[str, tuple[Real, Real]]:
     """Largest relative deviation of a mode's damping in %, against the time of the record."""
     chirped = rig.plant_with(LINK, DAMPING).respond(chirp(rate_hz=RATE_HZ).reference_rad).angle_rad
     ends_s = np.array([41.0, 45.0, 60.0, 90.0, 100.0, 105.0, 108.0, 110.0, 115.0, 136.0])
@@ -146,7 +146,7 @@ def curves(rig: LoopPreview, slope_rad: float) -> dict[str, tuple[Real, Real]]:
     return found
 
 
-def swept_rad(rig: LoopPreview, duration_s: float) -> Real:
+def swept_rad(rig: RigPreview, duration_s: float) -> Real:
     """Angle of the scan, followed by narrow sweeps over the modes as it has found them."""
     found = [
         {"frequency_hz": mode.frequency_hz, "damping_ratio": mode.damping_ratio}
@@ -164,7 +164,7 @@ def swept_rad(rig: LoopPreview, duration_s: float) -> Real:
     return rig.plant_with(LINK, DAMPING).respond(reference_rad).angle_rad
 
 
-def draw(rig: LoopPreview, path: Path, slope_rad: float) -> None:
+def draw(rig: RigPreview, path: Path, slope_rad: float) -> None:
     """Draw them."""
     import matplotlib as mpl
 
@@ -191,7 +191,7 @@ def draw(rig: LoopPreview, path: Path, slope_rad: float) -> None:
     figure.savefig(path, dpi=130)
 
 
-def check(rig: LoopPreview, sessions: int, slope_rad: float) -> None:
+def check(rig: RigPreview, sessions: int, slope_rad: float) -> None:
     """Print what fits state over what was predicted, and their scatter."""
     targets = [parse_target("damping", "1%")]
     reference, angle, _, _ = designed(rig, targets, 30.0, slope_rad)
@@ -239,7 +239,7 @@ def main() -> None:
     parser.add_argument("--check", type=int, metavar="N", help="fit so many records")
     parser.add_argument("--picture", type=Path, help="draw precision against time")
     given = parser.parse_args()
-    rig = LoopPreview(replace(load_profile("sim")))
+    rig = RigPreview(replace(load_profile("sim")))
     slopes_rad = given.tip_slope or [0.14, 0.5]
     if given.check:
         check(rig, given.check, slopes_rad[0])

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.bench import _loops as loops
-from rigd.bench.measure import Measurement, figures, measurement
+from rigd.bench.measure import LoopMeasurement, figures, measurement
 from rigd.engine.processes import LIVE
 from rigd.engine.shared_state import Phase
 from rigd.excitation import make_excitation
@@ -72,7 +72,7 @@ def child_of(pid: int) -> int:
     return int(child)
 
 
-def run(seconds: float, *, live: bool) -> tuple[Measurement, str, float]:
+def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
     """Run one chirp.
 
     Returns

@@ -14,10 +14,10 @@ import statistics
 import sys
 from pathlib import Path
 
-from rigd.bench import HIGHEST_HZ, core_of, cores_beside
+from rigd.bench import HIGHEST_HZ, core_of, cores_without_loop
 from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
-from rigd.bench.measure import HELD, Figures, Measurement, figures
+from rigd.bench.measure import HELD, Figures, LoopMeasurement, figures
 from rigd.checks.machine import settings_granted
 from rigd.profile import load_profile
 from rigd.runtime import use_one_thread
@@ -37,7 +37,7 @@ def quiet() -> None:
     """Show no progress."""
 
 
-def one_round(seconds: float, granted: dict[str, str]) -> dict[str, Measurement]:
+def one_round(seconds: float, granted: dict[str, str]) -> dict[str, LoopMeasurement]:
     """Measure each once."""
     profile = load_profile("sim")
     plain = loops.rig_for(profile, RATE_HZ, 0.0)
@@ -49,12 +49,12 @@ def one_round(seconds: float, granted: dict[str, str]) -> dict[str, Measurement]
         IDLE: loops.run_alone(IDLE, plain, seconds, quiet),
         SPUN: loops.run_alone(SPUN, spinning, seconds, quiet),
     }
-    with loops.busy_stranger(cores_beside(granted)):
+    with loops.busy_program(cores_without_loop(granted)):
         found[LOADED] = loops.run_session(LOADED, plain, seconds, quiet, live=True)
     return found
 
 
-def show(found: dict[str, Measurement]) -> None:
+def show(found: dict[str, LoopMeasurement]) -> None:
     """Print a round, in µs."""
     print(f"load {os.getloadavg()[0]:.2f}, steal since boot {steal_s():.2f} s")
     for name, one in found.items():
@@ -76,7 +76,7 @@ def steal_s() -> float:
     return int(fields[8]) / os.sysconf("SC_CLK_TCK")
 
 
-def ratio(rounds: list[dict[str, Measurement]], over: str, under: str, which: str) -> float:
+def ratio(rounds: list[dict[str, LoopMeasurement]], over: str, under: str, which: str) -> float:
     """Return the median over the rounds of the ratio of two lateness figures."""
 
     def value(late: Figures) -> float:

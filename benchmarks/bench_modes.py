@@ -34,7 +34,7 @@ from rigd.beam import transfer
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation import chirp, modes
 from rigd.profile import Profile, load_profile
-from rigd.runner.planning import LoopPreview
+from rigd.runner.planning import RigPreview
 
 POLE_RAD_S = 80.0
 
@@ -154,7 +154,7 @@ def main() -> None:
             for amplitude_rad in given.amplitude or [0.025, 0.1]:
                 options = {"amplitude_rad": amplitude_rad, "widths": given.widths}
                 options["tip_slope_rad"] = given.tip_slope
-                rig = LoopPreview(profile_of(name))
+                rig = RigPreview(profile_of(name))
                 excitation = modes(rate_hz=RATE_HZ, path=document, rig=rig, **options)
                 print(f"\nUp to {amplitude_rad:g} rad: {excitation.parameters['bands']}")
                 if given.engine:

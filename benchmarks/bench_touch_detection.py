@@ -19,7 +19,7 @@ from rigd.excitation import chirp
 from rigd.excitation.moves import slew, still_path
 from rigd.identified_beam import TOUCH
 from rigd.profile import Profile, load_profile
-from rigd.runner.planning import LoopPreview
+from rigd.runner.planning import RigPreview
 from rigd.sim import SimulatedRig
 from rigd.touch import ChannelNoise, DetectorSettings, TouchDetector, TouchModel, watched_beam
 
@@ -86,7 +86,7 @@ def with_rig(profile: Profile, **changes: object) -> Profile:
 def detection(touches: int) -> None:
     """Slew into obstacles of any place and stiffness at any speed."""
     profile = load_profile("sim")
-    poles = LoopPreview(profile).move_plant("", TOUCH).poles_rad_s
+    poles = RigPreview(profile).move_plant("", TOUCH).poles_rad_s
     random = np.random.default_rng(1)
     delays, peaks, missed = [], [], 0
     for number in range(touches):
@@ -134,7 +134,7 @@ def detection(touches: int) -> None:
 def free_motion(hours: float) -> None:
     """Slew, move and sweep without obstacles."""
     profile = load_profile("sim")
-    poles = LoopPreview(profile).move_plant("", TOUCH).poles_rad_s
+    poles = RigPreview(profile).move_plant("", TOUCH).poles_rad_s
     random = np.random.default_rng(2)
     false = ticks = 0
     number = 0

@@ -19,12 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from rigd.bench import _loops as loops
-from rigd.bench.measure import Figures, Measurement, UsageMeter, figures, measurement
+from rigd.bench.measure import Figures, LoopMeasurement, UsageMeter, figures, measurement
 from rigd.checks.machine import settings_granted
 from rigd.excitation import Excitation, touch
 from rigd.profile import Profile, load_profile
 from rigd.runner._touch_search import touch_search
-from rigd.runner.planning import LoopPreview
+from rigd.runner.planning import RigPreview
 from rigd.runner.request import Order
 from rigd.runner.session import SessionProgress
 from rigd.runtime import StopRequest, use_one_thread
@@ -45,11 +45,11 @@ def search(profile: Profile, passes: int) -> Excitation:
         passes=passes,
         rest_s=0.5,
         ring_down_s=0.5,
-        rig=LoopPreview(profile),
+        rig=RigPreview(profile),
     )
 
 
-def session(name: str, profile: Profile, excitation: Excitation) -> Measurement:
+def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurement:
     """Run a session and measure its loop."""
     with (
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
@@ -58,7 +58,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> Measurement:
         meter = UsageMeter(group.control.pid)
 
         def watch(progress: SessionProgress, _: object) -> None:
-            meter.look(progress.phase)
+            meter.sample(progress.phase)
 
         order = Order(
             profile,
@@ -82,7 +82,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> Measurement:
     )
 
 
-def show(one: Measurement) -> tuple[Figures, Figures]:
+def show(one: LoopMeasurement) -> tuple[Figures, Figures]:
     """Print a session, in µs; return its lateness and work."""
     late, work = figures(one.lateness_us), figures(one.work_us)
     cpu = "" if one.cpu_percent is None else f"  CPU {one.cpu_percent:.1f} %"

@@ -34,7 +34,7 @@ from rigd.excitation import BeamEstimate, chirp
 from rigd.excitation.experiment_design import expected_precisions
 from rigd.excitation.targets import parse_target
 from rigd.profile import load_profile
-from rigd.runner.planning import LoopPreview
+from rigd.runner.planning import RigPreview
 
 Real = NDArray[np.float64]
 
@@ -133,7 +133,7 @@ def asked(rig: Rig) -> float:
     paper's, lower where the tip's slope would leave the range that pieces keep to.
     """
     beam, damping = rig.beam(), rig.damping
-    loop = LoopPreview(load_profile("sim")).plant_with(LoadedBeam(beam, damping))
+    loop = RigPreview(load_profile("sim")).plant_with(LoadedBeam(beam, damping))
     angle_rad = loop.respond(chirp(rate_hz=RATE_HZ).reference_rad).angle_rad
     slope = tip_motion(beam, damping, angle_rad, RATE_HZ).slope_rad
     angle_rad = angle_rad * min(1.0, 0.9 * SMALL_SLOPE_RAD / slope)

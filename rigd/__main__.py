@@ -12,7 +12,7 @@ def main() -> None:
     """Run the command line; Ctrl-C ends it with 130 even while it is still being imported."""
     signal.signal(signal.SIGINT, _end)
     _fill_standard_descriptors()
-    from rigd.runtime import let_pass, use_one_thread
+    from rigd.runtime import ignore_handled_signals, use_one_thread
 
     use_one_thread()
     if sys.argv[1:] == ["stop"]:
@@ -22,7 +22,7 @@ def main() -> None:
     try:
         run()
     finally:
-        let_pass()
+        ignore_handled_signals()
 
 
 def _end(*_: object) -> None:

@@ -52,7 +52,7 @@ class RigdError(Exception):
     wrong_use = False
     """Whether the request must be changed; otherwise the same request may succeed later."""
 
-    def told(self) -> str:
+    def full_message(self) -> str:
         """Return the message for the operator; this may take some seconds for further checks."""
         return str(self)
 

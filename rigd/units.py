@@ -143,7 +143,7 @@ def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "")
     return " to ".join(to_uncertainty(interval, half, scale, sign))
 
 
-def with_share(std: float, value: float) -> str:
+def with_percentage(std: float, value: float) -> str:
     """Return a standard deviation as text, with its percentage of the value unless that is 0.
 
     Parameters

@@ -39,4 +39,4 @@ def test_the_drawing_names_every_error_under_its_base():
 def test_the_bases_tell_the_two_kinds_apart():
     assert errors.UserError("x").wrong_use
     assert not errors.FailureError("x").wrong_use
-    assert errors.FailureError("what to do").told() == "what to do"
+    assert errors.FailureError("what to do").full_message() == "what to do"

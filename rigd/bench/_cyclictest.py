@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigd.bench.measure import Measurement
+from rigd.bench.measure import LoopMeasurement
 from rigd.engine.realtime import WAKE_UP_US
 from rigd.errors import FailureError
 
@@ -29,7 +29,7 @@ def installed() -> bool:
     return shutil.which(NAME) is not None
 
 
-def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> Measurement:
+def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> LoopMeasurement:
     """Run cyclictest on the core of the loop, with its policy, priority and interval.
 
     `priority` is that of SCHED_FIFO; 0 means the ordinary policy.
@@ -55,7 +55,7 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> Measureme
     return measured(done.stdout, rate_hz)
 
 
-def measured(output: str, rate_hz: float) -> Measurement:
+def measured(output: str, rate_hz: float) -> LoopMeasurement:
     """Return the measurement from the output of ``cyclictest --histogram`` with one thread.
 
     A wake-up one period or more late counts as missed ticks, because cyclictest also continues with
@@ -65,7 +65,7 @@ def measured(output: str, rate_hz: float) -> Measurement:
     if not delays_us.size:
         raise CyclictestError("its output holds no histogram.")
     missed = int(np.floor(delays_us * rate_hz * 1e-6).sum())
-    return Measurement(
+    return LoopMeasurement(
         NAME, rate_hz, delays_us, np.empty(0), scheduled=delays_us.size + missed, missed=missed
     )
 

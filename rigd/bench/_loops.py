@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.bench.measure import Measurement, UsageMeter, measurement
+from rigd.bench.measure import LoopMeasurement, UsageMeter, measurement
 from rigd.devices import unknown_values
 from rigd.devices.parameters import Selection
 from rigd.engine.messages import Finished, SessionJob
@@ -101,7 +101,7 @@ def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, Pr
         raise LoopError(str(error)) from error
 
 
-def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> Measurement:
+def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> LoopMeasurement:
     """Measure the loop alone, with only a reader that empties the ring; raise LoopError."""
     rate_hz, excitation = profile.rig.rate_hz, _excitation(profile, seconds)
     with connected(profile) as (_, group):
@@ -116,7 +116,7 @@ def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> M
         while not isinstance(finished, Finished):
             finished = group.control.poll(_POLL_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
-            meter.look(Phase(shared_state[StateField.PHASE]))
+            meter.sample(Phase(shared_state[StateField.PHASE]))
             while block := channels.samples.take(_BLOCK):
                 blocks.append(block)
             channels.controls.discard()
@@ -135,7 +135,7 @@ def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> M
 
 def run_session(
     name: str, profile: Profile, seconds: float, on_poll: OnPoll, *, live: bool = False
-) -> Measurement:
+) -> LoopMeasurement:
     """Measure a whole session, as ``rigd run``, with a temporary file; raise LoopError."""
     excitation = _excitation(profile, seconds)
     with (
@@ -149,7 +149,7 @@ def run_session(
             rig.show(order, stop)
 
         def watch(progress: SessionProgress, _: object) -> None:
-            meter.look(progress.phase)
+            meter.sample(progress.phase)
             on_poll()
 
         result = rig.run(order, stop, watch)
@@ -167,7 +167,7 @@ def run_session(
 
 
 @contextmanager
-def busy_stranger(cores: set[int]) -> Iterator[int]:
+def busy_program(cores: set[int]) -> Iterator[int]:
     """Run a busy program on some cores; yield its process id."""
     with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as stranger:
         try:

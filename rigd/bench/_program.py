@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
-from rigd.bench.measure import HELD, Measurement, figures, pooled
+from rigd.bench.measure import HELD, LoopMeasurement, figures, pooled
 from rigd.checks.machine import settings_granted
 from rigd.engine.realtime import REFUSED
 from rigd.profile import Profile
@@ -42,22 +42,22 @@ class Results:
     """Value granted by the system for each real-time setting."""
     load_average: tuple[float, float, float]
     """Load average of this computer before the measurements."""
-    rounds: list[tuple[Measurement, Measurement | None]] = field(default_factory=list)
+    rounds: list[tuple[LoopMeasurement, LoopMeasurement | None]] = field(default_factory=list)
     """The loop alone, each followed by cyclictest."""
-    sessions: list[Measurement] = field(default_factory=list)
+    sessions: list[LoopMeasurement] = field(default_factory=list)
     """Sessions with the recorder and increasing load."""
-    search: list[Measurement] = field(default_factory=list)
+    search: list[LoopMeasurement] = field(default_factory=list)
     """Sessions at other rates, and the best one at this rate."""
     no_peer: str = ""
     """Why there is no cyclictest."""
 
     @property
-    def alone(self) -> Measurement:
+    def alone(self) -> LoopMeasurement:
         """Pooled rounds of the loop."""
         return pooled(ALONE, [ours for ours, _ in self.rounds])
 
     @property
-    def peer(self) -> Measurement | None:
+    def peer(self) -> LoopMeasurement | None:
         """Pooled rounds of cyclictest."""
         theirs = [their for _, their in self.rounds if their is not None]
         return pooled(cyclictest.NAME, theirs) if theirs else None
@@ -155,7 +155,7 @@ class Bench:
         """Measure whole sessions, with increasing load in addition to the loop."""
         results.sessions.append(self.session(RECORDED))
         results.sessions.append(self.session(SHOWN, live=True))
-        with loops.busy_stranger(cores_beside(results.granted)):
+        with loops.busy_program(cores_without_loop(results.granted)):
             results.sessions.append(self.session(LOADED, live=True))
 
     def search(self, results: Results) -> None:
@@ -180,7 +180,7 @@ class Bench:
 
     def session(
         self, name: str, *, rate_hz: float | None = None, live: bool = False
-    ) -> Measurement:
+    ) -> LoopMeasurement:
         """Measure a whole session, by default at the rate of the bench.
 
         Parameters
@@ -197,12 +197,12 @@ class Bench:
         profile = loops.rig_for(self._profile, rate_hz, self._spin_us)
         return loops.run_session(name, profile, self._seconds, self._show_progress, live=live)
 
-    def _alone(self) -> Measurement:
+    def _alone(self) -> LoopMeasurement:
         self._begin(ALONE)
         profile = loops.rig_for(self._profile, self._rate_hz, self._spin_us)
         return loops.run_alone(ALONE, profile, self._seconds, self._show_progress)
 
-    def _peer(self, results: Results) -> Measurement | None:
+    def _peer(self, results: Results) -> LoopMeasurement | None:
         self._begin(cyclictest.NAME)
         self._show_progress()
         if not cyclictest.installed():
@@ -242,17 +242,17 @@ def core_of(granted: dict[str, str]) -> int:
     return max(os.sched_getaffinity(0)) if text.startswith(REFUSED) else int(text.split(",")[0])
 
 
-def cores_beside(granted: dict[str, str]) -> set[int]:
+def cores_without_loop(granted: dict[str, str]) -> set[int]:
     """Return the cores without the loop; all cores if there is only one."""
     allowed = os.sched_getaffinity(0)
     return allowed - {core_of(granted)} or allowed
 
 
-def _merit(one: Measurement) -> tuple[bool, float]:
+def _merit(one: LoopMeasurement) -> tuple[bool, float]:
     return one.held >= HELD, one.held_between_stalls
 
 
-def _holds(one: Measurement) -> bool:
+def _holds(one: LoopMeasurement) -> bool:
     return one.held_between_stalls >= HELD
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.bench._program import Results
-from rigd.bench.measure import HELD, STALL_US, Measurement, figures
+from rigd.bench.measure import HELD, STALL_US, LoopMeasurement, figures
 from rigd.engine.realtime import REFUSED
 
 _NAME = 28
@@ -101,12 +101,12 @@ def as_json(results: Results) -> dict[str, object]:
     }
 
 
-def _rows(results: Results) -> list[Measurement]:
+def _rows(results: Results) -> list[LoopMeasurement]:
     peer = results.peer
     return [results.alone, *([] if peer is None else [peer]), *results.sessions]
 
 
-def _table(rows: list[Measurement]) -> Iterator[str]:
+def _table(rows: list[LoopMeasurement]) -> Iterator[str]:
     yield (
         f"{'':{_NAME}}{'wake-up latency, µs':>40}   {'execution, µs':>16}   {'missed':>7}  "
         f"{'CPU':>5}  faults"
@@ -130,7 +130,7 @@ def _table(rows: list[Measurement]) -> Iterator[str]:
         yield text
 
 
-def _search_table(search: list[Measurement]) -> Iterator[str]:
+def _search_table(search: list[LoopMeasurement]) -> Iterator[str]:
     yield (
         f"{'':>10}{'held, %':>9}{'but stalls':>12}{'stalls':>8}{'late p99, µs':>14}"
         f"{'exec p99, µs':>14}{'CPU, %':>8}"
@@ -155,7 +155,7 @@ def _peer_lines(results: Results) -> Iterator[str]:
     )
 
 
-def _as_dict(one: Measurement) -> dict[str, object]:
+def _as_dict(one: LoopMeasurement) -> dict[str, object]:
     return {
         "name": one.name,
         "rate_hz": one.rate_hz,

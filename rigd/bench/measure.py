@@ -63,7 +63,7 @@ class UsageMeter:
         self._pid = pid
         self._readings: list[tuple[float, Usage]] = []
 
-    def look(self, phase: Phase) -> None:
+    def sample(self, phase: Phase) -> None:
         """Read the usage if the record is running."""
         if phase == Phase.RUNNING:
             try:
@@ -105,8 +105,8 @@ class Figures:
 
 
 @dataclass(frozen=True, slots=True)
-class Measurement:
-    """Measurement of one loop for some seconds."""
+class LoopMeasurement:
+    """LoopMeasurement of one loop for some seconds."""
 
     name: str
     """Name of the measurement, with the load."""
@@ -184,7 +184,7 @@ def measurement(
     scheduled: int,
     cpu_percent: float | None,
     page_faults: int | None,
-) -> Measurement:
+) -> LoopMeasurement:
     """Return the measurement from the samples of a record.
 
     Parameters
@@ -200,7 +200,7 @@ def measurement(
     cpu_percent, page_faults
         Processor load and page faults of the control process.
     """
-    return Measurement(
+    return LoopMeasurement(
         name,
         rate_hz,
         wake_ups_us(samples, rate_hz),
@@ -212,7 +212,7 @@ def measurement(
     )
 
 
-def pooled(name: str, parts: list[Measurement]) -> Measurement:
+def pooled(name: str, parts: list[LoopMeasurement]) -> LoopMeasurement:
     """Return the pooled measurement of several measurements of the same loop.
 
     Parameters
@@ -224,7 +224,7 @@ def pooled(name: str, parts: list[Measurement]) -> Measurement:
     """
     costs = [part.cpu_percent for part in parts if part.cpu_percent is not None]
     faults = [part.page_faults for part in parts if part.page_faults is not None]
-    return Measurement(
+    return LoopMeasurement(
         name,
         parts[0].rate_hz,
         np.concatenate([part.lateness_us for part in parts]),

@@ -11,7 +11,7 @@ from rigd.checks.rows import Row, Verdict, grade
 from rigd.devices import unknown_values
 from rigd.errors import UserError
 from rigd.profile import Profile
-from rigd.runner.planning import LoopPreview, excitation_for
+from rigd.runner.planning import RigPreview, excitation_for
 
 
 def check_rig(profile: Profile) -> list[Row]:
@@ -63,7 +63,7 @@ def default_session_rows(profile: Profile) -> Iterator[Row]:
     """
     try:
         chirp = excitation_for(profile, "chirp", {})
-        percent = 100 * LoopPreview(profile).fraction_of_limits(chirp.reference_rad)
+        percent = 100 * RigPreview(profile).fraction_of_limits(chirp.reference_rad)
     except UserError:  # an unstable loop or an unknown value, which have rows of their own
         return
     beyond = not percent <= 100

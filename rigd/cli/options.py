@@ -37,7 +37,7 @@ def exit_on_errors() -> Iterator[None]:
     try:
         yield
     except RigdError as error:
-        fail(error.told(), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
+        fail(error.full_message(), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
 
 
 # Progress

@@ -41,7 +41,7 @@ from rigd.cli.start import SessionCommands, start_processes, start_sessions
 
 if TYPE_CHECKING:
     from rigd.excitation import Value
-    from rigd.runner.session import SessionResult
+    from rigd.runner.session import RunResult
 
 run_app = typer.Typer(
     name="run",
@@ -448,7 +448,7 @@ def until(
     }
 
 
-def _write_json(results: "list[SessionResult]") -> None:
+def _write_json(results: "list[RunResult]") -> None:
     from rigd.runner.session import results_document
 
     try:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.daemon._log import NAME
-from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, held_back
+from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, signals_blocked
 from rigd.runtime.addresses import announce, file_name, read_address, runtime_folder, started_at
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class PageProcess:
 
     def _run(self) -> None:
         """Start the process and wait for its end."""
-        with held_back():
+        with signals_blocked():
             process = subprocess.Popen(
                 [*OWN_PYTHON, *_PROGRAM],
                 stdin=subprocess.PIPE,

@@ -11,7 +11,7 @@ from rigd.daemon._log import NAME
 from rigd.daemon._states import DaemonState, Document, fit_document
 from rigd.engine.shared_state import LogEvent
 from rigd.runner import RigError, Series, result_line
-from rigd.runner.session import SessionProgress, SessionResult
+from rigd.runner.session import RunResult, SessionProgress
 from rigd.runtime import StopRequest
 
 _LOGGED = {
@@ -40,7 +40,7 @@ class ServedSeries:
     path: Path | None = None
     fit: Document | None = None
     """Last fit of that session's record."""
-    results: list[SessionResult] = field(default_factory=list)
+    results: list[RunResult] = field(default_factory=list)
     """Results of the sessions so far, including a failed one."""
     reason: str = ""
     """Reason for an early end."""
@@ -130,7 +130,7 @@ class SeriesReporter:
         for fit in progress.fits:
             self._report_fit(fit)
 
-    def ended(self, result: SessionResult, *, look_follows: bool) -> None:
+    def ended(self, result: RunResult, *, look_follows: bool) -> None:
         series = self._series
         series.results.append(result)
         fit = {}

@@ -41,7 +41,7 @@ from rigd.errors import UserError
 from rigd.profile import Profile
 from rigd.runner import ProbeFailedError, Rig, RigError, Series
 from rigd.runner.quick_looks import QuickLook, QuickLooks
-from rigd.runner.request import what_is_kept
+from rigd.runner.request import remaining_file_text
 from rigd.runner.session import SessionFailedError
 from rigd.runner.status import RigStatus
 
@@ -162,7 +162,7 @@ class Service:
             self._listened_s = time.monotonic()
             self.poll_status()
             if self._quick_looks is not None:
-                self._quick_looks.attend()
+                self._quick_looks.poll()
             # Returns at once while the worker thread is busy, so that the polls continue.
             await self.watch()
 
@@ -507,7 +507,7 @@ class Service:
             series.reason = str(error)
             if not error.wrong_use:
                 path = error.path if isinstance(error, SessionFailedError) else None
-                fault = series.reason = f"{error} {what_is_kept(path)}"
+                fault = series.reason = f"{error} {remaining_file_text(path)}"
         except Exception as error:
             # After an unexpected error everything is switched off, because nothing else may do so.
             _log.exception("unexpected error in a session")
@@ -553,7 +553,7 @@ class Service:
                 reporter,
                 live=self._live,
                 listens=self._listens,
-                looks=self._quick_looks,
+                quick_looks=self._quick_looks,
             )
         except SessionFailedError as error:
             reporter.ended(error.result(), look_follows=False)

@@ -305,7 +305,7 @@ def fit_document(fit: Mapping[str, Any]) -> Document:
     Parameters
     ----------
     fit
-        The fit, as in `SessionResult.fit`.
+        The fit, as in `RunResult.fit`.
     """
     return {name: _bounded(fit[name]) for name in _OF_A_FIT if name in fit}
 

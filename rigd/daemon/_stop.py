@@ -313,7 +313,7 @@ class _Daemon:
                 "drive."
             )
         elif self._error is not None:
-            report.doubts.append(f"Not stopped: {where}. {self._error.told()}")
+            report.doubts.append(f"Not stopped: {where}. {self._error.full_message()}")
         elif not self._reply:
             report.doubts.append(f"The daemon of {where} does not answer. {UNKNOWN_STATE}")
         elif not self._wait:

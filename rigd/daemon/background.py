@@ -25,7 +25,7 @@ from rigd.profile import Profile, with_specimen
 from rigd.runner import Series, with_tip_slope
 from rigd.runner.planning import excitation_for, largest_amplitude, plan_document, predict_session
 from rigd.runner.request import NoRoomError
-from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, killed_first
+from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, prefer_oom_kill
 
 _PATIENCE_S: Final = 50.0
 """Less than the client's timeout, so that the client gets a reply."""
@@ -210,7 +210,7 @@ def main() -> None:
 
     Unpickling is safe, because this program writes both ends.
     """
-    killed_first()
+    prefer_oom_kill()
     most_bytes = _memory_limit()
     resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
     job = pickle.load(sys.stdin.buffer)

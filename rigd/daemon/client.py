@@ -59,7 +59,7 @@ class DaemonGoneError(FailureError):
         super().__init__(message)
         self._lost = lost
 
-    def told(self) -> str:
+    def full_message(self) -> str:
         """Return the message; for a lost daemon, after up to 3 s, with what still runs."""
         return str(self) if self._lost is None else describe_remains(*self._lost)
 

@@ -23,7 +23,7 @@ from rigd.engine._control_names import CONTROL_MODULE
 from rigd.engine.messages import MessageReader, encode, is_ready
 from rigd.engine.shared_state import StateField
 from rigd.errors import FailureError
-from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, held_back, signal_when_orphaned
+from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, signal_when_orphaned, signals_blocked
 
 _WRITE_PATIENCE_S = 5.0
 _SILENT_GRACE_S = 1.0
@@ -62,7 +62,7 @@ class Child:
     ) -> None:
         self.name = name
         try:
-            with held_back():
+            with signals_blocked():
                 self._process = subprocess.Popen(
                     [*OWN_PYTHON, "-m", module, str(os.getpid())],
                     bufsize=0,

@@ -26,7 +26,7 @@ from rigd.excitation._signals import (
 from rigd.excitation.experiment_design import DesignRig, geometry_floors
 from rigd.excitation.moves import quintic
 from rigd.excitation.targets import QUANTITIES, Target, parse_target
-from rigd.units import with_share
+from rigd.units import with_percentage
 
 Real = NDArray[np.float64]
 
@@ -238,7 +238,8 @@ def _refuse_below_floor(
         return
     floors_text = "; ".join(
         f"{each.target} (standard deviation) is below the floor of "
-        f"{with_share(each.std, each.value)}, {with_share(each.exact_std, each.value)} if the beam "
+        f"{with_percentage(each.std, each.value)}, "
+        f"{with_percentage(each.exact_std, each.value)} if the beam "
         "is exactly uniform"
         for each in below
     )

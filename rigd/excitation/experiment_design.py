@@ -243,7 +243,7 @@ def design_excitation(
     estimate
         Beam, damping and noise as they are known beforehand.
     rig
-        Closed loop and limits: `rigd.runner.planning.LoopPreview`.
+        Closed loop and limits: `rigd.runner.planning.RigPreview`.
     targets
         Targets of the session.
     duration_s
@@ -267,7 +267,7 @@ def design_excitation(
     >>> from rigd.excitation.experiment_design import design_excitation
     >>> from rigd.excitation.targets import parse_target
     >>> from rigd.profile import load_profile
-    >>> from rigd.runner.planning import LoopPreview
+    >>> from rigd.runner.planning import RigPreview
     >>> estimate = BeamEstimate(
     ...     beam=Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903),
     ...     damping=Damping(zeta=7e-5, gamma=0.02),
@@ -275,7 +275,7 @@ def design_excitation(
     ...     noise_frequency_hz=np.array([1.0]),
     ...     noise_nm2_per_hz=np.array([5e-8]),
     ... )
-    >>> rig = LoopPreview(load_profile("sim"))
+    >>> rig = RigPreview(load_profile("sim"))
     >>> design = design_excitation(estimate, rig, [parse_target("zeta", "2%")], 20.0)
     >>> all(each.reached for each in design.expected), design.reference_rad.size < 10_000
     (True, True)

@@ -56,7 +56,7 @@ def result_line(session: Mapping[str, Any]) -> str:
     Parameters
     ----------
     session
-        The result as :meth:`rigd.runner.session.SessionResult.as_dict` returns it.
+        The result as :meth:`rigd.runner.session.RunResult.as_dict` returns it.
     """
     outcome = session["outcome"].capitalize()
     reason = f" {session['reason']}" if session["reason"] else ""

@@ -21,8 +21,8 @@ from rigd.runner._rig import Rig
 from rigd.runner._series import Series
 from rigd.runner._tip_slope import with_tip_slope
 from rigd.runner.quick_looks import QuickLook, QuickLooks
-from rigd.runner.request import load_rig, what_is_kept
-from rigd.runner.session import SessionFailedError, SessionProgress, SessionResult
+from rigd.runner.request import load_rig, remaining_file_text
+from rigd.runner.session import RunResult, SessionFailedError, SessionProgress
 from rigd.runtime import RigLock, StopRequest
 
 _QUICK_LOOK_PATIENCE_S: Final = 10.0
@@ -51,7 +51,7 @@ class SeriesFailedError(FailureError):
         The same results as a list.
     """
 
-    def __init__(self, message: str, results: Sequence[SessionResult] = ()) -> None:
+    def __init__(self, message: str, results: Sequence[RunResult] = ()) -> None:
         super().__init__(message)
         self.results = list(results)
 
@@ -79,7 +79,7 @@ def run_in_foreground(
     watch_fit: bool = False,
     identifies_motor: bool = False,
     tip_slope_rad: float | None = None,
-) -> list[SessionResult]:
+) -> list[RunResult]:
     """Run `repeat` sessions; end at a stop or at the first incomplete session.
 
     Parameters
@@ -123,7 +123,7 @@ def run_in_foreground(
         If a session cannot be run, or failed.
     """
     write: _Print = partial(_print, err=quiet_stdout)
-    results: list[SessionResult] = []
+    results: list[RunResult] = []
 
     def report(quick_look: QuickLook) -> None:
         quick_look.note(results)
@@ -170,7 +170,7 @@ def run_in_foreground(
             if not (stop.requested or rig.connected):
                 rig.connect(moving)
             with _Operator(series.ticks, repeat, write) as operator:
-                series.run(rig, stop, operator, live=live, looks=quick_looks)
+                series.run(rig, stop, operator, live=live, quick_looks=quick_looks)
         if stop.requested:
             _print_stop(results, repeat)
         if quick_looks is not None:
@@ -178,7 +178,7 @@ def run_in_foreground(
     except SessionFailedError as error:
         # The processes have ended, so that the remaining file can be reported.
         results.append(error.result())
-        raise SeriesFailedError(f"{error} {what_is_kept(error.path)}", results) from error
+        raise SeriesFailedError(f"{error} {remaining_file_text(error.path)}", results) from error
     except RigdError as error:
         if error.wrong_use and not results:
             raise
@@ -234,7 +234,7 @@ class _Operator:
             number=self._number,
         )
 
-    def ended(self, result: SessionResult, *, look_follows: bool) -> None:  # noqa: ARG002
+    def ended(self, result: RunResult, *, look_follows: bool) -> None:  # noqa: ARG002
         self._close()
         self._print(result_line(result.as_dict()))
         if result.path is not None:
@@ -263,7 +263,7 @@ def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
         skipped = True
 
     stop.on_request = skip
-    quick_looks.attend()
+    quick_looks.poll()
     if quick_looks.busy:
         _print("Quick look at the session; Ctrl-C skips it.", err=True)
     deadline_s = time.monotonic() + _LONGEST_QUICK_LOOK_S
@@ -274,7 +274,7 @@ def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
         and time.monotonic() < deadline_s
     ):
         time.sleep(_POLL_S)
-        quick_looks.attend()
+        quick_looks.poll()
     if quick_looks.busy and not skipped:
         why = (
             "took too long"
@@ -288,7 +288,7 @@ def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
     stop.requested = before  # this Ctrl-C skipped the quick look only
 
 
-def _print_stop(results: Sequence[SessionResult], repeat: int) -> None:
+def _print_stop(results: Sequence[RunResult], repeat: int) -> None:
     """Report a stop between two sessions or before the first one; a session reports its own."""
     if len(results) == repeat or any(not result.went_well for result in results):
         return

@@ -21,9 +21,9 @@ from rigd.excitation import BAND_HZ, PAUSE_S, SHORTEST_S, BeamEstimate, Precisio
 from rigd.excitation.experiment_design import expected_precisions, next_segment
 from rigd.excitation.targets import Target
 from rigd.profile import Profile
-from rigd.runner.planning import LoopPreview
+from rigd.runner.planning import RigPreview
 from rigd.session import Validity
-from rigd.units import with_half_width, with_share
+from rigd.units import with_half_width, with_percentage
 
 Real = NDArray[np.float64]
 
@@ -172,7 +172,7 @@ class ExcitationPlanner:
     ) -> None:
         self._targets = search.targets
         self._tip_slope_rad = search.tip_slope_rad
-        self._rig = LoopPreview(profile, start_rad)
+        self._rig = RigPreview(profile, start_rad)
         self._writer = writer
         self._rate_hz = profile.rig.rate_hz
         self._most_ticks = writer.ticks + writer.room
@@ -509,4 +509,6 @@ def in_words(found: Sequence[TargetEstimate]) -> str:
 def _one_in_words(each: TargetEstimate) -> str:
     if each.value is None or each.doubt:
         return f"{each.name}: {each.doubt}"
-    return f"{each.name} {each.value:.5g}, standard deviation {with_share(each.std, each.value)}"
+    return (
+        f"{each.name} {each.value:.5g}, standard deviation {with_percentage(each.std, each.value)}"
+    )

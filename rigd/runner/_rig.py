@@ -19,7 +19,7 @@ from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner.request import Order
-from rigd.runner.session import SessionFailedError, SessionResult, SessionRun, Watcher, always
+from rigd.runner.session import RunResult, SessionFailedError, SessionRun, Watcher, always
 from rigd.runner.signal_blocks import SignalBlock, SignalReader
 from rigd.runner.status import RigStatus, StatusWatch
 from rigd.runtime import StopRequest
@@ -162,7 +162,7 @@ class Rig:
         stop: StopRequest,
         watcher: Watcher,
         listens: Callable[[], bool] = always,
-    ) -> SessionResult:
+    ) -> RunResult:
         """Run one session.
 
         Parameters

@@ -18,7 +18,7 @@ from rigd.runner._touch_search import touch_search
 from rigd.runner.planning import RefusedError, plan_document, plan_session, predicted_metadata
 from rigd.runner.quick_looks import QuickLooks
 from rigd.runner.request import Order, check_required, choose_path, make_room
-from rigd.runner.session import SessionProgress, SessionResult, always
+from rigd.runner.session import RunResult, SessionProgress, always
 from rigd.runtime import StopRequest
 
 _QUICK_LOOK_PATIENCE_S: Final = 8.0
@@ -42,7 +42,7 @@ class SeriesWatcher(Protocol):
     def update(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         """Receive progress and events, about fifty times a second."""
 
-    def ended(self, result: SessionResult, *, look_follows: bool) -> None:
+    def ended(self, result: RunResult, *, look_follows: bool) -> None:
         """Receive the result, and whether a quick look follows."""
 
 
@@ -116,7 +116,7 @@ class Series:
             )
         self.plan = plan_session(profile, excitation, force=force, accept=accept)
         self._touch = touch_search(profile, excitation)
-        self.results: list[SessionResult] = []
+        self.results: list[RunResult] = []
         self._make_room()
 
     @property
@@ -140,7 +140,7 @@ class Series:
         *,
         live: bool,
         listens: Callable[[], bool] = always,
-        looks: QuickLooks | None = None,
+        quick_looks: QuickLooks | None = None,
     ) -> None:
         """Run the sessions; end at a stop or at the first incomplete session.
 
@@ -158,7 +158,7 @@ class Series:
             Show each session in a live view.
         listens
             See :class:`rigd.runner.session.Session`.
-        looks
+        quick_looks
             Makes a quick look at each session; the next session waits some seconds for it.
 
         Raises
@@ -177,8 +177,8 @@ class Series:
                 return  # the move was stopped, and nothing else happened
             raise
         for number in range(1, self._repeat + 1):
-            if looks is not None and number > 1:
-                _await_quick_look(looks, rig, stop)
+            if quick_looks is not None and number > 1:
+                _await_quick_look(quick_looks, rig, stop)
             if stop.requested:
                 return
             self._make_room()
@@ -203,16 +203,16 @@ class Series:
                 self._seed(number),
                 self.plan.clearance.accepted,
             )
-            with contextlib.nullcontext() if looks is None else looks.held():
+            with contextlib.nullcontext() if quick_looks is None else quick_looks.held():
                 if live:
                     watcher.shown(rig.show(order, stop))
                 result = rig.run(order, stop, watcher.update, listens)
             self.results.append(result)
             # The record of a vibration-free move contains no information on the modes.
             seen = result.path if self._excitation.shows_modes else None
-            watcher.ended(result, look_follows=looks is not None and seen is not None)
-            if looks is not None and seen is not None:
-                looks.begin(seen)
+            watcher.ended(result, look_follows=quick_looks is not None and seen is not None)
+            if quick_looks is not None and seen is not None:
+                quick_looks.begin(seen)
             if not result.went_well:
                 return
 
@@ -238,10 +238,10 @@ class Series:
         make_room(self._folder, self._excitation, self._profile.limits)
 
 
-def _await_quick_look(looks: QuickLooks, rig: Rig, stop: StopRequest) -> None:
+def _await_quick_look(quick_looks: QuickLooks, rig: Rig, stop: StopRequest) -> None:
     """Wait for the quick look at the last session before the next session suspends it."""
     deadline_s = time.monotonic() + _QUICK_LOOK_PATIENCE_S
-    while looks.busy and not stop.requested and time.monotonic() < deadline_s:
+    while quick_looks.busy and not stop.requested and time.monotonic() < deadline_s:
         rig.watch()
-        looks.attend()
+        quick_looks.poll()
         time.sleep(_POLL_S)

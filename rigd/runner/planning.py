@@ -95,7 +95,7 @@ class Plan:
     """Results of the checks on paper."""
 
 
-class LoopPreview:
+class RigPreview:
     """Preview of the closed loop of a rig, for the design of an excitation.
 
     Parameters
@@ -226,7 +226,7 @@ def excitation_for(
     """
     if "tip_slope_rad" in inspect.signature(KINDS[kind]).parameters:
         parameters = {"tip_slope_rad": profile.limits.tip_slope_rad} | dict(parameters)
-    return make_excitation(kind, parameters, profile.rig.rate_hz, LoopPreview(profile, start_rad))
+    return make_excitation(kind, parameters, profile.rig.rate_hz, RigPreview(profile, start_rad))
 
 
 def plan_session(

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.printable import printable
-from rigd.runner.session import SessionResult
+from rigd.runner.session import RunResult
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, processor_use
 from rigd.session.quick_look import quick_look_path, read_quick_look
 
@@ -73,7 +73,7 @@ class QuickLook:
             return [f"No quick look at {self.session.name}: {self.error}"]
         return [printable(str(line)) for line in self.content["text"]]
 
-    def note(self, results: list[SessionResult]) -> None:
+    def note(self, results: list[RunResult]) -> None:
         """Add the path of the file to the result of its session, if it is in the list."""
         for index, result in enumerate(results):
             if result.path == self.session:
@@ -90,7 +90,7 @@ class QuickLooks:
     Parameters
     ----------
     on_result
-        Called with the result of each quick look, in the thread that calls :meth:`attend`.
+        Called with the result of each quick look, in the thread that calls :meth:`poll`.
     """
 
     def __init__(self, on_result: Callable[[QuickLook], None]) -> None:
@@ -120,9 +120,9 @@ class QuickLooks:
         """Request a quick look at a session."""
         with self._lock:
             self._waiting.append(session)
-        self.attend()
+        self.poll()
 
-    def attend(self) -> None:
+    def poll(self) -> None:
         """Check progress and report results; call this several times a second between sessions."""
         with self._lock:
             ended = [*self._see(), *self._go_on()]

@@ -303,7 +303,7 @@ def another_path(path: Path) -> Path:
     return path.with_name(f"{path.stem}_2{path.suffix}")
 
 
-def what_is_kept(path: Path | None) -> str:
+def remaining_file_text(path: Path | None) -> str:
     """Return a sentence on the remaining file of a failed session, after its processes have ended.
 
     Parameters

@@ -79,7 +79,7 @@ class SessionFailedError(FailureError):
     counts: Mapping[str, int] = _NO_TICKS
     hardware: bool | None = None
 
-    def result(self) -> "SessionResult":
+    def result(self) -> "RunResult":
         """Return the result of the session, after its processes have ended."""
         part, whole = self.saved_path, None
         if part is None and self.path is not None:
@@ -90,7 +90,7 @@ class SessionFailedError(FailureError):
                     whole = self.path  # the recorder was only slow
             except OSError:
                 part = part_of(self.path)  # the folder cannot be read
-        return SessionResult(
+        return RunResult(
             path=whole,
             outcome="fault",
             reason=str(self),
@@ -111,7 +111,7 @@ class _NameTakenError(SessionFailedError):
 
 
 @dataclass(frozen=True, slots=True)
-class SessionResult:
+class RunResult:
     """Result of a session."""
 
     path: Path | None
@@ -251,7 +251,7 @@ class SessionRun:
         self._fit: FitSupervisor | None = None
         self.device_failed = False
 
-    def run(self, stop: StopRequest) -> SessionResult:
+    def run(self, stop: StopRequest) -> RunResult:
         """Run the session to its end.
 
         Raises
@@ -279,7 +279,7 @@ class SessionRun:
     def _stop(self) -> None:
         self._shared_state[StateField.STOP] = Stop.OPERATOR
 
-    def _run(self) -> SessionResult:
+    def _run(self) -> RunResult:
         group, search = self._group, self._order.excitation.search
         try:
             reference = put_reference(
@@ -511,7 +511,7 @@ class SessionRun:
             events,
         )
 
-    def _close(self, finished: Finished) -> SessionResult:
+    def _close(self, finished: Finished) -> RunResult:
         self._report()
         touches = None
         outcome = {
@@ -547,7 +547,7 @@ class SessionRun:
         ended, reason = finished.outcome, outcome["reason"]
         if closed.path is not None:
             ended, reason = closed.outcome, closed.reason
-        return SessionResult(
+        return RunResult(
             path=closed.path,
             outcome=ended,
             reason=reason,
@@ -567,7 +567,7 @@ class SessionRun:
         )
 
 
-def results_document(results: Sequence[SessionResult]) -> dict[str, Any]:
+def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
     """Return the results of a series as a JSON document.
 
     Parameters

@@ -5,7 +5,7 @@ processes (module `addresses`), the kernel's tables of processes and sockets (mo
 lock with the name of its holder (`HeldFile`), the lock of a rig (`RigLock`, `holds_rig`),
 background work at low priority (`begin_background`, `give_way`), opening of files named by users
 (`open_plain_file`), and the signals that request an end: `raise_on` for commands; `StopRequest`,
-`ignore`, `held_back` for the processes of a rig. The package depends on no other package. It
+`ignore`, `signals_blocked` for the processes of a rig. The package depends on no other package. It
 knows rigs by name only.
 """
 

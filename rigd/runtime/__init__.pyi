@@ -3,9 +3,9 @@ from . import processes as processes
 from ._background import OWN_PYTHON as OWN_PYTHON
 from ._background import SINGLE_THREADED as SINGLE_THREADED
 from ._background import begin_background as begin_background
-from ._background import end_with as end_with
+from ._background import die_with_parent as die_with_parent
 from ._background import give_way as give_way
-from ._background import killed_first as killed_first
+from ._background import prefer_oom_kill as prefer_oom_kill
 from ._background import processor_use as processor_use
 from ._background import use_one_thread as use_one_thread
 from ._locks import HeldError as HeldError
@@ -18,8 +18,8 @@ from ._plain_files import open_plain_file as open_plain_file
 from ._plain_files import read_plain_file as read_plain_file
 from ._stop_signals import STOP_SIGNAL as STOP_SIGNAL
 from ._stop_signals import StopRequest as StopRequest
-from ._stop_signals import held_back as held_back
 from ._stop_signals import ignore as ignore
-from ._stop_signals import let_pass as let_pass
+from ._stop_signals import ignore_handled_signals as ignore_handled_signals
 from ._stop_signals import raise_on as raise_on
 from ._stop_signals import signal_when_orphaned as signal_when_orphaned
+from ._stop_signals import signals_blocked as signals_blocked

@@ -36,7 +36,7 @@ def use_one_thread() -> None:
     os.environ.update(SINGLE_THREADED)
 
 
-def killed_first() -> None:
+def prefer_oom_kill() -> None:
     """Make this process and its children the first victims of the OOM killer."""
     with suppress(OSError):  # not on Linux
         Path("/proc/self/oom_score_adj").write_text("1000")
@@ -80,7 +80,7 @@ def processor_use(pid: int) -> tuple[bool, float] | None:
     return fields[0] == "R", ticks / os.sysconf("SC_CLK_TCK")
 
 
-def end_with(parent: int) -> None:
+def die_with_parent(parent: int) -> None:
     """End this process when its parent ends, in whatever way.
 
     Parameters
@@ -110,7 +110,7 @@ def begin_background(parser: "ArgumentParser") -> "Namespace":
     parser.add_argument("--parent", type=int, help="End with the process of this number.")
     arguments = parser.parse_args()
     if arguments.parent is not None:
-        end_with(arguments.parent)
-    killed_first()
+        die_with_parent(arguments.parent)
+    prefer_oom_kill()
     use_one_thread()
     return arguments

@@ -41,7 +41,7 @@ def interrupt(number: int, _frame: FrameType | None) -> NoReturn:
     raise Interruption(number)
 
 
-def let_pass() -> None:
+def ignore_handled_signals() -> None:
     """Ignore the signals handled so far, so that another Ctrl-C does not interrupt the cleanup.
 
     Otherwise Python restores the default action of handled signals before its cleanup has ended,
@@ -92,7 +92,7 @@ _STOPPING = (
 
 
 @contextmanager
-def held_back() -> Iterator[None]:
+def signals_blocked() -> Iterator[None]:
     """Block these signals; a process started in this context inherits the block.
 
     It unblocks them with :meth:`StopRequest.catch` or :func:`ignore` when it can handle them.

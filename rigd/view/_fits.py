@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from rigd.session import Validity
 from rigd.session.online_fit import unseen_modes
-from rigd.units import suffix_of, unit_of, with_half_width, with_share
+from rigd.units import suffix_of, unit_of, with_half_width, with_percentage
 from rigd.view._session_info import plain
 from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Plot, PlotCurve, Source, Values
 
@@ -193,13 +193,13 @@ def _target_row(target: Mapping[str, Any]) -> tuple[str, ...]:
     if value is None:
         return plain(target["name"]), "–", "–", "–"
     if std is None:
-        return plain(target["name"]), f"{value:.4g}", "doubtful", with_share(target_std, value)
+        return plain(target["name"]), f"{value:.4g}", "doubtful", with_percentage(target_std, value)
     reached = " ✓" if std <= target_std else ""
     return (
         plain(target["name"]),
         f"{value:.4g}",
-        f"**{with_share(std, value)}**{reached}",
-        with_share(target_std, value),
+        f"**{with_percentage(std, value)}**{reached}",
+        with_percentage(target_std, value),
     )
 
 

@@ -22,10 +22,10 @@ MOST_JOBS: Final = 16
 _PROGRAM: Final = (*OWN_PYTHON, "-m", "analysis")
 _DIE_WITH_PAGE: Final = """
 import os, signal, sys
-from rigd.runtime import end_with, killed_first
+from rigd.runtime import die_with_parent, prefer_oom_kill
 
-end_with(int(sys.argv[1]))
-killed_first()
+die_with_parent(int(sys.argv[1]))
+prefer_oom_kill()
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the page ignores
 os.execv(sys.argv[2], sys.argv[2:])
 """

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.bench import Bench
-from rigd.bench.measure import Measurement
+from rigd.bench.measure import LoopMeasurement
 from rigd.profile import load_profile
 
 
@@ -17,7 +17,7 @@ def measured():
         missed = round(lateness_us.size * (1.0 / held - 1.0))
         work_us = np.full(1000, 20.0) if works else np.empty(0)
         scheduled = lateness_us.size + missed
-        return Measurement(name, rate_hz, lateness_us, work_us, scheduled, missed, cpu, 0)
+        return LoopMeasurement(name, rate_hz, lateness_us, work_us, scheduled, missed, cpu, 0)
 
     return make
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from rigd.bench import Results, as_json, report_lines
 from rigd.bench.measure import (
-    Measurement,
+    LoopMeasurement,
     UsageMeter,
     figures,
     measurement,
@@ -86,7 +86,7 @@ def results_of(*measurements):
 
 def loop_of(delays_us, name="loop"):
     delays_us = np.array(delays_us, dtype=float)
-    return Measurement(name, 1000.0, delays_us, np.full(1, 20.0), delays_us.size, 0)
+    return LoopMeasurement(name, 1000.0, delays_us, np.full(1, 20.0), delays_us.size, 0)
 
 
 @given(st.lists(st.floats(0.0, 1e7), min_size=1, max_size=50))
@@ -125,23 +125,23 @@ def test_the_account_of_a_process_is_read_whatever_its_name(tmp_path):
 
 def test_usage_is_taken_between_looks_at_a_running_record():
     meter = UsageMeter(os.getpid())
-    meter.look(Phase.TARING)
+    meter.sample(Phase.TARING)
     assert meter.cpu_percent is None
-    meter.look(Phase.RUNNING)
+    meter.sample(Phase.RUNNING)
     assert (meter.cpu_percent, meter.page_faults) == (None, None)
     with mmap.mmap(-1, 16 << 20) as fresh:  # from the system, not from what was freed before
         fresh[:: 1 << 12] = bytes(len(fresh) >> 12)
-    meter.look(Phase.RUNNING)
+    meter.sample(Phase.RUNNING)
     faults = meter.page_faults
     assert meter.cpu_percent is not None
     assert meter.cpu_percent > 0.0
     assert faults > 0
-    meter.look(Phase.RETURNING)
+    meter.sample(Phase.RETURNING)
     assert meter.page_faults == faults
 
 
 def test_a_process_that_is_gone_leaves_no_usage(monkeypatch):
     monkeypatch.setattr("rigd.bench.measure.usage_of", lambda pid: usage_of(pid, Path("/nowhere")))
     meter = UsageMeter(1)
-    meter.look(Phase.RUNNING)
+    meter.sample(Phase.RUNNING)
     assert meter.cpu_percent is None

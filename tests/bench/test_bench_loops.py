@@ -54,6 +54,6 @@ def test_a_loop_that_fails_is_told(profile, monkeypatch):
 
 
 def test_the_stranger_is_gone_afterwards():
-    with loops.busy_stranger(os.sched_getaffinity(0)) as pid:
+    with loops.busy_program(os.sched_getaffinity(0)) as pid:
         assert Path(f"/proc/{pid}").exists()
     assert not Path(f"/proc/{pid}").exists()

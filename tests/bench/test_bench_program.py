@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from rigd.bench import Bench, as_json, cores_beside, report_lines
+from rigd.bench import Bench, as_json, cores_without_loop, report_lines
 from rigd.engine.realtime import REFUSED
 from rigd.profile import load_profile
 
@@ -136,10 +136,10 @@ def test_the_table_has_a_row_for_each(bench):
 
 def test_the_neighbour_works_beside_the_loop(monkeypatch):
     monkeypatch.setattr("rigd.bench._program.os.sched_getaffinity", lambda _: {0, 1, 2})
-    assert cores_beside({"cpu": "2"}) == {0, 1}
-    assert cores_beside({"cpu": "2, isolated"}) == {0, 1}
+    assert cores_without_loop({"cpu": "2"}) == {0, 1}
+    assert cores_without_loop({"cpu": "2, isolated"}) == {0, 1}
     monkeypatch.setattr("rigd.bench._program.os.sched_getaffinity", lambda _: {0})
-    assert cores_beside({"cpu": f"{REFUSED}no"}) == {0}
+    assert cores_without_loop({"cpu": f"{REFUSED}no"}) == {0}
 
 
 @pytest.mark.parametrize("name", ["sim", "antenna_can", "antenna_serial"])

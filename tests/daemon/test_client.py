@@ -137,7 +137,7 @@ def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(
     with pytest.raises(DaemonGoneError) as raised:
         stop_session(path)
     assert process.stdout.readline() == "asked to stop\n"
-    said = raised.value.told()
+    said = raised.value.full_message()
     assert f"process {process.pid}" in said
     assert STOP_SIGNAL.name in said
     assert "may still be running" in said
@@ -151,7 +151,7 @@ def test_a_process_that_does_not_know_the_signal_is_not_ended_by_it(path, deaf, 
     with pytest.raises(DaemonGoneError) as raised:
         stop_session(path)
     assert process.poll() is None
-    assert "though it runs" in raised.value.told()
+    assert "though it runs" in raised.value.full_message()
 
 
 @pytest.fixture

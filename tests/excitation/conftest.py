@@ -3,7 +3,7 @@ import json
 import pytest
 
 from rigd.profile import load_profile
-from rigd.runner.planning import LoopPreview
+from rigd.runner.planning import RigPreview
 
 MODES = [
     {"frequency_hz": 2.57, "damping_ratio": 0.0091},
@@ -19,7 +19,7 @@ def profile():
 
 @pytest.fixture(scope="session")
 def rig(profile):
-    return LoopPreview(profile)
+    return RigPreview(profile)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation import KINDS, ExcitationError, make_excitation
 from rigd.excitation._narrow_sweeps import Band, FoundMode, damping_of, time_fractions
 from rigd.runner import with_tip_slope
-from rigd.runner.planning import LoopPreview, excitation_for, plan_session
+from rigd.runner.planning import RigPreview, excitation_for, plan_session
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 
@@ -231,6 +231,6 @@ def test_without_a_rig_the_bands_get_equal_times_and_the_full_amplitude(document
 def test_foresight_agrees_with_the_plan(document, profile):
     made = excitation_for(profile, "modes", {"path": document(), "duration_s": 30.0})
     predicted = plan_session(profile, made).prediction
-    assert LoopPreview(profile).fraction_of_limits(made.reference_rad) == pytest.approx(
+    assert RigPreview(profile).fraction_of_limits(made.reference_rad) == pytest.approx(
         predicted.peak_torque_nm / profile.rig.motor.peak_torque_nm
     )

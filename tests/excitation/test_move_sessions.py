@@ -13,8 +13,8 @@ from rigd.identified_beam import MOVE, IdentifiedBeamError
 from rigd.profile import load_profile
 from rigd.runner import Series
 from rigd.runner.planning import (
-    LoopPreview,
     RefusedError,
+    RigPreview,
     excitation_for,
     plan_document,
     plan_session,
@@ -37,12 +37,12 @@ def test_the_move_is_planned_for_the_beam_of_the_analysis(analysed, profile):
     assert off_nm[0] < 0.1 * off_nm[1]
     assert same.parameters["residual_nm"] == pytest.approx(own.parameters["residual_nm"], rel=0.5)
     stiffness = 1.2 * profile.rig.beam.bending_stiffness_n_m2
-    stiffer = LoopPreview(profile).move_plant(
+    stiffer = RigPreview(profile).move_plant(
         analysed(bending_stiffness_n_m2={"value": stiffness, "std": 0.0},
                  density_over_stiffness={"value": 4.7e-3 / stiffness, "std": 0.0}),
         MOVE,
     )  # fmt: skip
-    stated = LoopPreview(profile).move_plant("", MOVE)
+    stated = RigPreview(profile).move_plant("", MOVE)
     ratio = abs(stiffer.poles_rad_s[0]) / abs(stated.poles_rad_s[0])
     assert ratio == pytest.approx(1.2**0.5, rel=1e-2)
 
@@ -163,7 +163,7 @@ def test_a_model_with_an_effect_that_its_use_does_not_take_is_refused(
     ],
 )
 def test_the_poles_of_a_move_are_those_of_the_beam_as_identified(profile, analysed, effect):
-    plant = LoopPreview(profile).move_plant(analysed(**effect), MOVE)
+    plant = RigPreview(profile).move_plant(analysed(**effect), MOVE)
     assert plant.model is not None
     locked = plant.model.loaded_beam.poles(clamped_free_eigenvalues(3))[:, 0]
     assert plant.poles_rad_s[:3] == pytest.approx(locked, rel=5e-3)

@@ -8,7 +8,7 @@ import subprocess
 import pytest
 
 from rigd.cli.app import app
-from rigd.runner.request import what_is_kept
+from rigd.runner.request import remaining_file_text
 from rigd.session import (
     SessionError,
     SessionWriter,
@@ -39,14 +39,14 @@ def test_of_a_file_without_a_sample_no_recovery_is_promised(original, tmp_path, 
     assert "0 complete samples are readable before that, so there is nothing to recover" in said
     assert "rigd recover" not in said
     assert run("recover", part).exit_code == 1
-    kept = what_is_kept(tmp_path / "a.mcap")
+    kept = remaining_file_text(tmp_path / "a.mcap")
     assert kept == f"Nothing was recorded; {part} holds no sample and can be removed."
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MC"])
 def test_nor_of_one_that_was_only_begun(tmp_path, content):
     (tmp_path / "a.mcap.part").write_bytes(content)
-    assert "rigd recover" not in what_is_kept(tmp_path / "a.mcap")
+    assert "rigd recover" not in remaining_file_text(tmp_path / "a.mcap")
 
 
 def test_a_damaged_file_without_a_sample_before_that_is_only_worth_a_copy(original, tmp_path, run):
@@ -87,11 +87,11 @@ def test_what_is_kept_beside_a_name_that_was_taken_can_be_recovered_as_told(
     path = folder / name
     part = folder / f"{name}.part"
     shutil.copy(torn, part)
-    assert what_is_kept(path).endswith(
+    assert remaining_file_text(path).endswith(
         f"rigd recover {shlex.quote(str(part))} makes a clean file of it."
     )
     path.write_text("somebody else's")
-    said = what_is_kept(path)
+    said = remaining_file_text(path)
     move, recovery = re.findall(r"after (mv .*) (rigd recover .*) makes a clean file", said)[0]
     assert subprocess.run(shlex.split(move), check=False).returncode == 0
     assert run(*shlex.split(recovery)[1:]).exit_code == 0

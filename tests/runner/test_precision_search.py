@@ -19,7 +19,7 @@ from rigd.runner._precision_search import (
     target_estimates,
     targets_json,
 )
-from rigd.runner.planning import LoopPreview
+from rigd.runner.planning import RigPreview
 
 NAMES = ("zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "bending_stiffness_n_m2")
 RATE_HZ = 1000
@@ -85,7 +85,7 @@ class Bench:
     def __init__(self, profile, targets="damping 1%", at_most_s=60.0):
         self.profile = profile
         excitation = until(
-            rate_hz=RATE_HZ, targets=targets, at_most_s=at_most_s, rig=LoopPreview(profile)
+            rate_hz=RATE_HZ, targets=targets, at_most_s=at_most_s, rig=RigPreview(profile)
         )
         planned = excitation.search.planned_ticks
         spec = put_reference(shared_memory_fd(), excitation.reference_rad, planned)
@@ -363,7 +363,7 @@ def test_deviations_are_designed_for_as_fits_state_them(profile):
 
 
 def parameter_floor(targets, **given):
-    rig = LoopPreview(load_profile("sim"))
+    rig = RigPreview(load_profile("sim"))
     return until(rate_hz=RATE_HZ, targets=targets, rig=rig, **given)
 
 

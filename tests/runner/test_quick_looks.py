@@ -15,7 +15,7 @@ from processes import children, eventually, state_of
 
 from rigd.runner import quick_looks
 from rigd.runner.quick_looks import QuickLook, QuickLooks
-from rigd.runner.session import SessionResult
+from rigd.runner.session import RunResult
 from rigd.runtime import processor_use
 from rigd.session.quick_look import quick_look_path
 
@@ -62,7 +62,7 @@ def looks(tmp_path, monkeypatch, started):
 
 def done(looks):
     def idle():
-        looks.attend()
+        looks.poll()
         return not looks.busy
 
     assert eventually(idle)
@@ -70,7 +70,7 @@ def done(looks):
 
 
 def spent_s(looks):
-    looks.attend()
+    looks.poll()
     return looks.spent_s
 
 
@@ -110,7 +110,7 @@ def test_none_runs_beside_a_session(looks, tmp_path, started):
         (tmp_path / "waits.go").touch()
         looks.begin(tmp_path / "next.mcap")
         time.sleep(0.1)
-        looks.attend()
+        looks.poll()
         assert started() == [pid]
         assert state_of(Path(f"/proc/{pid}")) == "T"
         assert looks.told == []
@@ -122,7 +122,7 @@ def test_one_that_hangs_is_killed_and_not_for_the_time_of_a_session(looks, tmp_p
     looks.begin(tmp_path / "hangs.mcap")
     with looks.held():
         time.sleep(0.5)
-    looks.attend()
+    looks.poll()
     assert looks.told == []
     (told,) = done(looks)
     assert told.error == "it took longer than 0.4 s."
@@ -135,11 +135,11 @@ def test_the_wait_for_a_processor_does_not_count(looks, tmp_path, monkeypatch):
     looks.begin(tmp_path / "waits.mcap")
     for _ in range(3):
         time.sleep(0.05)
-        looks.attend()
+        looks.poll()
     assert (looks.busy, looks.told, looks.spent_s) == (True, [], 0.0)
     used_s = 0.06
     time.sleep(0.06)
-    looks.attend()
+    looks.poll()
     (told,) = done(looks)
     assert told.error == "it took longer than 0.05 s."
 
@@ -160,7 +160,7 @@ def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeyp
     monkeypatch.setattr(quick_looks, "_END_S", 0.05)
     # As on a busy computer, it has no time to end in; at last it is killed, lest a failure hang.
     monkeypatch.setattr(subprocess.Popen, "kill", lambda _: None)
-    for end in (looks.attend, looks.close):
+    for end in (looks.poll, looks.close):
         looks.begin(tmp_path / "hangs.mcap")
         process = looks._process
         late = threading.Timer(5.0, process.send_signal, (signal.SIGKILL,))
@@ -171,9 +171,9 @@ def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeyp
         assert process.poll() is None
         late.cancel()
         process.send_signal(signal.SIGKILL)
-        if end == looks.attend:
+        if end == looks.poll:
             with looks.held():  # nor does a session
-                looks.attend()
+                looks.poll()
             (told,) = done(looks)
             assert told.error == "it took longer than 0.05 s."
             looks.told.clear()
@@ -204,7 +204,7 @@ def test_closing_ends_one_that_is_suspended(looks, tmp_path, started):
 def test_a_look_is_noted_and_told_as_an_event():
     path = Path("out/a.mcap")
     look = QuickLook(path, quick_look_path(path), {"text": ["Look\x1b[2J"]}, "")
-    result = SessionResult(path, "complete", "", 1, 1, 0, 0, 0, fault=False)
+    result = RunResult(path, "complete", "", 1, 1, 0, 0, 0, fault=False)
     other = replace(result, path=Path("out/b.mcap"))
     results = [other, result]
     look.note(results)

@@ -14,11 +14,11 @@ from rigd.profile import load_profile
 from rigd.runner import ProgressLine, Series, plan_lines, result_line
 from rigd.runner.planning import RefusedError
 from rigd.runner.request import NoRoomError
-from rigd.runner.session import SessionResult
+from rigd.runner.session import RunResult
 from rigd.runtime import StopRequest
 from rigd.testing import write_profile
 
-WELL = SessionResult(None, "complete", "", 1200, 1200, 0, 0, 0, fault=False)
+WELL = RunResult(None, "complete", "", 1200, 1200, 0, 0, 0, fault=False)
 UNSEEN = ("look_follows", False)
 
 
@@ -136,7 +136,7 @@ class Looks:
         self.told.append(("look", path.stem[-2:]))
         self.left = 3
 
-    def attend(self):
+    def poll(self):
         self.left -= 1
 
     @contextlib.contextmanager
@@ -161,7 +161,7 @@ def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_serie
     results = (replace(WELL, path=Path(f"a-0{number}.mcap")) for number in (1, 2))
     looks = Looks(watcher.told)
     series = make_series(repeat=3)
-    series.run(Watched(*results, stopped), StopRequest(), watcher, live=False, looks=looks)
+    series.run(Watched(*results, stopped), StopRequest(), watcher, live=False, quick_looks=looks)
     session = ["held", "run", "let go", "ended"]
     pause = ["look", "watch", "watch", "watch"]
     told = [each if isinstance(each, str) else each[0] for each in watcher.told]
@@ -180,7 +180,7 @@ def test_a_stop_ends_the_wait_for_a_quick_look(make_series):
 
     looks = Looks(watcher.told)
     result = replace(WELL, path=Path("a-01.mcap"))
-    make_series(repeat=3).run(Stopped(result), stop, watcher, live=False, looks=looks)
+    make_series(repeat=3).run(Stopped(result), stop, watcher, live=False, quick_looks=looks)
     told = [each if isinstance(each, str) else each[0] for each in watcher.told]
     assert told == ["begins", "held", "let go", "ended", "look", "watch"]
 
@@ -190,7 +190,7 @@ def test_no_quick_look_at_a_move_is_begun_and_none_announced(tmp_path):
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
     recorded, looks = replace(WELL, path=Path("a.mcap")), Looks(watcher.told)
     series = Series(profile, replace(excitation, stays=True), tmp_path / "out")
-    series.run(Rig(recorded), StopRequest(), watcher, live=False, looks=looks)
+    series.run(Rig(recorded), StopRequest(), watcher, live=False, quick_looks=looks)
     assert watcher.told[-2:] == ["let go", ("ended", recorded, UNSEEN)]
 
 

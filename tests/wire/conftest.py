@@ -11,7 +11,7 @@ from rigd.excitation import chirp
 from rigd.profile import load_profile
 from rigd.runner import Rig
 from rigd.runner.request import Order
-from rigd.runner.session import SessionProgress, SessionResult
+from rigd.runner.session import RunResult, SessionProgress
 from rigd.runtime import StopRequest
 from rigd.sim.wire import inject
 
@@ -57,7 +57,7 @@ def run_order(tmp_path):
 
     def run(
         profile, name: str, *, fast: bool, faults=(), injected: list | None = None, **options
-    ) -> SessionResult:
+    ) -> RunResult:
         noted = [] if injected is None else injected
 
         def watch(progress: SessionProgress, _: list[LogEvent]) -> None:
