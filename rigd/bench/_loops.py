@@ -14,7 +14,7 @@ import numpy as np
 
 from rigd.bench.measure import LoopMeasurement, UsageMeter, measurement
 from rigd.devices import unknown_values
-from rigd.devices.parameters import Selection
+from rigd.devices.parameters import DeviceSelection
 from rigd.engine.messages import Finished, SessionJob
 from rigd.engine.reference import put_reference
 from rigd.engine.shared_state import Phase, StateField, Stop
@@ -58,7 +58,7 @@ def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
             rig,
             rate_hz=rate_hz,
             actuation=replace(rig.actuation, delay_s=1.0 / rate_hz),
-            devices=Selection("sim", "sim"),
+            devices=DeviceSelection("sim", "sim"),
             simulation=rig.simulation or load_profile("sim").rig.simulation,
             can=None,
             acquisition=None,

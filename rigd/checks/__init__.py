@@ -2,7 +2,7 @@
 
 Offers the whole check (`check_rig`) and the part that every session runs (`check_on_paper`). In
 this order: what profile and EDS file show (module `on_paper`, its functions listed in `_gate`),
-this computer (`machine`), the devices (`devices`). Each is a list of `rows.Row`, with their
+this computer (`machine`), the devices (`devices`). Each is a list of `rows.CheckRow`, with their
 verdict. No torque is ever commanded.
 """
 

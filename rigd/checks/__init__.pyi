@@ -1,5 +1,5 @@
-from ._check import check_beside as check_beside
 from ._check import check_rig as check_rig
+from ._check import check_without_devices as check_without_devices
 from ._gate import ACCEPTABLE as ACCEPTABLE
 from ._gate import Clearance as Clearance
 from ._gate import FailedCheck as FailedCheck

@@ -7,30 +7,32 @@ from rigd.checks._gate import paper_rows
 from rigd.checks.devices import calibration_rows, inspect_devices
 from rigd.checks.machine import machine_rows, rights_rows
 from rigd.checks.on_paper import wiring_rows
-from rigd.checks.rows import Row, Verdict, grade
+from rigd.checks.rows import CheckResult, CheckRow, grade
 from rigd.devices import unknown_values
 from rigd.errors import UserError
 from rigd.profile import Profile
 from rigd.runner.planning import RigPreview, excitation_for
 
 
-def check_rig(profile: Profile) -> list[Row]:
+def check_rig(profile: Profile) -> list[CheckRow]:
     """Check the rig of a profile without a torque: on paper, this computer, then the devices.
 
     If identifiers collide or the bus load is too high, nothing is connected, because devices might
     obey frames for others; nor if a value of the profile is unknown.
     """
     rows = _rows_without_devices(profile)
-    if any(row.verdict is Verdict.FAIL for row in wiring_rows(profile.rig)):
+    if any(row.verdict is CheckResult.FAIL for row in wiring_rows(profile.rig)):
         why = "not connected: first the bus has to be right"
-        return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]
+        return [*rows, CheckRow("devices", "connection", why, "", CheckResult.SKIPPED)]
     if unknown_values(profile.rig):
         why = "not connected: first the unknown values have to be entered"
-        return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]
+        return [*rows, CheckRow("devices", "connection", why, "", CheckResult.SKIPPED)]
     return rows + inspect_devices(profile)
 
 
-def check_beside(profile: Profile, calibration: Mapping[str, Any] | None) -> list[Row]:
+def check_without_devices(
+    profile: Profile, calibration: Mapping[str, Any] | None
+) -> list[CheckRow]:
     """Check the rig of a profile while a daemon uses its devices, which are not polled.
 
     Parameters
@@ -42,12 +44,12 @@ def check_beside(profile: Profile, calibration: Mapping[str, Any] | None) -> lis
     """
     rows = _rows_without_devices(profile)
     if calibration is None:
-        return [*rows, Row("devices", "connection", "not connected", "", Verdict.SKIPPED)]
-    rows.append(Row("devices", "connection", "connected by the daemon", "", Verdict.OK))
+        return [*rows, CheckRow("devices", "connection", "not connected", "", CheckResult.SKIPPED)]
+    rows.append(CheckRow("devices", "connection", "connected by the daemon", "", CheckResult.OK))
     return [*rows, *calibration_rows(calibration, profile.rig)]
 
 
-def _rows_without_devices(profile: Profile) -> list[Row]:
+def _rows_without_devices(profile: Profile) -> list[CheckRow]:
     return [
         *paper_rows(profile),
         *default_session_rows(profile),
@@ -56,7 +58,7 @@ def _rows_without_devices(profile: Profile) -> list[Row]:
     ]
 
 
-def default_session_rows(profile: Profile) -> Iterator[Row]:
+def default_session_rows(profile: Profile) -> Iterator[CheckRow]:
     """Check whether `rigd run chirp` without options stays within the limits of the profile.
 
     Advice, since another session may: a hold moves nothing.
@@ -67,7 +69,7 @@ def default_session_rows(profile: Profile) -> Iterator[Row]:
     except UserError:  # an unstable loop or an unknown value, which have rows of their own
         return
     beyond = not percent <= 100
-    yield Row(
+    yield CheckRow(
         "session",
         "chirp without options",
         f"predicted peaks reach {percent:.0f} % of a limit",

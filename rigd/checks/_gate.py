@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from rigd.checks import on_paper as paper
-from rigd.checks.rows import Row, Verdict
+from rigd.checks.rows import CheckResult, CheckRow
 from rigd.devices import unknown_values
 from rigd.errors import FailureError, UserError
 from rigd.profile import Profile
@@ -39,7 +39,7 @@ class UnknownRowError(UserError):
 class PaperCheck:
     """One check that needs no device."""
 
-    rows: Callable[[Profile], Iterator[Row]]
+    rows: Callable[[Profile], Iterator[CheckRow]]
     """Function that makes its rows; those that can fail have a name."""
     names: tuple[str, ...] = ()
     """Names of the rows that can fail; none: it gives advice only and refuses no session."""
@@ -91,7 +91,7 @@ ACCEPTABLE: Final = tuple(
 _OWNERS: Final = {name: check for check in PAPER_CHECKS for name in check.names}
 
 
-def paper_rows(profile: Profile) -> list[Row]:
+def paper_rows(profile: Profile) -> list[CheckRow]:
     """Return the rows of all checks that need no device.
 
     Parameters
@@ -102,7 +102,7 @@ def paper_rows(profile: Profile) -> list[Row]:
     return [row for check in PAPER_CHECKS for row in _rows(check, profile)]
 
 
-def _rows(check: PaperCheck, profile: Profile) -> Iterator[Row]:
+def _rows(check: PaperCheck, profile: Profile) -> Iterator[CheckRow]:
     if not (check.needs_values and unknown_values(profile.rig)):
         yield from check.rows(profile)
 
@@ -173,7 +173,7 @@ def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
     failed: dict[str, FailedCheck] = {}
     for check in PAPER_CHECKS:
         for row in _rows(check, profile) if check.names else ():
-            if row.verdict is not Verdict.FAIL:
+            if row.verdict is not CheckResult.FAIL:
                 continue
             name, text = row.name, _text(row)
             if name in failed:  # several rows of one name: an EDS file that lacks two objects
@@ -199,7 +199,7 @@ def _check_name(name: str) -> None:
         )
 
 
-def _text(row: Row) -> str:
+def _text(row: CheckRow) -> str:
     wanted = f" (wanted: {row.wanted})" if row.wanted else ""
     return f"{row.group}, {row.what}: {row.found.rstrip('.')}{wanted}. {row.detail}".strip()
 

@@ -13,8 +13,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from rigd.checks.rows import Row, Verdict, grade, name_of, value_of
-from rigd.devices import WhatMoves, open_devices, reality
+from rigd.checks.rows import CheckResult, CheckRow, grade, name_of, value_of
+from rigd.devices import ActuationTarget, actuation_target, open_devices
 from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import WATCHDOG, Watchdog
 from rigd.devices.contracts import DeviceError, Devices
@@ -60,7 +60,7 @@ class InspectedDrive(Protocol):
         """Return the capabilities found at connecting."""
 
 
-def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
+def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRow]:
     """Show identity and rated torque; what contradicts the profile was refused on connecting."""
     settings = rig.cia402
     wanted = {
@@ -77,26 +77,26 @@ def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
             found = f"{value:#x}"
         else:
             found = "not stated by the drive" if value in (None, "") else value_of(key, value)
-        verdict = Verdict.OK
+        verdict = CheckResult.OK
         if key in _SCALES and value is None:
             found = f"unknown: the drive does not state it (object {_SCALES[key]})"
-            verdict = Verdict.SKIPPED
-        yield Row("drive", name_of(key), found, wanted.get(key, ""), verdict)
+            verdict = CheckResult.SKIPPED
+        yield CheckRow("drive", name_of(key), found, wanted.get(key, ""), verdict)
     capabilities = drive.capabilities() if isinstance(drive, InspectedDrive) else None
     if capabilities is not None:
         yield from _safeguard_rows(capabilities)
 
 
-def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[Row]:
+def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[CheckRow]:
     """Show the watchdog, the replacements of missing objects, and what was accepted."""
     watchdog, after_s = capabilities.watchdog, capabilities.watchdog_s
     unproven = watchdog in (Watchdog.OWN, Watchdog.NONE)
-    yield Row(
+    yield CheckRow(
         "drive",
         "watchdog",
         f"{watchdog.value}, {after_s * 1e3:g} ms" if isfinite(after_s) else "none: accepted",
         "switches the torque off if this computer stops communicating",
-        Verdict.WARNING if unproven else Verdict.OK,
+        CheckResult.WARNING if unproven else CheckResult.OK,
         _WATCHDOG_DETAIL.get(watchdog, ""),
     )
     accepted = capabilities.accepted
@@ -106,16 +106,16 @@ def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[Row]:
         if row.accept == WATCHDOG:
             substitute = f"stands in: {watchdog.value}" if watchdog is not Watchdog.NONE else ""
         by_name = f'accepted by cia402.accept_without "{row.accept}"' if missing else ""
-        yield Row(
+        yield CheckRow(
             "drive",
             f"object {row.address} ({row.name})",
             "; ".join(("absent or not usable", *filter(None, (by_name, substitute)))),
             "",
-            Verdict.WARNING if missing else Verdict.OK,
+            CheckResult.WARNING if missing else CheckResult.OK,
             f"{row.name}: {row.sentence}" if missing else "",
         )
     for text in capabilities.assigned:
-        yield Row("drive", "object set", text, "read back", Verdict.OK)
+        yield CheckRow("drive", "object set", text, "read back", CheckResult.OK)
 
 
 # Sensor
@@ -141,7 +141,7 @@ class MeasurableSensor(Protocol):
         """Measure polls or stream for a while; the keys of the result end in their units."""
 
 
-def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterator[Row]:
+def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterator[CheckRow]:
     """Return the rows of identity and calibration, and compare ranges with the profile's.
 
     Parameters
@@ -153,22 +153,24 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
     """
     for key in _SHOWN:
         if key in found:
-            yield Row("sensor", name_of(key), _value(key, found), _wanted(key, rig), Verdict.OK)
+            yield CheckRow(
+                "sensor", name_of(key), _value(key, found), _wanted(key, rig), CheckResult.OK
+            )
     for key in _ALWAYS_SHOWN:
-        yield Row("sensor", name_of(key), _value(key, found), "", Verdict.OK)
+        yield CheckRow("sensor", name_of(key), _value(key, found), "", CheckResult.OK)
     yield _range_row(found, rig.sensor.range)
     if found.get(_ASSUMED):
-        yield Row(
+        yield CheckRow(
             "sensor",
             "counts and units",
             "assumed, below",
             "reported by the sensor",
-            Verdict.WARNING,
+            CheckResult.WARNING,
             f"Sensor: assumed are {found[_ASSUMED]}; compare with its calibration certificate.",
         )
     status = found.get(_STATUS)
     if status is not None:
-        yield Row(
+        yield CheckRow(
             "sensor",
             "status",
             value_of(_STATUS, status),
@@ -183,17 +185,17 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
     ]
     if more:
         detail = f"Sensor: {'; '.join(more)}."
-        yield Row("sensor", "more", f"{len(more)} values, below", "", Verdict.OK, detail)
+        yield CheckRow("sensor", "more", f"{len(more)} values, below", "", CheckResult.OK, detail)
 
 
 def _measured_rows(
     measured: Mapping[str, float], rig: RigParameters, cause: str = ""
-) -> Iterator[Row]:
+) -> Iterator[CheckRow]:
     """Return the rows on rate and turn-round; `cause` is the sensor's reason for gaps."""
     for key, value in measured.items():
         wanted, verdict = _assess_diagnostic(key, value, rig)
-        detail = cause if key == "longest_gap_s" and verdict is not Verdict.OK else ""
-        yield Row("sensor", name_of(key), value_of(key, value), wanted, verdict, detail)
+        detail = cause if key == "longest_gap_s" and verdict is not CheckResult.OK else ""
+        yield CheckRow("sensor", name_of(key), value_of(key, value), wanted, verdict, detail)
 
 
 def _value(key: str, found: Mapping[str, object]) -> str:
@@ -208,18 +210,18 @@ def _wanted(key: str, rig: RigParameters) -> str:
     return expected or (rig.ati_serial.serial_number if rig.ati_serial else "") or "any"
 
 
-def _range_row(found: Mapping[str, object], wanted: tuple[float, ...]) -> Row:
+def _range_row(found: Mapping[str, object], wanted: tuple[float, ...]) -> CheckRow:
     limits = "profile: " + value_of("range_n_nm", wanted)
     key = next((key for key in _RANGES if key in found), "")
     rated = found.get(key)
     if not isinstance(rated, list | tuple):
         # Over CAN there is no request for it.
-        return Row("sensor", "range", _UNSTATED, limits, Verdict.OK)
+        return CheckRow("sensor", "range", _UNSTATED, limits, CheckResult.OK)
     beyond = any(ours > _ROUNDING * float(its) for ours, its in zip(wanted, rated, strict=True))
-    return Row("sensor", "range", value_of("range_n_nm", rated), limits, grade(fail=beyond))
+    return CheckRow("sensor", "range", value_of("range_n_nm", rated), limits, grade(fail=beyond))
 
 
-def _assess_diagnostic(key: str, value: float, rig: RigParameters) -> tuple[str, Verdict]:
+def _assess_diagnostic(key: str, value: float, rig: RigParameters) -> tuple[str, CheckResult]:
     """Return the expected value of a diagnostic, and the verdict."""
     period_s = 1.0 / rig.rate_hz
     acquisition = rig.acquisition
@@ -250,7 +252,9 @@ _MANY_MISSING = 0.2
 _GROUP = "exchange"
 
 
-def _exchange_rows(profile: Profile, devices: Devices, moves: WhatMoves) -> Iterator[Row]:
+def _exchange_rows(
+    profile: Profile, devices: Devices, moves: ActuationTarget
+) -> Iterator[CheckRow]:
     """Run some ticks without a torque, and check latency and losses of the replies.
 
     Parameters
@@ -292,14 +296,14 @@ def _exchange_rows(profile: Profile, devices: Devices, moves: WhatMoves) -> Iter
         ("wrenches missing", missing_wrenches),
     ):
         verdict = grade(fail=missing > _MANY_MISSING * TICKS, warn=missing > _FEW_MISSING * TICKS)
-        yield Row(
+        yield CheckRow(
             _GROUP,
             what,
             f"{missing} of {TICKS} ticks",
             f"at most {100 * _FEW_MISSING:.0f} %",
             verdict,
         )
-    yield Row(
+    yield CheckRow(
         _GROUP, "sensor saturated", f"{saturated} of {TICKS} ticks", "0", grade(fail=saturated > 0)
     )
     moved_rad = float(np.ptp(angles_rad))
@@ -307,7 +311,7 @@ def _exchange_rows(profile: Profile, devices: Devices, moves: WhatMoves) -> Iter
         profile.session.rest_velocity_rad_s * TICKS / profile.rig.rate_hz,
         2.0 * profile.rig.encoder.resolution_rad,
     )
-    yield Row(
+    yield CheckRow(
         _GROUP,
         "shaft moved",
         f"{moved_rad:.2g} rad",
@@ -316,33 +320,35 @@ def _exchange_rows(profile: Profile, devices: Devices, moves: WhatMoves) -> Iter
     )
 
 
-def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: WhatMoves) -> Row:
+def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: ActuationTarget) -> CheckRow:
     acquisition = profile.rig.acquisition
     median, late = np.percentile(waited_ms, [50, 99]).tolist()
     found = f"p50 {median:.2f} ms, p99 {late:.2f} ms"
     what = "both replies after"
     if acquisition is None or acquisition.mode == "previous_tick":
-        return Row(_GROUP, what, "replies of the previous tick are used", "", Verdict.SKIPPED)
-    if moves is WhatMoves.LOCK_STEP:
-        return Row(_GROUP, what, found, "any time (lock-step)", Verdict.OK)
+        return CheckRow(
+            _GROUP, what, "replies of the previous tick are used", "", CheckResult.SKIPPED
+        )
+    if moves is ActuationTarget.LOCK_STEP:
+        return CheckRow(_GROUP, what, found, "any time (lock-step)", CheckResult.OK)
     limit_ms = acquisition.deadline_us * 1e-3
     verdict = grade(fail=median >= limit_ms, warn=late >= limit_ms)
-    return Row(_GROUP, what, found, f"less than {limit_ms:.2f} ms", verdict)
+    return CheckRow(_GROUP, what, found, f"less than {limit_ms:.2f} ms", verdict)
 
 
 # Probing move
 
 
-def _probing_rows(profile: Profile, moves: WhatMoves) -> Iterator[Row]:
+def _probing_rows(profile: Profile, moves: ActuationTarget) -> Iterator[CheckRow]:
     """Return the row on scales and signs: known, or verified before the first session."""
-    if moves is WhatMoves.SIMULATED:
+    if moves is ActuationTarget.SIMULATED:
         return
     missing = [key for key in MEASURED if profile.sources.get(key) != "measured"]
     if not missing:
-        found, verdict = "motor and encoder are measured", Verdict.OK
+        found, verdict = "motor and encoder are measured", CheckResult.OK
     else:
         found = "scales and signs: verified by the probing move before the first session"
-        verdict = Verdict.SKIPPED
+        verdict = CheckResult.SKIPPED
     detail = (
         f"Probing move: sessions begin with it because {', '.join(missing)} "
         f"{'is' if len(missing) == 1 else 'are'} not measured; rigd probe makes it by itself "
@@ -350,19 +356,19 @@ def _probing_rows(profile: Profile, moves: WhatMoves) -> Iterator[Row]:
         if missing
         else ""
     )
-    yield Row("drive", "probing move", found, "", verdict, detail)
+    yield CheckRow("drive", "probing move", found, "", verdict, detail)
 
 
 # All devices
 
 
-def inspect_devices(profile: Profile) -> list[Row]:
+def inspect_devices(profile: Profile) -> list[CheckRow]:
     """Connect to the devices of a profile, read them, run some ticks, and release them.
 
     No torque: the drive is never enabled. Whatever happens, both devices are closed.
     """
     rig = profile.rig
-    moves = reality(rig)
+    moves = actuation_target(rig)
     rows = list(_link_rows(rig, moves))
     try:
         devices = open_devices(rig)
@@ -371,28 +377,32 @@ def inspect_devices(profile: Profile) -> list[Row]:
             closing.callback(devices.drive.close)
             _ask(profile, devices, moves, rows)
     except (DeviceError, OSError) as error:
-        rows.append(Row("devices", "open and close", str(error), "", Verdict.FAIL))
+        rows.append(CheckRow("devices", "open and close", str(error), "", CheckResult.FAIL))
     return rows
 
 
-def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) -> None:
+def _ask(profile: Profile, devices: Devices, moves: ActuationTarget, rows: list[CheckRow]) -> None:
     rig, drive, sensor = profile.rig, devices.drive, devices.sensor
 
-    def about_drive() -> Iterator[Row]:
+    def about_drive() -> Iterator[CheckRow]:
         drive.connect()
-        yield Row("drive", "connection", _answer(moves), "an answer, no fault", Verdict.OK)
+        yield CheckRow("drive", "connection", _answer(moves), "an answer, no fault", CheckResult.OK)
         if isinstance(drive, InspectableDrive):
             yield from _drive_rows(drive, rig)
         yield from _probing_rows(profile, moves)
 
-    def about_sensor() -> Iterator[Row]:
+    def about_sensor() -> Iterator[CheckRow]:
         sensor.connect()
-        yield Row("sensor", "connection", _answer(moves), "an answer, no error", Verdict.OK)
+        yield CheckRow(
+            "sensor", "connection", _answer(moves), "an answer, no error", CheckResult.OK
+        )
         yield from calibration_rows(sensor.calibration(), rig)
 
-    def rate() -> Iterator[Row]:
+    def rate() -> Iterator[CheckRow]:
         if not isinstance(sensor, MeasurableSensor) or moves.any_clock:
-            yield Row("sensor", "rate", f"not measured: {moves.value}", "", Verdict.SKIPPED)
+            yield CheckRow(
+                "sensor", "rate", f"not measured: {moves.value}", "", CheckResult.SKIPPED
+            )
         else:
             measured = sensor.measure(MEASURED_S)
             yield from _measured_rows(measured, rig, sensor.health().cause)
@@ -400,40 +410,46 @@ def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) 
     # The drive last: once it is operational it expects a SYNC every period.
     sensor_answers = _try("sensor", about_sensor(), rows) and _try("sensor", rate(), rows)
     drive_answers = _try("drive", about_drive(), rows)
-    if moves is WhatMoves.SIMULATED:
-        rows.append(Row("exchange", "ticks", "simulated in this process", "", Verdict.SKIPPED))
+    if moves is ActuationTarget.SIMULATED:
+        rows.append(
+            CheckRow("exchange", "ticks", "simulated in this process", "", CheckResult.SKIPPED)
+        )
     elif drive_answers and sensor_answers:
         _try("exchange", _exchange_rows(profile, devices, moves), rows)
     else:
         why = "not without drive and sensor"
-        rows.append(Row("exchange", "ticks", why, "", Verdict.SKIPPED))
+        rows.append(CheckRow("exchange", "ticks", why, "", CheckResult.SKIPPED))
 
 
-def _try(group: str, found: Iterable[Row], rows: list[Row]) -> bool:
+def _try(group: str, found: Iterable[CheckRow], rows: list[CheckRow]) -> bool:
     """Collect rows up to the first error, which becomes a row; return whether there was none."""
     try:
         rows.extend(found)
     except (DeviceError, OSError) as error:
-        rows.append(Row(group, "error", str(error), "", Verdict.FAIL))
+        rows.append(CheckRow(group, "error", str(error), "", CheckResult.FAIL))
         return False
     return True
 
 
-def _answer(moves: WhatMoves) -> str:
-    return "simulated in this process" if moves is WhatMoves.SIMULATED else "it answers"
+def _answer(moves: ActuationTarget) -> str:
+    return "simulated in this process" if moves is ActuationTarget.SIMULATED else "it answers"
 
 
-def _link_rows(rig: RigParameters, moves: WhatMoves) -> Iterator[Row]:
+def _link_rows(rig: RigParameters, moves: ActuationTarget) -> Iterator[CheckRow]:
     simulator = find_simulator(rig.name)
     if simulator is not None:
         where = f"{moves.value} (process {simulator.pid})"
-        yield Row("link", "what moves", where, "", Verdict.OK)
+        yield CheckRow("link", "what moves", where, "", CheckResult.OK)
         return
-    yield Row("link", "what moves", moves.value, "", Verdict.OK)
+    yield CheckRow("link", "what moves", moves.value, "", CheckResult.OK)
     if rig.can is not None:
         bus = f"{rig.can.channel} ({rig.can.interface})"
-        yield Row("link", "CAN", bus, "", Verdict.OK)
+        yield CheckRow("link", "CAN", bus, "", CheckResult.OK)
     if rig.ati_serial is not None:
-        yield Row(
-            "link", "serial", f"{rig.ati_serial.port}, {rig.ati_serial.baud} baud", "", Verdict.OK
+        yield CheckRow(
+            "link",
+            "serial",
+            f"{rig.ati_serial.port}, {rig.ati_serial.baud} baud",
+            "",
+            CheckResult.OK,
         )

@@ -13,7 +13,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from rigd.checks.rows import Row, Verdict, grade
+from rigd.checks.rows import CheckResult, CheckRow, grade
 from rigd.engine.realtime import LOCKED, REFUSED, isolated_cores
 from rigd.profile import RealtimeSettings
 from rigd.runtime import OWN_PYTHON
@@ -67,15 +67,17 @@ def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
     return obtained
 
 
-def rights_rows(settings: RealtimeSettings) -> Iterator[Row]:
+def rights_rows(settings: RealtimeSettings) -> Iterator[CheckRow]:
     """Return the rows on the real-time settings that a session would be granted."""
     try:
         obtained = settings_granted(settings)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
-        yield Row("real time", "rights", f"could not be tried: {error}", "", Verdict.WARNING)
+        yield CheckRow(
+            "real time", "rights", f"could not be tried: {error}", "", CheckResult.WARNING
+        )
         return
     if settings.priority == 0:
-        yield Row("real time", "scheduling", "not requested", "", Verdict.OK)
+        yield CheckRow("real time", "scheduling", "not requested", "", CheckResult.OK)
     for name, text in obtained.items():
         lacking = (
             text.startswith(REFUSED)
@@ -83,7 +85,7 @@ def rights_rows(settings: RealtimeSettings) -> Iterator[Row]:
             or (name == "supervision" and not text.startswith("SCHED_RR"))
         )
         wanted = _WANTED.get(name, "granted") if lacking else ""
-        yield Row(
+        yield CheckRow(
             "real time",
             _ROWS.get(name, name.replace("_", " ")),
             text,
@@ -137,7 +139,7 @@ _LEAST_RUNTIME = 0.95
 
 def machine_rows(
     settings: RealtimeSettings, root: Path = Path("/"), kernel: str = ""
-) -> Iterator[Row]:
+) -> Iterator[CheckRow]:
     """Return the rows on settings of this computer that delay ticks, with remedies.
 
     Parameters
@@ -159,13 +161,13 @@ def machine_rows(
     yield _throttling_row(settings, root)
 
 
-def _kernel_row(root: Path, kernel: str) -> Row:
+def _kernel_row(root: Path, kernel: str) -> CheckRow:
     preemptible = "PREEMPT_RT" in kernel or _read(root / _REALTIME_KERNEL) == "1"
     if preemptible:
         found = "PREEMPT_RT"
     else:
         found = "preemptible" if "PREEMPT" in kernel else "not preemptible"
-    return Row(
+    return CheckRow(
         _GROUP,
         "kernel",
         found,
@@ -179,10 +181,10 @@ def _kernel_row(root: Path, kernel: str) -> Row:
     )
 
 
-def _virtual_row(root: Path) -> Row:
+def _virtual_row(root: Path) -> CheckRow:
     words = set(_read(root / "proc/cpuinfo").split())
     virtual = "hypervisor" in words or bool(_read(root / "sys/hypervisor/type"))
-    return Row(
+    return CheckRow(
         _GROUP,
         "hardware",
         "virtual machine" if virtual else "no hypervisor seen",
@@ -195,7 +197,7 @@ def _virtual_row(root: Path) -> Row:
     )
 
 
-def _core_row(settings: RealtimeSettings, root: Path) -> Row:
+def _core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
     isolated = isolated_cores(root)
     cores = ", ".join(map(str, sorted(isolated)))
     alone = settings.cpu in isolated if settings.cpu >= 0 else bool(isolated)
@@ -206,7 +208,7 @@ def _core_row(settings: RealtimeSettings, root: Path) -> Row:
         )
     else:
         found, remedy = cores or "none", _how_to_isolate((os.cpu_count() or 1) - 1)
-    return Row(
+    return CheckRow(
         _GROUP,
         "isolated core",
         found,
@@ -228,12 +230,12 @@ def _how_to_isolate(last: int) -> str:
     )
 
 
-def _governor_row(root: Path) -> Row:
+def _governor_row(root: Path) -> CheckRow:
     governors = {
         _read(path) for path in sorted((root / _CPU).glob("cpu[0-9]*/cpufreq/scaling_governor"))
     }
     slow = bool(governors - {"performance"})
-    return Row(
+    return CheckRow(
         _GROUP,
         "frequency governor",
         ", ".join(sorted(governors)) or "none: the frequency is not this system's",
@@ -246,11 +248,11 @@ def _governor_row(root: Path) -> Row:
     )
 
 
-def _clock_row(root: Path) -> Row:
+def _clock_row(root: Path) -> CheckRow:
     source = _read(root / _CLOCK_SOURCE)
     # On other architectures than x86 the counter is the architecture's own, and quick.
     quick = source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
-    return Row(
+    return CheckRow(
         _GROUP,
         "clock source",
         source or "unknown",
@@ -263,9 +265,9 @@ def _clock_row(root: Path) -> Row:
     )
 
 
-def _wall_clock_row() -> Row:
+def _wall_clock_row() -> CheckRow:
     synchronised = _synchronised()
-    return Row(
+    return CheckRow(
         _GROUP,
         "wall clock",
         "synchronised" if synchronised else "not synchronised",
@@ -278,12 +280,12 @@ def _wall_clock_row() -> Row:
     )
 
 
-def _throttling_row(settings: RealtimeSettings, root: Path) -> Row:
+def _throttling_row(settings: RealtimeSettings, root: Path) -> CheckRow:
     runtime_us = _number(root / _THROTTLING, -1)
     period_us = _number(root / _THROTTLING_PERIOD, 1_000_000)
     fraction = runtime_us / period_us if runtime_us >= 0 else 1.0
     low = fraction < _LEAST_RUNTIME and settings.priority > 0
-    return Row(
+    return CheckRow(
         _GROUP,
         "real-time share",
         "all of a core" if runtime_us < 0 else f"{100 * fraction:.0f} % of a core",

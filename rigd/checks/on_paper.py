@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.beam.realisation import RealisationError
-from rigd.checks.rows import Row, Verdict, grade
+from rigd.checks.rows import CheckResult, CheckRow, grade
 from rigd.control import ControlDesignError, stable_loop
 from rigd.devices import MAY_BE_UNKNOWN, unknown_values
 from rigd.devices.parameters import RigParameters
@@ -65,15 +65,15 @@ LEAST_DELAY_PERIODS = 1.0
 STABILITY = "loop_stability"
 
 
-def stability_rows(profile: Profile) -> Iterator[Row]:
+def stability_rows(profile: Profile) -> Iterator[CheckRow]:
     """Check whether the loop of a profile's rig is stable."""
     try:
         loop, warning = stable_loop(profile.loop_model())
     except (ControlDesignError, RealisationError) as error:
-        yield Row("loop", "stability", str(error), "stable", Verdict.FAIL, name=STABILITY)
+        yield CheckRow("loop", "stability", str(error), "stable", CheckResult.FAIL, name=STABILITY)
         return
     found = f"closed loop stable, slowest pole {loop.growth_per_s:.2g} 1/s"
-    yield Row(
+    yield CheckRow(
         "loop",
         "stability",
         warning or found,
@@ -83,7 +83,7 @@ def stability_rows(profile: Profile) -> Iterator[Row]:
     )
 
 
-def margin_rows(profile: Profile) -> Iterator[Row]:
+def margin_rows(profile: Profile) -> Iterator[CheckRow]:
     """Check the margins of a stable loop."""
     from rigd.control import loop_margins
 
@@ -92,7 +92,7 @@ def margin_rows(profile: Profile) -> Iterator[Row]:
     except (ControlDesignError, RealisationError) as error:
         warning = str(error)
     if warning is not None:
-        yield Row("loop", "margins", "the loop is not stable", "", Verdict.SKIPPED)
+        yield CheckRow("loop", "margins", "the loop is not stable", "", CheckResult.SKIPPED)
         return
     period_s = 1.0 / profile.rig.rate_hz
     for margins in loop_margins(loop):
@@ -100,27 +100,27 @@ def margin_rows(profile: Profile) -> Iterator[Row]:
         yield from _margin_rows(margins, least_gain, LEAST_DELAY_PERIODS * period_s)
 
 
-def _margin_rows(margins: "Margins", least_gain: float, least_delay_s: float) -> Iterator[Row]:
+def _margin_rows(margins: "Margins", least_gain: float, least_delay_s: float) -> Iterator[CheckRow]:
     group = f"loop, {margins.cut}"
     too_strong = "any" if margins.gain_up == inf else _at(_db(margins.gain_up), margins.gain_up_hz)
     too_weak = (
         "any" if margins.gain_down == 0.0 else _at(_db(margins.gain_down), margins.gain_down_hz)
     )
-    yield Row(
+    yield CheckRow(
         group,
         "gain margin",
         f"{too_weak} / {too_strong}",
         f"{_db(1 / least_gain)} / {_db(least_gain)}",
         grade(fail=False, warn=margins.gain_up < least_gain or margins.gain_down > 1 / least_gain),
     )
-    yield Row(
+    yield CheckRow(
         group,
         "phase margin",
         _at(f"{degrees(margins.phase_rad):.1f}°", margins.phase_hz),
         f"{degrees(LEAST_PHASE_RAD):.0f}°",
         grade(fail=False, warn=margins.phase_rad < LEAST_PHASE_RAD),
     )
-    yield Row(
+    yield CheckRow(
         group,
         "delay margin",
         "any"
@@ -129,12 +129,12 @@ def _margin_rows(margins: "Margins", least_gain: float, least_delay_s: float) ->
         f"{least_delay_s * 1e3:.2f} ms",
         grade(fail=False, warn=margins.delay_s < least_delay_s),
     )
-    yield Row(
+    yield CheckRow(
         group,
         "modulus margin",
         _at(f"{margins.modulus:.2f}", margins.modulus_hz),
         "",
-        Verdict.OK,
+        CheckResult.OK,
     )
 
 
@@ -282,12 +282,12 @@ def _ways(profile: Profile) -> tuple[_Blindness, ...]:
     )
 
 
-def travel_rows(profile: Profile) -> Iterator[Row]:
+def travel_rows(profile: Profile) -> Iterator[CheckRow]:
     """Compare the worst travel of each way with the angle available beyond the limit."""
     rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
     if drive is None:
         why = "the drive is part of this program and ends with it"
-        yield Row(_GROUP, _LOOP_FAILS, why, "", Verdict.SKIPPED, name=TRAVEL_LOOP_FAILS)
+        yield CheckRow(_GROUP, _LOOP_FAILS, why, "", CheckResult.SKIPPED, name=TRAVEL_LOOP_FAILS)
         return
     ways = _ways(profile)
     margin_rad = limits.stop_angle_rad - limits.angle_rad
@@ -295,12 +295,12 @@ def travel_rows(profile: Profile) -> Iterator[Row]:
     unbounded = isinf(drive.watchdog_s)
     if unbounded:
         ways = tuple(way for way in ways if not isinf(way.duration_s))
-        yield Row(
+        yield CheckRow(
             _GROUP,
             f"worst, {_LOOP_FAILS}",
             "without bound: the profile accepts a drive without a watchdog",
             bound,
-            Verdict.WARNING,
+            CheckResult.WARNING,
             f"Travel {_LOOP_FAILS}: nothing but the wired stop ends it "
             '(cia402.accept_without = ["watchdog"]).',
             TRAVEL_LOOP_FAILS,
@@ -328,7 +328,7 @@ def travel_rows(profile: Profile) -> Iterator[Row]:
                 "limits.velocity_rad_s or limits.angle_rad."
             )
         worst = "worst, " if number == longest and not unbounded else ""
-        yield Row(
+        yield CheckRow(
             _GROUP,
             f"{worst}{way.what}",
             f"{_angle(travel.total_rad)}: {_angle(travel.driven_rad)} in the "
@@ -354,7 +354,7 @@ def _friction_nm(rig: RigParameters, speed_rad_s: float) -> float:
 EDS = "eds"
 
 
-def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
+def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[CheckRow]:
     """Check an EDS file against the requirements on a drive.
 
     Parameters
@@ -364,26 +364,26 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
     rig
         Parameters of the profile that the drive is to serve, or None.
     """
-    from rigd.devices.cia402 import Grade, judge
+    from rigd.devices.cia402 import Grade, check_suitability
     from rigd.devices.eds import EdsError, read_eds
 
     verdicts = {
-        Grade.FITS: Verdict.OK,
-        Grade.SUBSTITUTED: Verdict.OK,
-        Grade.ASK: Verdict.SKIPPED,
-        Grade.ACCEPTED: Verdict.WARNING,
-        Grade.DOUBT: Verdict.WARNING,
-        Grade.REFUSED: Verdict.FAIL,
+        Grade.FITS: CheckResult.OK,
+        Grade.SUBSTITUTED: CheckResult.OK,
+        Grade.ASK: CheckResult.SKIPPED,
+        Grade.ACCEPTED: CheckResult.WARNING,
+        Grade.DOUBT: CheckResult.WARNING,
+        Grade.REFUSED: CheckResult.FAIL,
     }
     try:
         node_id = rig.cia402.node_id if rig is not None and rig.cia402 is not None else 1
         eds = read_eds(path, node_id)
     except EdsError as error:
-        yield Row("EDS", "file", str(error), "", Verdict.FAIL, name=EDS)
+        yield CheckRow("EDS", "file", str(error), "", CheckResult.FAIL, name=EDS)
         return
-    yield Row("EDS", "file", str(path), "", Verdict.OK, name=EDS)
-    for finding in judge(eds, rig).findings:
-        yield Row(
+    yield CheckRow("EDS", "file", str(path), "", CheckResult.OK, name=EDS)
+    for finding in check_suitability(eds, rig).findings:
+        yield CheckRow(
             "EDS",
             finding.what,
             finding.found,
@@ -394,7 +394,7 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
         )
 
 
-def drive_file_rows(profile: Profile) -> Iterator[Row]:
+def drive_file_rows(profile: Profile) -> Iterator[CheckRow]:
     """Compare the EDS file that a profile names with what is required of a drive."""
     settings = profile.rig.cia402
     if settings is not None and settings.eds:
@@ -407,11 +407,11 @@ HIGH_LOAD = 0.7
 """Load above which one more device, or repeated frames after a disturbance, do not fit."""
 
 
-def profile_rows(profile: Profile) -> Iterator[Row]:
+def profile_rows(profile: Profile) -> Iterator[CheckRow]:
     """Return the rows on the profile's name and its unverified numbers."""
-    yield Row("profile", profile.name, str(profile.path), "", Verdict.OK)
+    yield CheckRow("profile", profile.name, str(profile.path), "", CheckResult.OK)
     assumed = [key for key, source in profile.sources.items() if source == "assumed"]
-    yield Row(
+    yield CheckRow(
         "profile",
         "unverified profile values",
         f"{len(assumed)} of {len(profile.sources)}",
@@ -421,13 +421,13 @@ def profile_rows(profile: Profile) -> Iterator[Row]:
     )
 
 
-def record_rows(profile: Profile) -> Iterator[Row]:
+def record_rows(profile: Profile) -> Iterator[CheckRow]:
     """Return the row on the longest record, and whether a default chirp fits into it."""
     options = signature(chirp).parameters
     limit = f"no more than {MAX_SAMPLES} samples can be analysed, exported or replayed"
     usual_s = sum(float(options[name].default) for name in ("rest_s", "duration_s", "ring_down_s"))
     longest_s = MAX_SAMPLES / profile.rig.rate_hz
-    yield Row(
+    yield CheckRow(
         "profile",
         "longest record",
         f"{longest_s:g} s at {profile.rig.rate_hz:g} Hz",
@@ -444,12 +444,12 @@ the stiffness that its own weight along it adds (Rayleigh), over the modal mass,
 _EXAMPLE_TILT_DEG = 0.5
 
 
-def plumb_rows(profile: Profile) -> Iterator[Row]:
+def plumb_rows(profile: Profile) -> Iterator[CheckRow]:
     """Check whether the motor's axis is stated to be vertical; no session is refused for it."""
     if profile.rig.devices.drive == "sim":
-        found, detail, verdict = "the simulated rig has no gravity", "", Verdict.SKIPPED
+        found, detail, verdict = "the simulated rig has no gravity", "", CheckResult.SKIPPED
     elif profile.axis_tilt_deg is None:
-        found, verdict = "not known", Verdict.WARNING
+        found, verdict = "not known", CheckResult.WARNING
         shift = _tilt_shift_percent(profile.rig.beam, _EXAMPLE_TILT_DEG)
         detail = (
             f"Axis plumb: gravity along the beam shifts its modes, mode 1 by {shift:.2g} % for "
@@ -460,8 +460,8 @@ def plumb_rows(profile: Profile) -> Iterator[Row]:
     else:
         shift = _tilt_shift_percent(profile.rig.beam, profile.axis_tilt_deg)
         found = f"{profile.axis_tilt_deg:g}° off, mode 1 shifted by {shift:+.2g} %"
-        detail, verdict = "", Verdict.OK
-    yield Row("profile", "axis plumb", found, "measured", verdict, detail)
+        detail, verdict = "", CheckResult.OK
+    yield CheckRow("profile", "axis plumb", found, "measured", verdict, detail)
 
 
 def _tilt_shift_percent(beam: Beam, tilt_deg: float) -> float:
@@ -475,42 +475,44 @@ def _tilt_shift_percent(beam: Beam, tilt_deg: float) -> float:
 UNKNOWN_VALUES = "unknown_values"
 
 
-def unknown_rows(profile: Profile) -> Iterator[Row]:
+def unknown_rows(profile: Profile) -> Iterator[CheckRow]:
     """Return the row on unknown values that every session needs."""
     for key in unknown_values(profile.rig):
         remedy = f"{key}: enter its value in {profile.path} ({MAY_BE_UNKNOWN[key]})."
-        yield Row("profile", key, "unknown", "a value", Verdict.FAIL, remedy, UNKNOWN_VALUES)
+        yield CheckRow(
+            "profile", key, "unknown", "a value", CheckResult.FAIL, remedy, UNKNOWN_VALUES
+        )
 
 
 CAN_IDENTIFIERS, CAN_LOAD, SERIAL_LOAD = "can_identifiers", "can_load", "serial_load"
 
 
-def wiring_rows(rig: RigParameters) -> Iterator[Row]:
+def wiring_rows(rig: RigParameters) -> Iterator[CheckRow]:
     """Check identifiers and load of the bus or line in the profile."""
     if rig.can is not None:
         from rigd.devices.canbus import bus_load, check_identifiers
 
         collisions = check_identifiers(rig)
         for collision in collisions:
-            yield _identifier_row(collision, Verdict.FAIL)
+            yield _identifier_row(collision, CheckResult.FAIL)
         if not collisions:
-            yield _identifier_row("no collision", Verdict.OK)
+            yield _identifier_row("no collision", CheckResult.OK)
         yield _bus_row(bus_load(rig), rig.can.bitrate_bit_s)
     if rig.ati_serial is not None:
         yield _line_row(rig.ati_serial)
 
 
-def _identifier_row(found: str, verdict: Verdict) -> Row:
-    return Row("CAN bus", "identifiers", found, "no collision", verdict, name=CAN_IDENTIFIERS)
+def _identifier_row(found: str, verdict: CheckResult) -> CheckRow:
+    return CheckRow("CAN bus", "identifiers", found, "no collision", verdict, name=CAN_IDENTIFIERS)
 
 
-def _bus_row(load: "BusLoad", bitrate_bit_s: int) -> Row:
+def _bus_row(load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
     from rigd.devices.canbus import MAX_LOAD
 
     frames = ", ".join(
         f"{t.what} ({t.can_id:#05x}, {t.length} bytes, {t.rate_hz:g} Hz)" for t in load.traffic
     )
-    return Row(
+    return CheckRow(
         "CAN bus",
         "load",
         f"{100 * load.worst:.1f} % at worst, {100 * load.plain:.1f} % without stuffing",
@@ -521,12 +523,12 @@ def _bus_row(load: "BusLoad", bitrate_bit_s: int) -> Row:
     )
 
 
-def _line_row(serial: "AtiSerial") -> Row:
+def _line_row(serial: "AtiSerial") -> CheckRow:
     from rigd.devices.ati import RECORD_BITS
     from rigd.devices.canbus import MAX_LOAD
 
     load = RECORD_BITS * serial.stream_hz / serial.baud
-    return Row(
+    return CheckRow(
         "serial line",
         "load",
         f"{100 * load:.1f} % of {serial.baud} bit/s",

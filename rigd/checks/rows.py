@@ -58,7 +58,7 @@ def _is_number(value: object) -> bool:
 # Rows
 
 
-class Verdict(Enum):
+class CheckResult(Enum):
     """Result of one row."""
 
     OK = "ok"
@@ -71,7 +71,7 @@ class Verdict(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class CheckRow:
     """One check and its result; all texts are for the operator."""
 
     group: str
@@ -82,7 +82,7 @@ class Row:
     """Its value."""
     wanted: str
     """Value it is compared with; empty if there is none."""
-    verdict: Verdict
+    verdict: CheckResult
     """Result of the check."""
     detail: str = ""
     """Text that is too long for a table."""
@@ -103,15 +103,15 @@ class Row:
         }
 
 
-def overall(rows: Iterable[Row]) -> str:
+def overall(rows: Iterable[CheckRow]) -> str:
     """Return ``failed``, ``warnings`` or ``ok``; skipped rows do not count."""
     verdicts = {row.verdict for row in rows}
-    if Verdict.FAIL in verdicts:
+    if CheckResult.FAIL in verdicts:
         return "failed"
-    return "warnings" if Verdict.WARNING in verdicts else "ok"
+    return "warnings" if CheckResult.WARNING in verdicts else "ok"
 
 
-def grade(*, fail: bool, warn: bool = False) -> Verdict:
+def grade(*, fail: bool, warn: bool = False) -> CheckResult:
     """Return the verdict on a comparison.
 
     Parameters
@@ -120,17 +120,17 @@ def grade(*, fail: bool, warn: bool = False) -> Verdict:
         Whether it fails, and else whether it is a warning.
     """
     if fail:
-        return Verdict.FAIL
-    return Verdict.WARNING if warn else Verdict.OK
+        return CheckResult.FAIL
+    return CheckResult.WARNING if warn else CheckResult.OK
 
 
 # Table
 
 _STYLES = {
-    Verdict.OK: "green",
-    Verdict.WARNING: "yellow",
-    Verdict.FAIL: "bold red",
-    Verdict.SKIPPED: "dim",
+    CheckResult.OK: "green",
+    CheckResult.WARNING: "yellow",
+    CheckResult.FAIL: "bold red",
+    CheckResult.SKIPPED: "dim",
 }
 
 
@@ -147,7 +147,7 @@ OF_AN_EDS = {
 }
 
 
-def print_table(rows: Sequence[Row], consequences: Mapping[str, str] = OF_A_RIG) -> None:
+def print_table(rows: Sequence[CheckRow], consequences: Mapping[str, str] = OF_A_RIG) -> None:
     """Print the table, the longer details, and the verdict, to standard output.
 
     Parameters
@@ -193,11 +193,11 @@ def print_table(rows: Sequence[Row], consequences: Mapping[str, str] = OF_A_RIG)
     console.print(Text(_verdict(rows, consequences), style="bold"))
 
 
-def _verdict(rows: Sequence[Row], consequences: Mapping[str, str]) -> str:
-    counts = {verdict: sum(row.verdict is verdict for row in rows) for verdict in Verdict}
+def _verdict(rows: Sequence[CheckRow], consequences: Mapping[str, str]) -> str:
+    counts = {verdict: sum(row.verdict is verdict for row in rows) for verdict in CheckResult}
     text = (
-        f"failed: {counts[Verdict.FAIL]}, warnings: {counts[Verdict.WARNING]}, "
-        f"ok: {counts[Verdict.OK]}, skipped: {counts[Verdict.SKIPPED]}"
+        f"failed: {counts[CheckResult.FAIL]}, warnings: {counts[CheckResult.WARNING]}, "
+        f"ok: {counts[CheckResult.OK]}, skipped: {counts[CheckResult.SKIPPED]}"
     )
     verdict = overall(rows)
     return f"Verdict: {verdict} ({text}): {consequences[verdict]}."

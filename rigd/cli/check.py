@@ -14,7 +14,7 @@ from rigd.runtime import raise_on
 
 if TYPE_CHECKING:
     from rigd.bench import Results
-    from rigd.checks.rows import Row
+    from rigd.checks.rows import CheckRow
     from rigd.profile import Profile
 
 
@@ -50,7 +50,7 @@ def check(
     _report(check_rig(rig_profile), as_json=as_json, on_paper=False)
 
 
-def _rows_of(eds: Path, profile: str | None) -> "list[Row]":
+def _rows_of(eds: Path, profile: str | None) -> "list[CheckRow]":
     from rigd.checks.on_paper import eds_rows
 
     if profile is None:
@@ -65,7 +65,7 @@ def _rows_of(eds: Path, profile: str | None) -> "list[Row]":
     return list(eds_rows(eds, rig_profile.rig))
 
 
-def _report(rows: "list[Row]", *, as_json: bool, on_paper: bool) -> None:
+def _report(rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
     from rigd.checks.rows import overall
 
     verdict = overall(rows)
@@ -74,10 +74,10 @@ def _report(rows: "list[Row]", *, as_json: bool, on_paper: bool) -> None:
         typer.echo(json.dumps(document, ensure_ascii=False))
     else:
         from rigd.checks import ACCEPTABLE
-        from rigd.checks.rows import OF_A_RIG, OF_AN_EDS, Verdict, print_table
+        from rigd.checks.rows import OF_A_RIG, OF_AN_EDS, CheckResult, print_table
 
         print_table(rows, OF_AN_EDS if on_paper else OF_A_RIG)
-        failed = {row.name for row in rows if row.verdict is Verdict.FAIL}
+        failed = {row.name for row in rows if row.verdict is CheckResult.FAIL}
         if failed and failed.issubset(ACCEPTABLE) and not on_paper:
             accepted = " ".join(f"--accept {name}" for name in ACCEPTABLE if name in failed)
             typer.echo(f"To accept that for one session: rigd run … {accepted}")
@@ -168,10 +168,10 @@ def _run(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float) 
     from rich.status import Status
 
     from rigd.bench import Bench
-    from rigd.devices import WhatMoves, reality
+    from rigd.devices import ActuationTarget, actuation_target
     from rigd.runtime import RigLock
 
-    hardware = reality(profile.rig) is WhatMoves.HARDWARE
+    hardware = actuation_target(profile.rig) is ActuationTarget.HARDWARE
     console = Console(stderr=True)
     # A simultaneous session of this rig would make both loops late.
     with (

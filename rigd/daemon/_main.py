@@ -14,7 +14,12 @@ from rigd.daemon._server import Server
 from rigd.daemon._service import Service
 from rigd.daemon._states import resolve_user
 from rigd.daemon.address import COMMON, bind, socket_path
-from rigd.devices import WhatMoves, reality, simulated_differently, what_moves
+from rigd.devices import (
+    ActuationTarget,
+    actuation_target,
+    describe_actuation_target,
+    simulated_differently,
+)
 from rigd.profile import Profile
 from rigd.runner import Rig
 from rigd.runtime import STOP_SIGNAL, RigLock
@@ -66,12 +71,12 @@ def run_daemon(
     AddressError
         If the socket cannot be created.
     """
-    moving = reality(profile.rig)
+    moving = actuation_target(profile.rig)
     with ExitStack() as ending:
         ending.enter_context(Log())
         resolve_user(os.getuid())
         ending.enter_context(
-            RigLock(profile.name, "rigd serve", hardware=moving is WhatMoves.HARDWARE)
+            RigLock(profile.name, "rigd serve", hardware=moving is ActuationTarget.HARDWARE)
         )
         path = socket_path(profile.name, None if group is None else COMMON)
         listener = ending.enter_context(bind(path, group))
@@ -84,12 +89,12 @@ def run_daemon(
             folder,
             worker,
             server.publish,
-            partial(reality, profile.rig),
+            partial(actuation_target, profile.rig),
             fast=fast,
             live=live,
             quick_looks=quick_looks,
         )
-        _log.info("%s Listening on %s", what_moves(profile.rig, moving), path)
+        _log.info("%s Listening on %s", describe_actuation_target(profile.rig, moving), path)
         for difference in simulated_differently(profile.rig):
             _log.warning("the simulated rig has %s", difference)
         if page:

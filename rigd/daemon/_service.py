@@ -36,7 +36,7 @@ from rigd.daemon._states import (
     signals_document,
     transition_document,
 )
-from rigd.devices import WhatMoves, what_moves
+from rigd.devices import ActuationTarget, describe_actuation_target
 from rigd.errors import UserError
 from rigd.profile import Profile
 from rigd.runner import ProbeFailedError, Rig, RigError, Series
@@ -97,7 +97,7 @@ class Service:
         folder: Path,
         worker: Executor,
         publish: Publish,
-        moving: Callable[[], WhatMoves],
+        moving: Callable[[], ActuationTarget],
         *,
         fast: bool = False,
         live: bool = False,
@@ -261,8 +261,8 @@ class Service:
                 self._profile.name,
                 str(self._folder),
                 moving=self._began_moving.value,
-                hardware=self._began_moving is WhatMoves.HARDWARE,
-                moving_text=what_moves(self._profile.rig, self._began_moving),
+                hardware=self._began_moving is ActuationTarget.HARDWARE,
+                moving_text=describe_actuation_target(self._profile.rig, self._began_moving),
                 fast=self._fast,
                 live=self._live,
                 web=self._page,

@@ -89,7 +89,7 @@ class PredictionJob:
 
 @dataclass(frozen=True, slots=True)
 class CheckJob:
-    """Check of a rig whose devices the daemon owns, by `rigd.checks.check_beside`."""
+    """Check of a rig whose devices the daemon owns, by `rigd.checks.check_without_devices`."""
 
     during_sessions: ClassVar[bool] = True
     profile: Profile
@@ -99,10 +99,10 @@ class CheckJob:
 
     def perform(self) -> dict[str, Any]:
         """Return the rows and the verdict for the reply."""
-        from rigd.checks import check_beside
+        from rigd.checks import check_without_devices
         from rigd.checks.rows import overall
 
-        rows = check_beside(self.profile, self.calibration)
+        rows = check_without_devices(self.profile, self.calibration)
         return {
             "rows": [
                 {

@@ -1,7 +1,7 @@
 """Devices that the loop talks to: contracts, their parameters, and the registry of drivers.
 
 Offers the opening of the devices that a profile names (`open_devices`), and what will move: the
-hardware or a simulation (`reality`).
+hardware or a simulation (`actuation_target`).
 
 Public modules: `contracts` (`Devices`, `WrenchSensor`, `DeviceError`), `parameters`
 (`RigParameters`), `running_simulator` (the address of ``rigd simulate``), `obstacles` and `eds`

@@ -1,11 +1,11 @@
-from ._registry import WhatMoves as WhatMoves
+from ._registry import ActuationTarget as ActuationTarget
+from ._registry import actuation_target as actuation_target
 from ._registry import check_selection as check_selection
+from ._registry import describe_actuation_target as describe_actuation_target
 from ._registry import objections as objections
 from ._registry import open_devices as open_devices
-from ._registry import reality as reality
 from ._registry import simulated_differently as simulated_differently
 from ._registry import simulator as simulator
-from ._registry import what_moves as what_moves
 from ._seeds import fresh_seed as fresh_seed
 from ._seeds import session_seed as session_seed
 from ._unknown import MAY_BE_UNKNOWN as MAY_BE_UNKNOWN

@@ -9,15 +9,21 @@ from typing import cast
 
 from rigd.devices._unknown import describe_unknown_values
 from rigd.devices.contracts import DeviceError, Devices
-from rigd.devices.parameters import RigParameters, Selection
+from rigd.devices.parameters import DeviceSelection, RigParameters
 from rigd.devices.running_simulator import differences, find_simulator
 from rigd.errors import UserError
 
 # Drive and sensor use the same plant or bus, so drivers are opened in pairs.
 _OPENERS = {
-    Selection(drive="sim", sensor="sim"): ("rigd.sim._devices", "open_simulated_rig"),
-    Selection(drive="cia402", sensor="ati_can"): ("rigd.devices._wired_rig", "open_wired_rig"),
-    Selection(drive="cia402", sensor="ati_serial"): ("rigd.devices._wired_rig", "open_wired_rig"),
+    DeviceSelection(drive="sim", sensor="sim"): ("rigd.sim._devices", "open_simulated_rig"),
+    DeviceSelection(drive="cia402", sensor="ati_can"): (
+        "rigd.devices._wired_rig",
+        "open_wired_rig",
+    ),
+    DeviceSelection(drive="cia402", sensor="ati_serial"): (
+        "rigd.devices._wired_rig",
+        "open_wired_rig",
+    ),
 }
 
 
@@ -25,7 +31,7 @@ class UnknownDeviceError(UserError, ValueError):
     """A profile names drivers that do not exist or cannot be combined."""
 
 
-class WhatMoves(Enum):
+class ActuationTarget(Enum):
     """Target of the actuation: the hardware, or which simulation."""
 
     HARDWARE = "the hardware"
@@ -37,10 +43,10 @@ class WhatMoves(Enum):
     @property
     def any_clock(self) -> bool:
         """Whether the rig may run under the virtual clock."""
-        return self in (WhatMoves.SIMULATED, WhatMoves.LOCK_STEP)
+        return self in (ActuationTarget.SIMULATED, ActuationTarget.LOCK_STEP)
 
 
-def check_selection(selection: Selection, source: Path | None = None) -> None:
+def check_selection(selection: DeviceSelection, source: Path | None = None) -> None:
     """Raise if no driver exists for a selection of devices.
 
     Parameters
@@ -64,17 +70,17 @@ def check_selection(selection: Selection, source: Path | None = None) -> None:
         )
 
 
-def reality(rig: RigParameters) -> WhatMoves:
+def actuation_target(rig: RigParameters) -> ActuationTarget:
     """Return what moves if the devices of a rig are opened now."""
     if rig.devices.drive == "sim":
-        return WhatMoves.SIMULATED
+        return ActuationTarget.SIMULATED
     simulator = find_simulator(rig.name)
     if simulator is None:
-        return WhatMoves.HARDWARE
-    return WhatMoves.LOCK_STEP if simulator.lock_step else WhatMoves.SIMULATOR
+        return ActuationTarget.HARDWARE
+    return ActuationTarget.LOCK_STEP if simulator.lock_step else ActuationTarget.SIMULATOR
 
 
-def what_moves(rig: RigParameters, moving: WhatMoves) -> str:
+def describe_actuation_target(rig: RigParameters, moving: ActuationTarget) -> str:
     """Say what will move, the hardware or its simulation.
 
     Parameters
@@ -82,10 +88,10 @@ def what_moves(rig: RigParameters, moving: WhatMoves) -> str:
     rig
         Parameters of the rig.
     moving
-        Result of `reality`.
+        Result of `actuation_target`.
     """
-    if moving is not WhatMoves.HARDWARE:
-        how = "in this process" if moving is WhatMoves.SIMULATED else moving.value
+    if moving is not ActuationTarget.HARDWARE:
+        how = "in this process" if moving is ActuationTarget.SIMULATED else moving.value
         return f"No hardware: {rig.name} is simulated ({how})."
     assert rig.can is not None
     assert rig.cia402 is not None
@@ -123,7 +129,7 @@ def simulator() -> ModuleType:
     return importlib.import_module("rigd.sim.wire")
 
 
-def open_devices(rig: RigParameters, moving: WhatMoves | None = None) -> Devices:
+def open_devices(rig: RigParameters, moving: ActuationTarget | None = None) -> Devices:
     """Make the drivers that a profile names; nothing is connected yet.
 
     Parameters
@@ -150,8 +156,8 @@ def open_devices(rig: RigParameters, moving: WhatMoves | None = None) -> Devices
         "Callable[[RigParameters], Devices]", getattr(importlib.import_module(module), name)
     )
     devices = opener(rig)
-    if moving is not None and devices.simulated is (moving is WhatMoves.HARDWARE):
-        found = "a simulated rig" if devices.simulated else WhatMoves.HARDWARE.value
+    if moving is not None and devices.simulated is (moving is ActuationTarget.HARDWARE):
+        found = "a simulated rig" if devices.simulated else ActuationTarget.HARDWARE.value
         raise DeviceError(
             f"{moving.value.capitalize()} was to move, and now it would be {found}: rigd simulate "
             "was started or ended in between. Nothing was sent; start again."

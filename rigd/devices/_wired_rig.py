@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from rigd.devices._registry import WhatMoves, objections, open_devices
+from rigd.devices._registry import ActuationTarget, objections, open_devices
 from rigd.devices.canbus import CanLink
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError, Devices, WrenchSensor
@@ -93,7 +93,7 @@ class ResettableDrive(Protocol):
         """
 
 
-def reset_drive(rig: RigParameters, moving: WhatMoves | None = None) -> str:
+def reset_drive(rig: RigParameters, moving: ActuationTarget | None = None) -> str:
     """Reset the fault of a rig's drive, and release the drive.
 
     Parameters

@@ -108,12 +108,12 @@ _KEYS: dict[type[Disturbance], dict[str, _ObstacleKey]] = {
     },
 }
 _WORDS = {"rigid": inf}
-NOT_BESIDE_FORCES = (
+INCOMPATIBLE_WITH_FORCES = (
     "clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz", "stiffness_drift_per_s",
 )  # fmt: skip
 """Keys of ``[simulation]`` with which no force along the beam is simulated, whatever exerts it."""
-NOT_BESIDE_OBSTACLES = (
-    *NOT_BESIDE_FORCES, "air_drag_m", "zeta_scatter_percent", "gamma_scatter_percent",
+INCOMPATIBLE_WITH_OBSTACLES = (
+    *INCOMPATIBLE_WITH_FORCES, "air_drag_m", "zeta_scatter_percent", "gamma_scatter_percent",
     "stiffness_scatter_percent",
 )  # fmt: skip
 """Keys of ``[simulation]`` with which no obstacle is simulated."""
@@ -187,7 +187,7 @@ def check_obstacles(
     beam
         The beam, on which they have to be.
     simulated
-        Other simulated effects, by the keys of `NOT_BESIDE_OBSTACLES`; 0 or None: none
+        Other simulated effects, by the keys of `INCOMPATIBLE_WITH_OBSTACLES`; 0 or None: none
         of that kind.
 
     Raises
@@ -231,7 +231,7 @@ def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
             "obstacle; copy it from that of rigd profiles show sim."
         )
     texts = tuple(texts)
-    simulated = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
+    simulated = {name: getattr(simulation, name) for name in INCOMPATIBLE_WITH_OBSTACLES}
     check_obstacles(map(parse_obstacle, texts), rig.beam, simulated)
     return replace(rig, simulation=replace(simulation, obstacles=simulation.obstacles + texts))
 

@@ -49,7 +49,7 @@ class Encoder:
 
 
 @dataclass(frozen=True, slots=True)
-class WrenchSensor:
+class WrenchSensorSettings:
     """Force-torque sensor; every sequence of six is fx, fy, fz (N), tx, ty, tz (N·m)."""
 
     resolution: tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
@@ -138,7 +138,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, slots=True)
-class Selection:
+class DeviceSelection:
     """Which driver serves each device: names in :mod:`rigd.devices._registry`."""
 
     drive: Annotated[str, MinLen(1)]
@@ -317,11 +317,11 @@ class RigParameters:
     """Motor and gear."""
     encoder: Encoder
     """Encoder at the output shaft."""
-    sensor: WrenchSensor
+    sensor: WrenchSensorSettings
     """Force-torque sensor."""
     actuation: Actuation
     """From the command to the torque."""
-    devices: Selection
+    devices: DeviceSelection
     """Drivers of drive and sensor."""
     simulation: Simulation | None = field(default=None)
     """Noise of the simulated rig; None: it cannot be simulated in the process."""

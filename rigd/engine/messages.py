@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:  # children start before the supervisor has imported any of these
     from rigd.control.damper import DamperSettings
-    from rigd.devices import WhatMoves
+    from rigd.devices import ActuationTarget
     from rigd.engine.channels import ChannelSpecs
     from rigd.engine.reference import ReferenceSpec
     from rigd.excitation import Approach, PrecisionSearch
@@ -51,7 +51,7 @@ class ControlJob:
 
     profile: "Profile"
     """Profile whose devices are connected."""
-    moving: "WhatMoves | None"
+    moving: "ActuationTarget | None"
     """The only thing that may move, as stated to the operator; None: nothing was stated."""
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""

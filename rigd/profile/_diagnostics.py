@@ -19,8 +19,8 @@ from rigd.devices.ati import RECORD_BITS
 from rigd.devices.cia402 import parse_assignment
 from rigd.devices.cia402.requirements import ACCEPTABLE
 from rigd.devices.obstacles import (
-    NOT_BESIDE_FORCES,
-    NOT_BESIDE_OBSTACLES,
+    INCOMPATIBLE_WITH_FORCES,
+    INCOMPATIBLE_WITH_OBSTACLES,
     ObstacleError,
     check_obstacles,
     parse_obstacle,
@@ -183,7 +183,7 @@ def _incompatible_with_drag(values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for settings of the simulated rig that are incompatible with air drag."""
     if not values.get("simulation.air_drag_m"):
         return
-    for name in NOT_BESIDE_FORCES:
+    for name in INCOMPATIBLE_WITH_FORCES:
         if values.get(f"simulation.{name}"):
             yield (
                 f"simulation.{name} and simulation.air_drag_m cannot be simulated together; leave "
@@ -223,7 +223,7 @@ def _obstacles(values: Mapping[str, Any]) -> Iterator[str]:
         values["beam.density_kg_per_m"],
         values["beam.bending_stiffness_n_m2"],
     )
-    given = {name: values.get(f"simulation.{name}") for name in NOT_BESIDE_OBSTACLES}
+    given = {name: values.get(f"simulation.{name}") for name in INCOMPATIBLE_WITH_OBSTACLES}
     for text in values.get("simulation.obstacles") or ():
         try:
             check_obstacles([parse_obstacle(text)], beam, given)

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from rigd.devices import MAY_BE_UNKNOWN
-from rigd.devices.cia402 import Finding, Grade, judge
+from rigd.devices.cia402 import Grade, SuitabilityFinding, check_suitability
 from rigd.devices.cia402.objects import MAX_SPEED_RPM, RATED_TORQUE
 from rigd.devices.cia402.requirements import TORQUE_FEEDBACK, TORQUE_LIMIT, WATCHDOG
 from rigd.devices.eds import Eds
@@ -86,7 +86,7 @@ class Draft:
                 f"{base.path}: has no CiA 402 drive to put another in the place of; start from "
                 "antenna_can or antenna_serial."
             )
-        judgement = judge(eds)
+        judgement = check_suitability(eds)
         if judgement.refusals:
             raise UnusableDriveError(
                 f"{eds.path}: no session could be run with this drive, and no profile was "
@@ -151,7 +151,7 @@ class Draft:
     def _is_unknown(self, key: str) -> bool:
         return key in self._settings and self._settings[key].source == UNKNOWN
 
-    def unaccepted(self) -> list[Finding]:
+    def unaccepted(self) -> list[SuitabilityFinding]:
         """Return the missing features of the drive that the profile does not accept.
 
         Raises
@@ -161,7 +161,7 @@ class Draft:
         """
         accepted = Setting(_ACCEPT, tuple(self._accepted))
         text = with_settings(self._base.text, [*self._settings.values(), accepted])
-        found = judge(self._eds, profile_of(text, self._path).rig).findings
+        found = check_suitability(self._eds, profile_of(text, self._path).rig).findings
         return [each for each in found if each.accept and each.grade is Grade.REFUSED]
 
     def accept(self, name: str) -> None:
@@ -177,7 +177,7 @@ class Draft:
     @property
     def doubts(self) -> list[str]:
         """Return remarks on this drive for the operator, in sentences."""
-        findings = judge(self._eds, profile_of(self._body(), self._path).rig).findings
+        findings = check_suitability(self._eds, profile_of(self._body(), self._path).rig).findings
         remarks = [f.sentence for f in findings if f.sentence]
         return remarks + [
             f"The file does not tell what {f.what} holds, which has to be {f.wanted}: "

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from rigd.beam import Beam, Damping
-from rigd.devices import WhatMoves, reality
+from rigd.devices import ActuationTarget, actuation_target
 from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._load import ProfileError, complaint, flatten, parse, read_text, validate
 from rigd.profile._locations import specimen_files
@@ -132,6 +132,6 @@ def _in_words(profile: Profile, specimen: Specimen) -> str:
     if not different:
         return f"{head}beam as in the profile."
     words = f"{head}{', '.join(different)}; for prediction, nominal model and file."
-    if reality(profile.rig) is not WhatMoves.HARDWARE:
+    if actuation_target(profile.rig) is not ActuationTarget.HARDWARE:
         words += " The simulated rig keeps the beam of the profile."
     return words

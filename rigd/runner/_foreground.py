@@ -10,7 +10,7 @@ from typing import Final, Self
 import typer
 
 from rigd.checks import check_on_paper
-from rigd.devices import WhatMoves, simulated_differently, what_moves
+from rigd.devices import ActuationTarget, describe_actuation_target, simulated_differently
 from rigd.engine.shared_state import LogEvent
 from rigd.errors import FailureError, RigdError
 from rigd.excitation import Excitation
@@ -143,11 +143,11 @@ def run_in_foreground(
                 profile = prepare(profile)
             profile = with_tip_slope(profile, tip_slope_rad)
             mounted = with_specimen(profile, specimen)
-            _print(what_moves(profile.rig, moving), err=True)
+            _print(describe_actuation_target(profile.rig, moving), err=True)
             for difference in simulated_differently(profile.rig):
                 write(f"Warning: the simulated rig has {difference}.")
-            alone = not (fast and moving is WhatMoves.SIMULATED)
-            shared = moving is WhatMoves.HARDWARE
+            alone = not (fast and moving is ActuationTarget.SIMULATED)
+            shared = moving is ActuationTarget.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
             rig = Rig(profile, fast=fast, group=group)
             if from_angle and not stop.requested:

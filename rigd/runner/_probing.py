@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from rigd.devices import WhatMoves, what_moves
+from rigd.devices import ActuationTarget, describe_actuation_target
 from rigd.devices.running_simulator import described, find_simulator
 from rigd.engine import probed_rig
 from rigd.errors import FailureError
@@ -183,9 +183,9 @@ def probe_in_foreground(
     """
     with contextlib.ExitStack() as reserved, group:
         profile, moving = load_rig(profile_name, fast=fast, hardware=hardware)
-        says(what_moves(profile.rig, moving))
-        alone = not (fast and moving is WhatMoves.SIMULATED)
-        shared = moving is WhatMoves.HARDWARE
+        says(describe_actuation_target(profile.rig, moving))
+        alone = not (fast and moving is ActuationTarget.SIMULATED)
+        shared = moving is ActuationTarget.HARDWARE
         reserved.enter_context(RigLock(profile.name, "rigd probe", hardware=shared, alone=alone))
         rig = Rig(profile, fast=fast, group=group)
         rig.connect(moving)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from rigd.devices import WhatMoves, describe_unknown_values
+from rigd.devices import ActuationTarget, describe_unknown_values
 from rigd.devices.contracts import DeviceError
 from rigd.engine.messages import Connected, ControlJob, Ended, Measured, Probe, Refused, Tare, Zero
 from rigd.engine.processes import CONTROL, LIVE, ChildError, Heartbeat
@@ -114,7 +114,7 @@ class Rig:
         """Metadata that the connected drive states; empty while not connected."""
         return {} if self._connection is None or not self.connected else self._connection.drive
 
-    def connect(self, moving: WhatMoves | None = None, *, reset_fault: bool = False) -> None:
+    def connect(self, moving: ActuationTarget | None = None, *, reset_fault: bool = False) -> None:
         """Start the processes and connect the devices; the torque stays off.
 
         Parameters
@@ -401,7 +401,7 @@ class Rig:
         group.cores = self._precedence.cores_before
         return {f"supervisor_{name}": text for name, text in self._precedence.take().items()}
 
-    def _reset_fault(self, moving: WhatMoves | None) -> None:
+    def _reset_fault(self, moving: ActuationTarget | None) -> None:
         try:
             from rigd.devices import reset_drive  # late: loads the drivers, needed only here
 

@@ -19,12 +19,12 @@ from pathlib import Path
 from rigd import __version__
 from rigd.checks import FailedCheck
 from rigd.devices import (
-    WhatMoves,
+    ActuationTarget,
+    actuation_target,
     check_selection,
+    describe_actuation_target,
     objections,
-    reality,
     simulated_differently,
-    what_moves,
 )
 from rigd.devices.obstacles import with_obstacles
 from rigd.devices.running_simulator import unreachable_simulators
@@ -82,7 +82,7 @@ def load_rig(
     seed: int | None = None,
     hardware: bool = False,
     obstacles: Sequence[str] = (),
-) -> tuple[Profile, WhatMoves]:
+) -> tuple[Profile, ActuationTarget]:
     """Load a profile and find its actuation target: hardware or a simulated rig.
 
     Parameters
@@ -114,22 +114,26 @@ def load_rig(
     refusals = objections(profile.rig)
     if refusals:
         raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
-    moving = reality(profile.rig)
-    if hardware and moving is not WhatMoves.HARDWARE:
+    moving = actuation_target(profile.rig)
+    if hardware and moving is not ActuationTarget.HARDWARE:
         raise RefusedError(
-            f"--hardware: {what_moves(profile.rig, moving)} Omit the option, or end the simulated "
-            "rig."
+            f"--hardware: {describe_actuation_target(profile.rig, moving)} Omit the option, or end "
+            "the simulated rig."
         )
-    if moving is WhatMoves.HARDWARE and not hardware:
+    if moving is ActuationTarget.HARDWARE and not hardware:
         _refuse_unreachable_simulators(profile)
     if fast and not moving.any_clock:
         raise RefusedError(
             f"--fast: {moving.value} of {profile.path} moves in real time, which cannot be "
             "skipped; omit the option."
-            + (" Or start rigd simulate with --lock-step." if moving is WhatMoves.SIMULATOR else "")
+            + (
+                " Or start rigd simulate with --lock-step."
+                if moving is ActuationTarget.SIMULATOR
+                else ""
+            )
         )
     if seed is not None:
-        if moving is WhatMoves.HARDWARE:
+        if moving is ActuationTarget.HARDWARE:
             raise RefusedError(
                 f"--seed: {moving.value} of {profile.path} moves, whose noise is not simulated; "
                 "omit the option."
@@ -142,13 +146,13 @@ def load_rig(
         simulation = replace(profile.rig.simulation, seed=seed)
         profile = replace(profile, rig=replace(profile.rig, simulation=simulation))
     if obstacles:
-        if moving is not WhatMoves.SIMULATED:
+        if moving is not ActuationTarget.SIMULATED:
             raise RefusedError(
                 f"--obstacle: {moving.value} of {profile.path} is not simulated here; omit the "
                 "option."
                 + (
                     " Or inject the obstacle into the simulated rig (rigd inject obstacle,x=…)."
-                    if moving is WhatMoves.SIMULATOR
+                    if moving is ActuationTarget.SIMULATOR
                     else ""
                 )
             )

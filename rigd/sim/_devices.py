@@ -21,7 +21,7 @@ from rigd.beam import check_order
 from rigd.devices import fresh_seed
 from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
 from rigd.devices.obstacles import Disturbance, ObstacleError, describe_obstacle, with_obstacles
-from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
+from rigd.devices.parameters import RigParameters, Simulation, WrenchSensorSettings
 from rigd.sim._plant import SimulatedPlant
 from rigd.sim._session_scatter import scatters_between_sessions, session_parameters
 
@@ -335,7 +335,7 @@ class SimulatedSensor:
     def __init__(
         self,
         plant: SimulatedPlant,
-        sensor: WrenchSensor,
+        sensor: WrenchSensorSettings,
         simulation: Simulation,
         rate_hz: float,
         weights: tuple[float, ...] = (1.0,),
@@ -462,7 +462,9 @@ _CROSSTALK = (
 entry."""
 
 
-def _wrenches(sensor: WrenchSensor, crosstalk_percent: float) -> tuple[list[float], list[float]]:
+def _wrenches(
+    sensor: WrenchSensorSettings, crosstalk_percent: float
+) -> tuple[list[float], list[float]]:
     """Wrenches of a coupling torque of 1 N·m without shear, and of a base shear of 1 N alone."""
     projections = np.array([sensor.projection, sensor.shear_projection])
     known = projections.any(axis=1)

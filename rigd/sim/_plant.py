@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rigd.beam.realisation import Realisation
 from rigd.devices.obstacles import (
-    NOT_BESIDE_OBSTACLES,
+    INCOMPATIBLE_WITH_OBSTACLES,
     Disturbance,
     check_obstacles,
     parse_obstacle,
@@ -480,7 +480,7 @@ def _contact(
     if simulation is None or not simulation.obstacles:
         return None
     bodies = tuple(parse_obstacle(text) for text in simulation.obstacles)
-    simulated = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
+    simulated = {name: getattr(simulation, name) for name in INCOMPATIBLE_WITH_OBSTACLES}
     check_obstacles(bodies, parameters.beam, simulated)
     return AttachedObstacles(parameters.beam, parameters.damping, beam, bodies, period_s)
 

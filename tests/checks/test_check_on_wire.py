@@ -9,7 +9,7 @@ import pytest
 from cases import further
 
 from rigd.checks.devices import inspect_devices
-from rigd.checks.rows import Verdict, overall
+from rigd.checks.rows import CheckResult, overall
 from rigd.devices import reset_drive
 from rigd.devices.contracts import DeviceError
 from rigd.devices.running_simulator import find_simulator
@@ -50,7 +50,7 @@ def test_a_fault_is_found_and_only_the_operator_resets_it(profile):
 
     inject(profile.name, ["emcy,code=0x2310"])
     for _ in range(2):  # looking at it does not reset it
-        failed = [row for row in inspect_devices(profile) if row.verdict is Verdict.FAIL]
+        failed = [row for row in inspect_devices(profile) if row.verdict is CheckResult.FAIL]
         assert [row.group for row in failed] == ["drive"]
         assert "0x2310" in failed[0].found
         assert "rigd reset" in failed[0].found

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from rigd.checks.devices import inspect_devices
-from rigd.checks.rows import Verdict, overall
+from rigd.checks.rows import CheckResult, overall
 from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import Watchdog
 from rigd.devices.contracts import DeviceError
@@ -55,10 +55,10 @@ def test_a_dead_device_fails_and_the_other_is_still_asked(can_profile, stand_ins
     getattr(stand_ins, device).fails_at["connect"] = error
     rows = inspect_devices(can_profile)
     found = by_name(rows)
-    assert found[device, "error"].verdict is Verdict.FAIL
+    assert found[device, "error"].verdict is CheckResult.FAIL
     assert found[device, "error"].found == str(error)
-    assert found[other, "connection"].verdict is Verdict.OK
-    assert found["exchange", "ticks"].verdict is Verdict.SKIPPED
+    assert found[other, "connection"].verdict is CheckResult.OK
+    assert found["exchange", "ticks"].verdict is CheckResult.SKIPPED
     assert stand_ins.closed
 
 
@@ -67,7 +67,7 @@ def test_an_error_while_measuring_fails(can_profile, stand_ins, where):
     device = stand_ins.drive if where == "latch" else stand_ins.sensor
     device.fails_at[where] = DeviceError("the bus is gone")
     rows = inspect_devices(can_profile)
-    assert any(row.found == "the bus is gone" and row.verdict is Verdict.FAIL for row in rows)
+    assert any(row.found == "the bus is gone" and row.verdict is CheckResult.FAIL for row in rows)
     assert stand_ins.closed
 
 
@@ -91,11 +91,12 @@ def test_devices_that_cannot_be_opened(can_profile, monkeypatch):
         raise DeviceError("a simulated rig is running, and the hardware is here too")
 
     monkeypatch.setattr("rigd.checks.devices.open_devices", refuse)
-    assert inspect_devices(can_profile)[-1].verdict is Verdict.FAIL
+    assert inspect_devices(can_profile)[-1].verdict is CheckResult.FAIL
 
 
 @pytest.mark.parametrize(
-    ("profile_range", "verdict"), [(1.0, Verdict.OK), (0.5, Verdict.OK), (1.1, Verdict.FAIL)]
+    ("profile_range", "verdict"),
+    [(1.0, CheckResult.OK), (0.5, CheckResult.OK), (1.1, CheckResult.FAIL)],
 )
 def test_a_range_beyond_the_sensors_fails(can_profile, stand_ins, profile_range, verdict):
     sensor = replace(can_profile.rig.sensor, range=(20.0, 20.0, 60.0, 1.0, 1.0, profile_range))
@@ -110,16 +111,16 @@ def test_what_a_sensor_does_not_tell(can_profile, stand_ins):
     rows = by_name(inspect_devices(can_profile))
     for what in ("range", "calibration date", "firmware"):
         assert rows["sensor", what].found == "not stated by the sensor"
-        assert rows["sensor", what].verdict is Verdict.OK
+        assert rows["sensor", what].verdict is CheckResult.OK
 
 
 @pytest.mark.parametrize(
     ("watchdog", "verdict"),
     [
-        (Watchdog.HEARTBEAT, Verdict.OK),
-        (Watchdog.RPDO_DEADLINE, Verdict.OK),
-        (Watchdog.OWN, Verdict.WARNING),
-        (Watchdog.NONE, Verdict.WARNING),
+        (Watchdog.HEARTBEAT, CheckResult.OK),
+        (Watchdog.RPDO_DEADLINE, CheckResult.OK),
+        (Watchdog.OWN, CheckResult.WARNING),
+        (Watchdog.NONE, CheckResult.WARNING),
     ],
 )
 def test_a_watchdog_that_is_missing_or_unproven_is_a_warning(
@@ -137,36 +138,36 @@ def test_a_watchdog_that_is_missing_or_unproven_is_a_warning(
 def test_a_sensor_that_complains_is_a_warning(can_profile, stand_ins):
     stand_ins.sensor.found["status"] = ["its watchdog has reset the board"]
     row = by_name(inspect_devices(can_profile))["sensor", "status"]
-    assert row.verdict is Verdict.WARNING
+    assert row.verdict is CheckResult.WARNING
     assert "watchdog" in row.found
 
 
 @pytest.mark.parametrize(
     ("key", "value", "verdict"),
     [
-        ("polls_hz", 999.0, Verdict.FAIL),
-        ("polls_hz", 1001.0, Verdict.OK),
-        ("turnaround_median_s", 0.8e-3, Verdict.FAIL),  # the deadline is 0.7 ms
-        ("turnaround_median_s", float("nan"), Verdict.FAIL),
-        ("turnaround_p99_s", 0.8e-3, Verdict.WARNING),
-        ("lost", 1.0, Verdict.WARNING),
+        ("polls_hz", 999.0, CheckResult.FAIL),
+        ("polls_hz", 1001.0, CheckResult.OK),
+        ("turnaround_median_s", 0.8e-3, CheckResult.FAIL),  # the deadline is 0.7 ms
+        ("turnaround_median_s", float("nan"), CheckResult.FAIL),
+        ("turnaround_p99_s", 0.8e-3, CheckResult.WARNING),
+        ("lost", 1.0, CheckResult.WARNING),
     ],
 )
 def test_rate_and_turn_round_on_can(can_profile, stand_ins, key, value, verdict):
     stand_ins.sensor.measured[key] = value
     rows = [row for row in inspect_devices(can_profile) if row.group == "sensor"]
-    worst = [row.verdict for row in rows if row.verdict is not Verdict.OK]
-    assert worst == ([] if verdict is Verdict.OK else [verdict])
+    worst = [row.verdict for row in rows if row.verdict is not CheckResult.OK]
+    assert worst == ([] if verdict is CheckResult.OK else [verdict])
 
 
 @pytest.mark.parametrize(
     ("key", "value", "verdict"),
     [
-        ("records_hz", 7000.0, Verdict.OK),
-        ("records_hz", 6900.0, Verdict.WARNING),
-        ("records_hz", 6000.0, Verdict.FAIL),
-        ("checksum_errors", 2.0, Verdict.WARNING),
-        ("longest_gap_s", 16e-3, Verdict.WARNING),  # an adapter's latency timer
+        ("records_hz", 7000.0, CheckResult.OK),
+        ("records_hz", 6900.0, CheckResult.WARNING),
+        ("records_hz", 6000.0, CheckResult.FAIL),
+        ("checksum_errors", 2.0, CheckResult.WARNING),
+        ("longest_gap_s", 16e-3, CheckResult.WARNING),  # an adapter's latency timer
     ],
 )
 def test_rate_of_a_stream(serial_profile, stand_ins, key, value, verdict):
@@ -179,14 +180,14 @@ def test_rate_of_a_stream(serial_profile, stand_ins, key, value, verdict):
     }
     stand_ins.sensor.cause = "The adapter holds records back."
     rows = [row for row in inspect_devices(serial_profile) if row.group == "sensor"]
-    worst = [row.verdict for row in rows if row.verdict is not Verdict.OK]
-    assert worst == ([] if verdict is Verdict.OK else [verdict])
+    worst = [row.verdict for row in rows if row.verdict is not CheckResult.OK]
+    assert worst == ([] if verdict is CheckResult.OK else [verdict])
     named = [row.what for row in rows if row.detail == stand_ins.sensor.cause]
     assert named == (["longest gap"] if key == "longest_gap_s" else [])
 
 
 @pytest.mark.parametrize(
-    ("every", "verdict"), [(0, Verdict.OK), (25, Verdict.WARNING), (2, Verdict.FAIL)]
+    ("every", "verdict"), [(0, CheckResult.OK), (25, CheckResult.WARNING), (2, CheckResult.FAIL)]
 )
 def test_missing_replies(can_profile, stand_ins, every, verdict):
     stand_ins.drive.stale_every = every
@@ -197,20 +198,20 @@ def test_missing_replies(can_profile, stand_ins, every, verdict):
 def test_a_saturated_sensor_fails(can_profile, stand_ins):
     stand_ins.sensor.wrench_saturated = True
     row = by_name(inspect_devices(can_profile))["exchange", "sensor saturated"]
-    assert row.verdict is Verdict.FAIL
+    assert row.verdict is CheckResult.FAIL
 
 
 def test_a_shaft_that_moves_by_itself_is_a_warning(can_profile, stand_ins):
     stand_ins.drive.angles_rad = iter(tick * 1e-4 for tick in range(100))
     row = by_name(inspect_devices(can_profile))["exchange", "shaft moved"]
-    assert row.verdict is Verdict.WARNING
+    assert row.verdict is CheckResult.WARNING
 
 
 def test_replies_of_the_tick_before_are_not_waited_for(can_profile, stand_ins):
     acquisition = replace(can_profile.rig.acquisition, mode="previous_tick")
     profile = replace(can_profile, rig=replace(can_profile.rig, acquisition=acquisition))
     row = by_name(inspect_devices(profile))["exchange", "both replies after"]
-    assert row.verdict is Verdict.SKIPPED
+    assert row.verdict is CheckResult.SKIPPED
 
 
 def test_replies_that_take_longer_than_the_deadline_fail(can_profile, stand_ins):
@@ -218,11 +219,11 @@ def test_replies_that_take_longer_than_the_deadline_fail(can_profile, stand_ins)
     acquisition = replace(can_profile.rig.acquisition, deadline_us=0.1)
     profile = replace(can_profile, rig=replace(can_profile.rig, acquisition=acquisition))
     row = by_name(inspect_devices(profile))["exchange", "both replies after"]
-    assert row.verdict is Verdict.FAIL
+    assert row.verdict is CheckResult.FAIL
 
 
 def test_the_simulation_in_this_process():
     rows = by_name(inspect_devices(load_profile("sim")))
     assert overall(rows.values()) == "ok"
     assert rows["drive", "connection"].found == "simulated in this process"
-    assert rows["exchange", "ticks"].verdict is Verdict.SKIPPED
+    assert rows["exchange", "ticks"].verdict is CheckResult.SKIPPED

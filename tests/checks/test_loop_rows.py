@@ -6,7 +6,7 @@ import pytest
 
 from rigd.beam import Damping
 from rigd.checks.on_paper import margin_rows, stability_rows
-from rigd.checks.rows import Verdict, overall
+from rigd.checks.rows import CheckResult, overall
 from rigd.profile import load_profile
 
 
@@ -42,23 +42,23 @@ def test_the_shipped_loops_are_fine(name):
 
 def test_an_unstable_loop_fails_with_its_remedy(sim):
     stability, margins = loop_rows(with_control(sim, feedforward_gain=0.0))
-    assert stability.verdict is Verdict.FAIL
+    assert stability.verdict is CheckResult.FAIL
     assert "control.feedforward_gain" in stability.found
-    assert margins.verdict is Verdict.SKIPPED
+    assert margins.verdict is CheckResult.SKIPPED
 
 
 def test_a_loop_that_hardly_grows_is_a_warning(sim):
     light = replace(sim, rig=replace(sim.rig, damping=Damping(zeta=1e-6)))
     stability, margins = loop_rows(light)
-    assert stability.verdict is Verdict.WARNING
+    assert stability.verdict is CheckResult.WARNING
     assert "almost no damping" in stability.found
-    assert margins.verdict is Verdict.SKIPPED
+    assert margins.verdict is CheckResult.SKIPPED
 
 
 def test_a_margin_below_its_limit_is_a_warning(sim):
     """A feed-forward that is 20 % too strong has no 20 % left."""
     rows = list(loop_rows(with_control(sim, feedforward_gain=1.2)))
-    low = {(row.group, row.what) for row in rows if row.verdict is Verdict.WARNING}
+    low = {(row.group, row.what) for row in rows if row.verdict is CheckResult.WARNING}
     assert ("loop, torque reading", "gain margin") in low
     assert ("loop, torque command", "phase margin") in low
     assert overall(rows) == "warnings"
@@ -68,11 +68,11 @@ def test_a_delay_that_leaves_less_than_a_period_is_a_warning(sim):
     rig = replace(sim.rig, actuation=replace(sim.rig.actuation, delay_s=4.5e-3))
     rows = {(row.group, row.what): row for row in loop_rows(replace(sim, rig=rig))}
     delay = rows["loop, torque command", "delay margin"]
-    assert delay.verdict is Verdict.WARNING
+    assert delay.verdict is CheckResult.WARNING
     assert delay.wanted == "1.00 ms"
 
 
 def test_what_cannot_be_designed_fails(sim):
     stability, _ = loop_rows(with_control(sim, pole_rad_s=0.1))
-    assert stability.verdict is Verdict.FAIL
+    assert stability.verdict is CheckResult.FAIL
     assert "too slow for this motor" in stability.found

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from rigd.checks.machine import machine_rows
-from rigd.checks.rows import Verdict
+from rigd.checks.rows import CheckResult
 from rigd.profile import load_profile
 
 CPU = "sys/devices/system/cpu"
@@ -39,7 +39,7 @@ def rows(tmp_path, monkeypatch):
 
 def test_a_good_computer_has_no_advice(rows):
     found = rows()
-    assert {row.verdict for row in found.values()} == {Verdict.OK}
+    assert {row.verdict for row in found.values()} == {CheckResult.OK}
     assert not any(row.detail for row in found.values())
     assert found["isolated core"].found == "2, 3"
 
@@ -76,10 +76,10 @@ def test_a_good_computer_has_no_advice(rows):
 def test_what_is_not_good_is_a_warning_with_a_remedy(rows, what, path, text, found, remedy):
     rows_found = rows({path: text})
     row = rows_found.pop(what)
-    assert row.verdict is Verdict.WARNING
+    assert row.verdict is CheckResult.WARNING
     assert found in row.found
     assert remedy in row.detail
-    assert {other.verdict for other in rows_found.values()} == {Verdict.OK}
+    assert {other.verdict for other in rows_found.values()} == {CheckResult.OK}
 
 
 @pytest.mark.parametrize(
@@ -88,28 +88,28 @@ def test_what_is_not_good_is_a_warning_with_a_remedy(rows, what, path, text, fou
 )
 def test_an_ordinary_kernel_is_a_warning(rows, kernel, found):
     row = rows(kernel=kernel)["kernel"]
-    assert (row.found, row.verdict) == (found, Verdict.WARNING)
+    assert (row.found, row.verdict) == (found, CheckResult.WARNING)
 
 
 def test_a_kernel_may_say_in_its_files_that_it_is_a_realtime_one(rows):
-    assert rows({"sys/kernel/realtime": "1\n"}, kernel="#1 SMP")["kernel"].verdict is Verdict.OK
+    assert rows({"sys/kernel/realtime": "1\n"}, kernel="#1 SMP")["kernel"].verdict is CheckResult.OK
 
 
 def test_a_loop_that_is_kept_off_the_isolated_core_is_told_so(rows):
     row = rows(cpu=1)["isolated core"]
-    assert row.verdict is Verdict.WARNING
+    assert row.verdict is CheckResult.WARNING
     assert "realtime.cpu" in row.detail
-    assert rows(cpu=3)["isolated core"].verdict is Verdict.OK
+    assert rows(cpu=3)["isolated core"].verdict is CheckResult.OK
 
 
 def test_a_wall_clock_that_nobody_keeps_is_told(rows, monkeypatch):
     monkeypatch.setattr("rigd.checks.machine._synchronised", lambda: False)
-    assert rows()["wall clock"].verdict is Verdict.WARNING
+    assert rows()["wall clock"].verdict is CheckResult.WARNING
 
 
 def test_nothing_is_read_that_is_not_there(tmp_path):
     found = list(machine_rows(load_profile("sim").realtime, tmp_path))
-    assert Verdict.FAIL not in {row.verdict for row in found}
+    assert CheckResult.FAIL not in {row.verdict for row in found}
 
 
 def test_this_computer_can_be_looked_at():

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from rigd.beam import mode_shape, undamped_frequencies_rad_s
-from rigd.checks import check_beside, check_on_paper
+from rigd.checks import check_on_paper, check_without_devices
 from rigd.checks.on_paper import plumb_rows, profile_rows, record_rows, wiring_rows
-from rigd.checks.rows import Row, Verdict, overall
+from rigd.checks.rows import CheckResult, CheckRow, overall
 from rigd.devices.canbus import bus_load
 from rigd.excitation import ExcitationError, chirp
 from rigd.profile import load_profile
@@ -20,12 +20,12 @@ def by_name(rows):
 
 
 def row(verdict):
-    return Row("", "", "", "", verdict)
+    return CheckRow("", "", "", "", verdict)
 
 
 def test_the_worst_row_is_the_verdict():
     ok, skipped, warning, fail = map(
-        row, (Verdict.OK, Verdict.SKIPPED, Verdict.WARNING, Verdict.FAIL)
+        row, (CheckResult.OK, CheckResult.SKIPPED, CheckResult.WARNING, CheckResult.FAIL)
     )
     assert overall([]) == "ok"
     assert overall([ok, skipped]) == "ok"
@@ -35,7 +35,7 @@ def test_the_worst_row_is_the_verdict():
 
 def test_assumed_numbers_are_one_warning_that_names_them(can_profile):
     found = by_name(profile_rows(can_profile))["unverified profile values"]
-    assert found.verdict is Verdict.WARNING
+    assert found.verdict is CheckResult.WARNING
     assumed = [key for key, source in can_profile.sources.items() if source == "assumed"]
     assert found.found == f"{len(assumed)} of {len(can_profile.sources)}"
     assert all(key in found.detail for key in assumed)
@@ -49,11 +49,11 @@ def test_a_profile_without_assumptions_has_no_warning(can_profile):
 
 def test_the_longest_record_is_the_one_that_can_be_analysed(can_profile):
     (row,) = record_rows(can_profile)
-    assert (row.found, row.verdict, row.detail) == ("2400 s at 1000 Hz", Verdict.OK, "")
+    assert (row.found, row.verdict, row.detail) == ("2400 s at 1000 Hz", CheckResult.OK, "")
     assert row.wanted == "136 s (run chirp)"
     fast = replace(can_profile, rig=replace(can_profile.rig, rate_hz=20_000.0))
     (row,) = record_rows(fast)
-    assert (row.found, row.verdict) == ("120 s at 20000 Hz", Verdict.WARNING)
+    assert (row.found, row.verdict) == ("120 s at 20000 Hz", CheckResult.WARNING)
     assert "2400000 samples can be analysed" in row.detail
     with pytest.raises(ExcitationError, match="120 s is the most"):
         chirp(rate_hz=20_000.0)
@@ -61,13 +61,13 @@ def test_the_longest_record_is_the_one_that_can_be_analysed(can_profile):
 
 def test_an_unknown_tilt_of_the_axis_is_a_warning_that_refuses_nothing(can_profile):
     (row,) = plumb_rows(can_profile)
-    assert (row.found, row.verdict) == ("not known", Verdict.WARNING)
+    assert (row.found, row.verdict) == ("not known", CheckResult.WARNING)
     for words in ("0.027 % for 0.5°", "level", "rig.axis_tilt_deg"):
         assert words in row.detail
-    assert row in check_beside(can_profile, None)
+    assert row in check_without_devices(can_profile, None)
     assert not check_on_paper(can_profile).refusals
     (row,) = plumb_rows(load_profile("sim"))
-    assert row.verdict is Verdict.SKIPPED
+    assert row.verdict is CheckResult.SKIPPED
 
 
 @pytest.mark.parametrize("tilt_deg", [0.5, -2.0])
@@ -82,7 +82,7 @@ def test_a_measured_tilt_says_by_how_much_it_shifts_mode_1(can_profile, tilt_deg
     squared = undamped_frequencies_rad_s(beam, 1)[0] ** 2
     percent = 100 * (np.sqrt(1 + added / squared) - 1)
     (row,) = plumb_rows(replace(can_profile, axis_tilt_deg=tilt_deg))
-    assert (row.verdict, row.detail) == (Verdict.OK, "")
+    assert (row.verdict, row.detail) == (CheckResult.OK, "")
     number = re.search(r"shifted by (\S+) %", row.found)[1]
     assert float(number) == pytest.approx(percent, rel=0.05)
 
@@ -90,25 +90,25 @@ def test_a_measured_tilt_says_by_how_much_it_shifts_mode_1(can_profile, tilt_deg
 def test_the_shipped_wiring_is_fine(can_profile, serial_profile):
     for profile in (can_profile, serial_profile):
         rows = by_name(wiring_rows(profile.rig))
-        assert {row.verdict for row in rows.values()} == {Verdict.OK}
+        assert {row.verdict for row in rows.values()} == {CheckResult.OK}
     assert list(wiring_rows(load_profile("sim").rig)) == []
 
 
 def test_a_collision_fails(can_profile):
     rig = replace(can_profile.rig, ati_can=replace(can_profile.rig.ati_can, base_id=0x20))
     found = by_name(wiring_rows(rig))["identifiers"]
-    assert found.verdict is Verdict.FAIL
+    assert found.verdict is CheckResult.FAIL
     assert "0x201 (RPDO1)" in found.found
 
 
 @pytest.mark.parametrize(
     ("worst", "verdict"),
     [
-        (0.69, Verdict.OK),
-        (0.71, Verdict.WARNING),
-        (0.89, Verdict.WARNING),
-        (0.91, Verdict.FAIL),
-        (1.2, Verdict.FAIL),
+        (0.69, CheckResult.OK),
+        (0.71, CheckResult.WARNING),
+        (0.89, CheckResult.WARNING),
+        (0.91, CheckResult.FAIL),
+        (1.2, CheckResult.FAIL),
     ],
 )
 def test_bus_load_is_refused_above_90_percent(can_profile, worst, verdict):
@@ -139,4 +139,4 @@ def test_a_slow_serial_line_fails(serial_profile):
     assert rows[0].found.startswith("80.1 %")
     slow = replace(rig, ati_serial=replace(rig.ati_serial, baud=115_200))
     (found,) = (row for row in wiring_rows(slow) if row.group == "serial line")
-    assert found.verdict is Verdict.FAIL
+    assert found.verdict is CheckResult.FAIL

@@ -8,8 +8,8 @@ import pytest
 from cases import further
 from eds_files import eds_path
 
-from rigd.checks import check_beside, check_on_paper
-from rigd.checks.rows import Verdict, overall
+from rigd.checks import check_on_paper, check_without_devices
+from rigd.checks.rows import CheckResult, overall
 from rigd.control import ControlDesignError
 from rigd.devices import MAY_BE_UNKNOWN, open_devices, unknown_values
 from rigd.devices.contracts import DeviceError
@@ -82,8 +82,8 @@ def test_check_and_run_agree_on_a_profile_with_one_lie(lie, tmp_path, key, facto
         profile = load_profile(path)
     except ProfileError:
         return  # neither command begins
-    rows = check_beside(profile, None)
-    failed = [row for row in rows if row.verdict is Verdict.FAIL]
+    rows = check_without_devices(profile, None)
+    failed = [row for row in rows if row.verdict is CheckResult.FAIL]
     assert {row.name for row in failed} == {each.name for each in check_on_paper(profile).failed}
     refused = refusal(profile, tmp_path / "out", "hold", duration_s=0.5)
     assert bool(failed) == bool(refused)
@@ -92,7 +92,7 @@ def test_check_and_run_agree_on_a_profile_with_one_lie(lie, tmp_path, key, facto
     # A chirp may leave limits that a hold keeps: check says that, too.
     chirp = refusal(profile, tmp_path / "out", "chirp")
     advice = [row.verdict for row in rows if row.what == "chirp without options"]
-    assert bool(chirp) == bool(failed or advice == [Verdict.WARNING])
+    assert bool(chirp) == bool(failed or advice == [CheckResult.WARNING])
 
 
 def test_the_shipped_profiles_pass(can_profile, serial_profile):
@@ -107,7 +107,7 @@ def test_every_row_that_fails_has_a_name_of_its_check(lie):
     }  # fmt: skip
     assert {each.name for each in check_on_paper(profile).failed} == travel
     assert {
-        row.name for row in check_beside(profile, None) if row.verdict is Verdict.FAIL
+        row.name for row in check_without_devices(profile, None) if row.verdict is CheckResult.FAIL
     } == travel
 
 
@@ -194,7 +194,9 @@ def test_an_unknown_value_is_named_wherever_it_is_needed(unknown, tmp_path, key)
     profile = load_profile(path)
     assert unknown_values(profile.rig) == (key,)
     assert profile.sources[key] == "unknown"
-    (failed,) = [row for row in check_beside(profile, None) if row.verdict is Verdict.FAIL]
+    (failed,) = [
+        row for row in check_without_devices(profile, None) if row.verdict is CheckResult.FAIL
+    ]
     assert (failed.what, failed.name) == (key, "unknown_values")
     assert str(path) in failed.detail
     assert MAY_BE_UNKNOWN[key] in failed.detail
@@ -212,7 +214,7 @@ def test_an_unknown_value_is_named_wherever_it_is_needed(unknown, tmp_path, key)
 def test_all_unknown_at_once_and_on_a_simulated_rig(unknown, tmp_path):
     assert unknown_values(load_profile(unknown(*MAY_BE_UNKNOWN)).rig) == tuple(MAY_BE_UNKNOWN)
     profile = load_profile(unknown("motor.inertia_kg_m2", base=load_profile("sim")))
-    assert overall(check_beside(profile, None)) == "failed"
+    assert overall(check_without_devices(profile, None)) == "failed"
     with pytest.raises(DeviceError, match="inertia_kg_m2 is unknown; enter its value"):
         open_devices(profile.rig)
 

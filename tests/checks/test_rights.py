@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from rigd.checks.machine import rights_rows
-from rigd.checks.rows import Verdict
+from rigd.checks.rows import CheckResult
 from rigd.profile import load_profile
 
 
@@ -32,13 +32,13 @@ def test_every_setting_has_a_row_and_none_sticks(asked):
         "scheduling",
         "supervisor and recorder",
     }
-    assert rows["timer slack"].verdict is Verdict.OK
+    assert rows["timer slack"].verdict is CheckResult.OK
     assert state() == before
 
 
 def test_what_is_refused_is_a_warning_with_a_remedy(asked):
     rows = {row.what: row for row in rights_rows(replace(asked, cpu=4000))}
-    assert rows["cpu"].verdict is Verdict.WARNING
+    assert rows["cpu"].verdict is CheckResult.WARNING
     assert rows["cpu"].found.startswith("refused")
     assert "realtime.cpu" in rows["cpu"].wanted
 
@@ -46,13 +46,13 @@ def test_what_is_refused_is_a_warning_with_a_remedy(asked):
 def test_an_ordinary_scheduler_may_be_wanted(asked):
     rows = {row.what: row for row in rights_rows(replace(asked, priority=0))}
     assert rows["scheduling"].found == "not requested"
-    assert rows["scheduling"].verdict is Verdict.OK
+    assert rows["scheduling"].verdict is CheckResult.OK
 
 
 def test_a_trial_that_fails_is_told(asked, monkeypatch):
     monkeypatch.setattr("rigd.checks.machine.OWN_PYTHON", ("/no/such/python",))
     (row,) = rights_rows(asked)
-    assert row.verdict is Verdict.WARNING
+    assert row.verdict is CheckResult.WARNING
     assert "could not be tried" in row.found
 
 
@@ -71,12 +71,12 @@ def test_the_lines_that_grant_what_is_lacking_are_spelt_out(asked, monkeypatch):
     assert f"{user} - rtprio {asked.priority}" in rows["supervisor and recorder"].detail
     assert rows["supervisor and recorder"].wanted == "SCHED_RR 20"
     assert 'KERNEL=="cpu_dma_latency"' in rows["idle states"].detail
-    assert all(row.verdict is Verdict.WARNING for row in rows.values())
+    assert all(row.verdict is CheckResult.WARNING for row in rows.values())
 
 
 def test_memory_that_is_locked_in_part_only_is_a_warning(asked, monkeypatch):
     granted = {"memory": "locked, but for what is allocated later (limit of 8 MB)"}
     monkeypatch.setattr("rigd.checks.machine.settings_granted", lambda settings: granted)
     (row,) = rights_rows(asked)
-    assert row.verdict is Verdict.WARNING
+    assert row.verdict is CheckResult.WARNING
     assert "memlock unlimited" in row.detail

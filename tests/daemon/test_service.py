@@ -7,7 +7,7 @@ import pytest
 from cases import further
 from operated_daemons import CommandError, Peer, parse_request, shown_status
 
-from rigd.devices import WhatMoves
+from rigd.devices import ActuationTarget
 from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.engine.processes import ChildError
 from rigd.engine.shared_state import StateField
@@ -273,7 +273,7 @@ def test_a_rig_that_cannot_be_connected_is_a_fault_until_it_can(operate):
 def test_the_hardware_does_not_take_the_place_of_a_simulation(operated):
     operated.world.countdown, operated.world.then = 1200, fail
     operated.ask("start", **SHORT)
-    operated.moving = WhatMoves.HARDWARE
+    operated.moving = ActuationTarget.HARDWARE
     assert "restart the daemon" in str(operated.ask("reset"))
     assert operated.state == "fault"
     assert len(operated.world.drives) == 1

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 from rigd.devices import check_selection
-from rigd.devices.parameters import Selection
+from rigd.devices.parameters import DeviceSelection
 from rigd.errors import UserError
 
 
 def test_unknown_drivers_are_refused_with_what_there_is():
     with pytest.raises(UserError, match=r'a\.toml: .*"steam".*choose drive = "sim"'):
-        check_selection(Selection(drive="steam", sensor="sim"), Path("a.toml"))
+        check_selection(DeviceSelection(drive="steam", sensor="sim"), Path("a.toml"))
 
 
 def test_the_simulation_is_not_imported_unless_a_profile_names_it():

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.devices import WhatMoves, open_devices, reality, simulated_differently
+from rigd.devices import ActuationTarget, actuation_target, open_devices, simulated_differently
 from rigd.devices.contracts import DeviceError
 from rigd.devices.running_simulator import SimulatorAddress, announce, described
 from rigd.profile import load_profile
@@ -28,31 +28,31 @@ def stand_in(runtime_folder):
 
 
 def test_what_would_move(rig, stand_in):
-    assert reality(load_profile("sim").rig) is WhatMoves.SIMULATED
-    assert reality(rig) is WhatMoves.HARDWARE
+    assert actuation_target(load_profile("sim").rig) is ActuationTarget.SIMULATED
+    assert actuation_target(rig) is ActuationTarget.HARDWARE
     stand_in("another_rig")
-    assert reality(rig) is WhatMoves.HARDWARE
+    assert actuation_target(rig) is ActuationTarget.HARDWARE
     stand_in(rig.name)
-    assert reality(rig) is WhatMoves.SIMULATOR
+    assert actuation_target(rig) is ActuationTarget.SIMULATOR
     stand_in(rig.name, lock_step=True)
-    assert reality(rig) is WhatMoves.LOCK_STEP
+    assert actuation_target(rig) is ActuationTarget.LOCK_STEP
 
 
 def test_only_where_nothing_waits_for_the_clock_may_time_be_skipped():
-    assert {each for each in WhatMoves if each.any_clock} == {
-        WhatMoves.SIMULATED,
-        WhatMoves.LOCK_STEP,
+    assert {each for each in ActuationTarget if each.any_clock} == {
+        ActuationTarget.SIMULATED,
+        ActuationTarget.LOCK_STEP,
     }
 
 
 def test_what_moves_is_what_was_said_to_move(rig, stand_in):
-    assert not open_devices(rig, WhatMoves.HARDWARE).simulated
+    assert not open_devices(rig, ActuationTarget.HARDWARE).simulated
     with pytest.raises(DeviceError, match="was to move, and now it would be the hardware"):
-        open_devices(rig, WhatMoves.SIMULATOR)
+        open_devices(rig, ActuationTarget.SIMULATOR)
     stand_in(rig.name, can_socket="/nowhere")
-    assert open_devices(rig, WhatMoves.SIMULATOR).simulated
+    assert open_devices(rig, ActuationTarget.SIMULATOR).simulated
     with pytest.raises(DeviceError, match="hardware was to move"):
-        open_devices(rig, WhatMoves.HARDWARE)
+        open_devices(rig, ActuationTarget.HARDWARE)
 
 
 def test_devices_say_whether_they_are_simulated(rig, stand_in):

@@ -17,7 +17,7 @@ from rigd.cli.status_view import status_table
 from rigd.daemon._protocol import CommandError, RequestError, StartRequest, parse_request
 from rigd.daemon._service import Service
 from rigd.daemon._states import DaemonState, DaemonStateMachine, IllegalTransitionError, Peer
-from rigd.devices import WhatMoves, open_devices
+from rigd.devices import ActuationTarget, open_devices
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.engine import control_process as control
 from rigd.engine import recorder
@@ -275,7 +275,7 @@ class Operated:
         self.worker = ThreadPoolExecutor(1)
         self.events = []
         self.rig = Rig(profile, fast=True)
-        self.moving = WhatMoves.SIMULATED
+        self.moving = ActuationTarget.SIMULATED
         self.service = self.world.service = Service(
             self.rig,
             profile,

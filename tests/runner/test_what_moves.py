@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from rigd.devices import WhatMoves, what_moves
+from rigd.devices import ActuationTarget, describe_actuation_target
 from rigd.devices.running_simulator import unreachable_simulators
 from rigd.runner.planning import RefusedError
 from rigd.runner.request import load_rig
@@ -29,10 +29,14 @@ def listening(path):
 
 def test_hardware_is_named_as_loudly_as_its_simulation(profile, runtime_folder):
     loaded, moving = load_rig(profile)
-    assert moving is WhatMoves.HARDWARE
-    assert what_moves(loaded.rig, moving).startswith(f"HARDWARE: {loaded.name} moves the drive on ")
-    assert "node" in what_moves(loaded.rig, moving)
-    assert what_moves(loaded.rig, WhatMoves.LOCK_STEP).startswith("No hardware: ")
+    assert moving is ActuationTarget.HARDWARE
+    assert describe_actuation_target(loaded.rig, moving).startswith(
+        f"HARDWARE: {loaded.name} moves the drive on "
+    )
+    assert "node" in describe_actuation_target(loaded.rig, moving)
+    assert describe_actuation_target(loaded.rig, ActuationTarget.LOCK_STEP).startswith(
+        "No hardware: "
+    )
 
 
 def test_a_simulated_rig_of_another_environment_keeps_the_hardware_from_moving(
@@ -40,14 +44,14 @@ def test_a_simulated_rig_of_another_environment_keeps_the_hardware_from_moving(
 ):
     """As with sudo, cron or ssh, which have another runtime folder or none."""
     process = start_simulator(profile)
-    assert load_rig(profile)[1] is WhatMoves.SIMULATOR
+    assert load_rig(profile)[1] is ActuationTarget.SIMULATOR
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with pytest.raises(RefusedError, match=rf"XDG_RUNTIME_DIR={runtime_folder} .*--hardware"):
         load_rig(profile)
-    assert load_rig(profile, hardware=True)[1] is WhatMoves.HARDWARE
+    assert load_rig(profile, hardware=True)[1] is ActuationTarget.HARDWARE
     process.terminate()
     process.wait()
-    assert load_rig(profile)[1] is WhatMoves.HARDWARE
+    assert load_rig(profile)[1] is ActuationTarget.HARDWARE
 
 
 def test_neither_does_the_hardware_move_beside_one_of_another_user(profile, runtime_folder):
@@ -68,7 +72,7 @@ def test_a_socket_of_any_name_is_no_traceback_and_does_nothing_to_the_terminal(
     """Every user may make one, and the kernel lists its name as it is, line breaks included."""
     for name in ("a\n1: 2 3 xyz 5 6 7 /8", "b\n1 2 3 xyz 5 6 7 8", "c\x0b1 2 3 xyz 5 6 7 8"):
         with listening(runtime_folder / name):
-            assert load_rig(profile)[1] is WhatMoves.HARDWARE
+            assert load_rig(profile)[1] is ActuationTarget.HARDWARE
     with (
         listening(runtime_folder / "\x1b]0;gone\x07" / f"{profile.stem}.control"),
         pytest.raises(RefusedError, match="A simulated rig of") as refused,
@@ -79,10 +83,10 @@ def test_a_socket_of_any_name_is_no_traceback_and_does_nothing_to_the_terminal(
 
 def test_simulated_rigs_of_other_names_and_dead_ones_are_passed_over(profile, runtime_folder):
     with listening(runtime_folder / "rigd" / f"other_{profile.stem}.control"):
-        assert load_rig(profile)[1] is WhatMoves.HARDWARE
+        assert load_rig(profile)[1] is ActuationTarget.HARDWARE
     with socket.socket(socket.AF_UNIX) as bound:  # nobody listens there
         bound.bind(str(runtime_folder / "rigd" / f"{profile.stem}.control"))
-        assert load_rig(profile)[1] is WhatMoves.HARDWARE
+        assert load_rig(profile)[1] is ActuationTarget.HARDWARE
 
 
 def test_hardware_cannot_be_asked_for_where_something_stands_in(start_simulator, profile):

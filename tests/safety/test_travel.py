@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from rigd.checks.on_paper import travel_rows, worst_travel
-from rigd.checks.rows import Verdict
+from rigd.checks.rows import CheckResult
 from rigd.profile import load_profile
 
 
@@ -60,7 +60,7 @@ def test_the_drive_s_own_speed_limit_shortens_it(profile):
 @pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
 def test_the_shipped_rigs_come_to_rest_in_time(name):
     rows = list(travel_rows(load_profile(name)))
-    assert [row.verdict for row in rows] == [Verdict.OK] * 4
+    assert [row.verdict for row in rows] == [CheckResult.OK] * 4
     (worst,) = [row for row in rows if row.what.startswith("worst, ")]
     assert worst.what == "worst, if the loop fails"
     assert "object 6080" in worst.detail
@@ -69,7 +69,7 @@ def test_the_shipped_rigs_come_to_rest_in_time(name):
 
 def test_a_drive_in_this_program_ends_with_it():
     (row,) = travel_rows(load_profile("sim"))
-    assert row.verdict is Verdict.SKIPPED
+    assert row.verdict is CheckResult.SKIPPED
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_a_travel_beyond_the_stop_is_refused(profile, drive, limits):
     rig = replace(profile.rig, cia402=replace(profile.rig.cia402, **drive))
     wrong = replace(profile, rig=rig, limits=replace(profile.limits, **limits))
     row = worst_row(wrong)
-    assert row.verdict is Verdict.FAIL
+    assert row.verdict is CheckResult.FAIL
     assert "cia402.heartbeat_timeout_s" in row.detail
 
 
@@ -100,11 +100,11 @@ def test_a_loop_that_runs_blind_for_long_is_the_worst(profile, limits, what, key
     blind = replace(profile, limits=replace(profile.limits, **limits))
     row = worst_row(blind)
     assert row.what == f"worst, {what}"
-    assert row.verdict is Verdict.FAIL
+    assert row.verdict is CheckResult.FAIL
     assert f"1000 {'old angles' if 'stale' in key else 'missed ticks'} ({key})" in row.found
     assert key in row.detail
     others = [each for each in travel_rows(blind) if each.what != row.what]
-    assert [each.verdict for each in others] == [Verdict.OK] * 3
+    assert [each.verdict for each in others] == [CheckResult.OK] * 3
     # Five rad/s, the drive's own limit, for a second; then it runs out.
     travel = worst_travel(blind.rig, blind.limits, 1.002, 5.0)
     assert 4.9 < travel.driven_rad < 5.01
@@ -119,7 +119,7 @@ def test_what_nothing_ends_is_told_and_takes_no_time(profile):
         limits=replace(profile.limits, stale_ticks_in_a_row=10**9),
     )
     row = worst_row(blind)
-    assert row.verdict is Verdict.FAIL
+    assert row.verdict is CheckResult.FAIL
     assert row.found.startswith("more than 100 rad: more than 100 rad in the")
     assert worst_travel(profile.rig, profile.limits, math.inf, 5.0).total_rad == math.inf
 
@@ -133,10 +133,10 @@ def test_a_drive_that_is_accepted_without_a_watchdog_has_no_bound(profile):
     drive = replace(profile.rig.cia402, accept_without=("watchdog",))
     rows = list(travel_rows(replace(profile, rig=replace(profile.rig, cia402=drive))))
     worst, *others = rows
-    assert (worst.what, worst.verdict) == ("worst, if the loop fails", Verdict.WARNING)
+    assert (worst.what, worst.verdict) == ("worst, if the loop fails", CheckResult.WARNING)
     assert "without bound" in worst.found
     assert "cia402.accept_without" in worst.detail
-    assert [row.verdict for row in others] == [Verdict.OK] * 3
+    assert [row.verdict for row in others] == [CheckResult.OK] * 3
     assert not any(row.what.startswith("worst") for row in others)
 
 

@@ -26,11 +26,11 @@ from rigd.beam import Beam, Damping, TransferGrid, modes
 from rigd.beam.realisation import couple, propagator, realise
 from rigd.devices.parameters import (
     Actuation,
+    DeviceSelection,
     Encoder,
     Motor,
     RigParameters,
-    Selection,
-    WrenchSensor,
+    WrenchSensorSettings,
 )
 from rigd.sim import SimulatedPlant
 
@@ -225,9 +225,9 @@ def test_tick_by_tick():
             damping=damping,
             motor=MOTOR,
             encoder=Encoder(resolution_rad=0.0),
-            sensor=WrenchSensor((1e-4,) * 6, (1.0,) * 6, (0, 0, 0, 0, 0, 1), clamp),
+            sensor=WrenchSensorSettings((1e-4,) * 6, (1.0,) * 6, (0, 0, 0, 0, 0, 1), clamp),
             actuation=Actuation(delay_s=PERIOD_S),
-            devices=Selection("sim", "sim"),
+            devices=DeviceSelection("sim", "sim"),
         )
     )
     plant.enable()

@@ -10,11 +10,11 @@ from rigd.beam import Beam, Damping
 from rigd.beam.realisation import RealisationError
 from rigd.devices.parameters import (
     Actuation,
+    DeviceSelection,
     Encoder,
     Motor,
     RigParameters,
-    Selection,
-    WrenchSensor,
+    WrenchSensorSettings,
 )
 from rigd.sim import SimulatedPlant
 
@@ -31,9 +31,11 @@ RIG = RigParameters(
     damping=Damping(7.1e-5, 0.996, 0.055, 0.594),
     motor=MOTOR,
     encoder=Encoder(resolution_rad=0.0),
-    sensor=WrenchSensor((1e-4,) * 6, (1.0,) * 6, (0, 0, 0, 0, 0, 1), tool_inertia_kg_m2=1e-5),
+    sensor=WrenchSensorSettings(
+        (1e-4,) * 6, (1.0,) * 6, (0, 0, 0, 0, 0, 1), tool_inertia_kg_m2=1e-5
+    ),
     actuation=Actuation(delay_s=0.0),
-    devices=Selection("sim", "sim"),
+    devices=DeviceSelection("sim", "sim"),
 )
 STATE = (
     "angle_rad",

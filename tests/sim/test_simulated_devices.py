@@ -8,7 +8,7 @@ from shipped_profile import load_shipped
 
 from rigd.devices import open_devices
 from rigd.devices.contracts import DeviceError
-from rigd.devices.parameters import Selection
+from rigd.devices.parameters import DeviceSelection
 from rigd.sim import SimulatedRig
 
 PERIOD_NS = 1_000_000
@@ -199,7 +199,7 @@ def streaming():
     quiet = replace(rig.simulation, torque_noise_nm=0.0, force_noise_n=0.0, offset=(0.0,) * 6)
     sensor = replace(rig.sensor, resolution=(0.0,) * 6)
     return replace(
-        rig, devices=Selection(drive="sim", sensor="sim"), simulation=quiet, sensor=sensor
+        rig, devices=DeviceSelection(drive="sim", sensor="sim"), simulation=quiet, sensor=sensor
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.devices.parameters import Selection
+from rigd.devices.parameters import DeviceSelection
 from rigd.excitation import hold
 from rigd.runner import Rig
 from rigd.runner.request import Order
@@ -56,7 +56,7 @@ def test_samples_equal_those_of_the_direct_simulation(
     path = quiet_profile(name, values)
     profile = load(path)
     direct = replace(
-        profile, rig=replace(profile.rig, devices=Selection(drive="sim", sensor="sim"))
+        profile, rig=replace(profile.rig, devices=DeviceSelection(drive="sim", sensor="sim"))
     )
     start_simulator(path, "--lock-step")
     for which, rig_profile in (("wired", profile), ("direct", direct)):

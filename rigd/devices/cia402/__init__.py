@@ -1,6 +1,6 @@
 """A CiA 402 servo drive over CANopen, in cyclic synchronous torque mode.
 
-Offers the driver (`Cia402Drive`), the check of a drive's EDS file (`judge`), and
+Offers the driver (`Cia402Drive`), the check of a drive's EDS file (`check_suitability`), and
 the parser of a profile's own settings of objects (`parse_assignment`).
 
 Drives differ in what they support: the table in `requirements` lists what rigd needs; `objects` has

@@ -41,7 +41,7 @@ class Grade(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class SuitabilityFinding:
     """Finding about one object, or about the drive as a whole."""
 
     what: str
@@ -59,10 +59,10 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class SuitabilityReport:
     """All findings on one file."""
 
-    findings: tuple[Finding, ...]
+    findings: tuple[SuitabilityFinding, ...]
 
     @property
     def refusals(self) -> tuple[str, ...]:
@@ -88,7 +88,7 @@ _NOT_SET_BY_RIGD: Final = (Watchdog.OWN, Watchdog.NONE)
 _REPORTED_ELSEWHERE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
 
 
-def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
+def check_suitability(eds: Eds, rig: "RigParameters | None" = None) -> SuitabilityReport:
     """Check a drive's EDS file against the requirements.
 
     Parameters
@@ -99,7 +99,7 @@ def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
         Parameters of a profile with a section ``cia402``, whose values are compared too; None: the
         drive alone is judged, and what a profile may accept counts as accepted.
     """
-    return Judgement(tuple(_SuitabilityCheck(eds, rig).findings()))
+    return SuitabilityReport(tuple(_SuitabilityCheck(eds, rig).findings()))
 
 
 class _SuitabilityCheck:
@@ -109,7 +109,7 @@ class _SuitabilityCheck:
         self._settings: ServoDrive | None = self._rig.cia402 if self._rig else None
         self._wanted = wanted_values(self._rig) if self._rig else fixed_values(eds.node_id)
 
-    def findings(self) -> Iterator[Finding]:
+    def findings(self) -> Iterator[SuitabilityFinding]:
         yield from self._identity()
         yield from self._bit_rates()
         yield self._torque_mode()
@@ -120,7 +120,7 @@ class _SuitabilityCheck:
             entry = self._eds.get(needed.index, needed.sub)
             yield self._absent(needed) if entry is None else self._present(needed, entry)
 
-    def _identity(self) -> Iterator[Finding]:
+    def _identity(self) -> Iterator[SuitabilityFinding]:
         for key, stated, name in (
             ("vendor_id", self._eds.vendor_id, self._eds.vendor_name),
             ("product_code", self._eds.product_code, self._eds.product_name),
@@ -130,32 +130,34 @@ class _SuitabilityCheck:
             shown = f"0x{stated:08X}" if stated else "not stated"
             found = f"{shown} ({name})" if name else shown
             if not (stated and wanted and stated != wanted):
-                yield Finding(what, found, f"0x{wanted:08X}" if wanted else "any", Grade.FITS)
+                yield SuitabilityFinding(
+                    what, found, f"0x{wanted:08X}" if wanted else "any", Grade.FITS
+                )
                 continue
             sentence = (
                 f"The file is of another drive than the profile's: cia402.{key} is 0x{wanted:08X}, "
                 f"the file says {shown}."
             )
-            yield Finding(what, found, f"0x{wanted:08X}", Grade.REFUSED, sentence)
+            yield SuitabilityFinding(what, found, f"0x{wanted:08X}", Grade.REFUSED, sentence)
 
-    def _bit_rates(self) -> Iterator[Finding]:
+    def _bit_rates(self) -> Iterator[SuitabilityFinding]:
         rates = self._eds.bit_rates_bit_s
         found = ", ".join(f"{rate // 1000}" for rate in rates)
         found = f"{found} kbit/s" if rates else "not stated"
         if self._rig is None or self._rig.can is None:
-            yield Finding("bit rates", found, "", Grade.FITS)
+            yield SuitabilityFinding("bit rates", found, "", Grade.FITS)
             return
         rate = self._rig.can.bitrate_bit_s
         wanted = f"{rate / 1000:g} kbit/s"
         if not rates or rate in rates:
-            yield Finding("bit rates", found, wanted, Grade.FITS)
+            yield SuitabilityFinding("bit rates", found, wanted, Grade.FITS)
             return
         sentence = (
             f"The drive has no bit rate of {wanted} (can.bitrate_bit_s); choose one of {found}."
         )
-        yield Finding("bit rates", found, wanted, Grade.REFUSED, sentence)
+        yield SuitabilityFinding("bit rates", found, wanted, Grade.REFUSED, sentence)
 
-    def _torque_mode(self) -> Finding:
+    def _torque_mode(self) -> SuitabilityFinding:
         what, wanted = (
             f"{objects.SUPPORTED_MODES:04X} Supported drive modes",
             "bit 9 (cyclic torque)",
@@ -164,28 +166,30 @@ class _SuitabilityCheck:
         address = f"object {objects.SUPPORTED_MODES:04X}"
         if modes is None:
             sentence = f"No cyclic synchronous torque mode: {address} is missing."
-            return Finding(what, "absent", wanted, Grade.REFUSED, sentence)
+            return SuitabilityFinding(what, "absent", wanted, Grade.REFUSED, sentence)
         if modes.default:
             shown = f"0x{modes.default:X}"
             if modes.default & objects.SUPPORTS_CYCLIC_TORQUE:
-                return Finding(what, shown, wanted, Grade.FITS)
+                return SuitabilityFinding(what, shown, wanted, Grade.FITS)
             sentence = (
                 f"No cyclic synchronous torque mode: {address} = {shown} lacks bit 9; this drive "
                 "or its firmware cannot be used."
             )
-            return Finding(what, shown, wanted, Grade.REFUSED, sentence)
-        return Finding(
+            return SuitabilityFinding(what, shown, wanted, Grade.REFUSED, sentence)
+        return SuitabilityFinding(
             what, "the file does not state it; the drive will be asked", wanted, Grade.ASK
         )
 
-    def _watchdog(self) -> Finding:
+    def _watchdog(self) -> SuitabilityFinding:
         """Check which watchdog removes the torque when this computer falls silent."""
         found = self._expected_watchdog()
         what, wanted = "watchdog", "one of three"
         if found is Watchdog.HEARTBEAT:
-            return Finding(what, found.value, wanted, Grade.FITS)
+            return SuitabilityFinding(what, found.value, wanted, Grade.FITS)
         if found is not Watchdog.NONE:
-            return Finding(what, f"1016:1 absent; {found.value}", wanted, Grade.SUBSTITUTED)
+            return SuitabilityFinding(
+                what, f"1016:1 absent; {found.value}", wanted, Grade.SUBSTITUTED
+            )
         return self._to_accept(requirement(objects.HEARTBEAT_CONSUMER, 1), what, "absent", wanted)
 
     def _expected_watchdog(self) -> Watchdog:
@@ -197,32 +201,36 @@ class _SuitabilityCheck:
             own=self._settings is not None and self._settings.own_watchdog_s > 0,
         )
 
-    def _absent(self, needed: Requirement) -> Finding:
+    def _absent(self, needed: Requirement) -> SuitabilityFinding:
         what = f"{needed.address} {needed.name}"
         if needed.core:
-            return Finding(what, "absent", "core", Grade.REFUSED, _sentence(needed.missing()))
+            return SuitabilityFinding(
+                what, "absent", "core", Grade.REFUSED, _sentence(needed.missing())
+            )
         if needed.index == objects.ABORT_OPTION and self._expected_watchdog() in _NOT_SET_BY_RIGD:
             found = "absent; in its place: the manufacturer's own watchdog"
-            return Finding(what, found, "", Grade.SUBSTITUTED)
+            return SuitabilityFinding(what, found, "", Grade.SUBSTITUTED)
         if needed.accept:
             return self._to_accept(needed, what, "absent", "")
         if self._is_set_by_profile(needed):
             sentence = f"it has no object {needed.address} ({needed.name}). {needed.sentence}"
-            return Finding(what, "absent", "", Grade.REFUSED, _sentence(sentence))
+            return SuitabilityFinding(what, "absent", "", Grade.REFUSED, _sentence(sentence))
         stand_in = f"; in its place: {needed.stand_in}" if needed.stand_in.strip("–") else ""
-        return Finding(what, f"absent{stand_in}", "", Grade.SUBSTITUTED)
+        return SuitabilityFinding(what, f"absent{stand_in}", "", Grade.SUBSTITUTED)
 
-    def _to_accept(self, needed: Requirement, what: str, found: str, wanted: str) -> Finding:
+    def _to_accept(
+        self, needed: Requirement, what: str, found: str, wanted: str
+    ) -> SuitabilityFinding:
         """Return the finding on a missing object that the profile may accept by name."""
         stand_in = f" In its place: {needed.stand_in}." if needed.stand_in else ""
         if self._settings is not None and needed.accept in self._settings.accept_without:
             found = f"{found}, accepted by the profile"
             sentence = f"{what}: {found}.{stand_in}"
-            return Finding(what, found, wanted, Grade.ACCEPTED, sentence, needed.accept)
+            return SuitabilityFinding(what, found, wanted, Grade.ACCEPTED, sentence, needed.accept)
         sentence = _sentence(needed.missing()) + stand_in
         # Without a profile there was no chance to accept it.
         grade = Grade.DOUBT if self._settings is None else Grade.REFUSED
-        return Finding(what, found, wanted, grade, sentence, needed.accept)
+        return SuitabilityFinding(what, found, wanted, grade, sentence, needed.accept)
 
     def _is_set_by_profile(self, needed: Requirement) -> bool:
         """Whether the profile asks for what only this object can do."""
@@ -235,17 +243,17 @@ class _SuitabilityCheck:
             (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option > 0,
         }.get((needed.index, needed.sub), False)
 
-    def _present(self, needed: Requirement, entry: EdsEntry) -> Finding:
+    def _present(self, needed: Requirement, entry: EdsEntry) -> SuitabilityFinding:
         what = f"{needed.address} {needed.name}"
         wanted = self._wanted.get((needed.index, needed.sub))
         wanted_text = "" if wanted is None else _shown(needed, wanted)
         default = "" if entry.default is None else f", {_shown(needed, entry.default)}"
         found = f"{entry.access}{default}"
 
-        def objection(text: str, *, doubt: bool = False) -> Finding:
+        def objection(text: str, *, doubt: bool = False) -> SuitabilityFinding:
             sentence = _sentence(f"its object {needed.address} ({needed.name}) {text}")
             grade = Grade.DOUBT if doubt else Grade.REFUSED
-            return Finding(what, found, wanted_text, grade, sentence)
+            return SuitabilityFinding(what, found, wanted_text, grade, sentence)
 
         if needed.access & (ObjectAccess.SENT | ObjectAccess.RECEIVED):
             trouble = self._unmappable(entry)
@@ -265,11 +273,11 @@ class _SuitabilityCheck:
             return objection(
                 f"takes {limits}, not {wanted_text}. {needed.sentence}", doubt=not needed.core
             )
-        return Finding(what, found, wanted_text, Grade.FITS)
+        return SuitabilityFinding(what, found, wanted_text, Grade.FITS)
 
     def _read_only(
         self, needed: Requirement, entry: EdsEntry, found: str, wanted: int | None
-    ) -> Finding:
+    ) -> SuitabilityFinding:
         """Return the finding on a read-only object: its value may be acceptable."""
         what = f"{needed.address} {needed.name}"
         if needed.fit is AllowedValue.AT_LEAST:
@@ -290,18 +298,22 @@ class _SuitabilityCheck:
                     f"its object {needed.address} ({needed.name}) is read-only, so that the PDO "
                     f"cannot be switched off to be remapped. {needed.sentence}"
                 )
-                return Finding(what, found, wanted_text, Grade.REFUSED, _sentence(sentence))
+                return SuitabilityFinding(
+                    what, found, wanted_text, Grade.REFUSED, _sentence(sentence)
+                )
         else:
             does = needed.fit.allows(entry.default, wanted)
         if does:
-            return Finding(what, f"{found}: it does", wanted_text, Grade.FITS)
+            return SuitabilityFinding(what, f"{found}: it does", wanted_text, Grade.FITS)
         if does is None and needed.index != objects.CONTROLWORD:
-            return Finding(what, f"{found}: the drive will be asked", wanted_text, Grade.ASK)
+            return SuitabilityFinding(
+                what, f"{found}: the drive will be asked", wanted_text, Grade.ASK
+            )
         sentence = (
             f"its object {needed.address} ({needed.name}) is read-only and does not hold what is "
             f"needed{f' ({wanted_text})' if wanted_text else ''}. {needed.sentence}"
         )
-        return Finding(what, found, wanted_text, Grade.REFUSED, _sentence(sentence))
+        return SuitabilityFinding(what, found, wanted_text, Grade.REFUSED, _sentence(sentence))
 
     def _unmappable(self, entry: EdsEntry) -> str:
         """Describe why an object cannot be mapped into its PDO; empty if it can."""

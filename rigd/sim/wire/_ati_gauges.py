@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.devices.contracts import Wrench
-from rigd.devices.parameters import WrenchSensor
+from rigd.devices.parameters import WrenchSensorSettings
 from rigd.sim import Stuck
 
 COUNTS_PER_UNIT = (1_000_000, 1_000_000)
@@ -64,7 +64,7 @@ class AtiGauges:
     """
 
     def __init__(
-        self, sensor: WrenchSensor, counts_per_unit: tuple[int, int] = COUNTS_PER_UNIT
+        self, sensor: WrenchSensorSettings, counts_per_unit: tuple[int, int] = COUNTS_PER_UNIT
     ) -> None:
         self.counts_per_unit = counts_per_unit
         counts = np.repeat(np.array(counts_per_unit, dtype=np.float64), 3)

@@ -13,7 +13,7 @@ from eds_files import (
     without,
 )
 
-from rigd.devices.cia402 import Grade, judge
+from rigd.devices.cia402 import Grade, check_suitability
 from rigd.devices.cia402.requirements import CORE, OPTIONAL, requirement
 from rigd.devices.eds import read_eds
 from rigd.profile import load_profile
@@ -41,7 +41,7 @@ def judged(tmp_path):
     def judged(table, rig=None):
         path = tmp_path / "drive.eds"
         path.write_text(table if table.startswith("[") else eds_text(table))
-        return judge(read_eds(path), rig)
+        return check_suitability(read_eds(path), rig)
 
     return judged
 
@@ -61,7 +61,7 @@ def test_a_complete_drive_fits(judged, rig):
 
 @pytest.mark.parametrize("name", WITH_TORQUE)
 def test_drives_with_torque_mode_are_not_refused(name):
-    judgement = judge(read_eds(eds_path(name)))
+    judgement = check_suitability(read_eds(eds_path(name)))
     assert judgement.refusals == ()
     mode = by_place(judgement)["6502"]
     told = name in ("e35", "epos4_0110")
@@ -73,13 +73,13 @@ def test_drives_with_torque_mode_are_not_refused(name):
     list(zip(WITHOUT_TORQUE, ("0x6D", "0x43", "0x63", "0xA5", "0x1F0065"), strict=True)),
 )
 def test_drives_without_it_are_refused_by_its_name(name, modes):
-    first = judge(read_eds(eds_path(name))).refusals[0]
+    first = check_suitability(read_eds(eds_path(name))).refusals[0]
     assert first.startswith("No cyclic synchronous torque mode: object 6502 = ")
     assert f"{modes} lacks bit 9" in first
 
 
 def test_what_the_two_real_drives_lack(rig):
-    elmo = by_place(judge(read_eds(eds_path("elmo_gold")), rig()))
+    elmo = by_place(check_suitability(read_eds(eds_path("elmo_gold")), rig()))
     for place in ("60E0", "60E1"):
         assert elmo[place].grade is Grade.FITS
         assert elmo[place].found == "ro, 50000: it does"
@@ -87,10 +87,10 @@ def test_what_the_two_real_drives_lack(rig):
     assert not [f for f in elmo.values() if f.grade is Grade.REFUSED]
 
     epos = read_eds(eds_path("epos4_0170"))
-    (refusal,) = judge(epos, rig()).refusals
+    (refusal,) = check_suitability(epos, rig()).refusals
     assert "6072 (Max torque)" in refusal
     assert 'cia402.accept_without = ["torque_limit"]' in refusal
-    accepted = by_place(judge(epos, rig(accept_without=("torque_limit",))))
+    accepted = by_place(check_suitability(epos, rig(accept_without=("torque_limit",))))
     assert accepted["6072"].grade is Grade.ACCEPTED
     assert accepted["1006"].grade is Grade.SUBSTITUTED
     assert not [f for f in accepted.values() if f.grade is Grade.REFUSED]
