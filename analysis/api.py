@@ -72,7 +72,7 @@ def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyRespo
 
     Raises
     ------
-    EstimateError
+    FrequencyResponseError
         The settings do not suit the record, or its angle does not move.
 
     Examples
@@ -149,7 +149,7 @@ def fit(
     ------
     ValueError
         No such type, method or setting; among its kinds those of the methods:
-        `MeasurementError` and `EstimateError`, if the record cannot be used.
+        `MeasurementError` and `FrequencyResponseError`, if the record cannot be used.
 
     Examples
     --------

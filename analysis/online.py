@@ -1,8 +1,8 @@
 """Online fit: the estimate of a session that still runs, from the samples recorded so far.
 
-`OnlineFit` receives samples and fits them on request, by the functions of `analyze`, so that the
-last estimate of a session equals that of its file. As a program, ``python -m analysis.online``, it
-takes the samples on standard input, as `rigd.session.online_fit` writes them, and answers on
+`OnlineEstimator` receives samples and fits them on request, by the functions of `analyze`, so that
+the last estimate of a session equals that of its file. As a program, ``python -m analysis.online``,
+it takes the samples on standard input, as `rigd.session.online_fit` writes them, and answers on
 standard output, one line of JSON per estimate (docs/online_fit.md).
 """
 
@@ -174,7 +174,7 @@ def _noise(analysis: RecordAnalysis) -> dict[str, Any]:
     return {"frequency_hz": points_hz.tolist(), "nm2_per_hz": levels.tolist()}
 
 
-class OnlineFit:
+class OnlineEstimator:
     """Fit of the recorded part of a running session.
 
     Parameters
@@ -188,10 +188,10 @@ class OnlineFit:
 
     Examples
     --------
-    >>> from analysis.online import OnlineFit
+    >>> from analysis.online import OnlineEstimator
     >>> from rigd.session import read_session
     >>> session = read_session("session.mcap")
-    >>> fit = OnlineFit(session.metadata, session.segments)
+    >>> fit = OnlineEstimator(session.metadata, session.segments)
     >>> fit.feed(session.samples)
     >>> for tick in (400, 10_000):
     ...     estimate = fit.estimate(tick)
@@ -357,7 +357,7 @@ def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateReques
     SessionError
         The stream is broken.
     """
-    fit = OnlineFit(start.metadata, start.segments)
+    fit = OnlineEstimator(start.metadata, start.segments)
     came: queue.SimpleQueue[NDArray[np.void] | EstimateRequest | SessionError | None]
     came = queue.SimpleQueue()
 
@@ -398,7 +398,7 @@ _ALL: Final = 1 << 32
 """Beyond every tick."""
 
 
-def _answer(fit: OnlineFit, request: EstimateRequest) -> None:
+def _answer(fit: OnlineEstimator, request: EstimateRequest) -> None:
     estimate = fit.estimate(request.tick, whole=request.whole, from_last=request.from_last)
     line = json.dumps({"id": request.id, **estimate.as_json()}, allow_nan=False)
     sys.stdout.write(line + "\n")

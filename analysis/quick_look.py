@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import Finding
-    from analysis.identify.headline import Headline, Mode
+    from analysis.identify.headline import Headline, ReportedMode
     from analysis.record import Record
     from rigd.spectral import RunningEstimate, Segmentation
 
@@ -62,14 +62,14 @@ _NICE: Final = 10
 """Niceness of the program: a tenth of the processor time of an ordinary one."""
 
 
-class LookError(ValueError):
+class QuickLookError(ValueError):
     """A quick look cannot be made or written; the message states cause and remedy."""
 
 
 # The quick look
 
 
-def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
+def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
     """Return the quick look at a session.
 
     Parameters
@@ -178,7 +178,7 @@ def _headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:
     return headline, validity, sentences
 
 
-def _mode(mode: Mode) -> dict[str, Any]:
+def _mode(mode: ReportedMode) -> dict[str, Any]:
     return {
         "mode": mode.number,
         "frequency_hz": mode.frequency_hz.as_json(),
@@ -320,7 +320,7 @@ def _no_coherence() -> dict[str, Any]:
 def _quick_look_of(last: Path) -> dict[str, Any]:
     look = read_quick_look(quick_look_path(last))
     if look is None:
-        raise LookError(
+        raise QuickLookError(
             f"--last {last}: there is no readable quick look beside it; make one with "
             f"python -m analysis.quick_look {last}."
         )
@@ -431,7 +431,7 @@ def _without_name(sentence: str, path: Path) -> str:
 # The file
 
 
-def write_look(document: Mapping[str, Any], path: Path) -> Path:
+def write_quick_look(document: Mapping[str, Any], path: Path) -> Path:
     """Write a quick look to the folder of its session file, whole or not at all.
 
     An older quick look of the same session is replaced; one that was made later stays.
@@ -439,7 +439,7 @@ def write_look(document: Mapping[str, Any], path: Path) -> Path:
     Parameters
     ----------
     document : mapping
-        Result of `look_at`.
+        Result of `make_quick_look`.
     path : Path
         Session file.
 
@@ -460,11 +460,11 @@ def write_look(document: Mapping[str, Any], path: Path) -> Path:
     new = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         if there is None and target.exists() and target.stat().st_size > 0:
-            raise LookError(f"{target} is not a quick look of this version; move it away.")
+            raise QuickLookError(f"{target} is not a quick look of this version; move it away.")
         new.write_text(json.dumps(document, allow_nan=False), "utf-8")
         new.replace(target)
     except OSError as error:
-        raise LookError(f"{target} cannot be written ({error.strerror}).") from None
+        raise QuickLookError(f"{target} cannot be written ({error.strerror}).") from None
     finally:
         with suppress(OSError):
             new.unlink(missing_ok=True)
@@ -487,9 +487,9 @@ def main() -> None:
     with suppress(OSError):
         os.nice(_NICE)
     try:
-        document = look_at(arguments.file, arguments.last)
-        write_look(document, arguments.file)
-    except (SessionError, LookError) as error:
+        document = make_quick_look(arguments.file, arguments.last)
+        write_quick_look(document, arguments.file)
+    except (SessionError, QuickLookError) as error:
         sys.exit(f"Error: {error}")
     except KeyboardInterrupt:
         sys.exit(130)

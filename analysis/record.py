@@ -14,7 +14,7 @@ import numpy as np
 from analysis.record_checks import (
     MAX_GAP_S,
     MAX_TICKS,
-    MAX_UNKNOWN_SHARE,
+    MAX_UNKNOWN_FRACTION,
     RecordError,
     check_clock,
     check_fillable,
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MAX_GAP_S",
     "MAX_SAMPLES",
-    "MAX_UNKNOWN_SHARE",
+    "MAX_UNKNOWN_FRACTION",
     "RECORD_FIELDS",
     "Gaps",
     "Record",
@@ -203,9 +203,9 @@ def load_record(path: Path) -> Record:
     """Read a session file and put it on a uniform time grid.
 
     Missing ticks, and values flagged as stale, are replaced by linear interpolation between their
-    fresh neighbours, up to `MAX_UNKNOWN_SHARE` of the sweep and `MAX_GAP_S` at a time. The result
-    has their counts and masks. Without segments the whole record is the sweep; a sweep that was
-    stopped ends with the recorded samples.
+    fresh neighbours, up to `MAX_UNKNOWN_FRACTION` of the sweep and `MAX_GAP_S` at a time. The
+    result has their counts and masks. Without segments the whole record is the sweep; a sweep that
+    was stopped ends with the recorded samples.
 
     Parameters
     ----------

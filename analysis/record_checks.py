@@ -261,7 +261,7 @@ def _wrong(session: Session, key: str, value: float, rule: str) -> RecordError:
 
 # Samples
 
-MAX_UNKNOWN_SHARE = 0.05
+MAX_UNKNOWN_FRACTION = 0.05
 """Largest fraction of angle or torque that may be missing or flagged: one limit for import, loading
 and estimation. Whole-record fits stand so much of it (within their own uncertainty at 4.5 %)."""
 
@@ -439,7 +439,7 @@ def check_fillable(
 
 
 def too_much_unknown(what: str, unknown: int, of: int) -> str | None:
-    """Return the message that more than `MAX_UNKNOWN_SHARE` of a channel is unknown, or None.
+    """Return the message that more than `MAX_UNKNOWN_FRACTION` of a channel is unknown, or None.
 
     Parameters
     ----------
@@ -448,11 +448,11 @@ def too_much_unknown(what: str, unknown: int, of: int) -> str | None:
     unknown, of : int
         Samples without a new value, and all.
     """
-    if unknown <= MAX_UNKNOWN_SHARE * of:
+    if unknown <= MAX_UNKNOWN_FRACTION * of:
         return None
     return (
         f"{unknown} of {of} samples ({100 * unknown / of:.2g} %) of {what} are missing or flagged, "
-        f"more than the {100 * MAX_UNKNOWN_SHARE:g} % that an analysis tolerates; record the "
+        f"more than the {100 * MAX_UNKNOWN_FRACTION:g} % that an analysis tolerates; record the "
         "session again."
     )
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from analysis.identify import RecordAnalysis, RecordFit, Selection, Setting
-    from analysis.identify.headline import Headline, Quantity
+    from analysis.identify.headline import Headline, ReportedValue
     from analysis.identify.verdict import OrderVerdict, Verdict
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
@@ -143,7 +143,7 @@ class WholeRecord:
         return frozenset(_ORDERS & self.headline.flags.keys())
 
     @property
-    def combined(self) -> dict[str, Quantity]:
+    def combined(self) -> dict[str, ReportedValue]:
         """Return the headline's parameters that depend on a scale of stated uncertainty.
 
         Their standard uncertainties and intervals include that of the scale.
@@ -290,7 +290,7 @@ def record_result(
     ------
     SessionError, RecordError
         The file cannot be read, or holds no record that can be analysed.
-    EstimateError, MeasurementError
+    FrequencyResponseError, MeasurementError
         No analysis suits the record, or the settings do not.
     """
     from analysis.identify import MeasurementError

@@ -163,17 +163,17 @@ def welch_analysis(
 
     Raises
     ------
-    EstimateError
+    FrequencyResponseError
         The fits were requested, and cannot be run.
     """
-    from analysis.paper import EstimateError, SettingsError, analyse
+    from analysis.paper import FrequencyResponseError, SettingsError, analyse
 
     optional = optional and settings.are_usual
     reason = against_welch(record, requested_hz) if optional else None
     if reason is None:
         try:
             return analyse(record, welch_settings(record, settings, requested_hz), on_step), None
-        except EstimateError as error:
+        except FrequencyResponseError as error:
             if not optional or isinstance(error, SettingsError):
                 raise
             reason = str(error).removeprefix(f"{record.path}: ").removesuffix(".")

@@ -33,7 +33,7 @@ from independent_records import (
 from numpy.typing import NDArray
 
 from analysis.models import STRUCTURES
-from analysis.online import OnlineEstimate, OnlineFit
+from analysis.online import OnlineEstimate, OnlineEstimator
 from rigd.session.layout import SAMPLE_DTYPE
 
 Real = NDArray[np.float64]
@@ -131,7 +131,7 @@ def estimate_of(made: Exact, noise_nm: float, seed: int, *, whole: bool) -> Onli
         "beam_density_kg_per_m": repr(DENSITY_KG_PER_M),
         "beam_bending_stiffness_n_m2": repr(STIFFNESS_N_M2),
     }
-    fit = OnlineFit(stated)
+    fit = OnlineEstimator(stated)
     fit.feed(samples)
     return fit.estimate(whole=whole)
 

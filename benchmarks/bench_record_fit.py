@@ -107,7 +107,7 @@ class Peer:
         """Sum of squares, free decay projected out."""
         comparison, plant = self.comparison, self.unknowns.plant(x)
         torque, _ = comparison.prediction.torque(plant)
-        residual = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
+        residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
         residual *= self.weight
         poles = mode_poles(plant, comparison.visible_modes, ())
         columns = comparison.decays.columns(poles) * self.weight

@@ -50,11 +50,11 @@ class SingleSessionError(CampaignError):
 def task_errors() -> tuple[type[Exception], ...]:
     """Errors that concern one session and leave the others as they are."""
     from analysis.identify import MeasurementError
-    from analysis.paper import EstimateError
+    from analysis.paper import FrequencyResponseError
     from analysis.record import RecordError
     from rigd.session import SessionError
 
-    return SessionError, RecordError, EstimateError, MeasurementError
+    return SessionError, RecordError, FrequencyResponseError, MeasurementError
 
 
 _STATED: Final = ("excitation", "amplitude_rad", "start_hz", "stop_hz", "duration_s", "taper_s",

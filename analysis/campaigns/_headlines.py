@@ -6,8 +6,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from analysis.identify import headline_json, with_modal_model
-from analysis.identify.headline import Mode, Numbers, Quantity, Simpler, Size
-from analysis.identify.verdict import STRONG
+from analysis.identify.headline import (
+    ConditionalEstimate,
+    Estimates,
+    ReportedLossFactor,
+    ReportedMode,
+    ReportedValue,
+)
+from analysis.identify.verdict import BIC_DECISIVE
 from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 from analysis.statistics import student_t_quantile
 
@@ -52,7 +58,7 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
     return found
 
 
-def campaign_numbers(campaign: CampaignResult) -> Numbers | None:
+def campaign_numbers(campaign: CampaignResult) -> Estimates | None:
     """Collect the numbers of all sessions together, with flags.
 
     Parameters
@@ -71,7 +77,7 @@ def campaign_numbers(campaign: CampaignResult) -> Numbers | None:
     exactly = tuple(each.exact or each for each in orders)
     explained = verdict.adequate >= _ADEQUATE * verdict.sessions
     every = None if explained else _UNEXPLAINED
-    exact = Numbers(
+    exact = Estimates(
         name=pooled.name,
         parameters=_parameters(campaign, pooled, exactly, every),
         sizes=_sizes(pooled, exactly, every),
@@ -89,8 +95,8 @@ def campaign_numbers(campaign: CampaignResult) -> Numbers | None:
 
 
 def _flagged(
-    numbers: Numbers, campaign: CampaignResult, orders: tuple[PooledOrder, ...]
-) -> Numbers:
+    numbers: Estimates, campaign: CampaignResult, orders: tuple[PooledOrder, ...]
+) -> Estimates:
     """Flag quantities that differ between sessions, doubtful orders, and hidden modes."""
     flags, mixed = _flags(orders), campaign.homogeneity.is_mixed
 
@@ -118,17 +124,17 @@ def _flagged(
     )
 
 
-def _simpler(campaign: CampaignResult, pooled: PooledEstimate) -> Simpler | None:
+def _simpler(campaign: CampaignResult, pooled: PooledEstimate) -> ConditionalEstimate | None:
     """Return the estimate of the lowest BIC, on condition that its orders are true."""
     conditional = campaign.pooled[0]
     if conditional is pooled:
         return None
     fixed = STRUCTURES[conditional.structure].fixed
-    return Simpler(
+    return ConditionalEstimate(
         name=conditional.name,
         fixed={name: value for name, value in fixed.items() if name in COEFFICIENT_OF},
         parameters={
-            each.name: Quantity(each.value, each.std, each.interval)
+            each.name: ReportedValue(each.value, each.std, each.interval)
             for each in conditional.parameters
         },
     )
@@ -139,11 +145,11 @@ def _parameters(
     pooled: PooledEstimate,
     orders: tuple[PooledOrder, ...],
     every: str | None,
-) -> dict[str, Quantity]:
+) -> dict[str, ReportedValue]:
     mixed = campaign.homogeneity.is_mixed
     flags = _flags(orders)
     found = {
-        each.name: Quantity(
+        each.name: ReportedValue(
             each.value,
             each.std,
             each.interval,
@@ -154,7 +160,7 @@ def _parameters(
     free = STRUCTURES[pooled.structure].free
     for name, value in pooled.plant.parameters.items():
         if name not in found and (name not in PARAMETERS or name in free):
-            found[name] = Quantity(value, None, None, every or _ON_BOUND)
+            found[name] = ReportedValue(value, None, None, every or _ON_BOUND)
     return found
 
 
@@ -170,20 +176,22 @@ def _flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
 
 def _sizes(
     pooled: PooledEstimate, orders: tuple[PooledOrder, ...], every: str | None
-) -> tuple[Size, ...]:
+) -> tuple[ReportedLossFactor, ...]:
     flags = _flags(orders)
     return tuple(each.flagged(every or flags.get(each.order)) for each in pooled.sizes)
 
 
-def _modes(campaign: CampaignResult, pooled: PooledEstimate, every: str | None) -> tuple[Mode, ...]:
+def _modes(
+    campaign: CampaignResult, pooled: PooledEstimate, every: str | None
+) -> tuple[ReportedMode, ...]:
     t, mixed = student_t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
 
-    def quantity_of(value: float, std: float, quantity: str) -> Quantity:
+    def quantity_of(value: float, std: float, quantity: str) -> ReportedValue:
         flag = every or (_MIXTURE if mixed(quantity) else None)
-        return Quantity(value, std, (value - t * std, value + t * std), flag)
+        return ReportedValue(value, std, (value - t * std, value + t * std), flag)
 
     return tuple(
-        Mode(
+        ReportedMode(
             mode.number,
             quantity_of(mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"),
             quantity_of(mode.damping_ratio, mode.damping_ratio_std, f"damping_ratio_{mode.number}"),
@@ -197,4 +205,4 @@ def _status(each: RankedStructure, pooled: PooledEstimate) -> StructureStatus:
     if each.name == pooled.name:
         return "selected"
     above = each.bic_above_lowest
-    return "compatible" if above is not None and above < STRONG else "excluded"
+    return "compatible" if above is not None and above < BIC_DECISIVE else "excluded"

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns.pooling import by_structure
 from analysis.identify import tolerant_status
-from analysis.identify.profile_likelihood import WIDEST_SHARE
-from analysis.identify.verdict import STRONG, too_few_modes
+from analysis.identify.profile_likelihood import WIDEST_FRACTION
+from analysis.identify.verdict import BIC_DECISIVE, too_few_modes
 from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import student_t_quantile
 
@@ -243,11 +243,11 @@ def _judged(
     if free is None and structure.fixed.get(order) == 1.0 and next(iter(alone)) == "compatible":
         # No fitted structure has it free: only the sessions' own verdicts are available.
         return "compatible", None
-    if free is None or _wide(free.interval) > WIDEST_SHARE:
+    if free is None or _wide(free.interval) > WIDEST_FRACTION:
         return "not identifiable", "the sessions do not determine the order"
     if not _adequate(verdicts):
         return "open", _UNEXPLAINED
-    integer = [each for each in (ranked[0], *rivals(ranked, STRONG)) if _integer(each, order)]
+    integer = [each for each in (ranked[0], *rivals(ranked, BIC_DECISIVE)) if _integer(each, order)]
     low, high = free.interval
     if low <= 1 <= high:
         return "compatible", None

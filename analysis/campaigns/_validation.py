@@ -139,7 +139,7 @@ def left_out_errors(
         return LostTrial(path, str(why))
     except MemoryError:
         return LostTrial(path, "not enough memory to predict it; use fewer --jobs")
-    measured = comparison.torque_nm[comparison.kept]
+    measured = comparison.torque_nm[comparison.retained]
     size = np.linalg.norm(comparison.spectrum(measured))
 
     def error(plant: Plant) -> float:

@@ -21,7 +21,7 @@ from analysis.campaigns._orders import (
 )
 from analysis.identify import refused_reason, tolerant_sizes
 from analysis.identify.sentences import uniformity
-from analysis.identify.verdict import EVEN, STRONG
+from analysis.identify.verdict import BIC_DECISIVE, BIC_TIE
 from rigd.units import interval_text
 
 if TYPE_CHECKING:
@@ -214,7 +214,7 @@ def campaign_verdict(
     sweeps = opposite_sweeps(sessions)
     refused = modal is not None and modal.uniform_beam.status == "refused"
     found = common_findings(sessions)
-    close = rivals(pooled, EVEN)
+    close = rivals(pooled, BIC_TIE)
     alone = dict(Counter(each.selected for each in sessions if each.selected).most_common())
     adequate = sum(verdict.adequate for verdict in verdicts)
     dissent = _dissent(sessions, best)
@@ -311,6 +311,6 @@ def _dissent(sessions: Sequence[SessionAnalysis], best: PooledEstimate) -> tuple
         if by_name:
             own = min(by_name.values(), key=lambda each: each.bic)
             margin = by_name[best.name].bic - own.bic
-            if margin > STRONG:
+            if margin > BIC_DECISIVE:
                 found.append(Dissent(session.name, own.name, margin))
     return tuple(sorted(found, key=lambda each: -each.margin))

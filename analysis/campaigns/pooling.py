@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from analysis.identify import LOGARITHMIC, SETTINGS, Plant, damping_size
-from analysis.identify.headline import Quantity, Size
+from analysis.identify.headline import ReportedLossFactor, ReportedValue
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_p_value, student_t_quantile
 from rigd.beam import Beam, undamped_frequencies_rad_s
@@ -254,7 +254,7 @@ class PooledEstimate:
         return self.structure
 
     @property
-    def sizes(self) -> tuple[Size, ...]:
+    def sizes(self) -> tuple[ReportedLossFactor, ...]:
         """Sizes of the dampings that all sessions together determine."""
         names = tuple(each.name for each in self.parameters)
         t, found = student_t_quantile(0.95, self.sessions - 1), []
@@ -265,8 +265,8 @@ class PooledEstimate:
             if size is not None:
                 factor = math.exp(t * size.std / size.value)
                 ends = size.value / factor, size.value * factor
-                quantity = Quantity(size.value, size.std, ends)
-                found.append(Size(damping, size.omega_rad_s, quantity))
+                quantity = ReportedValue(size.value, size.std, ends)
+                found.append(ReportedLossFactor(damping, size.omega_rad_s, quantity))
         return tuple(found)
 
     @property

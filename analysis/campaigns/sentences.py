@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
     from analysis.campaigns.pooling import PooledEstimate, PooledMode
-    from analysis.identify.headline import Size
+    from analysis.identify.headline import ReportedLossFactor
     from analysis.identify.profile_likelihood import Order
 
 
@@ -330,7 +330,7 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
     return sentence
 
 
-def sizes(found: Sequence[Size]) -> list[str]:
+def sizes(found: Sequence[ReportedLossFactor]) -> list[str]:
     """Describe each damping at its pivot frequency, where it depends least on its order."""
     factors = []
     for each in found:

@@ -401,7 +401,7 @@ def _explained(run: Callable[[], None]) -> int:
     from analysis.exchange import ExchangeError, TargetError
     from analysis.identify import MeasurementError
     from analysis.linear_model import LinearModelError
-    from analysis.paper import EstimateError, SettingsError
+    from analysis.paper import FrequencyResponseError, SettingsError
     from analysis.record import RecordError
     from analysis.report.folder import OutputError, OutputExistsError
     from rigd.identified_beam import IdentifiedBeamError
@@ -413,8 +413,8 @@ def _explained(run: Callable[[], None]) -> int:
         complain(str(error))
         return 2
     except (
-        ExchangeError, SessionError, RecordError, EstimateError, MeasurementError, OutputError,
-        IdentifiedBeamError, LinearModelError,
+        ExchangeError, SessionError, RecordError, FrequencyResponseError, MeasurementError,
+        OutputError, IdentifiedBeamError, LinearModelError,
     ) as error:  # fmt: skip
         complain(str(error))
         return 1

@@ -177,7 +177,7 @@ def _analyse_all(
     from numpy.linalg import LinAlgError
 
     from analysis.identify import MeasurementError
-    from analysis.paper import EstimateError, SettingsError
+    from analysis.paper import FrequencyResponseError, SettingsError
     from analysis.record import RecordError
     from analysis.report.folder import OutputError
     from rigd.printable import progress_bar
@@ -209,7 +209,7 @@ def _analyse_all(
                     )
                 )
             except (
-                SessionError, RecordError, EstimateError, MeasurementError, OutputError,
+                SessionError, RecordError, FrequencyResponseError, MeasurementError, OutputError,
                 MemoryError, LinAlgError,
             ) as error:  # fmt: skip
                 code = max(code, 2 if isinstance(error, SettingsError) else 1)

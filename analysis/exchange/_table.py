@@ -119,7 +119,8 @@ def frf_table(
 
     Raises
     ------
-    rigd.session.SessionError, analysis.record.RecordError, analysis.paper._estimate.EstimateError
+    rigd.session.SessionError, analysis.record.RecordError,
+    analysis.paper._estimate.FrequencyResponseError
         As the analysis raises them.
     """
     record = load_record(path)

@@ -31,8 +31,8 @@ from ._plant import LOGARITHMIC as LOGARITHMIC
 from ._plant import SETTINGS as SETTINGS
 from ._plant import Plant as Plant
 from ._plant import Setting as Setting
-from ._predictor import Prediction as Prediction
 from ._predictor import ResponseGrid as ResponseGrid
+from ._predictor import TorquePredictor as TorquePredictor
 from ._problem import Objective as Objective
 from ._result import DampingSize as DampingSize
 from ._result import ModeEstimate as ModeEstimate

@@ -118,8 +118,8 @@ _BEYOND: Final = math.log(5.0)
 
 def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
     """Yield a finding if torque over angle has the wrong sign or a wrong unit."""
-    angle = comparison.spectrum(comparison.angle_rad[comparison.kept])
-    torque = comparison.spectrum(comparison.torque_nm[comparison.kept])
+    angle = comparison.spectrum(comparison.angle_rad[comparison.retained])
+    torque = comparison.spectrum(comparison.torque_nm[comparison.retained])
     power = np.abs(angle) ** 2
     driven = power > _DRIVEN * power.max()
     beam = comparison.measurement.nominal.beam
@@ -178,7 +178,7 @@ def drift_of_zero(candidate_set: CandidateSet) -> float:
     """Return the range of the means over parts of the record in N·m; 0 if noise explains it."""
     comparison = candidate_set.comparison
     torque, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
-    left = comparison.torque_nm[comparison.kept] - torque
+    left = comparison.torque_nm[comparison.retained] - torque
     length = left.size // _PARTS
     means = left[: _PARTS * length].reshape(_PARTS, length).mean(axis=1)
     # White noise as loud as that of the band's upper half.

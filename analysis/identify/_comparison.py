@@ -13,7 +13,7 @@ import numpy as np
 
 from analysis.identify._data import Decimation, MeasurementError, fast_length_below
 from analysis.identify._instrument import following
-from analysis.identify._predictor import Prediction
+from analysis.identify._predictor import TorquePredictor
 from analysis.identify.drag_torque import DragExpansion, DragResponse
 from analysis.identify.free_decay import (
     DecaySpectra,
@@ -60,9 +60,9 @@ class Comparison:
     angle_rad, torque_nm : ndarray, shape (m,)
         Both channels in the band at the decimated rate; unknown torque is filled by the prediction.
     decimation : Decimation
-    kept : slice
+    retained : slice
         Samples that are compared.
-    prediction : Prediction
+    prediction : TorquePredictor
     bins : slice
         Bins of the residual's transform that lie in the band.
     frequency_hz : ndarray, shape (K,)
@@ -94,8 +94,8 @@ class Comparison:
     angle_rad: NDArray[np.float64]
     torque_nm: NDArray[np.float64]
     decimation: Decimation
-    kept: slice
-    prediction: Prediction
+    retained: slice
+    prediction: TorquePredictor
     bins: slice
     frequency_hz: NDArray[np.float64]
     visible_modes: int
@@ -154,7 +154,7 @@ class Comparison:
                 f"{max(bins.stop - bins.start, 0)} frequencies, at least {_FEWEST_BINS} are "
                 "needed; record longer or widen the band."
             )
-        kept = slice(inside.start, inside.start + samples)
+        retained = slice(inside.start, inside.start + samples)
         frequency_hz = all_hz[bins]
         beam = measurement.beam
         gaps = measurement.long_gaps(highest_hz)
@@ -169,8 +169,8 @@ class Comparison:
             angle_rad=angle_rad,
             torque_nm=decimation.apply(interpolated),
             decimation=decimation,
-            kept=kept,
-            prediction=Prediction(angle_rad, decimation.rate_hz, kept),
+            retained=retained,
+            prediction=TorquePredictor(angle_rad, decimation.rate_hz, retained),
             bins=bins,
             frequency_hz=frequency_hz,
             visible_modes=int(
@@ -210,7 +210,7 @@ class Comparison:
     ) -> Comparison:
         """Remove torque at the retained samples and at the ticks with unknown torque."""
         left_nm = self.torque_nm.copy()
-        left_nm[self.kept] -= torque_nm
+        left_nm[self.retained] -= torque_nm
         return replace(
             self,
             torque_nm=left_nm,
@@ -225,12 +225,12 @@ class Comparison:
     @property
     def first_s(self) -> float:
         """Return the time of the first compared sample."""
-        return float(self.kept.start - self.decimation.reach) / self.decimation.rate_hz
+        return float(self.retained.start - self.decimation.reach) / self.decimation.rate_hz
 
     @property
     def samples(self) -> int:
         """Return the number of compared samples."""
-        return int(self.kept.stop - self.kept.start)
+        return int(self.retained.stop - self.retained.start)
 
     def poles(self, plant: Plant, wrt: Sequence[str] = ()) -> tuple[Pole, ...]:
         """Return the poles of a plant whose free decay is projected out, as `mode_poles` does.
@@ -265,7 +265,7 @@ class Comparison:
         followed = self._followed(self.angle_rad)
         # By its speed: an angle that drifts follows no reference, and disturbs nothing.
         own, apart = (
-            np.sum(np.diff(angle_rad[self.kept]) ** 2)
+            np.sum(np.diff(angle_rad[self.retained]) ** 2)
             for angle_rad in (self.angle_rad, self.angle_rad - followed)
         )
         return followed if apart < _LARGEST_REST * own else self.angle_rad
@@ -360,7 +360,7 @@ class Comparison:
         if np.vdot(change, change).real <= _LARGEST_CHANGE:
             return self
         moved_rad, followed = self.angle_rad + self.incoherent_rad, self.angle_rad
-        felt = Prediction(followed, self.decimation.rate_hz, slice(0, self._recorded))
+        felt = TorquePredictor(followed, self.decimation.rate_hz, slice(0, self._recorded))
         # What rings moves the motor, which makes it ring otherwise.
         for _ in range(_FEEDBACKS):
             followed = self._followed(moved_rad, felt.of_other(followed).torque(plant)[0])
@@ -375,7 +375,7 @@ class Comparison:
         """Remove hum, and restore the hum that was removed before."""
         other = replace(self, hum=hum)
         ticks = self._decimated_indices(~self.measurement.torque_known)
-        first_s = self.kept.start / self.decimation.rate_hz
+        first_s = self.retained.start / self.decimation.rate_hz
         time_s = ticks / self.measurement.rate_hz - first_s
         return other._without(
             other.hum_nm - self.hum_nm, other._hum_at(time_s) - self._hum_at(time_s)
@@ -401,7 +401,7 @@ class Comparison:
         found = response.torque(law, range(1, self.visible_modes + 1))
 
         def band(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-            return self.spectrum(values[..., self.kept])
+            return self.spectrum(values[..., self.retained])
 
         unknown = self._decimated_indices(~self.measurement.torque_known)
         between = np.fft.irfft(
@@ -411,7 +411,7 @@ class Comparison:
         return replace(
             self,
             torque_nm=self.torque_nm - found.torque_nm,
-            removed_nm=self.removed_nm + found.torque_nm[self.kept],
+            removed_nm=self.removed_nm + found.torque_nm[self.retained],
             removed_at_unknown_nm=self.removed_at_unknown_nm + between[unknown],
             drag=DragExpansion(
                 plant=plant,
@@ -480,7 +480,7 @@ class Comparison:
             )[0]
         )
         torque_nm = self.decimation.apply(torque)
-        torque_nm[self.kept] -= self.removed_nm
+        torque_nm[self.retained] -= self.removed_nm
         return replace(self, torque_nm=torque_nm)
 
     def lost_gradient(self, plant: Plant, wrt: tuple[str, ...]) -> NDArray[np.complex128]:
@@ -502,7 +502,7 @@ class Comparison:
             for row, values in zip(lost, gradient, strict=True):
                 only = np.zeros(unknown.size)
                 only[unknown] = values
-                row[:] = self.spectrum(self.decimation.apply(only)[self.kept])
+                row[:] = self.spectrum(self.decimation.apply(only)[self.retained])
         return lost
 
     def _decimated_indices(self, ticks: NDArray[np.bool_]) -> NDArray[np.intp]:

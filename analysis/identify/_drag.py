@@ -233,7 +233,7 @@ def small_drag(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
     """Return the spectrum of the torque by a small drag over C_D d, shape (1, K)."""
     moved_rad = comparison.angle_rad + comparison.incoherent_rad
     response = DragResponse(moved_rad, comparison.decimation.rate_hz, plant)
-    return comparison.spectrum(response.first_order()[None, comparison.kept])
+    return comparison.spectrum(response.first_order()[None, comparison.retained])
 
 
 def _first_amplitude(refit: Refit) -> tuple[float, float]:

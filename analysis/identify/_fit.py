@@ -63,8 +63,8 @@ def fit_record(
 ) -> RecordAnalysis:
     """Fit structures to a whole record in the band.
 
-    The torque is predicted from the measured angle (`Prediction`); the squared residual, whitened
-    with the estimated noise spectrum, is minimised over the damping and over density over
+    The torque is predicted from the measured angle (`TorquePredictor`); the squared residual,
+    whitened with the estimated noise spectrum, is minimised over the damping and over density over
     stiffness, stiffness, delay and tool inertia. For noise in the torque alone that is the
     maximum-likelihood estimate, whatever the excitation. Where a controller held the motor to a
     reference, the part coherent with that is used as input (`analysis.identify._instrument`): the

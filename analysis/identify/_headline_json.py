@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from analysis.identify._finding import Finding
-    from analysis.identify.headline import Mode, Numbers
+    from analysis.identify.headline import Estimates, ReportedMode
     from rigd.session import Validity
 
 
@@ -32,7 +32,7 @@ class OrderResult(Protocol):
 
 def headline_json(
     file: str | None,
-    estimates: Numbers,
+    estimates: Estimates,
     orders: Iterable[OrderResult],
     findings: Iterable[Finding],
     validity: Validity,
@@ -43,7 +43,7 @@ def headline_json(
     ----------
     file : str or None
         None for the estimate of a whole campaign.
-    estimates : Numbers
+    estimates : Estimates
     orders : iterable of JudgedOrder
     findings : iterable of Finding
     validity : Validity
@@ -100,7 +100,7 @@ def headline_json(
     }
 
 
-def _mode_json(mode: Mode) -> dict[str, Any]:
+def _mode_json(mode: ReportedMode) -> dict[str, Any]:
     participation = mode.participation
     return {
         "mode": mode.number,
@@ -112,7 +112,7 @@ def _mode_json(mode: Mode) -> dict[str, Any]:
     }
 
 
-def _exact_json(exact: Numbers) -> dict[str, Any]:
+def _exact_json(exact: Estimates) -> dict[str, Any]:
     """Return the estimates that are valid if the beam is uniform to 1e-5."""
     return {
         "condition": EXACT_CONDITION,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify.noise import Line
+from analysis.identify.noise import NoiseLine
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -76,9 +76,9 @@ class Hum:
     phasor_nm: complex
 
     @property
-    def line(self) -> Line:
+    def line(self) -> NoiseLine:
         """Return frequency and amplitude."""
-        return Line(self.frequency_hz, float(abs(self.phasor_nm)))
+        return NoiseLine(self.frequency_hz, float(abs(self.phasor_nm)))
 
     def torque(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the torque in N·m at some times, of their shape."""
@@ -118,7 +118,7 @@ def hum_near_modes(
         At most one per mode.
     """
     predicted, _ = comparison.prediction.torque(plant)
-    measured = comparison.torque_nm[comparison.kept] + comparison.hum_nm
+    measured = comparison.torque_nm[comparison.retained] + comparison.hum_nm
     hz = comparison.frequency_hz
     blocks = _Blocks(comparison.samples, comparison.decimation.rate_hz)
     found: list[Hum] = []

@@ -40,7 +40,7 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
     rate_hz, samples = comparison.decimation.rate_hz, comparison.samples
     end_hz = float(comparison.frequency_hz[-1])
     torque, _ = comparison.prediction.torque(fit.plant)
-    residual = np.fft.rfft(comparison.torque_nm[comparison.kept] - torque)
+    residual = np.fft.rfft(comparison.torque_nm[comparison.retained] - torque)
     all_hz = np.fft.rfftfreq(samples, 1 / rate_hz).astype(np.float64)
     near = np.abs(all_hz - end_hz) < min(_NEAR_HZ, rate_hz / 2 - end_hz)
     known_fraction = comparison.measurement.known_torque_fraction
@@ -66,7 +66,7 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
 
 def repeats_after_s(comparison: Comparison) -> float:
     """Return the period of the angle in s, 0 if it does not repeat at least once as a whole."""
-    angle = comparison.angle_rad[comparison.kept]
+    angle = comparison.angle_rad[comparison.retained]
     angle = angle - angle.mean()
     count = angle.size
     spectrum = np.fft.rfft(angle, 2 * count)

@@ -296,7 +296,7 @@ class _ModalSearch:
     def relation(self, point: _ModalPoint) -> InputRelation:
         """Return the relation of the residual at this point to the angle."""
         residual = point.residual.view(np.complex128)
-        angle = self.comparison.spectrum(self.comparison.angle_rad[self.comparison.kept])
+        angle = self.comparison.spectrum(self.comparison.angle_rad[self.comparison.retained])
         counts = self.noise.counts
         first = int(np.argmax(counts))
         return input_relation(residual[first:], angle[first:], self.comparison.frequency_hz[first:])
@@ -395,7 +395,7 @@ class _ModalProblem:
         self._further = further
         self._s = comparison.prediction.s
         self.scale_rad_s = 2 * math.pi * float(comparison.frequency_hz[-1])
-        self._measured = self._white(comparison.spectrum(comparison.torque_nm[comparison.kept]))
+        self._measured = self._white(comparison.spectrum(comparison.torque_nm[comparison.retained]))
         background = np.array([(self._s / self.scale_rad_s) ** n for n in range(BACKGROUND)])
         self._background = self._spectra(background)
 
@@ -504,7 +504,7 @@ class _ModalProblem:
         here = self._poles(x)
         comparison = self._comparison
         torque = comparison.prediction.torque(model)[0]
-        bare = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
+        bare = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
         drag: NDArray[np.complex128] = self._drag(here)[0]
         return drag + bare + amplitudes @ self._nuisance(here)
 

@@ -13,8 +13,15 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from analysis.identify._plant import OF_BEAM
 from analysis.identify._uncertainty import damping_size
-from analysis.identify.headline import NAMES, Mode, Numbers, Quantity, size_of, symmetric
-from analysis.identify.profile_likelihood import WIDEST_SHARE
+from analysis.identify.headline import (
+    NAMES,
+    Estimates,
+    ReportedMode,
+    ReportedValue,
+    size_of,
+    symmetric,
+)
+from analysis.identify.profile_likelihood import WIDEST_FRACTION
 from analysis.identify.uniform_beam import PARAMETERS
 from analysis.identify.verdict import EXCLUDED, NOT_DETERMINED, OrderVerdict, Status
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
@@ -22,7 +29,7 @@ from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from analysis.identify._modal_model import ModalEstimate
-    from analysis.identify.headline import Size, StructureStatus
+    from analysis.identify.headline import ReportedLossFactor, StructureStatus
     from analysis.identify.profile_likelihood import LikelihoodProfile, Order
     from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
 
@@ -43,7 +50,7 @@ def refused_reason(test: UniformBeamTest) -> str | None:
     return f"a uniform beam does not predict the modal constants ({test.summary.chance})"
 
 
-_N = TypeVar("_N", bound=Numbers)
+_N = TypeVar("_N", bound=Estimates)
 
 
 def with_modal_model(
@@ -60,7 +67,7 @@ def with_modal_model(
 
     Parameters
     ----------
-    exact : Numbers
+    exact : Estimates
         Estimates for an exactly uniform beam.
     modal : ModalEstimate
     test : UniformBeamTest
@@ -93,7 +100,7 @@ def with_modal_model(
         sizes=tuple(each.flagged(doubt) for each in tolerant_sizes(test, tolerant)),
         structures=_structures(condition, tolerant),
         simpler=None,
-        exact=Numbers(
+        exact=Estimates(
             name=condition.name,
             parameters=condition.parameters,
             sizes=condition.sizes,
@@ -107,15 +114,15 @@ def with_modal_model(
 
 
 def _modes(
-    numbers: Numbers, modal: ModalEstimate, doubt: str | None, half_width: float, *, own: bool
-) -> tuple[Mode, ...]:
+    numbers: Estimates, modal: ModalEstimate, doubt: str | None, half_width: float, *, own: bool
+) -> tuple[ReportedMode, ...]:
     """Return the visible modes from the modal model, and the others from the beam."""
     visible = modal.visible
-    found: dict[int, Mode] = {mode.number: mode for mode in numbers.modes}
+    found: dict[int, ReportedMode] = {mode.number: mode for mode in numbers.modes}
     for number in visible:
         its = modal.mode(number)
         inertia, spread = modal.inertia(number)
-        mode = Mode(
+        mode = ReportedMode(
             number,
             symmetric(its.frequency_hz, its.frequency_std_hz, doubt, half_width),
             symmetric(its.damping_ratio, its.damping_ratio_std, doubt, half_width),
@@ -135,7 +142,7 @@ def _modes(
 
 def _parameters(
     estimate: TolerantEstimate, doubt: str | None, effective: str | None
-) -> dict[str, Quantity]:
+) -> dict[str, ReportedValue]:
     """Return the parameters of the nearly uniform beam, with flags on undetermined ones.
 
     `doubt` is the reason against every number. `effective` is the reason why stiffness, density and
@@ -143,7 +150,7 @@ def _parameters(
     than the tolerance.
     """
     return {
-        name: Quantity(
+        name: ReportedValue(
             estimate.values[name],
             estimate.std[name],
             estimate.interval[name],
@@ -166,13 +173,13 @@ def _reason(estimate: TolerantEstimate, name: str) -> str | None:
 def identifiable(estimate: TolerantEstimate, order: str) -> bool:
     """Return whether the modes bound an order within less than half of its range."""
     low, high = estimate.interval[order]
-    wide = WIDEST_SHARE * (ORDER_RANGE[1] - ORDER_RANGE[0])
+    wide = WIDEST_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
     shows = estimate.deviance_without[COEFFICIENT_OF[order]] > NORMAL_95**2
     return high - low <= wide and shows
 
 
 def _structures(
-    exact: Numbers, estimate: TolerantEstimate
+    exact: Estimates, estimate: TolerantEstimate
 ) -> tuple[tuple[str, StructureStatus], ...]:
     """Return the status of the structures by their losses; mode frequencies are no proof."""
 
@@ -194,7 +201,9 @@ def _structures(
     return tuple((name, status(name, before)) for name, before in exact.structures)
 
 
-def tolerant_sizes(test: UniformBeamTest, estimate: TolerantEstimate) -> tuple[Size, ...]:
+def tolerant_sizes(
+    test: UniformBeamTest, estimate: TolerantEstimate
+) -> tuple[ReportedLossFactor, ...]:
     """Return the loss factors where they depend least on their orders.
 
     The loss factor of external damping is relative to the inertia, which is an effective value if

@@ -30,7 +30,7 @@ from analysis.identify._data import fast_length
 from analysis.identify._predictor import torque_channel
 from analysis.identify._refit import Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
-from analysis.identify.verdict import STRONG
+from analysis.identify.verdict import BIC_DECISIVE
 from rigd.beam import clamped_free_eigenvalues, participation
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class ModalForces:
         n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
         self._comparison, self._plant, self._samples = comparison, plant, n
         self._length = fast_length(int(np.ceil(_PADDED * n)))
-        # On s = sigma + j omega what wraps round has decayed: see `Prediction`.
+        # On s = sigma + j omega what wraps round has decayed: see `TorquePredictor`.
         sigma = _DECAY * rate_hz / self._length
         bins = np.arange(self._length // 2 + 1)
         self._s = sigma + 2j * np.pi * rate_hz / self._length * bins
@@ -122,7 +122,9 @@ class ModalForces:
         torque = -scale * k * self._p / resists * force * torque_channel(self._plant, self._s)
         in_time = np.fft.irfft(torque, self._length)[: self._samples]
         in_time *= self._growth[::_OVERSAMPLING]
-        spectrum: NDArray[np.complex128] = self._comparison.spectrum(in_time[self._comparison.kept])
+        spectrum: NDArray[np.complex128] = self._comparison.spectrum(
+            in_time[self._comparison.retained]
+        )
         return spectrum
 
     def _stiffness(self, mode: int) -> tuple[float, NDArray[np.complex128]]:
@@ -210,7 +212,11 @@ def nonlinear_forces(
         return candidate_set, ()
     for lead in _leads(candidate_set):
         found, forces = _added(candidate_set, lead, modes)
-        if forces and found.bic < candidate_set.bic - STRONG and _explain(candidate_set, found):
+        if (
+            forces
+            and found.bic < candidate_set.bic - BIC_DECISIVE
+            and _explain(candidate_set, found)
+        ):
             return found, forces
     return candidate_set, ()
 

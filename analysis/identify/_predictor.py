@@ -166,7 +166,7 @@ still does after a whole record, and is a free decay, of which no fit takes noti
 what the decimation left beyond the band grow by exp(6.6 / 1.1) = 400."""
 
 
-class Prediction:
+class TorquePredictor:
     """Prediction of the torque from one angle, with derivatives by the parameters.
 
     A finite convolution by discrete transforms wraps around, and a lightly damped beam rings longer
@@ -180,7 +180,7 @@ class Prediction:
     angle_rad : ndarray, shape (n,)
         From rest, band-limited: nothing left at half the rate.
     rate_hz : float
-    kept : slice
+    retained : slice
         Retained samples of the prediction.
     """
 
@@ -195,9 +195,9 @@ class Prediction:
         "rate_hz",
     )
 
-    def __init__(self, angle_rad: NDArray[np.float64], rate_hz: float, kept: slice) -> None:
+    def __init__(self, angle_rad: NDArray[np.float64], rate_hz: float, retained: slice) -> None:
         self.rate_hz = rate_hz
-        self._retained = kept
+        self._retained = retained
         self._length = fast_length(int(np.ceil(_PADDED * angle_rad.size)))
         self._sigma = sigma = _DECAY * rate_hz / self._length
         time_s = np.arange(angle_rad.size) / rate_hz
@@ -205,9 +205,9 @@ class Prediction:
         self._response = ResponseGrid(sigma + 2j * np.pi * rate_hz / self._length * bins)
         self._decay = np.exp(-sigma * time_s)
         self._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
-        self._growth = np.exp(sigma * time_s[kept])
+        self._growth = np.exp(sigma * time_s[retained])
 
-    def of_other(self, angle_rad: NDArray[np.float64]) -> Prediction:
+    def of_other(self, angle_rad: NDArray[np.float64]) -> TorquePredictor:
         """Return the prediction from another angle of the same length, shape (n,)."""
         other = copy(self)
         other._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)

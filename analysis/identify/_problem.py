@@ -122,7 +122,7 @@ class Objective:
             Pole(pole.mode, pole.at_rad_s, pole.derivative @ chain)
             for pole in comparison.poles(plant, names)
         )
-        residual = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
+        residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
         jacobian = (chain.T @ _parts(comparison.spectrum(gradient))).view(np.complex128)
         if comparison.drag is not None:
             change, slopes = comparison.drag.change_to(plant, poles, unknowns.names, chain)

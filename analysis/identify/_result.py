@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._plant import Plant
-    from analysis.identify.noise import Line
+    from analysis.identify.noise import NoiseLine
     from analysis.models import Structure
 
 _RARE: Final = 1e-4
@@ -169,7 +169,7 @@ class RecordAnalysis:
         False at the lines; the residuals are 0 there.
     noise_nm2_per_hz : ndarray, shape (K,)
         One-sided power spectral density of the torque's noise, without lines.
-    lines : tuple of Line
+    lines : tuple of NoiseLine
         Narrow-band disturbances of the torque, excluded from all comparisons.
     comparison : Comparison
         Data that all of them were compared with.
@@ -179,7 +179,7 @@ class RecordAnalysis:
     frequency_hz: NDArray[np.float64]
     compared: NDArray[np.bool_]
     noise_nm2_per_hz: NDArray[np.float64]
-    lines: tuple[Line, ...]
+    lines: tuple[NoiseLine, ...]
     comparison: Comparison
 
     @classmethod
@@ -225,7 +225,7 @@ class RecordAnalysis:
         """
         comparison, noise = self.comparison, self.noise
         torque_nm = (
-            comparison.torque_nm[comparison.kept] + comparison.removed_nm - comparison.hum_nm
+            comparison.torque_nm[comparison.retained] + comparison.removed_nm - comparison.hum_nm
         )
         measured = comparison.spectrum(torque_nm)[noise.counts]
         residual = (fit.residual * np.sqrt(noise.power / 2))[noise.counts]

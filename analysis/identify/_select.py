@@ -34,7 +34,7 @@ from analysis.identify._step_in_time import step_score
 from analysis.identify._time_varying import along_time, changing, established
 from analysis.identify._visible_modes import visible_modes
 from analysis.identify.headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
-from analysis.identify.profile_likelihood import WIDEST_SHARE, profiled
+from analysis.identify.profile_likelihood import WIDEST_FRACTION, profiled
 from analysis.identify.residual_tests import (
     InputRelation,
     Whiteness,
@@ -45,7 +45,7 @@ from analysis.identify.residual_tests import (
 from analysis.identify.sentences import experiments, of_headline
 from analysis.identify.uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify.verdict import (
-    EVEN,
+    BIC_TIE,
     NOT_DETERMINED,
     CandidateRow,
     Verdict,
@@ -259,7 +259,7 @@ def _selected(
     clipped = _CLIPPED if "clipping" in kinds else None
     doubt = wrong or clipped or _doubt_reason(changes, one_sweep=measurement.one_sweep)
     alpha, lambda_ = (order_verdict(candidate_set, each, visible, doubt=doubt) for each in profiles)
-    orders, close = (alpha, lambda_), rivals(candidate_set, EVEN)
+    orders, close = (alpha, lambda_), rivals(candidate_set, BIC_TIE)
     numbers = headline(candidate_set, orders, visible, unexplained=wrong)
     if doubt is not None:
         numbers = numbers.doubted(doubt)
@@ -520,7 +520,7 @@ def _unidentifiable_orders(candidate_set: CandidateSet, visible: tuple[int, ...]
     found = {}
     for name in COEFFICIENT_OF.keys() & set(freest.structure.free):
         low, high = freest.fit.interval[name] or (-math.inf, math.inf)
-        too_wide = high - low > WIDEST_SHARE * (ORDER_RANGE[1] - ORDER_RANGE[0])
+        too_wide = high - low > WIDEST_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
         # An interval that is too narrow for what lies between: a local minimum of its own.
         astray = not low <= 1 <= high and any(
             each.structure.fixed.get(name) == 1.0  # type: ignore[call-overload]
@@ -598,7 +598,7 @@ def _tests(
     """Test the residual of the modal model, or of the first candidate if there is none."""
     comparison, counts = candidate_set.comparison, candidate_set.noise.counts
     residual = candidate_set.best.fit.residual if modal is None else modal.residual
-    angle_rad = comparison.angle_rad[comparison.kept]
+    angle_rad = comparison.angle_rad[comparison.retained]
     of_variance_1 = comparison.in_time(residual) * math.sqrt(comparison.samples / 2)
     multiples = harmonics(angle_rad, of_variance_1, comparison.decimation.rate_hz, band_hz)
     if modal is not None:

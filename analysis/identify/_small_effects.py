@@ -135,4 +135,4 @@ def _friction(comparison: Comparison) -> NDArray[np.complex128]:
     angle = measurement.angle_from_rest(float(comparison.frequency_hz[-1]))
     speed = np.gradient(angle) * measurement.rate_hz
     torque = comparison.decimation.apply(speed / np.hypot(speed, _SLIDING_RAD_S))
-    return comparison.spectrum(torque[comparison.kept])
+    return comparison.spectrum(torque[comparison.retained])

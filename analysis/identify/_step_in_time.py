@@ -130,10 +130,10 @@ class _Stiffened:
 
     def spectrum(self, instant: int) -> NDArray[np.complex128]:
         """Return the spectrum of the torque by a step at a sample, per unit change, (K,)."""
-        kept = self._comparison.kept
+        retained = self._comparison.retained
         later = self._vibrations.copy()
-        later[:, : kept.start + instant] = 0.0
+        later[:, : retained.start + instant] = 0.0
         forces = np.fft.rfft(later, self._length)
         torque = np.fft.irfft(np.sum(forces * self._answers, axis=0), self._length)
         torque = torque[: self._decay.size] / self._decay
-        return self._comparison.spectrum(torque[kept])
+        return self._comparison.spectrum(torque[retained])

@@ -32,7 +32,7 @@ from analysis.identify._finding import Finding
 from analysis.identify._predictor import ResponseGrid, eigenvalues, torque_channel
 from analysis.identify._refit import MANY, Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
-from analysis.identify.verdict import STRONG
+from analysis.identify.verdict import BIC_DECISIVE
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 
@@ -98,7 +98,7 @@ class TemporalChange:
     @property
     def certain(self) -> bool:
         """Return whether nothing else explains the record as well."""
-        return self.behind < -STRONG
+        return self.behind < -BIC_DECISIVE
 
 
 def along_time(
@@ -113,7 +113,7 @@ def along_time(
     if candidate_set.misread:
         return candidate_set, ()
     lag = _lag_of_play(candidate_set.comparison)
-    most = candidate_set.best.bic + min(STRONG, _IN_SIGHT * (rival_bic - candidate_set.bic))
+    most = candidate_set.best.bic + min(BIC_DECISIVE, _IN_SIGHT * (rival_bic - candidate_set.bic))
     tried: dict[What, tuple[float, Refit]] = {}
     for lead in _leads(candidate_set):
         for what, predicted in _promising(candidate_set, lead, lag, most):
@@ -128,13 +128,13 @@ def along_time(
         change = TemporalChange(
             what, unit * float(sizes[-1]), unit * float(std[-1]), bic - candidate_set.best.bic
         )
-        if change.behind < STRONG and _possible(change):
+        if change.behind < BIC_DECISIVE and _possible(change):
             found.append((change, refit))
     found.sort(key=lambda pair: pair[0].behind)
     if not found:
         return candidate_set, ()
     first, refit = found[0]
-    changes = tuple(c for c, _ in found if c.behind < first.behind + STRONG)
+    changes = tuple(c for c, _ in found if c.behind < first.behind + BIC_DECISIVE)
     if not first.certain or len(changes) > 1:
         return candidate_set, changes
     return candidate_set.with_columns(refit.columns, refit.noise_here()), changes
@@ -305,8 +305,8 @@ def memory_torque(
     sigma = _DECAY * rate_hz / length
     s = sigma + 2j * np.pi * rate_hz / length * np.arange(length // 2 + 1)
     growth = np.exp(sigma * np.arange(n) / rate_hz)
-    kept = comparison.kept
-    w = np.interp(np.arange(n), np.arange(kept.start, kept.stop), change)
+    retained = comparison.retained
+    w = np.interp(np.arange(n), np.arange(retained.start, retained.stop), change)
     damping, beam = plant.damping, plant.beam
     internal = damping.zeta * s**damping.alpha
     external = damping.gamma * s**damping.lambda_
@@ -341,7 +341,7 @@ def memory_torque(
         total += stiffness * (
             late - w * in_time(external * (1 - follows) * angle - follows * steady)
         )
-    return total[kept]
+    return total[retained]
 
 
 # Words

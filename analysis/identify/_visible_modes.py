@@ -48,8 +48,8 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
     than the smooth response is evidence as well, for weaker resonances in a long record. `fit`
     provides the frequencies and widths of the modes.
     """
-    torque = comparison.spectrum(comparison.torque_nm[comparison.kept])
-    angle = comparison.spectrum(comparison.angle_rad[comparison.kept])
+    torque = comparison.spectrum(comparison.torque_nm[comparison.retained])
+    angle = comparison.spectrum(comparison.angle_rad[comparison.retained])
     found = []
     for mode in fit.modes:
         offset = comparison.frequency_hz - mode.frequency_hz

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from analysis.identify._plant import OF_BEAM
-from analysis.identify.verdict import ANOTHER_DAMPING, EXCLUDED, STRONG, WITH_DRAG
+from analysis.identify.verdict import ANOTHER_DAMPING, BIC_DECISIVE, EXCLUDED, WITH_DRAG
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
@@ -57,7 +57,7 @@ _DAMPINGS: Final[tuple[Damping, Damping]] = ("internal", "external")
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class ReportedValue:
     """Value with its uncertainty.
 
     Attributes
@@ -77,7 +77,7 @@ class Quantity:
     interval_95: tuple[float, float] | None
     flag: str | None = None
 
-    def flagged(self, flag: str | None) -> Quantity:
+    def flagged(self, flag: str | None) -> ReportedValue:
         """Return the value with a flag, unless it already has one.
 
         Parameters
@@ -98,7 +98,7 @@ class Quantity:
 
 
 @dataclass(frozen=True, slots=True)
-class Size:
+class ReportedLossFactor:
     """Loss factor of a damping at the frequency where it depends least on its order.
 
     Attributes
@@ -107,20 +107,20 @@ class Size:
         "internal" or "external".
     omega_rad_s : float or None
         That frequency; None if the order is fixed: then it is the coefficient itself.
-    size : Quantity
+    size : ReportedValue
         Value of the loss factor, as in `DampingSize`.
     """
 
     damping: Damping
     omega_rad_s: float | None
-    size: Quantity
+    size: ReportedValue
 
     @property
     def order(self) -> str:
         """Return the name of its order: "alpha" or "lambda"."""
         return NAMES[self.damping][1]
 
-    def flagged(self, flag: str | None) -> Size:
+    def flagged(self, flag: str | None) -> ReportedLossFactor:
         """Return the loss factor with a flag, unless it already has one.
 
         Parameters
@@ -131,25 +131,25 @@ class Size:
 
 
 @dataclass(frozen=True, slots=True)
-class Mode:
+class ReportedMode:
     """One mode of the beam with locked hub (clamped–free)."""
 
     number: int
     """From 1 on."""
-    frequency_hz: Quantity
+    frequency_hz: ReportedValue
     """Frequency of the free decay."""
-    damping_ratio: Quantity
+    damping_ratio: ReportedValue
     """Fraction of the critical damping."""
     shown: bool
     """Whether the record shows it; else it is computed from the model."""
     source: Literal["modal", "beam"] = "beam"
     """Model behind the numbers: the modal one, or the beam."""
-    participation: Quantity | None = None
+    participation: ReportedValue | None = None
     """Effective inertia about the motor axis, in kg m²; None for a mode from the beam."""
 
 
 @dataclass(frozen=True, slots=True)
-class Simpler:
+class ConditionalEstimate:
     """Estimates of a simpler structure, on condition that this structure is true.
 
     Attributes
@@ -158,34 +158,34 @@ class Simpler:
         Name in tables.
     fixed : mapping of str to float
         Assumed values: orders by name.
-    parameters : mapping of str to Quantity
+    parameters : mapping of str to ReportedValue
     """
 
     name: str
     fixed: Mapping[str, float]
-    parameters: Mapping[str, Quantity]
+    parameters: Mapping[str, ReportedValue]
 
 
 @dataclass(frozen=True, slots=True)
-class Numbers:
+class Estimates:
     """Estimates from one record or a campaign, without an assumption on the orders.
 
     Attributes
     ----------
     name : str
         Name in tables of the freest structure that the data support.
-    parameters : mapping of str to Quantity
+    parameters : mapping of str to ReportedValue
         Parameters of the structure, by the names of `RecordFit`.
-    sizes : tuple of Size
-    modes : tuple of Mode
+    sizes : tuple of ReportedLossFactor
+    modes : tuple of ReportedMode
     structures : tuple of (str, str)
         Every structure fitted, by its name in tables, and its status: "selected" for the reported
         one; "compatible"; "excluded".
-    simpler : Simpler or None
+    simpler : ConditionalEstimate or None
         Estimates of the simplest sufficient structure, if it is another.
     drag_speed_m_s : float or None
         Speed at which the parameter ``drag`` is reported; None without drag.
-    exact : Numbers or None
+    exact : Estimates or None
         Estimates on condition that the beam is uniform to 1e-5; None if these assume that already.
     uniform_beam : UniformBeamTest or None
         Whether a uniform beam predicts the modal constants; None if no mode shows.
@@ -196,14 +196,14 @@ class Numbers:
     """
 
     name: str
-    parameters: Mapping[str, Quantity]
-    sizes: tuple[Size, ...]
-    modes: tuple[Mode, ...]
+    parameters: Mapping[str, ReportedValue]
+    sizes: tuple[ReportedLossFactor, ...]
+    modes: tuple[ReportedMode, ...]
     structures: tuple[tuple[str, StructureStatus], ...]
-    simpler: Simpler | None
+    simpler: ConditionalEstimate | None
     drag_speed_m_s: float | None
     _: KW_ONLY
-    exact: Numbers | None = None
+    exact: Estimates | None = None
     uniform_beam: UniformBeamTest | None = None
     tolerant: TolerantEstimate | None = None
     modal: ModalEstimate | None = None
@@ -232,7 +232,7 @@ class Numbers:
 
 
 @dataclass(frozen=True, slots=True)
-class Headline(Numbers):
+class Headline(Estimates):
     """Reported numbers of one record, and the fit that they come from.
 
     Attributes
@@ -321,7 +321,7 @@ def headline(
     )  # fmt: skip
     if candidate_set.drag is not None:
         drag = candidate_set.drag
-        at = Quantity(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
+        at = ReportedValue(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
         sizes = (
             each.flagged(WITH_DRAG) if each.damping == "external" else each for each in result.sizes
         )
@@ -434,7 +434,7 @@ def _status(
     simpler = set(candidate.structure.free) < set(freest.structure.free)
     if not simpler:
         behind = candidate.deviance - freest.deviance > EXCLUDED[0]
-        worse = candidate.bic > candidate_set.best.bic + STRONG
+        worse = candidate.bic > candidate_set.best.bic + BIC_DECISIVE
         return "excluded" if behind and worse else "compatible"
     if any(
         candidate.structure.fixed.get(order) == 1.0  # type: ignore[call-overload]
@@ -446,7 +446,7 @@ def _status(
     return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
 
 
-def _simpler(candidate_set: CandidateSet, fractional: frozenset[str]) -> Simpler | None:
+def _simpler(candidate_set: CandidateSet, fractional: frozenset[str]) -> ConditionalEstimate | None:
     """Return the estimates of the simplest sufficient structure."""
     freest = candidate_set.freest
     would_do = [
@@ -463,7 +463,7 @@ def _simpler(candidate_set: CandidateSet, fractional: frozenset[str]) -> Simpler
         for order, coefficient in COEFFICIENT_OF.items()
         if order in best.structure.fixed and coefficient in best.structure.free
     }
-    return Simpler(
+    return ConditionalEstimate(
         name=best.name,
         fixed=fixed,
         parameters={
@@ -476,7 +476,7 @@ def _simpler(candidate_set: CandidateSet, fractional: frozenset[str]) -> Simpler
 
 def _parameter(
     fit: RecordFit, name: str, reason: str | None, interval: tuple[float, float] | None
-) -> Quantity:
+) -> ReportedValue:
     free = name in fit.interval
     ends = interval or fit.interval.get(name)
     flag = reason
@@ -484,10 +484,10 @@ def _parameter(
         flag = _AT_EDGE
     if flag is None and free and ends is None:
         flag = _NOT_DETERMINED
-    return Quantity(fit.parameters[name], fit.std[name] if free else 0.0, ends, flag)
+    return ReportedValue(fit.parameters[name], fit.std[name] if free else 0.0, ends, flag)
 
 
-def size_of(damping: Damping, size: DampingSize, reason: str | None) -> Size:
+def size_of(damping: Damping, size: DampingSize, reason: str | None) -> ReportedLossFactor:
     """Return a loss factor with its 95 % interval.
 
     Parameters
@@ -500,7 +500,9 @@ def size_of(damping: Damping, size: DampingSize, reason: str | None) -> Size:
     # Positive, and uncertain by a factor.
     spread = NORMAL_95 * size.std / size.value
     ends = (size.value * math.exp(-spread), size.value * math.exp(min(spread, 300.0)))
-    return Size(damping, size.omega_rad_s, Quantity(size.value, size.std, ends, reason))
+    return ReportedLossFactor(
+        damping, size.omega_rad_s, ReportedValue(size.value, size.std, ends, reason)
+    )
 
 
 def _bounded(fit: RecordFit, with_both: RecordFit) -> Iterator[ModeEstimate]:
@@ -515,11 +517,11 @@ def _bounded(fit: RecordFit, with_both: RecordFit) -> Iterator[ModeEstimate]:
         )
 
 
-def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> Mode:
+def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> ReportedMode:
     shown = mode.number in visible
     if reason is None and not shown:
         reason = "computed from the model: the record does not show this mode"
-    return Mode(
+    return ReportedMode(
         mode.number,
         symmetric(mode.frequency_hz, mode.frequency_std_hz, reason),
         symmetric(mode.damping_ratio, mode.damping_ratio_std, reason),
@@ -529,7 +531,7 @@ def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> M
 
 def symmetric(
     value: float, std: float, reason: str | None, half_width: float = NORMAL_95
-) -> Quantity:
+) -> ReportedValue:
     """Return a value with a symmetric 95 % interval.
 
     Parameters
@@ -541,4 +543,4 @@ def symmetric(
         Half width of the interval, in standard deviations.
     """
     half = half_width * std
-    return Quantity(value, std, (value - half, value + half), reason)
+    return ReportedValue(value, std, (value - half, value + half), reason)

@@ -39,7 +39,7 @@ _STEADY: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class NoiseLine:
     """An oscillation of one frequency, all through the record, that the motor did not cause."""
 
     frequency_hz: float
@@ -58,12 +58,12 @@ class NoiseSpectrum:
         Expected ``|residual|²`` of each bin.
     counts : ndarray of bool, shape (K,)
         Bins that are compared; False at the lines.
-    lines : tuple of Line
+    lines : tuple of NoiseLine
     """
 
     power: NDArray[np.float64]
     counts: NDArray[np.bool_]
-    lines: tuple[Line, ...]
+    lines: tuple[NoiseLine, ...]
 
     @property
     def weight(self) -> NDArray[np.float64]:
@@ -96,7 +96,7 @@ def noise_of(
     """
     power = smooth_power(residual) / known_fraction
     counts = np.ones(power.size, dtype=bool)
-    lines: list[Line] = []
+    lines: list[NoiseLine] = []
     if near_mode is None:
         return NoiseSpectrum(power, counts, ())
     for part in _standing_out(residual, power):
@@ -105,7 +105,7 @@ def noise_of(
             continue
         counts[part] &= near_mode[part]
         lines.append(
-            Line(
+            NoiseLine(
                 frequency_hz=float(own @ frequency_hz[part] / own.sum()),
                 amplitude_nm=float(2 * np.sqrt(own.sum()) / (samples * known_fraction)),
             )

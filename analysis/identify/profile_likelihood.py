@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 Order = Literal["alpha", "lambda"]
 
-WIDEST_SHARE: Final = 0.25
+WIDEST_FRACTION: Final = 0.25
 """Fraction of the range 0 to 2: an order with ±0.25 does not distinguish materials."""
 
 
@@ -101,7 +101,7 @@ class LikelihoodProfile:
     @property
     def identifiable(self) -> bool:
         """Return whether the record determines this order to a useful precision."""
-        narrow = self.relative_width <= WIDEST_SHARE and not (self.open_below or self.open_above)
+        narrow = self.relative_width <= WIDEST_FRACTION and not (self.open_below or self.open_above)
         return narrow and len(self.local_minima) < 2
 
     @property

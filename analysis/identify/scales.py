@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from analysis.identify._result import RecordFit
-    from analysis.identify.headline import Quantity
+    from analysis.identify.headline import ReportedValue
 
 _RATIO: Final = "density_over_stiffness"
 _STIFFNESS: Final = "bending_stiffness_n_m2"
@@ -63,20 +63,20 @@ def scales_absorbed(fit: RecordFit) -> bool:
 
 
 def with_scales(
-    parameters: Mapping[str, Quantity], uncertainty: Mapping[str, float]
-) -> dict[str, Quantity]:
+    parameters: Mapping[str, ReportedValue], uncertainty: Mapping[str, float]
+) -> dict[str, ReportedValue]:
     """Combine statistical uncertainties with those of the scales.
 
     Parameters
     ----------
-    parameters : mapping of str to Quantity
+    parameters : mapping of str to ReportedValue
         By the names of `RecordFit`, with statistical uncertainties.
     uncertainty : mapping of str to float
         Relative standard uncertainties by scale: "torque_scale", "length".
 
     Returns
     -------
-    dict of str to Quantity
+    dict of str to ReportedValue
         Parameters with an interval that depend on a scale of given uncertainty, with the combined
         standard uncertainty and 95 % interval.
     """
@@ -92,7 +92,7 @@ def _relative(exponents: Mapping[str, int], uncertainty: Mapping[str, float]) ->
     return math.hypot(*(power * uncertainty.get(scale, 0.0) for scale, power in exponents.items()))
 
 
-def _combined(quantity: Quantity, relative: float, *, logarithmic: bool) -> Quantity:
+def _combined(quantity: ReportedValue, relative: float, *, logarithmic: bool) -> ReportedValue:
     """Widen an interval on either side by the uncertainty of the scales, in quadrature."""
     assert quantity.interval_95 is not None
     value, (low, high) = quantity.value, quantity.interval_95

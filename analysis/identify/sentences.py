@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
-    from analysis.identify.headline import Headline, Quantity, Simpler
+    from analysis.identify.headline import ConditionalEstimate, Headline, ReportedValue
     from analysis.identify.profile_likelihood import Order
     from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
     from analysis.identify.verdict import OrderVerdict, Status
@@ -227,7 +227,7 @@ def _types(names: tuple[str, ...]) -> str:
     return f"type{'s' if len(names) > 1 else ''} {listed(sorted(names))}"
 
 
-def _condition(simpler: Simpler) -> str:
+def _condition(simpler: ConditionalEstimate) -> str:
     """Return the sentence on the conditional estimate of a simpler structure."""
     taken = " and ".join(f"{name} = {value:g}" for name, value in simpler.fixed.items())
     numbers = [
@@ -241,7 +241,7 @@ def _condition(simpler: Simpler) -> str:
     )
 
 
-def _with_interval(quantity: Quantity) -> str:
+def _with_interval(quantity: ReportedValue) -> str:
     """Return a number with its 95 % interval, rounded to significant digits."""
     if quantity.interval_95 is None or not quantity.std:
         return f"{quantity.value:.4g}"

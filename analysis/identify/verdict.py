@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 Status = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 
-STRONG: Final = 10.0
+BIC_DECISIVE: Final = 10.0
 """Difference of BIC from which the worse structure may be dismissed (Kass and Raftery, J. American
-Statistical Association 90 (1995) 773-795); below `EVEN` the data do not distinguish the two."""
+Statistical Association 90 (1995) 773-795); below `BIC_TIE` the data do not distinguish the two."""
 
-EVEN: Final = 6.0
+BIC_TIE: Final = 6.0
 
 EXCLUDED: Final = (10.828, 13.816, 16.266, 18.467)
 """Deviance above the freest structure's from which a simpler one is excluded, by the number of

@@ -1,4 +1,4 @@
-from ._estimate import EstimateError as EstimateError
+from ._estimate import FrequencyResponseError as FrequencyResponseError
 from ._estimate import SettingsError as SettingsError
 from ._estimate import estimate as estimate
 from ._fit import fit_frf as fit_frf

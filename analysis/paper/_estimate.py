@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from rigd.spectral import Segmentation
 
 
-class EstimateError(ValueError):
+class FrequencyResponseError(ValueError):
     """The requested frequency response cannot be estimated from this record."""
 
 
-class SettingsError(EstimateError):
+class SettingsError(FrequencyResponseError):
     """The settings are inconsistent, or do not suit the record's rate."""
 
 
@@ -60,7 +60,7 @@ def estimate(
     ------
     SettingsError
         The segments or the band make no sense at the record's rate.
-    EstimateError
+    FrequencyResponseError
         The record is too short for the segments, or its angle does not move.
     """
     segmentation = settings.segmentation(record.rate_hz)
@@ -92,7 +92,7 @@ def estimate(
                 estimator=settings.estimator,
             )
     except SpectralError as error:
-        raise EstimateError(f"{record.path}: {error}") from error
+        raise FrequencyResponseError(f"{record.path}: {error}") from error
     try:
         response, whole_record = (
             each.band(*settings.band_hz).without_delays(
@@ -104,7 +104,7 @@ def estimate(
         raise SettingsError(f"{record.path}: {error}") from error
     unknown = np.flatnonzero(~np.isfinite(response.response))
     if unknown.size:
-        raise EstimateError(
+        raise FrequencyResponseError(
             f"{record.path}: the angle has no power at {response.frequency_hz[unknown[0]]:g} Hz, "
             "so there is no frequency response there; choose a --band that was excited."
         )
@@ -114,11 +114,11 @@ def estimate(
 def _moving_reference_rad(record: Record) -> NDArray[np.float64]:
     """Return the requested motion from its start, shape (n,).
 
-    Raise `EstimateError` if there is none: an imported record may lack it.
+    Raise `FrequencyResponseError` if there is none: an imported record may lack it.
     """
     reference: NDArray[np.float64] = record.reference_rad - record.reference_rad[0]
     if not reference[record.first_sweep].any():
-        raise EstimateError(
+        raise FrequencyResponseError(
             f"{record.path}: the record has no reference that moves, which --frf iv needs; "
             "choose --frf h1."
         )
@@ -149,7 +149,7 @@ def _check_segmentation(record: Record, segmentation: Segmentation) -> None:
         )
     samples = record.first_sweep_samples
     if segment_count(samples, length, overlap) == 0:
-        raise EstimateError(
+        raise FrequencyResponseError(
             f"{record.path}: the sweep has {samples} samples ({samples / record.rate_hz:g} s), "
             f"fewer than one Welch segment of {length}{_remedy(samples)}"
         )

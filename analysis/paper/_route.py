@@ -14,7 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.models import STRUCTURES, FrequencyResponseModel, WeightingError, weights
-from analysis.paper._estimate import EstimateError, SettingsError, estimate, estimate_warnings
+from analysis.paper._estimate import (
+    FrequencyResponseError,
+    SettingsError,
+    estimate,
+    estimate_warnings,
+)
 from analysis.paper._fit import FitError, FrfFit, fit_many
 from rigd.beam import modes, transfer, undamped_frequencies_rad_s
 
@@ -364,7 +369,7 @@ def analyse(
     ------
     SettingsError
         The segments, the band or the weightings make no sense.
-    EstimateError
+    FrequencyResponseError
         Nothing was excited, or the record is too short for the segments.
     """
     _check_excited(record)
@@ -406,12 +411,12 @@ def _check_excited(record: Record) -> None:
     """Raise if the motor did not move, before the checks of segments and bands."""
     angles = record.angle_rad[record.angle_known]
     if record.metadata.get("excitation") == "hold":
-        raise EstimateError(
+        raise FrequencyResponseError(
             f"{record.path}: nothing was excited: the motor was held; record an excitation, such "
             "as rigd run chirp."
         )
     if angles.size == 0 or np.ptp(angles) == 0:
-        raise EstimateError(
+        raise FrequencyResponseError(
             f"{record.path}: nothing was excited: the angle never changes; check the encoder and "
             "that the motor moved."
         )

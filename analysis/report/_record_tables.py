@@ -28,7 +28,13 @@ from rigd.printable import listed
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from analysis.identify.headline import Headline, Mode, Numbers, Quantity, Size
+    from analysis.identify.headline import (
+        Estimates,
+        Headline,
+        ReportedLossFactor,
+        ReportedMode,
+        ReportedValue,
+    )
     from analysis.results import WholeRecord
 
 _STRONG_CORRELATION: Final = 0.9
@@ -97,7 +103,7 @@ _MODE: Final = (
 )
 
 
-def _mode_cells(mode: Mode) -> tuple[Cell, ...]:
+def _mode_cells(mode: ReportedMode) -> tuple[Cell, ...]:
     """Fill the columns of `_MODE` but for the number."""
     return *_quantity_cells(mode.frequency_hz)[:2], *_quantity_cells(mode.damping_ratio, 100.0)
 
@@ -114,7 +120,7 @@ def _modes_source(headline: Headline) -> str:
     )
 
 
-def _inertia(participation: Quantity | None) -> tuple[Cell, Cell]:
+def _inertia(participation: ReportedValue | None) -> tuple[Cell, Cell]:
     if participation is None:
         return number(None), number(None)
     value, std, *_ = _quantity_cells(participation, _SQUARE_MM)
@@ -265,7 +271,7 @@ def sizes_table(whole: WholeRecord) -> Table:
 
 def condition_table(whole: WholeRecord) -> Table | None:
     """Compare the reported values with those of a simpler structure; None if none suffices."""
-    headline: Numbers = whole.headline.exact or whole.headline
+    headline: Estimates = whole.headline.exact or whole.headline
     simpler = headline.simpler
     if simpler is None:
         return None
@@ -329,7 +335,7 @@ def correlations_table(whole: WholeRecord) -> Table:
 
 
 def _parameter_row(
-    name: str, each: Quantity, combined: Mapping[str, Quantity], *, fixed: bool
+    name: str, each: ReportedValue, combined: Mapping[str, ReportedValue], *, fixed: bool
 ) -> tuple[Entry, ...]:
     symbol, meaning, unit, factor = _described(name)
     shown = estimate((each.value, each.std or None, *_ends(each)), each.std, factor)
@@ -357,7 +363,7 @@ def _unit_cell(shown: str) -> Cell:
     return Cell(_SI.get(shown, unit if power.startswith("1e") else shown), shown)
 
 
-def _size_row(headline: Headline, each: Size) -> tuple[Entry, ...]:
+def _size_row(headline: Headline, each: ReportedLossFactor) -> tuple[Entry, ...]:
     size, internal = each.size, each.damping == "internal"
     symbol = "ζ ω^α sin(απ/2)" if internal else "γ ω^λ sin(λπ/2) / (ρ/EI ω²)"
     flag = size.flag
@@ -373,16 +379,16 @@ def _size_row(headline: Headline, each: Size) -> tuple[Entry, ...]:
     return (each.damping, symbol, each.omega_rad_s, value, *others)
 
 
-def _quantity_cells(each: Quantity, factor: float = 1.0) -> tuple[Cell, ...]:
+def _quantity_cells(each: ReportedValue, factor: float = 1.0) -> tuple[Cell, ...]:
     """Return the cells of a quantity, its standard deviation and the ends of its interval."""
     return estimate((each.value, each.std, *_ends(each)), each.std, factor)
 
 
-def _ends(quantity: Quantity) -> tuple[float | None, float | None]:
+def _ends(quantity: ReportedValue) -> tuple[float | None, float | None]:
     return quantity.interval_95 or (None, None)
 
 
-def _reasons(quantities: Iterable[Quantity]) -> tuple[str, ...]:
+def _reasons(quantities: Iterable[ReportedValue]) -> tuple[str, ...]:
     """List the meaning of each mark once."""
     reasons = dict.fromkeys(each.flag for each in quantities if each.flag is not None)
     return tuple(f"{MARK} {reason}." for reason in reasons)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from analysis.identify import Measurement, Prediction
+from analysis.identify import Measurement, TorquePredictor
 from analysis.paper import band_limited, loudest_moment_s, modelled_torque
 from analysis.report import _style as style
 from rigd.beam import undamped_frequencies_rad_s
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from analysis.report._shown_model import ShownModel
 
     LineStyle = dict[str, Any]
-    Line = tuple[NDArray[np.float64], LineStyle]
+    NoiseLine = tuple[NDArray[np.float64], LineStyle]
 
 _PERIODS_SHOWN: Final = 12
 _SHORTEST_S: Final = 0.3
@@ -120,7 +120,7 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
     angle = Measurement.of_record(record).angle_from_rest(highest_hz)
     everything = slice(0, angle.size)
     band_hz = (0.0, highest_hz)
-    modelled, _ = Prediction(
+    modelled, _ = TorquePredictor(
         band_limited(angle, record.rate_hz, band_hz), record.rate_hz, everything
     ).torque(plant)
     offset = float(np.mean(record.torque_nm - modelled))
@@ -203,7 +203,7 @@ _CLOSE: Final[tuple[LineStyle, ...]] = (
 def _whole(
     axes: Axes,
     record: Record,
-    lines: Iterable[Line],
+    lines: Iterable[NoiseLine],
     title: str,
     label: str,
     pad: float | None = None,
@@ -219,7 +219,7 @@ def _whole(
 
 
 def _detail(
-    axes: Axes, record: Record, lines: Iterable[Line], column: int, moment: Moment, label: str
+    axes: Axes, record: Record, lines: Iterable[NoiseLine], column: int, moment: Moment, label: str
 ) -> None:
     """Draw one interval of signals; the first panel of a row has the legend."""
     for values, line_style in lines:

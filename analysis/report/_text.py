@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from analysis.identify.headline import Headline, Mode, Quantity, Size
+    from analysis.identify.headline import Headline, ReportedLossFactor, ReportedMode, ReportedValue
     from analysis.report.table import Table
     from analysis.results import RecordResult, WholeRecord
 
@@ -226,12 +226,12 @@ def damping_sentences(headline: Headline) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _mode(mode: Mode) -> str:
+def _mode(mode: ReportedMode) -> str:
     ratio = mode.damping_ratio
     return f"{_percent(ratio)} at {mode.frequency_hz.value:.4g} Hz"
 
 
-def _percent(ratio: Quantity) -> str:
+def _percent(ratio: ReportedValue) -> str:
     value, low, high = estimate(
         (ratio.value, *(ratio.interval_95 or (None, None))), ratio.std, 100.0
     )
@@ -240,7 +240,7 @@ def _percent(ratio: Quantity) -> str:
     return f"{value.text} % ({low.text} to {high.text} %)"
 
 
-def _size(each: Size) -> str:
+def _size(each: ReportedLossFactor) -> str:
     coefficient, unit, *_names = _SYMBOLS[each.damping]
     size = each.size
     factor, tenth = (1e5, " · 10⁻⁵") if size.value < _SMALL else (1.0, "")
@@ -251,12 +251,12 @@ def _size(each: Size) -> str:
     return f"has a loss factor of {bounds} at {each.omega_rad_s / (2 * math.pi):.3g} Hz"
 
 
-def _flagged(headline: Headline, each: Size) -> bool:
+def _flagged(headline: Headline, each: ReportedLossFactor) -> bool:
     """Whether coefficient and order of a damping carry a flag."""
     return headline.parameters[_SYMBOLS[each.damping][2]].flag is not None
 
 
-def _order(headline: Headline, each: Size) -> str:
+def _order(headline: Headline, each: ReportedLossFactor) -> str:
     *_others, name, symbol = _SYMBOLS[each.damping]
     order = headline.parameters[name]
     if headline.tolerant is None and name not in headline.fit.structure.free:

@@ -11,7 +11,7 @@ import pytest
 from cases import further
 
 from analysis.identify import Measurement, freest_alone, select
-from analysis.online import OnlineEstimate, OnlineFit, serve
+from analysis.online import OnlineEstimate, OnlineEstimator, serve
 from analysis.record import load_record
 from analysis.results import whole_record
 from analysis.suited import record_band_hz
@@ -35,14 +35,14 @@ def session(short_chirps):
     return read_session(short_chirps[0])
 
 
-def fed(session, block=777) -> OnlineFit:
-    fit = OnlineFit(session.metadata, session.segments, str(session.path))
+def fed(session, block=777) -> OnlineEstimator:
+    fit = OnlineEstimator(session.metadata, session.segments, str(session.path))
     for first in range(0, len(session.samples), block):
         fit.feed(session.samples[first : first + block])
     return fit
 
 
-def fed_with(signals, session, beam=PAPER_BEAM) -> OnlineFit:
+def fed_with(signals, session, beam=PAPER_BEAM) -> OnlineEstimator:
     """Online fit of signals, with the metadata of a session but for the beam's."""
     samples = np.zeros(signals.angle_rad.size, session.samples.dtype)
     samples["tick"] = np.arange(samples.size)
@@ -56,7 +56,7 @@ def fed_with(signals, session, beam=PAPER_BEAM) -> OnlineFit:
         "beam_density_kg_per_m": repr(beam.density_kg_per_m),
         "beam_bending_stiffness_n_m2": repr(beam.bending_stiffness_n_m2),
     }
-    fit = OnlineFit(stated, signals.segments)
+    fit = OnlineEstimator(stated, signals.segments)
     fit.feed(samples)
     return fit
 
@@ -90,7 +90,7 @@ def test_the_quick_estimate_is_that_of_the_file(session):
 
 
 def test_an_estimate_depends_on_what_was_before_its_tick_alone(session):
-    early = OnlineFit(session.metadata, session.segments)
+    early = OnlineEstimator(session.metadata, session.segments)
     early.feed(session.samples[:12_000])
     asked, early = fed(session).estimate(12_000), early.estimate()
     assert asked.headline.modes == early.headline.modes
@@ -333,7 +333,7 @@ def test_an_estimate_is_made_as_it_is_asked_for(monkeypatch, capsys, whole, from
         asked.append((tick, how))
         return OnlineEstimate(tick, 1.0, whole, 0.0, problem="None here.")
 
-    monkeypatch.setattr(OnlineFit, "estimate", estimate)
+    monkeypatch.setattr(OnlineEstimator, "estimate", estimate)
     serve(StreamStart({}, {}, None), iter([EstimateRequest(7, 9000, whole, from_last)]))
     assert asked == [(9000, {"whole": whole, "from_last": from_last})]
     assert json.loads(capsys.readouterr().out)["id"] == 7

@@ -13,7 +13,7 @@ from processes import eventually, has_ended
 
 from analysis import quick_look
 from analysis.identify import Measurement, freest_alone
-from analysis.quick_look import LookError, look_at, write_look
+from analysis.quick_look import QuickLookError, make_quick_look, write_quick_look
 from analysis.record import load_record
 from analysis.results import whole_record
 from rigd.beam import transfer
@@ -27,8 +27,8 @@ def chirps(short_chirps, tmp_path_factory):
     paths = [Path(shutil.copy(path, folder)) for path in short_chirps]
     looks = []
     for path in paths:
-        looks.append(look_at(path))
-        write_look(looks[-1], path)
+        looks.append(make_quick_look(path))
+        write_quick_look(looks[-1], path)
     return paths, looks
 
 
@@ -93,7 +93,7 @@ def test_the_last_session_of_the_specimen_is_compared_with(chirps):
         assert mode["damping_ratio_change_percent"] == pytest.approx(100 * (ratio - 1))
         assert mode["significant"] is False
     # Asked for, an earlier one is compared with a later one too.
-    assert look_at(paths[0], paths[1])["against_last"]["file"] == paths[1].name
+    assert make_quick_look(paths[0], paths[1])["against_last"]["file"] == paths[1].name
 
 
 def estimated(value, std):
@@ -181,7 +181,7 @@ def test_the_fitted_model_has_a_band_that_holds_it(chirps, selection):
 def test_a_long_record_is_fitted_by_the_freest_structure_alone(chirps, selection, monkeypatch):
     paths, _ = chirps
     monkeypatch.setattr(quick_look, "_JUDGED_S", 10.0)
-    look = look_at(paths[0])
+    look = make_quick_look(paths[0])
     for told, mode in zip(look["modes"], selection.headline.modes, strict=True):
         # The same structure is selected, under a noise spectrum that hardly differs.
         std = mode.frequency_hz.std
@@ -206,13 +206,13 @@ def test_the_freest_structure_alone_flags_what_it_does_not_explain(short_chirps)
 
 def test_what_cannot_be_analysed_says_why(write_session, short_signals, signals_of, tmp_path):
     held = replace(short_signals, metadata={"excitation": "hold", "specimen": "a"})
-    look = look_at(write_session(tmp_path / "held.mcap", held))
+    look = make_quick_look(write_session(tmp_path / "held.mcap", held))
     assert look["modes"] == []
     assert look["specimen"] == "a"
     assert look["flags"][-1].startswith("No modes: the motor was held")
     assert "No modes" in look["text"][-1]
     cut = replace(short_signals, segments={"sweep": (6000, 7000)})
-    look = look_at(write_session(tmp_path / "cut.mcap", cut))
+    look = make_quick_look(write_session(tmp_path / "cut.mcap", cut))
     assert look["flags"][0].startswith("segment 'sweep' covers ticks 6000 to 6999")
     json.dumps(look, allow_nan=False)
 
@@ -232,17 +232,17 @@ def test_the_text_is_for_a_terminal(chirps):
 def test_a_look_is_written_whole_and_replaces_an_older_one_only(tmp_path):
     path = tmp_path / "a.mcap"
     place = quick_look_path(path)
-    write_look(look_with(2.5, made_utc_ns=6), path)
-    write_look(look_with(2.6, made_utc_ns=7), path)
+    write_quick_look(look_with(2.5, made_utc_ns=6), path)
+    write_quick_look(look_with(2.6, made_utc_ns=7), path)
     assert json.loads(place.read_text())["made_utc_ns"] == 7
-    write_look(look_with(2.7, made_utc_ns=5), path)
+    write_quick_look(look_with(2.7, made_utc_ns=5), path)
     assert json.loads(place.read_text())["made_utc_ns"] == 7
     place.write_text("somebody else's")
-    with pytest.raises(LookError, match="move it away"):
-        write_look(look_with(2.5), path)
+    with pytest.raises(QuickLookError, match="move it away"):
+        write_quick_look(look_with(2.5), path)
     assert place.read_text() == "somebody else's"
-    with pytest.raises(LookError, match="cannot be written"):
-        write_look(look_with(2.5), tmp_path / "missing" / "a.mcap")
+    with pytest.raises(QuickLookError, match="cannot be written"):
+        write_quick_look(look_with(2.5), tmp_path / "missing" / "a.mcap")
     assert [each.name for each in tmp_path.iterdir()] == [place.name]
 
 

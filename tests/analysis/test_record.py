@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from analysis.identify import Measurement
-from analysis.record import MAX_UNKNOWN_SHARE, RecordError, load_record
+from analysis.record import MAX_UNKNOWN_FRACTION, RecordError, load_record
 from rigd.session import SessionError
 from rigd.session.layout import Status
 
@@ -131,7 +131,7 @@ def test_a_long_gap_is_refused_even_if_few_ticks_are_missing(tmp_path, write_ses
     present[10_000:10_101] = False
     signals = signals_of(wave, wave, wave, {}).part(present)
     path = write_session(tmp_path / "a.mcap", signals, ticks=np.flatnonzero(present))
-    assert 101 / n < MAX_UNKNOWN_SHARE
+    assert 101 / n < MAX_UNKNOWN_FRACTION
     with pytest.raises(RecordError, match=r"101 ticks .* from tick 10000 .*100 ms"):
         load_record(path)
 

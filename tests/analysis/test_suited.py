@@ -11,7 +11,7 @@ import pytest
 
 from analysis.identify import Comparison, Measurement
 from analysis.models import WelchSettings
-from analysis.paper import EstimateError, SettingsError
+from analysis.paper import FrequencyResponseError, SettingsError
 from analysis.record import load_record
 from analysis.suited import (
     against_welch,
@@ -80,7 +80,7 @@ def test_an_option_that_is_said_to_make_the_fits_makes_them(record_of):
     """Of 4 s the usual segments are too long, and only an estimator without them is left."""
     record = record_of(excitation="step")
     assert "(--method welch --frf fft makes them nevertheless)" in against_welch(record)
-    with pytest.raises(EstimateError):
+    with pytest.raises(FrequencyResponseError):
         welch_analysis(record, WelchSettings(), optional=False)
     chosen = WelchSettings(estimator="fft", types=("I",), weightings=("const",))
     assert welch_analysis(record, chosen, optional=False)[0] is not None
@@ -110,7 +110,7 @@ def test_a_short_sweep_is_told_with_what_would_fit(record_of):
     found, left_out = welch_analysis(record_of(), WelchSettings(), optional=True)
     assert found is None
     assert "--segment 575 --overlap 86" in left_out
-    with pytest.raises(EstimateError):
+    with pytest.raises(FrequencyResponseError):
         welch_analysis(record_of(), WelchSettings(), optional=False)
     wrong = WelchSettings(types=("I",), band_hz=(1.0, 900.0))
     with pytest.raises(SettingsError):

@@ -22,10 +22,10 @@ def listed(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def sessions(record_briefly, write_look, write_report):
+def sessions(record_briefly, write_quick_look, write_report):
     """Two sessions of a specimen, one of another, and a text."""
     first = record_briefly("first", specimen="antenna 3", operator="Ada")
-    write_look(first, mode(2.600, 0.002, 0.00910, 0.00008), mode(16.3))
+    write_quick_look(first, mode(2.600, 0.002, 0.00910, 0.00008), mode(16.3))
     second = record_briefly("second", specimen="antenna 3", day=1.5, outcome="stopped")
     write_report(
         second,
@@ -74,8 +74,8 @@ def test_the_trend_says_which_changes_are_beyond_the_intervals(listed):
 
 
 @pytest.mark.usefixtures("sessions")
-def test_a_trend_is_of_one_specimen(listed, write_look, record_briefly):
-    write_look(record_briefly("fourth", day=3), mode(9.0))
+def test_a_trend_is_of_one_specimen(listed, write_quick_look, record_briefly):
+    write_quick_look(record_briefly("fourth", day=3), mode(9.0))
     refused = listed(".", "--trend")
     assert refused.exit_code == 2
     assert "--specimen" in refused.stderr

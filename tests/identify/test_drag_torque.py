@@ -51,9 +51,9 @@ def test_the_torque_is_that_of_steps_in_time(brake, law):
     angle_rad = swept(16.0, 20.0)
     damping = Damping(zeta=5.4e-5, alpha=1.0, gamma=0.02, lambda_=1.0)
     comparison = compared(angle_rad)
-    found = response(comparison, Plant(LINK, damping)).torque(law).torque_nm[comparison.kept]
+    found = response(comparison, Plant(LINK, damping)).torque(law).torque_nm[comparison.retained]
     stepped = brake.drag_torque(angle_rad, RATE_HZ, LINK, damping, law.constant_m, law.slowing)
-    truth = comparison.decimation.apply(stepped)[comparison.kept]
+    truth = comparison.decimation.apply(stepped)[comparison.retained]
     assert np.abs(truth).max() > 0.03
     spectra = comparison.spectrum(found), comparison.spectrum(truth)
     assert deviation(*spectra) < 2e-3
@@ -64,7 +64,7 @@ def test_a_rod_in_air_halves_the_peaks_of_the_papers_chirp():
     comparison = compared(swept(120.0, 50.0, after_s=15.0))
     plant = Plant(LINK, Damping(zeta=5.4e-5, alpha=1.0, gamma=0.0, lambda_=1.0))
     linear = comparison.prediction.torque(plant)[0]
-    braked = linear + response(comparison, plant).torque(WHITE).torque_nm[comparison.kept]
+    braked = linear + response(comparison, plant).torque(WHITE).torque_nm[comparison.retained]
     assert np.abs(linear).max() == pytest.approx(0.331, rel=0.03)
     assert np.abs(braked).max() == pytest.approx(0.161, rel=0.03)
 
@@ -136,14 +136,14 @@ def test_a_small_drag_is_the_first_order(short):
 def test_the_torque_that_was_taken_out_comes_back_beside_the_beam(short, here, there):
     """A fit's residual with another beam than that of the drag, against recomputed drag."""
     torque_nm = short.prediction.torque(there)[0]
-    torque_nm = torque_nm + response(short, there).torque(LAW).torque_nm[short.kept]
+    torque_nm = torque_nm + response(short, there).torque(LAW).torque_nm[short.retained]
     with_drag = short.with_drag(here, LAW)
     assert with_drag.drag is not None
     names = ("gamma",)
     poles = mode_poles(there, 3, names)
     change, _ = with_drag.drag.change_to(there, poles, names, np.eye(1))
     linear = with_drag.spectrum(short.prediction.torque(there)[0])
-    taken = with_drag.spectrum((short.torque_nm - with_drag.torque_nm)[short.kept])
+    taken = with_drag.spectrum((short.torque_nm - with_drag.torque_nm)[short.retained])
     truth = short.spectrum(torque_nm)
     moved = np.linalg.norm(truth - taken - short.spectrum(short.prediction.torque(here)[0]))
     assert np.linalg.norm(linear + taken + change - truth) < 0.05 * moved
@@ -154,7 +154,7 @@ def test_a_filter_of_the_torque_filters_that_of_the_drag():
     plant = Plant(LINK, Damping(zeta=7.1e-5, alpha=1.0, gamma=5.5e-2, lambda_=1.0))
     law, constant_s = DragLaw(2.3e-3), 3e-3
     bare, filtered = (
-        comparison.spectrum(response(comparison, each).torque(law).torque_nm[comparison.kept])
+        comparison.spectrum(response(comparison, each).torque(law).torque_nm[comparison.retained])
         for each in (plant, replace(plant, filter_time_constant_s=constant_s))
     )
     divisor = 1 + 2j * np.pi * comparison.frequency_hz * constant_s

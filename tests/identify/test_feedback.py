@@ -210,8 +210,8 @@ def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
         first.angle_rad + first.incoherent_rad
     )
     for each in (first, other):
-        kept = each.torque_nm[each.kept] + each.incoherent_nm
-        assert kept == pytest.approx(comparison.torque_nm[comparison.kept])
+        retained = each.torque_nm[each.retained] + each.incoherent_nm
+        assert retained == pytest.approx(comparison.torque_nm[comparison.retained])
     # Nothing was taken out there.
     assert comparison.renewed(plant, found.noise) is comparison
 
@@ -224,5 +224,5 @@ def test_what_rings_in_narrow_bands_is_followed_with_the_torque_it_makes(in_narr
     wrong = first.renewed(Plant(LINK, DAMPED), noise)
     told = wrong.renewed(plant, noise)
     assert loaded.tip_mass_kg == plant.tip_mass_kg
-    rest, told_rest = (np.std(each.incoherent_rad[each.kept]) for each in (first, told))
+    rest, told_rest = (np.std(each.incoherent_rad[each.retained]) for each in (first, told))
     assert told_rest < 0.2 * rest

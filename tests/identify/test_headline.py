@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from analysis.identify.headline import Quantity, structures
+from analysis.identify.headline import ReportedValue, structures
 from analysis.identify.profile_likelihood import LikelihoodProfile
 from analysis.identify.verdict import NOT_DETERMINED, order_verdict
 from analysis.models import STRUCTURES
@@ -31,7 +31,7 @@ class Fitted:
 
 
 def test_the_first_flag_stays():
-    number = Quantity(0.98, 0.01, (0.96, 1.0))
+    number = ReportedValue(0.98, 0.01, (0.96, 1.0))
     assert number.flagged(None) is number
     told = number.flagged(NOT_DETERMINED).flagged("part of the record is unexplained")
     assert told.flag == NOT_DETERMINED

@@ -16,7 +16,7 @@ def forces(sessions, plants, link):
 
 
 def spectrum(comparison, torque_nm):
-    return comparison.spectrum(comparison.decimation.apply(torque_nm)[comparison.kept])
+    return comparison.spectrum(comparison.decimation.apply(torque_nm)[comparison.retained])
 
 
 def deviation(one, other):

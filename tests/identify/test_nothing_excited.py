@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper import EstimateError, analyse
+from analysis.paper import FrequencyResponseError, analyse
 
 
 @pytest.mark.parametrize(
@@ -26,6 +26,8 @@ def test_the_plain_reason_comes_first(metadata, angle_rad, words):
         rate_hz=1000.0,
         sweep_samples=angle_rad.size,
     )
-    with pytest.raises(EstimateError, match=rf"^a\.mcap: nothing was excited: {words}") as raised:
+    with pytest.raises(
+        FrequencyResponseError, match=rf"^a\.mcap: nothing was excited: {words}"
+    ) as raised:
         analyse(record, WelchSettings())
     assert "segment" not in str(raised.value)

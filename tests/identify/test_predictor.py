@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.identify import Comparison, Plant, Prediction
+from analysis.identify import Comparison, Plant, TorquePredictor
 from rigd.beam import PARAMETERS, Beam, Damping
 
 OFFSETS = (0.03, -0.05)
@@ -27,7 +27,7 @@ def test_the_torque_of_an_independent_synthesis(sessions, link, plant, more):
     compared = Comparison.of(sessions("VI", **more).measured(), (0.0, 50.0))
     renamed = {name.replace("offsets", "stiffness_offsets"): value for name, value in more.items()}
     torque, _ = compared.prediction.torque(Plant(link, plant.damping, **renamed))
-    measured = compared.torque_nm[compared.kept]
+    measured = compared.torque_nm[compared.retained]
     assert np.sqrt(np.mean((torque - measured) ** 2)) < 3e-7 * measured.std()
 
 
@@ -54,7 +54,7 @@ def moved(plant, name, step):
 @pytest.mark.parametrize("name", WRT)
 def test_derivatives(plant, name):
     angle = np.random.default_rng(1).normal(size=400)
-    prediction = Prediction(angle, 125.0, slice(10, 390))
+    prediction = TorquePredictor(angle, 125.0, slice(10, 390))
     _, gradient = prediction.torque(plant, WRT)
     step = 1e-5 * (plant.parameters.get(name) or 1.0)
     after, _ = prediction.torque(moved(plant, name, step))
@@ -66,7 +66,7 @@ def test_derivatives(plant, name):
 def test_between_the_samples_it_is_the_same(plant, decimation):
     noise = np.random.default_rng(1).normal(size=3200)
     angle = decimation.apply(noise)
-    prediction = Prediction(angle, 125.0, slice(0, 400))
+    prediction = TorquePredictor(angle, 125.0, slice(0, 400))
     torque, gradient = prediction.torque(plant, WRT)
     at, gradient_at = prediction.torque_between(plant, 8, np.arange(0, 3200, 8), WRT)
     assert np.abs(at - torque).max() < 1e-3 * torque.std()
@@ -80,10 +80,10 @@ def test_between_the_samples_it_is_that_of_more_samples(plant, factor):
         waves = np.sin(2 * np.pi * 7.3 * time_s) + np.cos(2 * np.pi * 31.0 * time_s)
         return np.sin(np.pi * time_s / 3.2) ** 8 * waves  # nothing at half the rate
 
-    fine = Prediction(angle(factor * 125.0), factor * 125.0, slice(0, factor * 400))
+    fine = TorquePredictor(angle(factor * 125.0), factor * 125.0, slice(0, factor * 400))
     torque, gradient = fine.torque(plant, WRT)
     places = np.arange(1, torque.size, 5)
-    coarse = Prediction(angle(125.0), 125.0, slice(0, 400))
+    coarse = TorquePredictor(angle(125.0), 125.0, slice(0, 400))
     at, gradient_at = coarse.torque_between(plant, factor, places, WRT)
     assert np.abs(at - torque[places]).max() < 1e-6 * torque.std()
     apart = np.abs(gradient_at - gradient[:, places]).max(axis=1)

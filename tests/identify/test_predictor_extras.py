@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import SETTINGS, Plant, Prediction
+from analysis.identify import SETTINGS, Plant, TorquePredictor
 from analysis.identify.free_decay import mode_poles
 from analysis.identify.parametrization import Unknowns
 from analysis.models import STRUCTURES
@@ -47,7 +47,7 @@ def moved(plant, name, step):
 @pytest.mark.parametrize("name", WRT)
 def test_derivatives(plant, name):
     angle = np.random.default_rng(1).normal(size=400)
-    prediction = Prediction(angle, 125.0, slice(10, 390))
+    prediction = TorquePredictor(angle, 125.0, slice(10, 390))
     _, gradient = prediction.torque(plant, WRT)
     step = STEPS.get(name, 1e-7)
     after, before = (prediction.torque(moved(plant, name, s), WRT)[0] for s in (step, -step))
@@ -68,7 +68,7 @@ def test_poles_move_as_differences_say(plant):
 
 def test_between_the_samples_it_is_the_same():
     angle = np.random.default_rng(1).normal(size=400)
-    prediction = Prediction(np.convolve(angle, np.hanning(9), "same"), 125.0, slice(0, 400))
+    prediction = TorquePredictor(np.convolve(angle, np.hanning(9), "same"), 125.0, slice(0, 400))
     torque, gradient = prediction.torque(ALL, WRT)
     at, gradient_at = prediction.torque_between(ALL, 4, np.arange(0, 1600, 4), WRT)
     assert at == pytest.approx(torque, abs=1e-9 * torque.std())

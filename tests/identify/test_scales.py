@@ -7,7 +7,7 @@ import pytest
 
 from analysis.identify import Plant, ResponseGrid, fit_record
 from analysis.identify.drag_torque import DragLaw, DragResponse
-from analysis.identify.headline import Quantity
+from analysis.identify.headline import ReportedValue
 from analysis.identify.scales import SCALE_EXPONENTS, density_check, scales_absorbed, with_scales
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
@@ -102,15 +102,15 @@ def test_fits_to_scaled_data_go_with_the_scales(fits):
 def test_intervals_include_the_scales_in_quadrature():
     def told(value, relative):
         ends = value * math.exp(-1.96 * relative), value * math.exp(1.96 * relative)
-        return Quantity(value, relative * value, ends)
+        return ReportedValue(value, relative * value, ends)
 
     parameters = {
         "zeta": told(7e-5, 0.02),
         "gamma": told(0.05, 0.003),
         "density_over_stiffness": told(0.052, 4e-5),
         "bending_stiffness_n_m2": told(0.09, 7e-4),
-        "tool_inertia_kg_m2": Quantity(1e-6, 2e-6, (0.0, 1e-6 + 1.96 * 2e-6)),
-        "tip_mass_kg": Quantity(1e-3, None, None, "the record does not determine it"),
+        "tool_inertia_kg_m2": ReportedValue(1e-6, 2e-6, (0.0, 1e-6 + 1.96 * 2e-6)),
+        "tip_mass_kg": ReportedValue(1e-3, None, None, "the record does not determine it"),
     }
     found = with_scales(parameters, {"torque_scale": 0.01, "length": 0.002, "density": 0.1})
     assert found.keys() == {
@@ -139,7 +139,7 @@ def test_intervals_with_scales_hold_the_truth(fits):
     _, wrong = fits
     uncertainty = {"torque_scale": 0.03, "length": 0.02}
     parameters = {
-        name: Quantity(value, wrong.std[name], wrong.interval[name])
+        name: ReportedValue(value, wrong.std[name], wrong.interval[name])
         for name, value in wrong.parameters.items()
     }
     truth = {

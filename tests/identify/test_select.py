@@ -7,7 +7,7 @@ import pytest
 
 from analysis.identify import fit_record, headline_json, select
 from analysis.identify.profile_likelihood import CHI_SQUARE_95
-from analysis.identify.verdict import ANOTHER_DAMPING, EVEN
+from analysis.identify.verdict import ANOTHER_DAMPING, BIC_TIE
 from analysis.models import STRUCTURES, Structure
 from rigd.beam import Beam, LoadedBeam, clamped_free_eigenvalues
 from rigd.session import Validity
@@ -217,7 +217,7 @@ def test_of_two_modes_one_damping_that_is_enough_tells_no_order(sessions):
 
 def test_what_cannot_be_told_apart_is_said(one_mode):
     verdict = one_mode.verdict
-    close = [row.structure for row in verdict.table[1:] if row.delta_bic < EVEN]
+    close = [row.structure for row in verdict.table[1:] if row.delta_bic < BIC_TIE]
     assert close
     assert list(verdict.rivals) == close
     status = dict(one_mode.headline.structures)

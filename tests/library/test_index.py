@@ -32,14 +32,14 @@ def read_files(monkeypatch):
 
 
 def test_only_what_is_new_or_has_changed_is_read(
-    record_briefly, write_look, write_report, tmp_path, read_files
+    record_briefly, write_quick_look, write_report, tmp_path, read_files
 ):
     paths = [record_briefly(name) for name in "abc"]
     list_sessions(tmp_path)
     assert sorted(read_files) == ["a.mcap", "b.mcap", "c.mcap"]
     steps = [
         (lambda: None, []),
-        (lambda: write_look(paths[0], mode(2.5)), ["a.mcap"]),
+        (lambda: write_quick_look(paths[0], mode(2.5)), ["a.mcap"]),
         (lambda: write_report(paths[1], mode(2.5)), ["b.mcap"]),
         (lambda: write_report(paths[1], mode(2.6), number=2), ["b.mcap"]),
         (lambda: os.utime(paths[2], ns=(1, 1)), ["c.mcap"]),
@@ -80,10 +80,10 @@ def refuse(path, *_):
 
 
 def test_an_index_goes_with_its_folder(
-    record_briefly, write_look, write_report, tmp_path, read_files
+    record_briefly, write_quick_look, write_report, tmp_path, read_files
 ):
     path = record_briefly("a")
-    write_look(path, mode(2.5))
+    write_quick_look(path, mode(2.5))
     folder = write_report(path, mode(2.5))
     list_sessions(tmp_path)
     moved = tmp_path.rename(tmp_path.with_name("moved"))
@@ -178,8 +178,10 @@ def test_several_writers_share_an_index(record_briefly, tmp_path, read_files):
     assert read_files == []
 
 
-def test_the_index_opens_as_a_table(record_briefly, write_look, tmp_path):
-    write_look(record_briefly("a", specimen="antenna 3", meta_temperature_c="21.4"), mode(2.5))
+def test_the_index_opens_as_a_table(record_briefly, write_quick_look, tmp_path):
+    write_quick_look(
+        record_briefly("a", specimen="antenna 3", meta_temperature_c="21.4"), mode(2.5)
+    )
     list_sessions(tmp_path)
     with sqlite3.connect(tmp_path / INDEX_NAME) as database:
         database.row_factory = sqlite3.Row

@@ -13,11 +13,11 @@ from rigd.session import SessionWriter, Validity
 
 
 def test_what_file_look_and_report_say_stands_in_the_row(
-    record_briefly, write_look, write_report, tmp_path
+    record_briefly, write_quick_look, write_report, tmp_path
 ):
     path = record_briefly("first", specimen="antenna 3", operator="Ada", note="dry air",
                   meta_temperature_c="21.4", meta_batch="7")  # fmt: skip
-    write_look(path, mode(2.5))
+    write_quick_look(path, mode(2.5))
     write_report(path, mode(2.6))
     last = write_report(path, mode(2.61), mode(16.3), number=12)
     (row,) = list_sessions(tmp_path)
@@ -34,7 +34,7 @@ def test_what_file_look_and_report_say_stands_in_the_row(
 
 
 def test_modes_come_with_the_validity_of_their_source(
-    record_briefly, write_look, write_report, tmp_path
+    record_briefly, write_quick_look, write_report, tmp_path
 ):
     of_look, of_report = Validity(0.6, 0.12).as_json(), Validity(0.1, 0.003).as_json()
     for name, look, report, expected in (
@@ -43,7 +43,7 @@ def test_modes_come_with_the_validity_of_their_source(
         ("c", {}, None, Validity().as_json()),  # of before an update: not known
     ):
         path = record_briefly(name)
-        write_look(path, mode(2.5), validity=look)
+        write_quick_look(path, mode(2.5), validity=look)
         if report is not None:
             write_report(path, mode(2.6), validity=report)
         for _ in "read", "from the index":
@@ -58,9 +58,9 @@ def test_a_rate_that_no_rig_has_gives_no_length(record_briefly, tmp_path):
     assert row.duration_s is None
 
 
-def test_without_a_report_the_modes_are_of_the_look(record_briefly, write_look, tmp_path):
+def test_without_a_report_the_modes_are_of_the_look(record_briefly, write_quick_look, tmp_path):
     modes = [mode(2.5) | {"shown": True}, mode(16.3) | {"shown": False}]
-    write_look(record_briefly("first"), *modes)
+    write_quick_look(record_briefly("first"), *modes)
     (row,) = list_sessions(tmp_path)
     assert [each["frequency_hz"]["value"] for each in row.modes] == [2.5]
     assert row.report is None

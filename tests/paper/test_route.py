@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper import EstimateError, SettingsError, analyse
+from analysis.paper import FrequencyResponseError, SettingsError, analyse
 from analysis.record import load_record
 from rigd.beam import transfer
 from rigd.spectral import Segmentation
@@ -131,7 +131,7 @@ def test_the_other_estimators_follow_the_plant(paper_file, estimator, link, plan
 
 def test_a_short_sweep_is_refused_with_settings_that_fit(write_session, short_signals, tmp_path):
     record = load_record(write_session(tmp_path / "a.mcap", short_signals))
-    with pytest.raises(EstimateError, match="4000 samples") as caught:
+    with pytest.raises(FrequencyResponseError, match="4000 samples") as caught:
         analyse(record, WelchSettings())
     words = str(caught.value).replace(",", "").split()
     length, overlap = (int(words[words.index(o) + 1]) for o in ("--segment", "--overlap"))
@@ -163,7 +163,7 @@ def test_a_sweep_downwards_excites_as_much(write_session, paper_signals, tmp_pat
 def test_an_angle_that_does_not_move_is_refused(write_session, paper_signals, tmp_path):
     still = replace(paper_signals, angle_rad=np.full(136_000, 0.25))
     record = load_record(write_session(tmp_path / "a.mcap", still))
-    with pytest.raises(EstimateError, match=r"a\.mcap.*nothing was excited"):
+    with pytest.raises(FrequencyResponseError, match=r"a\.mcap.*nothing was excited"):
         analyse(record, WelchSettings(types=("I",)))
 
 
@@ -215,5 +215,5 @@ def test_it_is_told_which_modes_a_fit_follows(paper_analysis, paper_file):
 def test_hiv_without_a_reference_is_refused_kindly(paper_file):
     record = load_record(paper_file)
     still = replace(record, reference_rad=np.full_like(record.reference_rad, 0.3))
-    with pytest.raises(EstimateError, match=r"no reference that moves.*--frf h1"):
+    with pytest.raises(FrequencyResponseError, match=r"no reference that moves.*--frf h1"):
         analyse(still, WelchSettings(estimator="iv", types=("I",)))

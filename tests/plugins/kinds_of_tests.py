@@ -19,7 +19,7 @@ STARTS = {
 FITS = {
     "select", "fit_record", "fit_frf", "analyse", "analyse_session", "campaign", "CandidateSet",
     "Refit", "Comparison", "identify", "estimate_motor", "analyze_here", "judged",
-    "look_at", "fit_many",
+    "make_quick_look", "fit_many",
 }  # fmt: skip
 """Names by which models are fitted."""
 

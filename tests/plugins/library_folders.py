@@ -38,7 +38,7 @@ def mode(frequency_hz, half_hz=0.01, damping_ratio=0.005, half=0.0005):
 
 
 @pytest.fixture
-def write_look():
+def write_quick_look():
     """Write the quick look of a session, with its modes."""
 
     def write(path, *modes, **others):

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify.headline import Simpler, of_fit
+from analysis.identify.headline import ConditionalEstimate, of_fit
 from analysis.report import FIGURES, document, illustrations
 from analysis.report.folder import OutputExistsError
 from analysis.report.record_report import record_page, report_tables, write_report
@@ -293,7 +293,7 @@ def test_what_is_unexplained_makes_every_number_a_condition(record_result, retol
 
 def test_a_simpler_structure_stands_beside_the_freest(record_result, retold):
     taken = of_fit("VII", record_result.whole.fits["VII"], (1, 2, 3)).parameters
-    simpler = Simpler("VII", {"alpha": 1.0}, taken)
+    simpler = ConditionalEstimate("VII", {"alpha": 1.0}, taken)
     told = replace(record_result.whole.headline, simpler=simpler)
     _modes, tables, _ = report_tables(retold(record_result, headline=told))
     (table,) = [table for table in tables if table.name == "on_condition"]

@@ -22,7 +22,7 @@ ACTING = {
 
 
 @pytest.fixture
-def two(served, record_briefly, write_look, replace_in_page):
+def two(served, record_briefly, write_quick_look, replace_in_page):
     """Two sessions, of which one has a quick look and a report."""
     # What runs only while nothing else does may not run for minutes beside the other tests.
     replace_in_page(give_way=lambda _: None)
