@@ -32,13 +32,17 @@ WORDS: Final = frozenset({
 """Words for which the field has a better one: report, poll, segment, offset, fraction, …"""
 
 ALLOWED_TERMS: Final = re.compile(
-    r"quick.?look(?:s|ed)?(?![a-z])|decimal places?(?![a-z])|(?<![a-z])in.place(?![a-z])",
+    r"quick.?look(?:s|ed)?(?![a-z])|QuickLook|\.look\.json|decimal places?(?![a-z])|(?<![a-z])in.place(?![a-z])",
     re.IGNORECASE,
 )
 """Terms that contain such a word: the report after a session; digits; the term of NumPy."""
 
 ALLOWED_NAMES: Final[dict[str, str]] = {
     "no_look": "option --no-look of the command line",
+    "look_follows": "key of the documents on the socket",
+    "look_target": "argument of Rerun",
+    "column_shares": "argument of Rerun",
+    "row_shares": "argument of Rerun",
 }
 """Identifiers that are not ours to choose, each with its reason."""
 

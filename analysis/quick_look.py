@@ -87,7 +87,7 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
 
     Raises
     ------
-    rigd.session.SessionError, LookError
+    rigd.session.SessionError, QuickLookError
         There is no session file, or no quick look of `last`.
     """
     from analysis.record import RecordError, load_record
@@ -318,13 +318,13 @@ def _no_coherence() -> dict[str, Any]:
 
 
 def _quick_look_of(last: Path) -> dict[str, Any]:
-    look = read_quick_look(quick_look_path(last))
-    if look is None:
+    quick_look = read_quick_look(quick_look_path(last))
+    if quick_look is None:
         raise QuickLookError(
             f"--last {last}: there is no readable quick look beside it; make one with "
             f"python -m analysis.quick_look {last}."
         )
-    return look
+    return quick_look
 
 
 def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
@@ -334,7 +334,7 @@ def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str,
         specimen,
         before_utc_ns=before_utc_ns,
         but=path.stem,
-        usable=lambda look: any(mode["shown"] for mode in look["modes"]),
+        usable=lambda document: any(mode["shown"] for mode in document["modes"]),
     )
     return None if found is None else found[1]
 
@@ -450,7 +450,7 @@ def write_quick_look(document: Mapping[str, Any], path: Path) -> Path:
 
     Raises
     ------
-    LookError
+    QuickLookError
         It cannot be written, or another file has its name.
     """
     target = quick_look_path(path)

@@ -153,7 +153,7 @@ def with_percentage(std: float, value: float) -> str:
 
     Examples
     --------
-    >>> print(with_share(6.5e-5, 0.0091), with_share(0.1, 0.0), sep=", ")
+    >>> print(with_percentage(6.5e-5, 0.0091), with_percentage(0.1, 0.0), sep=", ")
     6.5e-05 (0.71 %), 0.1
     """
     return f"{std:.2g} ({100.0 * std / abs(value):.2g} %)" if value else f"{std:.2g}"

@@ -595,15 +595,15 @@ class Service:
         )
         self._publish({"event": "state", **transition_document(transition)})
 
-    def _report_quick_look(self, look: QuickLook) -> None:
+    def _report_quick_look(self, quick_look: QuickLook) -> None:
         """Log and publish a quick look; called in either thread."""
         if self._series is not None:
-            look.note(self._series.results)
-        for line in look.lines:
+            quick_look.note(self._series.results)
+        for line in quick_look.lines:
             _log.info("%s", line)
         if self._loop is not None:
             self._loop.call_soon_threadsafe(
-                self._publish, {"event": "quick_look", **look.as_dict()}
+                self._publish, {"event": "quick_look", **quick_look.as_dict()}
             )
 
     async def _call(self, function: Callable[[], T]) -> T:

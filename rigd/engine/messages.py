@@ -9,8 +9,8 @@ control       ControlJob, then SessionJob, Tare, Zero, Probe Connected, then Rea
                                                              Measured or Refused; last Ended
 recorder      RecorderJob, FileHeader, Close                 Opened, Armed, Closed; or Failed
 live          LiveJob, LiveSession, LiveEnd of `rigd.live`   LiveAddress, LiveShown; or Failed
-touch         TouchJob                                       TouchReady, then TouchTold
-fit           FitJob, FileHeader, RecordEnded                FitReady, then FitTold, PieceTold,
+touch         TouchJob                                       TouchReady, then TouchReport
+fit           FitJob, FileHeader, RecordEnded                FitReady, then FitReport, PlannedSegment,
                                                              SearchEnded; or Failed
 ============  =============================================  ================================
 

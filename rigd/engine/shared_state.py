@@ -255,9 +255,9 @@ def activity(shared_state: SharedState) -> Activity:
     Examples
     --------
     >>> from rigd.engine import shared_memory_fd
-    >>> from rigd.engine.shared_state import Phase, SharedState, Word, activity
+    >>> from rigd.engine.shared_state import Phase, SharedState, StateField, activity
     >>> shared_state = SharedState.create(shared_memory_fd())
-    >>> shared_state[Word.PHASE] = Phase.TARING
+    >>> shared_state[StateField.PHASE] = Phase.TARING
     >>> activity(shared_state)
     <Activity.PREPARING: 'preparing'>
     """

@@ -15,7 +15,7 @@ from rigd.excitation._until import ScanRig, until
 Value = float | int | str | Path
 
 
-class RigPreview(SweepRig, MoveRig, ScanRig, Protocol):
+class ExcitationRig(SweepRig, MoveRig, ScanRig, Protocol):
     """Interface to a rig for which an excitation is made."""
 
 
@@ -37,7 +37,7 @@ FROM_THE_RIG = frozenset({"rate_hz", "rig", "tip_slope_rad"})
 
 
 def make_excitation(
-    kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: RigPreview | None = None
+    kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: ExcitationRig | None = None
 ) -> Excitation:
     """Return an excitation at a rig's rate.
 
