@@ -32,7 +32,8 @@ WORDS: Final = frozenset({
 """Words for which the field has a better one: report, poll, segment, offset, fraction, …"""
 
 ALLOWED_TERMS: Final = re.compile(
-    r"quick.?look(?:s|ed)?(?![a-z])|QuickLook|\.look\.json|decimal places?(?![a-z])|(?<![a-z])in.place(?![a-z])",
+    r"quick.?look(?:s|ed)?(?![a-z])|QuickLook|\.look\.json|decimal places?(?![a-z])"
+    r"|(?<![a-z])in.place(?![a-z])",
     re.IGNORECASE,
 )
 """Terms that contain such a word: the report after a session; digits; the term of NumPy."""

@@ -425,9 +425,10 @@ def until(
         ),
     ] = None,
 ) -> "dict[str, Value | None]":
-    """Choose the most informative excitation until a precision is reached.
+    """Excite the modes until a precision is reached.
 
-    A quick scan finds the modes. Each further segment is planned from the record so far.
+    A quick scan finds the modes. Each further segment is the most informative one by the record so
+    far.
 
     Example: rigd run until --damping 1% --at-most 60
     """

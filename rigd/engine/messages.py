@@ -10,8 +10,8 @@ control       ControlJob, then SessionJob, Tare, Zero, Probe Connected, then Rea
 recorder      RecorderJob, FileHeader, Close                 Opened, Armed, Closed; or Failed
 live          LiveJob, LiveSession, LiveEnd of `rigd.live`   LiveAddress, LiveShown; or Failed
 touch         TouchJob                                       TouchReady, then TouchReport
-fit           FitJob, FileHeader, RecordEnded                FitReady, then FitReport, PlannedSegment,
-                                                             SearchEnded; or Failed
+fit           FitJob, FileHeader, RecordEnded                FitReady, then FitReport,
+                                                             PlannedSegment, SearchEnded; or Failed
 ============  =============================================  ================================
 
 A message is its length followed by one of these objects, pickled. Each is short enough for a pipe's

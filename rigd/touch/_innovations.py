@@ -58,9 +58,10 @@ class ObservedBeam:
     Examples
     --------
     >>> from rigd.beam import Beam, Damping
-    >>> from rigd.touch import Noise, observed_beam
+    >>> from rigd.touch import ChannelNoise, observed_beam
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
-    >>> model = observed_beam(beam, Damping(zeta=7e-5), 1000.0, Noise(torque_nm=5e-3, shear_n=0.02))
+    >>> noise = ChannelNoise(torque_nm=5e-3, shear_n=0.02)
+    >>> model = observed_beam(beam, Damping(zeta=7e-5), 1000.0, noise)
     >>> model.states, model.matrix.shape
     (39, (43, 42))
     """

@@ -179,8 +179,12 @@ def unknown(tmp_path, can_profile):
         for line in base.text.splitlines():
             section = f"{line.strip('[]')}." if line.startswith("[") else section
             name = line.partition(" =")[0]
-            unknown = section + name in keys
-            text += f'{name} = {{ source = "unknown" }}\n' if unknown else f"{line}\n"
+            if section + name == "name":
+                text += 'name = "rig_of_unknowns"\n'
+            elif section + name in keys:
+                text += f'{name} = {{ source = "unknown" }}\n'
+            else:
+                text += f"{line}\n"
         path = tmp_path / "unknown.toml"
         path.write_text(text, "utf-8")
         return path

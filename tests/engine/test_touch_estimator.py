@@ -19,10 +19,10 @@ class Growing:
     def __init__(self, asked):
         self.asked = asked
 
-    def look(self, record):
+    def preview(self, record):
         self.asked.append(("look", record.angle_rad.size - record.detected))
 
-    def told(self, record, *, scan, first):
+    def update(self, record, *, scan, first):
         assert not scan
         after = record.angle_rad.size - record.detected
         self.asked.append(("first" if first else "last", after))

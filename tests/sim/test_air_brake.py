@@ -66,8 +66,8 @@ def unexplained(parameters, drag_m):
     )
     linear = compared.prediction.torque(plant)[0]
     response = DragResponse(compared.angle_rad, compared.decimation.rate_hz, plant)
-    drag = response.torque(DragLaw(drag_m)).torque_nm[compared.kept]
-    measured_nm = compared.torque_nm[compared.kept]
+    drag = response.torque(DragLaw(drag_m)).torque_nm[compared.retained]
+    measured_nm = compared.torque_nm[compared.retained]
     left, by_drag, whole = (
         float(np.linalg.norm(compared.spectrum(values)))
         for values in (linear + drag - measured_nm, drag, measured_nm)

@@ -108,7 +108,7 @@ class Wrong:
     [
         (lambda drive: {"disable": lambda: None}, "does not coast to a stop"),
         (lambda drive: {"command": lambda nm: drive.command(-nm)}, "towards positive"),
-        (lambda drive: {"command": lambda nm: 1e3 * drive.command(nm)}, "said to be 300 N·m"),
+        (lambda drive: {"command": lambda nm: 1e3 * drive.command(nm)}, "reported as 300 N·m"),
         (lambda drive: {"command": lambda nm: drive.command(nm) or nm}, "before it is enabled"),
         (lambda drive: {"read_angle": lambda: float("nan")}, "an angle is not finite"),
         (lambda drive: {"angle_stale": True}, "the angle is stale"),
