@@ -273,7 +273,7 @@ def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[n
 
 
 def weighting_name(weighting: Weighting) -> str:
-    """Return the name of a weighting in results: its own, or that of its function.
+    """Return the name of a weighting in results: its own name, or that of its function.
 
     Raises
     ------

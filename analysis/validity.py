@@ -71,7 +71,7 @@ def record_validity(
 
 
 def worst(validities: Iterable[Validity]) -> Validity:
-    """Return the joint validity of several records: unknown if one is unknown.
+    """Return the combined validity of several records; unknown if any of them is unknown.
 
     Parameters
     ----------

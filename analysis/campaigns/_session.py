@@ -150,7 +150,7 @@ class SessionAnalysis:
 
 @dataclass(frozen=True, slots=True)
 class SessionTask:
-    """Settings of the analysis of every session.
+    """Settings that the analyses of all sessions share.
 
     Attributes
     ----------

@@ -153,7 +153,7 @@ def _start_ns(properties: Mapping[str, Any], unit_s: float) -> int | None:
 
 
 def _with_common_starts(channels: dict[str, SourceChannel]) -> dict[str, SourceChannel]:
-    """Leave out offsets without a start time where other channels have one."""
+    """Drop the time offsets of channels without a start time if other channels have one."""
     starts = [channel.start_ns or 0 for channel in channels.values()]
     if max(starts) < _EARLIEST_NS:
         return channels

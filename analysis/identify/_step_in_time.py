@@ -78,7 +78,7 @@ class Step:
 
 
 def step_score(comparison: Comparison, fit: ModalFit) -> Step:
-    """Return the step of the stiffness that explains most of the modal model's residual."""
+    """Return the stiffness step that best explains the residual of the modal model."""
     residual = fit.residual.view(np.float64)
     stiffened = _Stiffened(comparison, fit)
     best, instants = Step(0.0, 0.0, 0.0), np.linspace(0, comparison.samples, _INSTANTS + 2)[1:-1]

@@ -445,7 +445,7 @@ class Walk:
     def _lower(
         self, found: Refit, other: Refit, value: float, hopeless: tuple[int, float] | None = None
     ) -> Refit:
-        """Descend from another refit with only the order changed; return the lower of the two."""
+        """Minimize from another fit at a new value of the order; return the better of both fits."""
         start = other.x.copy()
         start[self._index] = value
         again = self._descend(start, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless)

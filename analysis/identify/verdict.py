@@ -254,9 +254,12 @@ class Verdict:
     damping_with_amplitude: tuple[DampingAt, ...] = ()
 
     def as_json(self) -> dict[str, object]:
-        """Return the verdict as `json.dumps` takes it; numbers that are not finite become null."""
+        """Return the verdict in a form that `json.dumps` accepts; non-finite numbers become null."""
         plain = _plain(dataclasses.asdict(self))
         assert isinstance(plain, dict)
+        for order in ("alpha", "lambda"):
+            profile = plain[order]["profile"]
+            profile["valleys"] = profile.pop("local_minima")  # the key of the document
         return plain
 
 

@@ -55,7 +55,7 @@ def main_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 
 def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
-    """Modes, parameters with a tolerance of the geometry, and those of the type pooled."""
+    """Return the main tables: modes, parameters with a tolerance of the geometry, pooled fit."""
     made = (
         modes_table(campaign),
         tolerant_table(campaign),

@@ -76,7 +76,7 @@ class WrenchSensorSettings:
 
 @dataclass(frozen=True, slots=True)
 class Actuation:
-    """The way of a torque command to the motor's shaft."""
+    """Path of a torque command to the motor shaft."""
 
     delay_s: NonNegative
     """Time from the tick that computes a command to the moment the motor exerts it."""

@@ -391,7 +391,7 @@ class SessionSequence:
             time.sleep(_GO_POLL_S)
 
     def _watch_touch(self, touch: "TouchWatch", tick: int, missed: int) -> SessionEnd | None:
-        """Check the tick that was just run for a touch; the watch changes the reference."""
+        """Check the last tick for a touch; after one, the watch changes the reference."""
         contact = touch.step(tick, missed)
         if contact is None:
             return None

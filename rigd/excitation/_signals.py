@@ -114,7 +114,7 @@ def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
 
 
 def finite(option: str, value: float, unit: str) -> None:
-    """Raise unless a value is a finite number of a size that a rig can have."""
+    """Raise if the value of an option is not finite, or too large for any rig."""
     if not isfinite(value):
         raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
     if not is_usable_size(value):

@@ -412,7 +412,7 @@ class SimulatedSensor:
             self._hum_turns = (self._hum_turns + readings * self._hum_turn) % 1.0
 
     def measure(self) -> Wrench:
-        """Return a reading of this instant."""
+        """Return a reading taken now."""
         row = next(self._rows)
         torque_nm = self._plant.sensed_torque_nm
         if self._hum_nm:

@@ -234,7 +234,7 @@ class CrossKernels:
     """Response of each mode to a hat of force, by the square of its shape, (modes, n)."""
 
     def between(self, x_m: Real, other_m: Real, steps: int) -> Real:
-        """Interpolate the kernels of pairs of positions.
+        """Interpolate the kernels between pairs of positions, for a number of time steps.
 
         Parameters
         ----------

@@ -368,7 +368,7 @@ class BusLock:
 
 
 class CanLink:
-    """One bus and its users.
+    """One CAN bus and the device drivers that share it.
 
     Parameters
     ----------

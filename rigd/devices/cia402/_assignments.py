@@ -45,7 +45,7 @@ class Assignment:
 
     @property
     def address(self) -> str:
-        """Index and sub-index as messages show them."""
+        """Return index and sub-index as text for error messages, such as "6040:00"."""
         return f"{self.index:04X}:{self.sub:X}"
 
 
