@@ -147,7 +147,7 @@ class Workers:
         submit: Callable[[int], Future[Result]],
         done: Callable[[int, Result], None],
     ) -> list[int]:
-        """Run waiting tasks until a worker process dies; return those in progress at that moment."""
+        """Run waiting tasks until a worker process dies; return those in progress then."""
         under_way: dict[Future[Result], int] = {}
         suspects: list[int] = []
         seen = time.monotonic()

@@ -254,7 +254,7 @@ class Verdict:
     damping_with_amplitude: tuple[DampingAt, ...] = ()
 
     def as_json(self) -> dict[str, object]:
-        """Return the verdict in a form that `json.dumps` accepts; non-finite numbers become null."""
+        """Return the verdict as `json.dumps` accepts it; non-finite numbers become null."""
         plain = _plain(dataclasses.asdict(self))
         assert isinstance(plain, dict)
         for order in ("alpha", "lambda"):

@@ -254,7 +254,7 @@ def readable_texts(values: Mapping[str, str], what: str) -> tuple[dict[str, str]
 
 
 class _Excerpt:
-    """Beginning of a part of the file that may be of any length.
+    """First characters of an entry of the file, whose length is not limited.
 
     Parameters
     ----------

@@ -78,7 +78,7 @@ class StiffnessDrift:
         self._per_period = abs(rate_per_s) * period_s / MOST_DRIFT
 
     def renew(self, periods: int) -> bool:
-        """Update the arrays for the coming periods, if it is time to.
+        """Update the arrays for the coming periods, if an update is due.
 
         Parameters
         ----------

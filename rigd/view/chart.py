@@ -443,7 +443,7 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thinning:
-    """Decimation of curves on a grid, which preserves the extremes of groups of points.
+    """Min/max decimation of curves on a grid: keeps the extremes of each group of points.
 
     Attributes
     ----------
