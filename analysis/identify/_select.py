@@ -226,8 +226,10 @@ def _selected(
                 return with_impact
     if modal is not None:
         small = small_effect(linear.comparison, modal, modal.plant_like(linear.likeliest.plant))
-    alone = modal if small is None else _modal(linear, small.column[None])
-    suffices = alone is not None and _linear_and_constant(linear, alone, band_hz)
+    alone, suffices = modal, plain
+    if small is not None:
+        alone = _modal(linear, small.column[None])
+        suffices = alone is not None and _linear_and_constant(linear, alone, band_hz)
     if not (plain or suffices) or (small is not None and small.large):
         candidate_set, forces, changes = _with_effects(linear, again=again is not None)
         modal = _modal(candidate_set)
