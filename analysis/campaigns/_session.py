@@ -150,7 +150,7 @@ class SessionAnalysis:
 
 @dataclass(frozen=True, slots=True)
 class SessionTask:
-    """Settings that the analyses of all sessions share.
+    """Settings common to the analyses of all sessions.
 
     Attributes
     ----------

@@ -368,7 +368,7 @@ class BusLock:
 
 
 class CanLink:
-    """One CAN bus and the device drivers that share it.
+    """One CAN bus and the drivers of its devices.
 
     Parameters
     ----------
