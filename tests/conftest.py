@@ -24,7 +24,7 @@ from rigd import testing
 from rigd.runtime import use_one_thread
 
 pytest_plugins = [
-    "browsers", "kinds_of_tests", "library_folders", "paper_sweeps", "patient_drives",
+    "browsers", "library_folders", "paper_sweeps", "patient_drives",
     "rewritten_once", "shared_memory_closed", "shipped_profile", "standstill", "synthetic_sessions",
     "touch_sessions", "web_daemon",
 ]  # fmt: skip

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.process
+
 CHECK = Path(__file__).parents[1] / ".ci" / "check_names.py"
 
 

@@ -10,6 +10,8 @@ import pytest
 
 from rigd.testing import DEVICE_CHECKS
 
+pytestmark = pytest.mark.process
+
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
 

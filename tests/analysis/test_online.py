@@ -27,6 +27,8 @@ from rigd.session.online_fit import (
 )
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING, chirp_signals
 
+pytestmark = pytest.mark.process
+
 MODAL = ("frequency_hz", "damping_ratio")
 
 
@@ -199,6 +201,7 @@ def test_a_judgement_may_start_from_the_last(session, monkeypatch):
         assert (found.flag is None) == (expected[name].flag is None), name
 
 
+@pytest.mark.fit
 def test_what_the_last_judgement_does_not_explain_is_searched_for(session):
     """Here in vain, for it hums within the width of mode 2: as if nothing had been known."""
     signals = scan(ring_down_s=2.0)

@@ -37,6 +37,8 @@ def selection(short_chirps):
     return whole_record(load_record(short_chirps[0])).selection
 
 
+@pytest.mark.fit
+@pytest.mark.process
 def test_the_modes_are_those_of_the_whole_judgement(chirps, selection):
     _, (look, _) = chirps
     assert [mode["mode"] for mode in look["modes"]] == [1, 2, 3]
@@ -47,6 +49,8 @@ def test_the_modes_are_those_of_the_whole_judgement(chirps, selection):
     assert look["flags"] == [finding.sentence for finding in selection.verdict.findings]
 
 
+@pytest.mark.fit
+@pytest.mark.process
 def test_the_modes_have_their_validity(chirps, short_chirps):
     """The files state no slope: it is that of the whole judgement, by the fitted beam."""
     _, (look, _) = chirps
@@ -56,6 +60,8 @@ def test_the_modes_have_their_validity(chirps, short_chirps):
     assert f"  {validity.sentence}" in look["text"]
 
 
+@pytest.mark.fit
+@pytest.mark.process
 def test_the_response_keeps_the_height_of_the_resonances(chirps):
     _, (look, _) = chirps
     response = look["response"]
@@ -80,6 +86,8 @@ def test_low_bands_are_joined():
     assert list(quick_look._bands(hz, ~low, 0.15)) == [(10.0, pytest.approx(19.8))]
 
 
+@pytest.mark.fit
+@pytest.mark.process
 def test_the_last_session_of_the_specimen_is_compared_with(chirps):
     paths, (first, second) = chirps
     assert first["against_last"] is None
@@ -161,6 +169,8 @@ def test_the_last_look_is_found_by_start_and_specimen(tmp_path, name, content, f
     assert found["file"] == file
 
 
+@pytest.mark.fit
+@pytest.mark.process
 def test_the_fitted_model_has_a_band_that_holds_it(chirps, selection):
     """Its peak is the mode's, which Welch's segments do not resolve."""
     _, (look, _) = chirps
@@ -178,6 +188,8 @@ def test_the_fitted_model_has_a_band_that_holds_it(chirps, selection):
     assert magnitude[near].max() == pytest.approx(peak, rel=0.02)
 
 
+@pytest.mark.fit
+@pytest.mark.process
 def test_a_long_record_is_fitted_by_the_freest_structure_alone(chirps, selection, monkeypatch):
     paths, _ = chirps
     monkeypatch.setattr(quick_look, "_JUDGED_S", 10.0)
@@ -191,6 +203,7 @@ def test_a_long_record_is_fitted_by_the_freest_structure_alone(chirps, selection
     assert "type VI alone was fitted" in look["flags"][0]
 
 
+@pytest.mark.process
 def test_the_freest_structure_alone_flags_what_it_does_not_explain(short_chirps):
     measurement = Measurement.of_record(load_record(short_chirps[0]))
     cubic = measurement.torque_nm + 4e3 * measurement.angle_rad**3
@@ -204,6 +217,7 @@ def test_the_freest_structure_alone_flags_what_it_does_not_explain(short_chirps)
     assert [finding.kind for finding in found] == ["sign"]
 
 
+@pytest.mark.fit
 def test_what_cannot_be_analysed_says_why(write_session, short_signals, signals_of, tmp_path):
     held = replace(short_signals, metadata={"excitation": "hold", "specimen": "a"})
     look = make_quick_look(write_session(tmp_path / "held.mcap", held))
@@ -217,6 +231,8 @@ def test_what_cannot_be_analysed_says_why(write_session, short_signals, signals_
     json.dumps(look, allow_nan=False)
 
 
+@pytest.mark.fit
+@pytest.mark.process
 def test_the_text_is_for_a_terminal(chirps):
     paths, (_, look) = chirps
     head, *modes = look["text"]
@@ -253,6 +269,7 @@ def look(*arguments):
     )  # fmt: skip
 
 
+@pytest.mark.process
 def test_the_program_writes_the_look_and_prints_it(short_chirps, tmp_path):
     path = Path(shutil.copy(short_chirps[0], tmp_path))
     done = look(path)
@@ -261,6 +278,7 @@ def test_the_program_writes_the_look_and_prints_it(short_chirps, tmp_path):
     assert done.stderr == ""
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -275,6 +293,7 @@ def test_the_program_says_what_is_wrong_in_a_sentence(arguments, said):
     assert done.stderr.count("\n") == bool(said)
 
 
+@pytest.mark.process
 def test_it_runs_at_a_low_priority_and_ends_with_its_parent(short_chirps, tmp_path):
     """As it is started: below a process that is killed, suspended."""
     path = Path(shutil.copy(short_chirps[0], tmp_path))

@@ -43,6 +43,7 @@ def record_of(write_session, short_signals, tmp_path):
     return make
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize(("every", "last_hz"), [(1, 50.0), (8, 50.0), (10, 40.0), (25, 16.0)])
 def test_the_band_ends_at_four_tenths_of_the_rate(record_of, every, last_hz):
     record = record_of(every)
@@ -130,6 +131,7 @@ def slow(write_session, make_signals, tmp_path):
     )  # fmt: skip
 
 
+@pytest.mark.fit
 @pytest.mark.usefixtures("slow")
 def test_a_record_of_100_hz_is_analysed(analyze_here, tmp_path):
     brief = ("--types", "I", "--weights", "const", "--figures", "png")
@@ -146,6 +148,7 @@ def test_a_record_of_100_hz_is_analysed(analyze_here, tmp_path):
     assert all(line.startswith("Warning: slow.mcap:") for line in result.stderr.splitlines())
 
 
+@pytest.mark.fit
 @pytest.mark.further  # as report/test_method_record.py, at another rate
 @pytest.mark.usefixtures("slow")
 def test_a_band_of_a_record_of_100_hz_is_analysed(analyze_here, tmp_path):
@@ -154,6 +157,7 @@ def test_a_band_of_a_record_of_100_hz_is_analysed(analyze_here, tmp_path):
     assert json.loads((tmp_path / "b.json").read_text())["records"][0]["band_hz"] == [1.0, 20.0]
 
 
+@pytest.mark.fit
 @pytest.mark.further  # what suits a step is decided above
 def test_a_step_gets_the_whole_record_s_analysis_and_a_line(
     write_session, make_signals, analyze_here, tmp_path
@@ -172,6 +176,7 @@ def test_a_step_gets_the_whole_record_s_analysis_and_a_line(
     assert "Welch fits left out" in (tmp_path / "r" / "report.html").read_text()
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("asked", [False, True])
 def test_warnings_of_libraries_stay_off_the_terminal(tmp_path, asked):
     """Those of numpy and matplotlib, here and in the processes that it starts; unless asked for."""

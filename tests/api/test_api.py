@@ -16,6 +16,8 @@ from analysis.paper import estimate
 from analysis.record import RecordError, load_record
 from rigd.session import SessionError
 
+pytestmark = pytest.mark.process
+
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "python_api.md").read_text(encoding="utf-8")
 
 
@@ -54,6 +56,7 @@ def test_load_and_frf_are_the_command_s(record, workspace):
     assert whole.estimator == "fft"
 
 
+@pytest.mark.fit
 def test_fit_by_either_method(record):
     settings = {"fixed": ("delay_s",), "band_hz": (0.0, 30.0)}
     (found,) = api.fit(record, ["III"], **settings).fits

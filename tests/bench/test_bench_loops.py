@@ -8,6 +8,8 @@ import pytest
 from rigd.bench import _loops as loops
 from rigd.profile import load_profile
 
+pytestmark = pytest.mark.process
+
 SECONDS = 0.3
 
 

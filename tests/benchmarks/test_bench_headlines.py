@@ -126,6 +126,7 @@ def test_a_record_that_cannot_be_judged_is_told_and_stops_nothing(
     assert "orders told, one mode" in told.out  # what `held` says of an order
 
 
+@pytest.mark.fit
 @pytest.mark.further  # as make bench
 def test_a_record_is_judged_from_the_document_alone():
     name = f"undeclared, {NAME}"

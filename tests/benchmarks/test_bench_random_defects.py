@@ -35,6 +35,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *options: object) -> int:
     return int(end.value.code or 0)
 
 
+@pytest.mark.fit
 def test_it_goes_on_where_it_ended(
     judged: list[DefectTask],
     monkeypatch: pytest.MonkeyPatch,
@@ -49,6 +50,7 @@ def test_it_goes_on_where_it_ended(
     assert "| **all** | 4 |" in capsys.readouterr().out
 
 
+@pytest.mark.fit
 def test_kinds_are_drawn_in_turn(judged: list[DefectTask], monkeypatch: pytest.MonkeyPatch):
     run(monkeypatch, "--records", 5, "--kinds", "tilt", "mass, ")
     kinds = ["mass, sections", "mass, smooth", "tilt"]
@@ -58,6 +60,7 @@ def test_kinds_are_drawn_in_turn(judged: list[DefectTask], monkeypatch: pytest.M
     assert judged[-1].seed == 100_000
 
 
+@pytest.mark.fit
 def test_a_record_without_a_result_counts_and_ends_nothing(
     judged: list[DefectTask],
     monkeypatch: pytest.MonkeyPatch,

@@ -80,6 +80,7 @@ def still() -> Exact:
     return exact(Truth(**PAPER))
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize("declared", [True, False])
 def test_an_estimator_finds_the_truth(still: Exact, declared: bool):
     made = still if declared else exact(Truth(**PAPER, **UNDECLARED))

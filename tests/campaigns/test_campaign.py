@@ -21,6 +21,8 @@ from analysis.report.table import json_rows
 from analysis.results import whole_record
 from rigd.beam import modes
 
+pytestmark = pytest.mark.fit
+
 
 def test_sessions_keep_their_order_and_failures_are_told(done, short_sessions, other_beam):
     found, progress = done

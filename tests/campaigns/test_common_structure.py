@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.fit
+
 FREE = {"zeta": 7.1e-5, "alpha": 0.996, "gamma": 0.055, "lambda": 0.594}
 FREQUENCY_HZ = 44.8132
 STD_HZ = 3e-4

@@ -26,6 +26,7 @@ def cluster():
         yield made
 
 
+@pytest.mark.process
 def test_results_come_in_order_and_each_call_counts(cluster):
     seen = []
     with dask_cluster(cluster.scheduler_address) as workers:
@@ -35,6 +36,8 @@ def test_results_come_in_order_and_each_call_counts(cluster):
     assert sorted(seen) == list(range(9))
 
 
+@pytest.mark.fit
+@pytest.mark.process
 def test_a_campaign_finds_what_it_finds_here(cluster, short_sessions, settings, monkeypatch):
     """From another folder than the workers', by relative paths."""
     monkeypatch.chdir(short_sessions[0].parent)
@@ -73,6 +76,7 @@ def test_a_worker_of_other_versions_is_told(said, words):
     dask_workers._check_workers(Elsewhere(versions()), "tcp://10.0.0.5:8786")
 
 
+@pytest.mark.process
 def test_a_cluster_without_workers_is_told(monkeypatch):
     import distributed
 
@@ -100,6 +104,7 @@ def test_without_dask_it_is_said_what_to_install(monkeypatch):
         pass
 
 
+@pytest.mark.process
 @pytest.mark.further  # as test_workers.py
 def test_a_worker_that_is_lost_takes_one_task_with_it_and_no_more():
     import dask
@@ -125,6 +130,7 @@ def until_it_is_gone(number):
     assert number == 0 or GONE.wait(300.0)
 
 
+@pytest.mark.process
 def test_a_scheduler_that_goes_away_is_told():
     import distributed
 

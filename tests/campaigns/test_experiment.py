@@ -7,6 +7,8 @@ import pytest
 
 from analysis.campaigns import SessionFailure, SessionTask, analyse_session
 
+pytestmark = pytest.mark.fit
+
 
 @pytest.fixture
 def of_one_experiment(campaign_of):

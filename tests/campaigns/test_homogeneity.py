@@ -15,6 +15,8 @@ from analysis.report import campaign_document
 from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 from rigd.beam import undamped_frequencies_rad_s
 
+pytestmark = pytest.mark.fit
+
 STIFFER = 1.03
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from analysis.campaigns.pooling import pooled_bic
 
+pytestmark = pytest.mark.fit
+
 QUICK = (
     "--types", "I", "--weights", "const", "--segment", "2000", "--nfft", "8000", "--band", "1,50",
     "--figures", "png",

@@ -12,6 +12,8 @@ from analysis.identify import CONSTANTS, ModalEstimate, ModalModel, Plant
 from analysis.identify.sentences import uniformity
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING
 
+pytestmark = pytest.mark.fit
+
 PLANT = Plant(PAPER_BEAM, PAPER_DAMPING)
 MODES = (1, 2, 3)
 TRUE = modal_constants(PLANT, MODES)

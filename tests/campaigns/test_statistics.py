@@ -17,6 +17,7 @@ from rigd.beam import transfer
 DATA = Path(__file__).parents[1] / "data"
 
 
+@pytest.mark.fit
 def test_statistics_by_hand(make_fit, make_session, campaign_of):
     sessions = [
         make_session(
@@ -38,6 +39,7 @@ def test_statistics_by_hand(make_fit, make_session, campaign_of):
     assert [r.at_bounds for r in rows] == [1, 0, 0, 0]
 
 
+@pytest.mark.fit
 def test_one_session_has_no_scatter(make_fit, make_session, campaign_of):
     one = make_session(fits=[make_fit("I", "const", zeta=1e-5)])
     (row,) = campaign_of([one]).statistics
@@ -62,6 +64,7 @@ def test_deviation_of_peaks_by_hand():
     assert math.isnan(gone.magnitude_db)
 
 
+@pytest.mark.fit
 def test_nominal_model_is_of_the_mean_parameters(make_fit, make_session, campaign_of, truth):
     link, _ = truth
     frequency_hz = np.array([1.0, 2.0])

@@ -14,6 +14,8 @@ from analysis.cli.sessions import Outputs
 from analysis.report import campaign_document
 from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 
+pytestmark = pytest.mark.fit
+
 
 def ends_at_one(function, path, *arguments):
     """Call a function, but end the process that is given 1.mcap, as lack of memory does."""
@@ -50,6 +52,7 @@ def shaken(short_sessions, settings, done):
     return found
 
 
+@pytest.mark.process
 def test_a_trial_whose_worker_is_killed_is_lost_and_the_others_are_done(shaken):
     assert shaken.failures == ()
     (lost,) = shaken.lost_trials
@@ -58,6 +61,7 @@ def test_a_trial_whose_worker_is_killed_is_lost_and_the_others_are_done(shaken):
     assert {each.path.name for each in shaken.validation} == {"0.mcap", "2.mcap", "3.mcap"}
 
 
+@pytest.mark.process
 def test_the_verdict_says_over_how_many_a_prediction_is(shaken):
     (foresight,) = (s for s in shaken.verdict.sentences if s.startswith("Leave-one-out error"))
     assert "mean of 3 of 4 sessions" in foresight
@@ -66,6 +70,7 @@ def test_the_verdict_says_over_how_many_a_prediction_is(shaken):
     assert "(1.mcap: its worker process ended by itself twice" in told
 
 
+@pytest.mark.process
 def test_terminal_page_and_files_account_for_it(shaken):
     lines = campaign_text(shaken).splitlines()
     (row,) = (line for line in lines if line.startswith("record   III "))
@@ -81,6 +86,7 @@ def test_terminal_page_and_files_account_for_it(shaken):
     assert (Path(lost["file"]).name, lost.get("error")) == ("1.mcap", None)
 
 
+@pytest.mark.process
 @pytest.mark.further  # as terminal and page
 def test_the_figure_accounts_for_it(shaken, tmp_path):
     write_campaign(shaken, tmp_path / "report", with_paper=False)
@@ -90,6 +96,7 @@ def test_the_figure_accounts_for_it(shaken, tmp_path):
     assert any("".join(text.itertext()).strip().startswith("3 of 4 sessions") for text in texts)
 
 
+@pytest.mark.process
 def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("analysis.campaigns.campaign", lambda *_, **__: shaken)
     monkeypatch.setattr("analysis.report.campaign_report.write_campaign", lambda *_, **__: None)

@@ -131,6 +131,7 @@ def test_nothing_is_1_that_excludes_1(estimates_of, alpha, rival, status):
     assert ("consistent with 1" in sentences.order(order)) == (status == "compatible")
 
 
+@pytest.mark.fit
 def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(
     estimates_of, make_session, campaign_of
 ):
@@ -172,6 +173,7 @@ def stiffening(mode):
     )  # fmt: skip
 
 
+@pytest.mark.fit
 def test_findings_are_counted_over_the_sessions(make_session, estimates_of, campaign_of):
     six = estimates_of("VI", 100.0)
     sessions = [
@@ -193,6 +195,7 @@ def test_findings_are_counted_over_the_sessions(make_session, estimates_of, camp
     assert first.sentence.startswith("In 1 of 3 sessions (1.mcap):")
 
 
+@pytest.mark.fit
 def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimates_of, campaign_of):
     six, seven = estimates_of("VI", 100.0), estimates_of("VII", 150.0)
     sessions = [

@@ -9,6 +9,8 @@ import pytest
 from analysis.campaigns import sentences
 from analysis.paper import Indices
 
+pytestmark = pytest.mark.fit
+
 RECORD_STD = 0.001
 
 

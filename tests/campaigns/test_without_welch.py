@@ -12,6 +12,8 @@ from analysis.campaigns import SessionFailure, SessionTask, analyse_session, cam
 from analysis.models import WelchSettings
 from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 
+pytestmark = pytest.mark.fit
+
 
 @pytest.fixture(scope="module")
 def found(make_file, tmp_path_factory, in_this_process):

@@ -8,6 +8,8 @@ from cases import further
 from analysis.campaigns import CampaignError
 from analysis.campaigns.workers import Lost, process_pool
 
+pytestmark = pytest.mark.process
+
 
 def test_results_come_in_order_and_progress_as_they_are_done(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")

@@ -23,6 +23,7 @@ def rig():
     del sys.modules[spec.name]
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("victim", "how", "moment_s", "others"),
     [

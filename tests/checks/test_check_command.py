@@ -8,6 +8,8 @@ from typer.testing import CliRunner
 from rigd.cli.app import app
 from rigd.devices.contracts import DeviceError
 
+pytestmark = pytest.mark.process
+
 
 @pytest.fixture
 def rigd(monkeypatch):

@@ -9,6 +9,8 @@ from eds_files import COMPLETE, WITH_TORQUE, WITHOUT_TORQUE, eds_path, eds_text,
 from rigd.cli.app import app
 from rigd.profile import load_profile
 
+pytestmark = pytest.mark.process
+
 
 @pytest.fixture
 def rigd(rigd_here, monkeypatch):

@@ -37,6 +37,7 @@ def profile(request, can_profile, serial_profile):
     sys.stderr.write(process.communicate(timeout=300)[1])
 
 
+@pytest.mark.process
 def test_a_fault_is_found_and_only_the_operator_resets_it(profile):
     from rigd.sim.wire import inject
 

@@ -192,6 +192,7 @@ def unknown(tmp_path, can_profile):
     return unknown
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("key", MAY_BE_UNKNOWN)
 def test_an_unknown_value_is_named_wherever_it_is_needed(unknown, tmp_path, key):
     path = unknown(key)

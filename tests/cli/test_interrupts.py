@@ -72,6 +72,7 @@ def stop(tmp_path):
     return run
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("before", DURING.values(), ids=DURING.keys())
 def test_ctrl_c_ends_with_130(stop, before):
     done = stop(before, "replay", "seen.rrd", stderr=subprocess.PIPE)
@@ -79,11 +80,13 @@ def test_ctrl_c_ends_with_130(stop, before):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.process
 def test_before_anything_began_it_says_so(stop):
     done = stop(DURING["imports"], "run", "hold", stderr=subprocess.PIPE)
     assert (done.returncode, done.stderr) == (130, "Stopped before anything began.\n")
 
 
+@pytest.mark.process
 def test_nobody_who_hears_that_is_waited_for(stop):
     heard, told = os.pipe()
     os.set_blocking(told, False)
@@ -145,6 +148,7 @@ class StopAfterOne(StopRequest):
     )
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("repeat", [1, 3])
 def test_a_stop_between_two_sessions_is_told(rigd_here, monkeypatch, repeat):
     monkeypatch.setattr(

@@ -95,6 +95,7 @@ def test_it_waits_if_it_is_to(rigd_here, nobody_else, monkeypatch):
     assert "Waiting for a live view to start; Ctrl-C quits." in done.stderr
 
 
+@pytest.mark.process
 def test_the_window_keeps_to_this_computer_and_leaves_the_users_settings_alone(
     rigd, view, fake_viewer, runtime_folder
 ):
@@ -111,6 +112,7 @@ def test_the_window_keeps_to_this_computer_and_leaves_the_users_settings_alone(
     assert environment["XDG_DATA_HOME"].startswith(str(runtime_folder))
 
 
+@pytest.mark.process
 def test_a_window_that_cannot_be_opened_is_told_in_a_sentence(rigd, view, fake_viewer, monkeypatch):
     monkeypatch.setenv("CODE", "3")
     done = rigd("live")
@@ -119,6 +121,7 @@ def test_a_window_that_cannot_be_opened_is_told_in_a_sentence(rigd, view, fake_v
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.process
 def test_a_computer_that_cannot_draw_is_told_which_package_it_lacks(
     rigd, view, fake_viewer, monkeypatch
 ):
@@ -173,6 +176,7 @@ def test_the_window_goes_on_to_whatever_takes_the_place_of_its_view(rigd_here, v
     assert said.count("The live view of sim has restarted.") == 2
 
 
+@pytest.mark.process
 @pytest.mark.further  # as through its files
 def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read(
     rigd, rigd_here, start_rigd, runtime_folder
@@ -204,6 +208,7 @@ def test_a_daemon_whose_view_is_about_to_begin_is_named(rigd_here, monkeypatch):
     assert "rigd live --wait" in done.stderr
 
 
+@pytest.mark.process
 @pytest.mark.further  # as one whose view is about to begin
 def test_a_daemon_that_was_started_without_a_view_is_named(rigd_here, start_rigd):
     serve = start_rigd("serve", "--profile", "sim", "--fast")

@@ -31,6 +31,8 @@ from rigd.view._recorded import subject_of_session
 from rigd.view.frequency_charts import MAGNITUDE, ResponseCharts
 from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
 
+pytestmark = pytest.mark.process
+
 RIGD = Path(sys.executable).parent / "rigd"
 QUICK = ("--duration", "4", "--rest", "0.5", "--ring-down", "0.5", "--stop-hz", "10", "--fast")
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it

@@ -28,6 +28,8 @@ from rigd.profile import load_profile
 from rigd.session import read_controls, read_session
 from rigd.session.layout import Status
 
+pytestmark = pytest.mark.process
+
 RIGD = Path(sys.executable).parent / "rigd"
 SHORT = ("--duration", "2", "--rest", "0.2", "--ring-down", "0.3", "--stop-hz", "10")
 
@@ -148,6 +150,7 @@ def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
     assert abs(record.samples["angle_rad"][end + 2000] - sweep[-1]) < 1e-3
 
 
+@pytest.mark.fit
 @pytest.mark.further  # as identify/test_knock.py, of records without a motor that turns with it
 def test_a_loud_knock_is_named_though_the_motor_turns_with_it(rigd, tmp_path):
     """In mid-sweep, on the tip: the beam rings louder than the motor drives it, for half of it."""

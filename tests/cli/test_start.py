@@ -182,6 +182,7 @@ def interrupting_daemon(runtime_folder):
     listener.close()
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("options", [(), ("--detach",)])
 def test_ctrl_c_cancels_a_start_that_waits(interrupting_daemon, options):
     done = subprocess.run(

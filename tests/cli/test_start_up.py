@@ -9,6 +9,8 @@ from cases import further
 
 from rigd.runtime import SINGLE_THREADED
 
+pytestmark = pytest.mark.process
+
 PROGRAM = """
 import importlib, os, sys
 

@@ -12,6 +12,8 @@ from cases import further
 from rigd.session import read_session, read_touches
 from rigd.session.layout import TOUCH_KINDS, Status
 
+pytestmark = pytest.mark.process
+
 OBSTACLE = "x=0.62,angle=0.4,stiffness=3000"
 RIGD = Path(sys.executable).parent / "rigd"
 QUICK = ("--settle", "0.3", "--rest", "0.5", "--ring-down", "0.2", "--hold", "0.4", "--seed", "1")

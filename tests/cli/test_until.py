@@ -19,6 +19,8 @@ from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
 from rigd.profile import load_profile
 from rigd.session import read_session
 
+pytestmark = pytest.mark.process
+
 RIGD = Path(sys.executable).parent / "rigd"
 ASKED = 0.03
 SEEDED = ("--fast", "--seed", "1")

@@ -133,6 +133,7 @@ run_command(refuse)
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("error", "words"),
     [

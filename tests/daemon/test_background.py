@@ -93,6 +93,7 @@ def test_of_the_free_memory_a_job_may_have_a_part(tmp_path):
     assert limit(100_000) == 256 << 20
 
 
+@pytest.mark.process
 def test_a_job_is_the_first_that_is_killed_for_lack_of_memory():
     with subprocess.Popen(
         [sys.executable, "-m", "rigd.daemon.background"],
@@ -104,6 +105,7 @@ def test_a_job_is_the_first_that_is_killed_for_lack_of_memory():
         assert eventually(lambda: resource.prlimit(job.pid, resource.RLIMIT_AS)[1] <= 4 << 30)
 
 
+@pytest.mark.process
 def test_a_prediction_without_the_memory_is_refused(profile):
     job = background.PredictionJob(profile, "chirp", {"duration_s": 2300.0}, False, "")
     told = subprocess.run(

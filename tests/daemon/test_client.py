@@ -129,6 +129,7 @@ def deaf(path):
         process.communicate()
 
 
+@pytest.mark.process
 def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(
     path, deaf, monkeypatch
 ):
@@ -144,6 +145,7 @@ def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(
     assert "STO" in said
 
 
+@pytest.mark.process
 def test_a_process_that_does_not_know_the_signal_is_not_ended_by_it(path, deaf, monkeypatch):
     monkeypatch.setattr(client_module, "_STOP_PATIENCE_S", 1.0)
     monkeypatch.setattr(client_module, "_END_PATIENCE_S", 0.1)
@@ -162,6 +164,7 @@ def ended():
     return process.pid
 
 
+@pytest.mark.process
 def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
     assert (
         "Its control process, which alone moves the motor, has ended"
@@ -185,6 +188,7 @@ def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
     assert "may still be running" in client_module.describe_remains(os.getpid(), os.getuid())
 
 
+@pytest.mark.process
 def test_a_process_that_is_dead_but_not_buried_is_gone():
     process = subprocess.Popen([sys.executable, "-c", ""])
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)

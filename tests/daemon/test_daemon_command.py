@@ -16,6 +16,8 @@ from rigd.runtime import STOP_SIGNAL
 from rigd.runtime.addresses import answers
 from rigd.session import read_session
 
+pytestmark = pytest.mark.process
+
 RIGD = Path(sys.executable).parent / "rigd"
 SHORT = ("--duration", "1", "--rest", "0.2", "--ring-down", "0")
 LONG = ("--duration", "100", "--rest", "0.2")

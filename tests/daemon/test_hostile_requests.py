@@ -14,6 +14,8 @@ from processes import eventually
 from rigd.daemon.address import socket_path
 from rigd.runtime.addresses import answers
 
+pytestmark = pytest.mark.process
+
 MOST_GROWTH_MB = 15
 LONGEST = 65_536
 

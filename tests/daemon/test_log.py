@@ -3,6 +3,10 @@
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.process
+
 FLOOD = """
 import logging
 from rigd.daemon._log import NAME, Log

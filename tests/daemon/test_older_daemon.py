@@ -9,6 +9,8 @@ import pytest
 from rigd.daemon.address import socket_path
 from rigd.profile import load_profile
 
+pytestmark = pytest.mark.process
+
 PLAN = {
     "record_s": 136.0,
     "peak_angle_rad": 0.025,

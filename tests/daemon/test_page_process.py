@@ -17,6 +17,8 @@ from processes import eventually
 from rigd.daemon import _page, page_address
 from rigd.profile import load_profile
 
+pytestmark = pytest.mark.process
+
 STATUS = {
     "state": "ready", "doing": "", "since_utc_ns": 0, "reason": "", "zero_lost": False,
     "controller": None, "series": None, "progress": None, "rig": None, "history": [],

@@ -38,6 +38,7 @@ def test_where_nothing_runs_it_says_where_it_looked(stop_here, runtime_folder):
     assert str(runtime_folder / "rigd") in out
 
 
+@pytest.mark.process
 def test_a_session_in_the_foreground_is_stopped_from_another_folder(
     stop_here, start_rigd, monkeypatch, write_profile, tmp_path
 ):
@@ -87,6 +88,7 @@ class Impostor:
         self._listener.close()
 
 
+@pytest.mark.process
 def test_an_impostor_on_the_socket_is_not_believed(
     stop_here, start_rigd, runtime_folder, write_profile
 ):
@@ -160,6 +162,7 @@ FORGED = ("python", "-m", CONTROL.module)
 OTHER = os.getuid() + 1
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("command", "changes", "expected"),
     [
@@ -188,6 +191,7 @@ def test_only_what_runs_sessions_gets_a_signal(stop_here, bystander, command, ch
         assert process.stdout.readline() == f"{int(expected)}\n"
 
 
+@pytest.mark.process
 def test_a_process_that_a_forged_command_line_names_gets_no_signal(stop_here, bystander):
     process, row = bystander
     forged = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE, text=True)
@@ -203,6 +207,7 @@ def test_a_process_that_a_forged_command_line_names_gets_no_signal(stop_here, by
         forged.communicate()
 
 
+@pytest.mark.process
 @pytest.mark.further  # as in this process, from other users and environments; benchmarks/bench_stop
 @pytest.mark.parametrize("situation", SITUATIONS)
 def test_it_stops_wherever_it_is_called(situation):

@@ -312,6 +312,7 @@ def test_a_damaged_file_is_read_or_refused(tmp_path_factory, noise, start, lengt
         assert str(path) in str(error)
 
 
+@pytest.mark.process
 def test_nothing_is_printed_and_no_library_is_waited_for(tmp_path):
     """Neither warnings on the terminal nor an import that takes longer than the file."""
     path = tmp_path / "bare.eds"

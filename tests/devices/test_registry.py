@@ -16,6 +16,7 @@ def test_unknown_drivers_are_refused_with_what_there_is():
         check_selection(DeviceSelection(drive="steam", sensor="sim"), Path("a.toml"))
 
 
+@pytest.mark.process
 def test_the_simulation_is_not_imported_unless_a_profile_names_it():
     code = (
         "import sys, rigd.devices._registry, rigd.engine.control_process\n"

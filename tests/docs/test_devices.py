@@ -32,6 +32,7 @@ def run(tmp_path, runtime_folder):
     return run
 
 
+@pytest.mark.process
 @pytest.mark.further  # its commands are parsed in test_documents.py
 def test_from_its_eds_to_the_first_session(run, tmp_path):
     shutil.copy(eds_path("epos4_0170"), tmp_path / "drive.eds")
@@ -44,6 +45,7 @@ def test_from_its_eds_to_the_first_session(run, tmp_path):
     assert load_profile(tmp_path / "new_rig.toml").rig.cia402.eds == str(tmp_path / "drive.eds")
 
 
+@pytest.mark.process
 def test_a_drive_without_torque_ends_at_the_first_step(run, tmp_path):
     shutil.copy(eds_path(WITHOUT_TORQUE[0]), tmp_path / "drive.eds")
     done = run("\n".join(SHELLS))

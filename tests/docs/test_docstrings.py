@@ -151,6 +151,7 @@ def folder_of_examples(short_chirps, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.process
 @pytest.mark.usefixtures("folder_of_examples")
 @pytest.mark.parametrize("path", EXAMPLES, ids=name_of)
 def test_examples_give_what_they_say(path):

@@ -19,6 +19,8 @@ from session_schemas import message_class
 
 from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE
 
+pytestmark = pytest.mark.process
+
 DOCS = Path(__file__).parents[2] / "docs"
 LAYOUTS = DOCS / "layouts"
 PAGE = (DOCS / "opening_sessions.md").read_text("utf-8")

@@ -87,6 +87,7 @@ def script_of(shells):
     return "\n".join(("set -em", trap, *shells))
 
 
+@pytest.mark.process
 @pytest.mark.timeout(900)
 def test_every_how_to_from_a_session_to_what_becomes_of_it_runs_as_written(start, tmp_path):
     shells, python = list(filter(of_one_session, blocks("sh"))), blocks("python")
@@ -107,6 +108,7 @@ def test_every_how_to_from_a_session_to_what_becomes_of_it_runs_as_written(start
         assert_went_well(process)
 
 
+@pytest.mark.process
 @pytest.mark.timeout(900)
 def test_every_other_how_to_runs_as_written(start, write_profile, tmp_path):
     shells = [shell for shell in blocks("sh") if not of_one_session(shell)]

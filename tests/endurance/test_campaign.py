@@ -16,6 +16,8 @@ from rigd.runner import ProcessGroup, Rig
 from rigd.runner.request import Order
 from rigd.runtime import StopRequest
 
+pytestmark = pytest.mark.fit
+
 COARSE_KB = 4096
 
 
@@ -30,6 +32,7 @@ def campaign():
     del sys.modules[spec.name]
 
 
+@pytest.mark.process
 @pytest.mark.further  # at length
 def test_sessions_on_one_connection_leave_nothing_behind(campaign, tmp_path):
     profile = load_shipped("sim")

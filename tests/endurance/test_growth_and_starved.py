@@ -91,6 +91,7 @@ def test_what_ends_a_session_on_a_busy_computer_has_to_name_it(load, reason, com
     assert bool(complaint) == bool(outcome.complaints)
 
 
+@pytest.mark.process
 @pytest.mark.slow  # in `make test` all sessions in real time run beside other workers
 def test_a_session_beside_busy_programs_is_supervised_in_time(
     load, tmp_path, monkeypatch, write_profile

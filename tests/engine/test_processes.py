@@ -71,6 +71,7 @@ def test_what_is_no_message_is_not_waited_for(pipe):
         MessageReader(read).next(0.0)
 
 
+@pytest.mark.process
 def test_what_is_no_message_is_told_with_the_name_of_the_process():
     child = Child("recorder", "this", [])  # prints the Zen of Python
     try:
@@ -80,6 +81,7 @@ def test_what_is_no_message_is_told_with_the_name_of_the_process():
         child.stop(5.0)
 
 
+@pytest.mark.process
 def test_what_a_library_prints_does_not_stand_among_the_messages():
     says = (
         "import os; from rigd.engine.messages import Ended; "
@@ -95,6 +97,7 @@ def test_what_a_library_prints_does_not_stand_among_the_messages():
     assert errors == b"of a library\nand so on"
 
 
+@pytest.mark.process
 def test_a_process_may_be_stopped_twice():
     child = Child("recorder", "rigd.engine.recorder", [])
     child.stop(5.0)
@@ -102,6 +105,7 @@ def test_a_process_may_be_stopped_twice():
     assert not child.running
 
 
+@pytest.mark.process
 def test_a_process_that_the_system_does_not_start_is_told(monkeypatch):
     def refuse(*_, **__):
         raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))

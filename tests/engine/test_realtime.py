@@ -20,6 +20,8 @@ from rigd.engine.realtime import (
 )
 from rigd.profile import load_profile
 
+pytestmark = pytest.mark.process
+
 CODE = """
 import json, os, resource, sys
 from pathlib import Path

@@ -86,6 +86,7 @@ def test_an_observer_in_time_sees_everything(ring):
     assert observer.dropped == 0
 
 
+@pytest.mark.process
 def test_another_process_reads_what_this_one_wrote(ring):
     for number in range(5):
         put(ring, number)

@@ -197,6 +197,7 @@ def test_the_analysis_stands_beside_its_subcommands(analyze):
     assert analyze("--types", "I", "import").exit_code == 1  # a file of that name, not the command
 
 
+@pytest.mark.process
 def test_the_commands_load_no_library_before_they_run(analyze):
     code = (
         "import sys, analysis.cli.app; "

@@ -14,6 +14,8 @@ from analysis.exchange import ExchangeError, parse_choice, read_specimen
 from rigd.session import read_session
 from rigd.session.limits import MAX_SAMPLES
 
+pytestmark = pytest.mark.process
+
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "exchange.md").read_text(encoding="utf-8")
 
 

@@ -12,6 +12,8 @@ from cases import further
 
 from analysis.exchange import ExchangeError, read_source
 
+pytestmark = pytest.mark.process
+
 READ = """
 import resource, sys
 from pathlib import Path

@@ -422,6 +422,7 @@ def test_unusual_beams_are_accurate_too(exported, values):
     assert np.abs(response(model, frequency_hz) / true - 1).max() < 1e-3
 
 
+@pytest.mark.process
 def test_a_session_is_analysed_on_the_spot(simulated, analyze, tmp_path):
     result = analyze("export", "model", simulated, tmp_path / "a.npz", "--samples", 2)
     assert result.exit_code == 0, result.output
@@ -435,6 +436,7 @@ def test_a_session_is_analysed_on_the_spot(simulated, analyze, tmp_path):
     assert model["source"] == simulated.name
 
 
+@pytest.mark.process
 def test_beam_and_modal_model_of_a_session_agree_within_what_the_record_knows(simulated):
     found = identified_in_session(simulated)
     assert found.gate[0] == "passed"
@@ -456,6 +458,7 @@ def test_beam_and_modal_model_of_a_session_agree_within_what_the_record_knows(si
     assert by_modal.std[inner][at_mode] < 0.1
 
 
+@pytest.mark.process
 @pytest.mark.further
 def test_a_session_and_its_document_give_the_same_model(simulated, analyze, tmp_path):
     written = tmp_path / "results.json"
@@ -505,6 +508,7 @@ save("-v7", "out.mat", "y", "names", "count");
 """
 
 
+@pytest.mark.process
 def test_octave_reads_it(exported, export, tmp_path):
     octave = shutil.which("octave-cli")
     if octave is None:

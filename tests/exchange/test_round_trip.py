@@ -23,6 +23,8 @@ from analysis.paper import analyse, estimate
 from analysis.record import load_record
 from rigd.session import read_session
 
+pytestmark = pytest.mark.process
+
 FIELDS = tuple(QUANTITIES)
 SI = {"angle": "rad", "torque": "N.m", "force": "N"}
 SETTINGS = WelchSettings(types=("I",), weightings=("const",), segment_length=6000, nfft=20_000)
@@ -83,6 +85,7 @@ def test_what_was_exported_is_imported_as_it_was(
         assert after.metadata[key] == before.metadata[key]
 
 
+@pytest.mark.fit
 def test_an_imported_record_is_analysed_as_the_session_itself(simulated, specimen, tmp_path):
     record = load_record(simulated)
     export_record(simulated, tmp_path / "a.csv")

@@ -106,6 +106,7 @@ def test_a_steady_sine_tells_of_the_stiffness_in_closed_form():
     assert (longer - shorter) / 10.0 == pytest.approx(per_s, rel=0.03)
 
 
+@pytest.mark.fit
 def test_it_predicts_what_a_fit_states():
     angle = scan()
     torque = moved(angle, ESTIMATE)

@@ -140,6 +140,7 @@ def test_what_is_no_plain_file_is_refused(tmp_path):
         read_modes(tmp_path / "pipe")
 
 
+@pytest.mark.process
 @pytest.mark.further  # its plan is tested below
 def test_a_session_is_run_and_says_what_it_did(document, tmp_path):
     command = [sys.executable, "-m", "rigd", "run", "modes", str(document()), "--fast", "--json"]
@@ -154,6 +155,7 @@ def test_a_session_is_run_and_says_what_it_did(document, tmp_path):
     assert metadata["duration_s"] == "14.0"
 
 
+@pytest.mark.process
 def test_the_command_refuses_in_one_sentence(tmp_path):
     command = [sys.executable, "-m", "rigd", "run", "modes", str(tmp_path / "no.json"), "--fast"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)

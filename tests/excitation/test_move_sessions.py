@@ -86,6 +86,7 @@ def test_a_move_is_run_once(profile, tmp_path):
         Series(profile, made, tmp_path, repeat=2)
 
 
+@pytest.mark.process
 def test_a_move_through_the_engine_leaves_nothing_that_rings(rigd, tmp_path):
     """Friction, noise and quantisation included, against the quintic of the same time."""
     options = ("--fast", "--seed", "1", "--json", "--ring-down", "3", "--output", tmp_path)
@@ -114,6 +115,7 @@ def amplitude_nm(samples, first, hz):
     return 2 * abs(np.mean((torque - torque.mean()) * wave))
 
 
+@pytest.mark.process
 def test_a_move_with_an_identified_tip_mass_leaves_what_its_plan_states(rigd, analysed, tmp_path):
     """The rig has 0.3 g at its tip, of which its profile knows nothing and the model does."""
     heavy = write_profile(tmp_path, {"simulation.tip_mass_kg": 3e-4})

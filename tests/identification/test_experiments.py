@@ -122,6 +122,7 @@ def test_other_metadata_hold_no_layout(profile, change):
     assert read_layout(changed) is None
 
 
+@pytest.mark.process
 def test_a_session_counts_once(short_chirps, tmp_path, monkeypatch):
     monkeypatch.setattr(_records, "_passes", lambda *_: ([], 0))
     copied = tmp_path / "copied.mcap"

@@ -25,6 +25,8 @@ from rigd.identification.experiments import (
 )
 from rigd.profile import load_profile
 
+pytestmark = pytest.mark.fit
+
 OPTIONS = {"torque_percent": 40.0, "stroke_rad": 0.8}
 
 

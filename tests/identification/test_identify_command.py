@@ -25,6 +25,7 @@ def pasted(text, toml):
     return "\n".join(lines)
 
 
+@pytest.mark.process
 @pytest.mark.further  # as test_identified_motors.py, without processes
 def test_from_the_rig_to_lines_for_its_profile(rigd, tmp_path):
     done = rigd(
@@ -114,6 +115,7 @@ def test_wrong_use(rigd_here, tmp_path, options, code, words):
     assert not list(tmp_path.rglob("*.mcap*"))
 
 
+@pytest.mark.process
 def test_a_session_of_another_kind_is_refused(rigd_here, short_chirps):
     done = rigd_here("identify", "motor", "--from", short_chirps[0])
     assert done.returncode == 1

@@ -16,6 +16,8 @@ from rigd.identification.estimate import (
     estimate_motor,
 )
 
+pytestmark = pytest.mark.fit
+
 RATE_HZ = 1000.0
 STEPS = 5
 """A tick: delays are whole numbers of steps of 0.2 ms."""

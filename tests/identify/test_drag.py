@@ -12,6 +12,8 @@ from analysis.identify.drag_torque import HALF_DENSITY
 from analysis.models import STRUCTURES
 from rigd.beam import mode_shape
 
+pytestmark = pytest.mark.fit
+
 NOISE_NM = 5e-3
 DRAG_M = 2.3e-3
 

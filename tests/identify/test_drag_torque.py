@@ -11,6 +11,8 @@ from analysis.identify.drag_torque import DragError, DragLaw, DragResponse
 from analysis.identify.free_decay import mode_poles
 from rigd.beam import Beam, Damping
 
+pytestmark = pytest.mark.fit
+
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 RATE_HZ = 1000.0
 ROD_M = 2e-3

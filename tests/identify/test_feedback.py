@@ -80,6 +80,7 @@ def test_nothing_follows_a_reference_that_stands_still():
     assert not following(np.ones(500), np.zeros(500), 125.0).any()
 
 
+@pytest.mark.fit
 @pytest.mark.further  # as a hum that does
 def test_noise_that_moves_the_motor_is_no_response(sessions, controlled):
     """Against the same noise in the torque alone, which leaves nothing to chance."""
@@ -105,6 +106,7 @@ def test_a_reference_may_end_anywhere():
     assert np.abs(found - follows)[-125:].max() < 0.01 * follows[-1]
 
 
+@pytest.mark.fit
 def test_a_drift_does_not_keep_the_reference_from_being_followed(controlled):
     measured = controlled("III", 2)
     drift = np.linspace(0.0, 0.2, measured.angle_rad.size)
@@ -112,6 +114,7 @@ def test_a_drift_does_not_keep_the_reference_from_being_followed(controlled):
     assert comparison.coherent_rad() is not comparison.angle_rad
 
 
+@pytest.mark.fit
 def test_unknown_torques_do_not_count_under_a_controller_either(controlled):
     unknown = np.concatenate([np.arange(20_000, 20_050), np.arange(40_000, 60_000, 100)])
     every = fit(controlled("III", 5), "III")
@@ -121,6 +124,7 @@ def test_unknown_torques_do_not_count_under_a_controller_either(controlled):
             assert abs(found.parameters[name] - every.parameters[name]) < 0.3 * std, name
 
 
+@pytest.mark.fit
 def test_a_reference_that_does_not_explain_the_angle_is_not_believed(sessions, references):
     measured = sessions("III").measured()
     other = np.random.default_rng(0).normal(size=measured.angle_rad.size)
@@ -132,6 +136,7 @@ def test_a_reference_that_does_not_explain_the_angle_is_not_believed(sessions, r
     assert comparison.following_reference(plant) is not comparison
 
 
+@pytest.mark.fit
 def test_between_the_lines_of_a_multisine_there_is_noise_only(controlled, true_parameters):
     """It moves the motor there too: no response, no hum, and no other structure."""
     measured = controlled("VI", 7, multisine=True)
@@ -145,6 +150,7 @@ def test_between_the_lines_of_a_multisine_there_is_noise_only(controlled, true_p
             assert abs(deviates(seventh, name, value)) < 3.0, name
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize("hum", [(16.011, 5e-3), further((16.08, 2e-2))])
 def test_a_hum_on_a_mode_that_moves_the_motor_is_no_response(controlled, hum):
     quiet = fit(controlled("VI", 5), "VI")
@@ -184,6 +190,7 @@ def in_narrow_bands():
     )
 
 
+@pytest.mark.fit
 def test_a_first_wrong_beam_does_not_decide_what_followed_no_reference(in_narrow_bands):
     """What rings turns the motor in far narrower bands than its following is smoothed over."""
     found = select(in_narrow_bands)
@@ -195,6 +202,7 @@ def test_a_first_wrong_beam_does_not_decide_what_followed_no_reference(in_narrow
         assert abs(ratio.value + pole.real / abs(pole)) < 4 * ratio.std
 
 
+@pytest.mark.fit
 def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
     unknown = np.arange(30_000, 30_050)
     measured = controlled("III", 1, unknown_torque=unknown)
@@ -216,6 +224,7 @@ def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
     assert comparison.renewed(plant, found.noise) is comparison
 
 
+@pytest.mark.fit
 def test_what_rings_in_narrow_bands_is_followed_with_the_torque_it_makes(in_narrow_bands):
     loaded = LoadedBeam(LINK, DAMPED, tip_mass_kg=1.8e-4)
     plant = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4)

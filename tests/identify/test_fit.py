@@ -11,6 +11,8 @@ from analysis.models import STRUCTURES
 from analysis.optimizer import descend
 from rigd.beam import Beam, Damping, modes
 
+pytestmark = pytest.mark.fit
+
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 OTHER = Beam(0.98, 4.7e-3 * 1.01 * 1.02, 0.090275 * 1.02)
 """rho/EI off by 1 %, EI by 2 %."""

@@ -77,6 +77,7 @@ def assert_gradient(spectra, some):
         assert gradient[k] == pytest.approx(numeric, rel=1e-5, abs=1e-5)
 
 
+@pytest.mark.fit
 def test_spectra_of_decays_that_begin_within_a_filtered_record(decimation):
     rate_hz, begin = 1000.0, 2345
     inside = decimation.inside(7000)

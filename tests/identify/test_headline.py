@@ -38,12 +38,14 @@ def test_the_first_flag_stays():
     assert (told.value, told.std, told.interval_95) == (0.98, 0.01, (0.96, 1.0))
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize(("doubt", "status"), [(None, "fractional"), ("it rains", "open")])
 def test_a_doubt_leaves_an_order_open(candidates, doubt, status):
     found = order_verdict(candidates(Fitted("VI", 0.0, -71.0)), ALPHA, (1, 2, 3), doubt=doubt)
     assert (found.status, found.reason) == (status, doubt)
 
 
+@pytest.mark.fit
 def test_what_fixes_an_order_that_is_excluded_is_excluded_with_it(candidates):
     """By all that it lacks, type III would still do: two orders at once may cost more than one."""
     rig = candidates(Fitted("VI", 0.0, -71.0), Fitted("III", -1.0, -58.0, parameters=6))

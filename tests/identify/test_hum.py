@@ -16,6 +16,8 @@ from analysis.identify.noise import noise_of
 from analysis.models import STRUCTURES
 from rigd.beam import Damping
 
+pytestmark = pytest.mark.fit
+
 MODE_2_HZ = 16.011
 NOISE_NM = 1e-2
 

@@ -82,6 +82,7 @@ def test_a_knock_with_torque_missing(knocked, plants, link):
     assert told(headline, plants, link) < 4
 
 
+@pytest.mark.fit
 def test_the_whole_judgement_says_so(knocked):
     verdict = select(knocked(1.0, 30.0).measured(NOISE_NM, 1)).verdict
     assert verdict.adequate
@@ -91,6 +92,7 @@ def test_the_whole_judgement_says_so(knocked):
     assert finding.sentence in verdict.sentences
 
 
+@pytest.mark.fit
 def test_noise_and_a_disturbed_sensor_are_no_knock(plain, freest_of):
     for seed in range(3):
         assert knock_in(freest_of(plain.measured(NOISE_NM, seed))) is None

@@ -6,6 +6,8 @@ import pytest
 from analysis.identify import Comparison, Measurement, Plant
 from analysis.identify._nonlinear import ModalForces, Term
 
+pytestmark = pytest.mark.fit
+
 MODE_1 = Term("cubic stiffness", 1)
 
 

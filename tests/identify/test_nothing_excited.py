@@ -8,6 +8,8 @@ import pytest
 from analysis.models import WelchSettings
 from analysis.paper import FrequencyResponseError, analyse
 
+pytestmark = pytest.mark.fit
+
 
 @pytest.mark.parametrize(
     ("metadata", "angle_rad", "words"),

@@ -12,6 +12,8 @@ from analysis.identify import Measurement, fit_record
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
+pytestmark = pytest.mark.fit
+
 RATE_HZ = 500.0
 FREQUENCY_HZ, DAMPING_RATIO = 18.556, 0.00523
 DELAY_S = 0.69e-3

@@ -20,6 +20,7 @@ def link():
     return Beam(0.98, 4.7e-3, 0.090275)
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize(
     "more", [{}, {"delay_s": 3e-4, "tool_inertia_kg_m2": 1e-5}, {"offsets": OFFSETS}]
 )
@@ -63,6 +64,7 @@ def test_derivatives(plant, name):
     assert np.abs((after - before) / (2 * step) - analytic).max() < 1e-6 * np.abs(analytic).max()
 
 
+@pytest.mark.fit
 def test_between_the_samples_it_is_the_same(plant, decimation):
     noise = np.random.default_rng(1).normal(size=3200)
     angle = decimation.apply(noise)

@@ -8,6 +8,8 @@ from analysis.identify.parametrization import NEXT_TO_NOTHING, Steps, Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 
+pytestmark = pytest.mark.fit
+
 NOMINAL = Plant(Beam(0.98, 4.7e-3, 0.090275), Damping())
 
 

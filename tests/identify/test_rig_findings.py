@@ -15,6 +15,8 @@ from analysis.identify._time_varying import along_time
 from analysis.identify.headline import MISREAD
 from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues
 
+pytestmark = pytest.mark.fit
+
 RATE_HZ = 500.0
 TICKS = 45_000
 LINK = Beam(0.98, 4.7e-3, 0.090275)

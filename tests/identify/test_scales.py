@@ -88,6 +88,7 @@ def fits(sessions):
     return tuple(found)
 
 
+@pytest.mark.fit
 def test_fits_to_scaled_data_go_with_the_scales(fits):
     right, wrong = fits
     expected = scaled(right.parameters, TORQUE_SCALE, LENGTH_SCALE)
@@ -134,6 +135,7 @@ def test_intervals_include_the_scales_in_quadrature():
     assert with_scales(parameters, {"density": 0.1}) == {}
 
 
+@pytest.mark.fit
 def test_intervals_with_scales_hold_the_truth(fits):
     """Scales that are off by their standard uncertainties, which noise alone never is."""
     _, wrong = fits
@@ -157,6 +159,7 @@ def test_intervals_with_scales_hold_the_truth(fits):
         assert not narrow_low <= value <= narrow_high, name
 
 
+@pytest.mark.fit
 def test_what_is_held_fixed_does_not_make_up_for_a_scale(sessions):
     measurement = sessions("III").measured(noise_nm=1e-2, seed=1)
 
@@ -169,6 +172,7 @@ def test_what_is_held_fixed_does_not_make_up_for_a_scale(sessions):
     assert not scales_absorbed(fixed("density_over_stiffness"))
 
 
+@pytest.mark.fit
 def test_the_stated_density_checks_the_scales(fits):
     right, wrong = fits
     uncertainty = {"torque_scale": 0.005, "length": 0.001, "density": 0.003}

@@ -12,6 +12,8 @@ from analysis.models import STRUCTURES, Structure
 from rigd.beam import Beam, LoadedBeam, clamped_free_eigenvalues
 from rigd.session import Validity
 
+pytestmark = pytest.mark.fit
+
 OTHER = Beam(0.98, 4.7e-3 * 1.01 * 1.02, 0.090275 * 1.02)
 """rho/EI off by 1 %, EI by 2 %."""
 

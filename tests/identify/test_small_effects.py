@@ -5,6 +5,8 @@ import pytest
 
 from analysis.identify import select
 
+pytestmark = pytest.mark.fit
+
 RATE_HZ = 1000.0
 NOISE_NM = 5e-3
 

@@ -10,6 +10,8 @@ from analysis.identify._modal_fit import fit_modes
 from analysis.identify._step_in_time import step_score
 from rigd.beam import clamped_free_eigenvalues
 
+pytestmark = pytest.mark.fit
+
 PERIOD_S = 1e-3
 AT_S, CHANGE = 21.0, -0.004
 

@@ -7,6 +7,8 @@ from analysis.identify.profile_likelihood import LikelihoodProfile, profiled
 from analysis.identify.sentences import order as order_sentence
 from analysis.identify.verdict import order_verdict
 
+pytestmark = pytest.mark.fit
+
 
 @pytest.fixture(scope="module")
 def without_delay(steps, candidates_of):

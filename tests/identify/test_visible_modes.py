@@ -11,6 +11,8 @@ from analysis.identify.noise import NoiseSpectrum
 from analysis.identify.sentences import experiments
 from analysis.models import STRUCTURES
 
+pytestmark = pytest.mark.fit
+
 STRONG_NM = 0.05
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from cases import further
 
+pytestmark = pytest.mark.process
+
 HERE = Path(__file__).parent
 
 

@@ -16,6 +16,8 @@ from rigd.live._server import free_port
 from rigd.live.address import LiveAddress, announce, find, running, withdraw
 from rigd.runtime.addresses import runtime_folder
 
+pytestmark = pytest.mark.process
+
 
 @pytest.fixture
 def address(runtime_folder):

@@ -7,6 +7,8 @@ import pytest
 from rigd.engine.shared_state import StateField
 from rigd.live.publisher import POLL_S, Backlog, Vitals
 
+pytestmark = pytest.mark.process
+
 
 def drawing(name):
     return partial(str, name)

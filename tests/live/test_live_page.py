@@ -12,6 +12,8 @@ from processes import sockets
 
 from rigd.live._page import ViewerPageServer, confine_to_loopback
 
+pytestmark = pytest.mark.process
+
 
 def get(port: int, path: str, host: str | None = None):
     """Ask the publisher's page server, as a browser does."""

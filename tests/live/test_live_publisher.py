@@ -20,6 +20,8 @@ from rigd.engine.shared_state import StateField
 from rigd.live.address import LiveAddress, find
 from rigd.live.messages import LiveFit, LiveJob
 
+pytestmark = pytest.mark.process
+
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
 IMPATIENT = "from rigd.live import publisher; publisher._WAITING_S = 1.0"
 

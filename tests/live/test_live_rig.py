@@ -22,6 +22,8 @@ from rigd.runner.session import SessionFailedError
 from rigd.runtime import StopRequest
 from rigd.session import read_session
 
+pytestmark = pytest.mark.process
+
 
 @pytest.fixture
 def rig(write_profile, runtime_folder, monkeypatch):

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
+pytestmark = pytest.mark.process
+
 
 def run_session(publisher, name: str) -> tuple[int, int]:
     """Make the producer's next quarter of a second a separate session.

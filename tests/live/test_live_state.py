@@ -25,6 +25,8 @@ from rigd.view.banner import (
 )
 from rigd.view.frequency_charts import LastResponse
 
+pytestmark = pytest.mark.process
+
 PERIOD_S = 1 / 15
 """Between two looks at the board, of a publisher that shows a session."""
 

@@ -11,6 +11,8 @@ from processes import eventually, sockets
 from rigd.live import Viewer
 from rigd.live.address import LiveAddress
 
+pytestmark = pytest.mark.process
+
 
 @pytest.fixture
 def viewer(publisher, tmp_path):

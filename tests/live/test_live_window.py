@@ -23,6 +23,8 @@ from processes import eventually
 from rigd.view import plots
 from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
 
+pytestmark = pytest.mark.process
+
 PICTURES = os.environ.get("RIGD_PICTURES")
 # A ring-down that is longer than a busy computer needs for looking at everything.
 SESSION = (

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.process
+
 PROJECT = Path(__file__).resolve().parents[2]
 SHIPPED = sorted(path.name for path in (PROJECT / "hw_profiles").glob("*.toml"))
 

@@ -14,6 +14,8 @@ from analysis.models import STRUCTURES, FrequencyResponseModel, WeightingError, 
 from analysis.paper import fit_frf, fit_many
 from rigd.beam import TransferGrid
 
+pytestmark = pytest.mark.fit
+
 WEIGHTINGS = ("const", "omega")
 SOME = [name if name in ("I", "VI") else further(name) for name in STRUCTURES]
 """Structures of tests that are run each time for the simplest and the freest."""

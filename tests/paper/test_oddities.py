@@ -92,17 +92,20 @@ def found(session, link):
     return paper_route(h1, link, ["I", "III", "IV", "VI"])
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize("name", ["I", "IV"])
 def test_internal_damping_alone_is_many_times_larger_with_omega_weights(found, name):
     assert 4 < found[name, "omega"]["zeta"] / found[name, "const"]["zeta"] < 20
 
 
+@pytest.mark.fit
 def test_type_iii_hardly_depends_on_the_weights(found):
     const, omega = found["III", "const"], found["III", "omega"]
     assert omega["zeta"] / const["zeta"] == pytest.approx(1.0, abs=0.2)
     assert omega["gamma"] / const["gamma"] == pytest.approx(1.0, abs=0.3)
 
 
+@pytest.mark.fit
 def test_stiffness_offsets_are_read_as_a_fractional_order(found, session, link):
     assert found["VI", "const"]["alpha"] > 1.25
     assert found["VI", "const"]["zeta"] < INTEGER.zeta / 3
@@ -127,6 +130,7 @@ def test_the_first_peak_saturates(session, link):
     assert min(welch_hz) > 0.9 * max(welch_hz)
 
 
+@pytest.mark.fit
 def test_the_first_mode_s_damping_is_the_window_s(session, link):
     damping = Damping(INTEGER.zeta, 1.0, INTEGER.gamma * 0.1, INTEGER.lambda_)
     true = modes(link, damping, 1)[0].damping_ratio

@@ -9,6 +9,8 @@ from analysis.record import load_record
 from rigd.beam import transfer
 from rigd.spectral import Segmentation
 
+pytestmark = pytest.mark.fit
+
 
 def test_the_paper_s_settings_and_grid(paper_analysis):
     response = paper_analysis.response

@@ -78,6 +78,7 @@ def test_a_recovery_whose_name_is_taken_is_offered_with_what_has_to_go_first(tor
     assert f"`rigd recover {torn}`, once {taken}, which may hold it already, is moved away" in said
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("name", ["a.mcap", "an antenna_1.mcap"])
 def test_what_is_kept_beside_a_name_that_was_taken_can_be_recovered_as_told(
     torn, tmp_path, run, name

@@ -17,6 +17,7 @@ def hostile(load_script):
     return load_script("fuzz_hostile")
 
 
+@pytest.mark.process
 @pytest.mark.further  # the worst kinds are below
 def test_a_file_of_each_hostile_kind_and_as_many_damaged_ones(hostile):
     """In a separate process, which forks for each command: this one is large, and has threads."""
@@ -46,6 +47,7 @@ sys.exit("".join(wrong) or 0)
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("kinds", "scale", "megabytes"),
     [

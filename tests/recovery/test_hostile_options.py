@@ -42,6 +42,7 @@ HOSTILE = (
 )
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize(("program", "name", "code"), HOSTILE, ids=[name for _, name, _ in HOSTILE])
 def test_a_hostile_file_is_refused_in_few_words(
     options, tmp_path, rigd_here, analyze_here, program, name, code
@@ -76,6 +77,7 @@ def test_a_hostile_value_is_refused_in_few_words(rigd_here, arguments):
     assert done.stderr.replace("\n", "").isprintable()
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize("value", ["0,1e308", "nan,nan", "1e308,0", "0," + "9" * 5000])
 def test_a_hostile_interval_of_an_import(analyze_here, options, tmp_path, value):
     ground = options.Ground(tmp_path)
@@ -89,6 +91,7 @@ def test_a_hostile_interval_of_an_import(analyze_here, options, tmp_path, value)
     assert len(done.stderr) < 3000
 
 
+@pytest.mark.process
 @pytest.mark.slow  # half an hour: every case, and what each takes
 def test_all_cases(options):
     done = subprocess.run(

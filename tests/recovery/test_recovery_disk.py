@@ -63,6 +63,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", "--lazy", folder], check=True)
 
 
+@pytest.mark.process
 def test_a_full_disk_keeps_what_was_recorded(small_disk, tmp_path):
     writer = begun(small_disk / "a.mcap")
     count, message = fill(writer)
@@ -78,6 +79,7 @@ def test_a_full_disk_keeps_what_was_recorded(small_disk, tmp_path):
     assert recovered_ticks(elsewhere) in (list(range(count)), list(range(count + 250)))
 
 
+@pytest.mark.process
 def test_a_disk_that_cannot_be_written_is_refused_before_anything_moves(small_disk):
     subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
     with pytest.raises(SessionError, match=r"cannot be written: Read-only file system\. Check"):
@@ -186,6 +188,7 @@ CHILD = """
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     "rate_hz", [1000.0, *(pytest.param(hz, marks=pytest.mark.further) for hz in (100.0, 8000.0))]
 )

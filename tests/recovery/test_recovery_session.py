@@ -13,6 +13,8 @@ import pytest
 
 from rigd.session import read_session, recover
 
+pytestmark = pytest.mark.process
+
 RIGD = Path(sys.executable).parent / "rigd"
 
 

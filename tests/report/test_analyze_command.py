@@ -44,6 +44,7 @@ def session(paper_file, tmp_path):
     return shutil.copy(paper_file, tmp_path / "session.mcap")
 
 
+@pytest.mark.process
 def test_one_session_from_end_to_end(session, tmp_path):
     result = run(session.name, "--json", "fits.json", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
@@ -82,6 +83,7 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert len([m for m in content["modes"] if m["estimator"] == "record"]) == 3
 
 
+@pytest.mark.process
 def test_json_on_standard_output_is_alone_there(session, tmp_path):
     named = session.rename(tmp_path / "ζ.mcap")
     result = run(
@@ -101,6 +103,7 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path):
     assert (tmp_path / "out" / "figures" / "welch_signals.png").exists()
 
 
+@pytest.mark.fit
 @pytest.mark.further  # as in a campaign
 def test_several_files_with_one_that_fails(session, tmp_path, analyze_here):
     shutil.copy(session, tmp_path / "other.mcap")
@@ -148,6 +151,7 @@ def broken_file(kind, path, good):
         path.mkdir()
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize(
     "kind", ["missing", "empty", "no container", "truncated", "magic only", "foreign", "a folder"]
 )
@@ -159,12 +163,14 @@ def test_a_file_that_is_no_session_is_refused(paper_file, tmp_path, analyze_here
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize("folder", [".", "/", ""])
 def test_a_folder_in_place_of_a_file_is_refused(tmp_path, analyze_here, folder):
     refused(analyze_here(folder), 1, folder)
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.fit
 def test_a_session_too_short_for_the_segments_says_what_fits(
     write_session, short_signals, tmp_path, analyze_here
 ):
@@ -175,6 +181,7 @@ def test_a_session_too_short_for_the_segments_says_what_fits(
     refused(analyze_here("a.mcap", "--segment", "5000"), 1, "4000 samples", "5000")
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize("field", ["angle_rad", "torque_nm"])
 def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, analyze_here, field):
     values = getattr(short_signals, field).copy()
@@ -183,6 +190,7 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, an
     refused(analyze_here("a.mcap"), 1, "a.mcap", field, "tick 77")
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -229,10 +237,12 @@ def test_wrong_options_are_refused(session, tmp_path, analyze_here, options, wor
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.process
 def test_no_file_is_wrong_use(tmp_path):
     refused(run(cwd=tmp_path), 2, "FILE")
 
 
+@pytest.mark.fit
 def test_nothing_that_exists_is_overwritten(session, tmp_path, analyze_here):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "frf.png").write_text("mine")
@@ -244,11 +254,13 @@ def test_nothing_that_exists_is_overwritten(session, tmp_path, analyze_here):
     assert not (tmp_path / "session.report").exists()
 
 
+@pytest.mark.fit
 def test_a_report_that_cannot_be_written_is_refused(session, tmp_path, analyze_here):
     (tmp_path / "file").write_text("")
     refused(analyze_here(session.name, *QUICK, "--report", "file/out"), 1, "file/out")
 
 
+@pytest.mark.process
 def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "analysis", *([session.name] * 60),
@@ -287,6 +299,7 @@ def run_as_is(module, cwd):
     return result.returncode, result.stdout, result.stderr
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     "body",
     [
@@ -304,11 +317,13 @@ def test_ctrl_c_inside_what_python_does_itself_ends_with_130_too(tmp_path, body)
     assert run_as_is("stopped", tmp_path) == (130, "", "Stopped.\n")
 
 
+@pytest.mark.process
 def test_ctrl_c_while_it_is_being_imported_ends_with_130_and_without_traceback(tmp_path):
     (tmp_path / "typer.py").write_text(CTRL_C.format(30))
     assert run_as_is("analysis", tmp_path) == (130, "", "")
 
 
+@pytest.mark.process
 def test_ctrl_c_while_options_are_made_ready_ends_with_130_and_without_traceback(tmp_path):
     (tmp_path / "early.py").write_text(
         "import analysis.cli.app\n"
@@ -340,6 +355,7 @@ def test_a_folder_stands_for_the_sessions_in_it(tmp_path, monkeypatch):
     assert asked == [of_folder[1:], of_folder, [Path("first.mcap"), *of_folder]]
 
 
+@pytest.mark.fit
 @pytest.mark.further  # as test_folder.py
 def test_a_second_look_replaces_the_first_and_nothing_else(session, tmp_path, analyze_here):
     look = (session.name, "--json", "fits.json", "--report", "out", "--overwrite")
@@ -359,6 +375,7 @@ def test_a_second_look_replaces_the_first_and_nothing_else(session, tmp_path, an
     refused(analyze_here(*look, *quick), 2, "fits.json", "does not hold results")
 
 
+@pytest.mark.process
 def test_help_has_an_example_and_the_choices(tmp_path):
     result = run("--help", cwd=tmp_path)
     assert result.returncode == 0
@@ -366,6 +383,7 @@ def test_help_has_an_example_and_the_choices(tmp_path):
         assert word in result.stdout
 
 
+@pytest.mark.process
 def test_help_and_wrong_options_import_nothing_heavy(tmp_path):
     code = (
         "import sys, analysis.cli.app; "

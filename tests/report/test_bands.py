@@ -9,6 +9,8 @@ from analysis.identify import LOGARITHMIC
 from analysis.report.bands import loss_factors, response_band
 from rigd.beam import Beam, Damping, transfer
 
+pytestmark = pytest.mark.fit
+
 FREQUENCY_HZ = np.array([1.0, 2.5, 2.57, 8.0, 11.3, 16.01, 30.0, 44.8])
 
 

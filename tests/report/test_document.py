@@ -7,6 +7,8 @@ import pytest
 from analysis.report import document, document_text
 from analysis.results import RecordResult
 
+pytestmark = pytest.mark.fit
+
 
 def by_welch(analysis):
     return RecordResult(analysis.record, welch=analysis)

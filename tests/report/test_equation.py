@@ -10,6 +10,8 @@ from matplotlib.mathtext import MathTextParser
 from analysis.models import STRUCTURES
 from analysis.report._equation import definitions, equations, latex, mathml, types_table
 
+pytestmark = pytest.mark.fit
+
 
 @pytest.fixture
 def told(record_result):

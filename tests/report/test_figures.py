@@ -35,6 +35,7 @@ def count(image, colour):
     return int((np.abs(image - wanted).max(axis=2) <= 12).sum())
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize(
     ("draw", "colours"),
     [
@@ -58,6 +59,7 @@ def test_a_figure_shows_its_lines(paper_analysis, tmp_path, draw, colours):
     assert image[:, [0, -1]].min() == 255
 
 
+@pytest.mark.fit
 def test_colours_tell_what_they_show(paper_analysis, tmp_path):
     """Without the fits with omega weights, no dashed line of their colour is left."""
     fits = tuple(m for m in paper_analysis.models if m.fit.weighting == "const")
@@ -72,6 +74,7 @@ def test_colours_tell_what_they_show(paper_analysis, tmp_path):
     assert count(image, style.VERMILION) == 0
 
 
+@pytest.mark.fit
 def test_one_panel_a_type(paper_analysis):
     with style.styled():
         figure = frf_figure(paper_analysis)
@@ -87,6 +90,7 @@ def test_one_panel_a_type(paper_analysis):
     assert [len(line.get_xdata()) > 100 for line in lines[:4]] == [True] * 4
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize(
     ("types", "weightings", "estimator"),
     [
@@ -105,6 +109,7 @@ def test_any_choice_of_types_and_weightings_can_be_drawn(
     assert len(figure.legends[0].get_texts()) == len(weightings) + (1 if estimator == "fft" else 2)
 
 
+@pytest.mark.fit
 def test_the_torque_of_the_true_structure_is_followed(paper_analysis):
     assert best_model(paper_analysis).fit.structure.name == "VI"
     with style.styled():
@@ -115,6 +120,7 @@ def test_the_torque_of_the_true_structure_is_followed(paper_analysis):
     assert np.abs(residual).max() < 0.15 * np.abs(measured).max()
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize("draw", [paper_signals_figure, frf_figure, torque_figure])
 def test_no_figure_has_the_name_of_a_file(paper_analysis, draw):
     with style.styled():
@@ -188,6 +194,7 @@ def test_an_envelope_keeps_extremes_and_bounds_the_points():
     assert len(same_y) == 50
 
 
+@pytest.mark.fit
 def test_a_picture_is_never_overwritten(paper_analysis, tmp_path):
     target = tmp_path / "a.png"
     target.write_bytes(b"mine")
@@ -223,6 +230,7 @@ def test_labels_of_a_logarithmic_axis_stand_apart(span, height_in):
 MODES_HZ = np.array([2.5537, 16.003, 44.810])
 
 
+@pytest.mark.fit
 def test_each_mode_has_a_stretch_round_the_moment_the_chirp_passes_it(paper_analysis):
     record = paper_analysis.record
     moments = resonance_moments(record, 3)
@@ -241,6 +249,7 @@ def test_each_mode_has_a_stretch_round_the_moment_the_chirp_passes_it(paper_anal
         assert (times_s[0], times_s[-1]) == (moment.first_s, moment.last_s)
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize("draw", [paper_signals_figure, torque_figure])
 def test_marks_have_the_numbers_and_the_extent_of_the_enlargements(paper_analysis, draw):
     with style.styled():
@@ -258,6 +267,7 @@ def test_marks_have_the_numbers_and_the_extent_of_the_enlargements(paper_analysi
     assert len(whole.patches) == 3
 
 
+@pytest.mark.fit
 def test_the_fit_in_per_cent_is_that_of_the_torque_in_time(record_result):
     """The same number from signals: measured against predicted torque, without their means."""
     whole = record_result.whole

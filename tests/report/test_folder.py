@@ -93,6 +93,7 @@ def contents(folder):
     }
 
 
+@pytest.mark.process
 def test_a_report_lists_its_files_as_sha256sum_does(tmp_path):
     out = tmp_path / "out"
     write_report(out, overwrite=False, a="1", sub_in_b="2")

@@ -110,6 +110,7 @@ def in_turn(count):
     return repeated(message(1) + message(2), count, 8)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("parts", "message_", "share"),
     [

@@ -6,6 +6,8 @@ import sys
 import pytest
 from cases import further
 
+pytestmark = pytest.mark.process
+
 PAGES = ("jinja2", "analysis.report._page")
 ASK = "import sys; from analysis.report import {names}; print(*sys.modules)"
 

@@ -32,6 +32,7 @@ def body(source):
     return [line.strip() for line in inside.strip().splitlines()]
 
 
+@pytest.mark.fit
 def test_tables_of_a_report_hold_what_the_page_shows(record_result):
     modes, tables, of_paper = report_tables(record_result)
     for table in (modes, *tables, *of_paper):
@@ -65,6 +66,7 @@ def test_a_column_without_an_entry_is_left_out():
     assert "A & Remark" in latex_table(filled)
 
 
+@pytest.mark.fit
 def test_modes_and_parameters_are_written(report, record_result):
     modes, (_sizes, parameters, *_others), _ = report_tables(record_result)
     for table in (modes, parameters):

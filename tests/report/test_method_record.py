@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from analysis.cli.app import app
 
-pytestmark = pytest.mark.fit  # by the command, which plugins/kinds_of_tests does not follow
+pytestmark = pytest.mark.fit
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,8 @@ from analysis.report import FIGURES, document, illustrations
 from analysis.report.folder import OutputExistsError
 from analysis.report.record_report import record_page, report_tables, write_report
 
+pytestmark = pytest.mark.fit
+
 WITHOUT_TEST = [name for name in FIGURES if name != "uniform_beam"]
 """Figures of a record without a test of uniformity, as that of these tests."""
 
@@ -127,6 +129,7 @@ def test_it_is_readable_without_sight_and_on_paper(source, read_page):
     assert "prefers-color-scheme: dark" in source
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not shutil.which("chromium"), reason="no browser to print with")
 def test_on_paper_no_page_is_half_empty(report, tmp_path):
     """All of it fits on six pages; with a break before every part it takes nine."""

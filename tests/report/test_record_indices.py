@@ -9,6 +9,8 @@ from analysis.paper import fit_indices
 from analysis.report import document
 from rigd.beam import transfer
 
+pytestmark = pytest.mark.fit
+
 
 def indices_of_selected(result):
     """The indices of the selected fit in the document: of Welch's response, of the whole record."""

@@ -16,6 +16,8 @@ from analysis.report.bands import excited_band_hz, supported_band_hz
 from analysis.report.record_report import record_page, report_tables
 from analysis.report.table import MARK, Cell, csv_text, unreported
 
+pytestmark = pytest.mark.fit
+
 ALPHA = frozenset({"alpha"})
 PICTURES = tuple(
     SimpleNamespace(name=name, description="A figure.", source="data:image/png;base64,")

@@ -21,6 +21,8 @@ from rigd.cli.app import app as rigd
 from rigd.session import read_session
 from rigd.spectral import fft_response
 
+pytestmark = pytest.mark.fit
+
 BAND = (0.5875, 50.0)
 
 

@@ -11,6 +11,8 @@ from analysis.report import document
 from analysis.report.record_report import report_tables
 from analysis.results import RecordResult
 
+pytestmark = pytest.mark.fit
+
 ALL = {"torque_scale": 0.005, "length": 0.0005, "density": 0.003}
 
 

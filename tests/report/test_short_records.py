@@ -29,6 +29,7 @@ def cut(write_session, make_signals, tmp_path_factory):
     return make
 
 
+@pytest.mark.fit
 def test_what_there_is_is_reported(cut, analyze_here, tmp_path):
     """A record with fewer bins than tests have neighbours, figures stretches; none at a mode."""
     result = analyze_here(cut(1700), *ONE_FIT, "--report", "r", "--json", "r.json")
@@ -42,6 +43,7 @@ def test_what_there_is_is_reported(cut, analyze_here, tmp_path):
     }  # fmt: skip
 
 
+@pytest.mark.fit
 def test_too_short_for_the_whole_record_is_told(cut, analyze_here):
     result = analyze_here(cut(1200), *ONE_FIT, "--report", "r")
     assert result.returncode == 0
@@ -52,6 +54,7 @@ def test_too_short_for_the_whole_record_is_told(cut, analyze_here):
     assert "1.2 s of record are too short for the band" in alone.stderr
 
 
+@pytest.mark.fit
 def test_a_transform_that_cannot_show_a_mode_is_told(cut):
     settings = WelchSettings(estimator="fft", types=("I",), weightings=("const",))
     (warning,) = (w for w in analyse(load_record(cut(390)), settings).warnings if "resolves" in w)

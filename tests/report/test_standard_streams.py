@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from cases import further
 
+pytestmark = pytest.mark.process
+
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="needs a disk that is always full")
 

@@ -56,6 +56,7 @@ def rows(text, *starts):
     ]
 
 
+@pytest.mark.fit
 def test_the_tables_hold_every_fit_with_its_numbers(paper_analysis, tables_text):
     text = tables_text(paper_analysis)
     for model in paper_analysis.models:
@@ -75,12 +76,14 @@ def test_the_tables_hold_every_fit_with_its_numbers(paper_analysis, tables_text)
     assert "standard deviation" in " ".join(text.split())
 
 
+@pytest.mark.fit
 def test_absent_and_fixed_parameters_are_told_apart(paper_analysis, tables_text):
     text = tables_text(paper_analysis)
     internal_only = rows(text, "I", "const")[0]
     assert internal_only[4:7] == ["1", "–", "–"]
 
 
+@pytest.mark.fit
 def test_warnings_and_parameters_on_the_edge_are_shown(paper_analysis, tables_text):
     model = paper_analysis.models[0]
     edge = replace(model, fit=replace(model.fit, std=None, at_bounds=("zeta",)))
@@ -91,6 +94,7 @@ def test_warnings_and_parameters_on_the_edge_are_shown(paper_analysis, tables_te
     assert "Warning: Mind the gap [b]of[/b] 3 ticks." in text
 
 
+@pytest.mark.fit
 def test_the_summary_is_mean_and_standard_deviation(paper_analysis, as_text):
     model = paper_analysis.models[0]
     others = []
@@ -107,6 +111,7 @@ def modes_rows(text):
     return text, [row[2:] for row in (rows(text, "I", "const")[2], rows(text, "VI", "omega")[2])]
 
 
+@pytest.mark.fit
 def test_modes_that_do_not_vibrate_are_left_out(
     write_session, short_signals, tmp_path, tables_text
 ):
@@ -129,6 +134,7 @@ def test_modes_that_do_not_vibrate_are_left_out(
     )
 
 
+@pytest.mark.fit
 def test_modes_that_left_their_resonance_are_marked(paper_analysis, tables_text):
     text, (first, last) = modes_rows(tables_text(paper_analysis))
     assert "‡" not in text

@@ -13,6 +13,8 @@ from analysis.results import RecordResult
 from rigd.beam.tip import SMALL_SLOPE_RAD, linear_model_error
 from rigd.session import Validity
 
+pytestmark = pytest.mark.fit
+
 NUMBER_OF_DAMPING = re.compile(r"damping|[ζγαλ]|zeta|gamma", re.IGNORECASE)
 
 

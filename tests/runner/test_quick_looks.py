@@ -19,6 +19,8 @@ from rigd.runner.session import RunResult
 from rigd.runtime import processor_use
 from rigd.session.quick_look import quick_look_path
 
+pytestmark = pytest.mark.process
+
 PROGRAM = """
 import json, pathlib, sys, time
 

@@ -28,6 +28,7 @@ def test_the_sensors_serial_number_is_told_if_it_tells_one(metadata_of):
     assert "sensor_serial_number" not in metadata_of({"device": "simulated force-torque sensor"})
 
 
+@pytest.mark.process
 def test_the_commit_is_that_of_the_checkout(metadata_of):
     checkout = Path(__file__).parents[2]
     if not (checkout / ".git").exists():

@@ -17,6 +17,8 @@ from rigd.runner.request import Order
 from rigd.runtime import StopRequest
 from rigd.session import read_session
 
+pytestmark = pytest.mark.process
+
 
 @pytest.fixture
 def profile():

@@ -46,6 +46,7 @@ def test_hardware_is_locked_for_all_users_of_the_computer(runtime_folder, monkey
             pass
 
 
+@pytest.mark.process
 def test_who_holds_a_lock_without_saying_so_is_named_by_the_kernel(runtime_folder):
     with RigLock("antenna", "rigd run", hardware=False) as lock:
         path = lock._file.path

@@ -56,6 +56,7 @@ def make_series(tmp_path):
     return make
 
 
+@pytest.mark.process
 def test_a_series_ends_with_the_first_session_that_does_not_go_well(make_series):
     series = make_series(repeat=4, notes={"operator": "Ada", "note": ""})
     bad = replace(WELL, outcome="fault")
@@ -74,6 +75,7 @@ def test_a_series_ends_with_the_first_session_that_does_not_go_well(make_series)
     ]  # fmt: skip
 
 
+@pytest.mark.process
 def test_a_lone_session_is_not_numbered(make_series):
     rig = Rig(WELL)
     make_series().run(rig, StopRequest(), Watcher(), live=False)
@@ -85,6 +87,7 @@ def test_a_lone_session_is_not_numbered(make_series):
     assert order.path.stem.endswith("-hold")
 
 
+@pytest.mark.process
 def test_the_sessions_of_a_series_derive_their_seeds_from_the_stated_one(make_series):
     def seeds():
         rig = Rig(*[WELL] * 3)
@@ -101,6 +104,7 @@ def test_no_shipped_profile_states_a_seed():
         assert load_profile(name).rig.simulation.seed is None
 
 
+@pytest.mark.process
 def test_after_a_stop_no_session_begins(make_series):
     stop, watcher = StopRequest(), Watcher()
     stop.request()
@@ -108,6 +112,7 @@ def test_after_a_stop_no_session_begins(make_series):
     assert watcher.told == []
 
 
+@pytest.mark.process
 def test_a_disk_that_fills_up_keeps_what_there_is(make_series, tmp_path):
     series = make_series(repeat=3)
 
@@ -146,6 +151,7 @@ class Looks:
         self.told.append("let go")
 
 
+@pytest.mark.process
 def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_series):
     watcher = Watcher()
 
@@ -170,6 +176,7 @@ def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_serie
     assert ends == [("look_follows", True), ("look_follows", True), UNSEEN]
 
 
+@pytest.mark.process
 def test_a_stop_ends_the_wait_for_a_quick_look(make_series):
     watcher, stop = Watcher(), StopRequest()
 
@@ -185,6 +192,7 @@ def test_a_stop_ends_the_wait_for_a_quick_look(make_series):
     assert told == ["begins", "held", "let go", "ended", "look", "watch"]
 
 
+@pytest.mark.process
 def test_no_quick_look_at_a_move_is_begun_and_none_announced(tmp_path):
     profile, watcher = load_shipped("sim"), Watcher()
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)

@@ -39,6 +39,7 @@ def test_hardware_is_named_as_loudly_as_its_simulation(profile, runtime_folder):
     )
 
 
+@pytest.mark.process
 def test_a_simulated_rig_of_another_environment_keeps_the_hardware_from_moving(
     profile, start_simulator, runtime_folder, monkeypatch, tmp_path
 ):
@@ -89,6 +90,7 @@ def test_simulated_rigs_of_other_names_and_dead_ones_are_passed_over(profile, ru
         assert load_rig(profile)[1] is ActuationTarget.HARDWARE
 
 
+@pytest.mark.process
 def test_hardware_cannot_be_asked_for_where_something_stands_in(start_simulator, profile):
     with pytest.raises(RefusedError, match="--hardware: No hardware: sim is simulated"):
         load_rig("sim", hardware=True)

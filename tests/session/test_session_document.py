@@ -73,6 +73,7 @@ def test_the_limits_are_those_of_the_code():
     assert f"up to {limits.MAX_SAMPLES / 1e6:g} million samples" in DOCUMENT
 
 
+@pytest.mark.process
 def test_the_example_writes_a_session(tmp_path):
     (program,) = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)
     assert not re.search(r"import (rigd|numpy)|from rigd", program)

@@ -143,6 +143,7 @@ def test_a_block_that_is_no_whole_number_of_samples_is_refused():
         decode_samples(bytes(120))
 
 
+@pytest.mark.process
 def test_the_control_process_imports_neither_container_nor_protobuf():
     heavy = ("mcap", "google.protobuf", "zstandard", "lz4", "scipy")
     code = (

@@ -11,6 +11,8 @@ import pytest
 
 from rigd.session.layout import SAMPLE_FIELDS, decode_controls
 
+pytestmark = pytest.mark.process
+
 NODE_FILES = Path(__file__).parent / "node"
 
 

@@ -33,6 +33,7 @@ def with_unreadable_samples(path):
     return path
 
 
+@pytest.mark.process
 def test_it_says_what_the_whole_file_says(short_chirps):
     session = read_session(short_chirps[0])
     summary = read_summary(short_chirps[0])
@@ -42,6 +43,7 @@ def test_it_says_what_the_whole_file_says(short_chirps):
     assert (summary.problem, summary.recording) == ("", False)
 
 
+@pytest.mark.process
 def test_an_indexed_file_is_not_read_whole(short_chirps, tmp_path):
     path = tmp_path / "a.mcap"
     path.write_bytes(short_chirps[0].read_bytes())

@@ -153,6 +153,7 @@ CHILD = """
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("after", [100, 2600])
 def test_a_killed_recorder_loses_at_most_250_samples(kit, tmp_path, after):
     path = tmp_path / "a.mcap"

@@ -75,6 +75,7 @@ def unexplained(parameters, drag_m):
     return left / whole, by_drag / whole
 
 
+@pytest.mark.fit
 @pytest.mark.parametrize(
     ("damping", "coulomb_nm", "delay_s"),
     [
@@ -90,6 +91,7 @@ def test_the_simulated_drag_is_that_of_the_exact_beam(damping, coulomb_nm, delay
     assert left < 2e-3
 
 
+@pytest.mark.fit
 def test_without_drag_there_is_none():
     damping = Damping(7.1e-5, 0.996, 0.055, 0.594)
     still, braked = (swept(rig(drag_m, damping)) for drag_m in (0.0, DRAG_M))

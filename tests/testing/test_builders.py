@@ -35,6 +35,7 @@ def test_the_page_s_tests_pass(tmp_path):
     found["test_my_analysis"](tmp_path)
 
 
+@pytest.mark.process
 def test_it_needs_no_test_framework():
     code = "import sys; from rigd.testing import *; assert 'pytest' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

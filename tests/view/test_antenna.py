@@ -8,6 +8,8 @@ import pytest
 from rigd.beam import DeflectionFilter
 from rigd.view import Scene
 
+pytestmark = pytest.mark.process
+
 ANTENNA = "/antenna"
 BEAM, TRAIL, LABEL, TOUCH = (f"{ANTENNA}/{name}" for name in ("beam", "trail", "label", "touch"))
 FACTOR = 2.0

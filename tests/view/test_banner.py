@@ -110,6 +110,7 @@ def test_a_gauge_is_told_to_a_thousandth_of_its_limit(gauge, text):
     assert gauge_text("speed", gauge) == text
 
 
+@pytest.mark.process
 def test_state_and_values_are_drawn_as_they_come(sweep, make_samples, shown):
     scene = Scene(sweep)
     drawings = scene.frame()
@@ -128,6 +129,7 @@ def test_state_and_values_are_drawn_as_they_come(sweep, make_samples, shown):
     assert packed(ORANGE) in colors  # the bar of the angle
 
 
+@pytest.mark.process
 def test_a_peak_between_two_drawings_is_not_lost(sweep, make_samples, shown):
     scene = Scene(sweep)
     samples = make_samples(1000)
@@ -138,6 +140,7 @@ def test_a_peak_between_two_drawings_is_not_lost(sweep, make_samples, shown):
     assert "angle 0.500 of 1 rad" in found[f"{VALUES}/texts"].values["Points2D:labels"][-1]
 
 
+@pytest.mark.process
 def test_events_are_shown_in_full_the_newest_first(sweep, shown):
     scene = Scene(sweep)
     long = "The *torque* command " + 40 * "is above its warning level " + "now."

@@ -10,6 +10,8 @@ from online_fits import online_fit
 from rigd.session import read_session
 from rigd.view import Scene, draw_session
 
+pytestmark = pytest.mark.process
+
 TABLE = "/fit_table"
 
 

@@ -10,6 +10,8 @@ from rigd.view.banner import VALUES
 from rigd.view.frequency_charts import SIZES
 from rigd.view.plots import TIMELINE
 
+pytestmark = pytest.mark.process
+
 
 def leaves(part):
     children = getattr(part, "contents", None)

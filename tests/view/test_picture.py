@@ -18,6 +18,8 @@ from rigd.session.layout import Status
 from rigd.view import Health, Note, Scene, Subject, draw_session
 from rigd.view.frequency_charts import MAGNITUDE, SweepResponse
 
+pytestmark = pytest.mark.process
+
 RIGD = Path(sys.executable).parent / "rigd"
 
 

@@ -57,6 +57,7 @@ def health_values(subject, shown):
     return values
 
 
+@pytest.mark.process
 def test_health_has_the_unit_its_name_ends_in(health_values):
     health = Health(
         missed_ticks=3, late_ticks=7, lost_ticks=0, recorder_lag_ticks=80, disk_free_mb=51_234.0,
@@ -72,6 +73,7 @@ def test_health_has_the_unit_its_name_ends_in(health_values):
     }
 
 
+@pytest.mark.process
 def test_what_is_not_known_is_not_drawn_as_a_number(health_values):
     shown = health_values(Health(missed_ticks=0))
     assert shown["faulty_ticks"] == pytest.approx([0.0, np.nan, np.nan], nan_ok=True)
@@ -115,6 +117,7 @@ def test_rerun_gets_the_columns_at_the_time_of_the_session(shown, make_samples):
     assert signals.kinds["angle_mrad"] == "rerun.components.Scalar"
 
 
+@pytest.mark.process
 def test_views_are_imported_without_the_viewer():
     code = "import sys; from rigd.view import Scene; sys.exit('rerun' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -4,6 +4,8 @@ import pytest
 
 from rigd.view import Health, Scene
 
+pytestmark = pytest.mark.process
+
 WELL = Health(
     missed_ticks=0, late_ticks=0, lost_ticks=0, recorder_lag_ticks=17, disk_free_mb=51_234.0,
     view_dropped=0, bus_load_percent=31.4, bus_errors=0, sensor_status=0, rate_hz=1000.0,

@@ -13,6 +13,8 @@ from playwright.sync_api import expect
 from processes import child_running
 from web_daemon import rig_with_page
 
+pytestmark = pytest.mark.browser
+
 TELL_S = 1.0
 """Within this time the page has to say what the daemon has seen."""
 END_MS = 60_000

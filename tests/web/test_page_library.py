@@ -239,6 +239,7 @@ time.sleep(600)
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("end", ["killed", "ended"])
 @pytest.mark.parametrize("state", ["suspended", "running"])
 def test_a_job_ends_with_the_page(tmp_path, state, end):

@@ -502,6 +502,7 @@ def test_a_page_stops_over_its_websocket(served, pages):
     assert [each["command"] for each in served.daemon.asked].count("stop") == 2
 
 
+@pytest.mark.process
 def test_the_process_writes_no_nonsense_that_it_is_sent_to_its_terminal(served):
     with subprocess.Popen(
         [sys.executable, "-m", "rigd.web"],

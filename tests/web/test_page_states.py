@@ -8,6 +8,8 @@ from fake_web_server import STATIC, TOKEN, UTC_NS, fake_web_server, gauges, prog
 from playwright.sync_api import expect
 from processes import eventually
 
+pytestmark = pytest.mark.browser
+
 TELL_S = 1.0
 """Within this time the page has to say what has happened."""
 

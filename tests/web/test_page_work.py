@@ -21,6 +21,8 @@ from online_fits import online_fit
 from playwright.sync_api import expect
 from processes import eventually
 
+pytestmark = pytest.mark.browser
+
 
 @pytest.fixture
 def server():

@@ -9,6 +9,8 @@ from rigd.devices import reset_drive
 from rigd.runner import Rig, RigError
 from rigd.sim.wire import inject
 
+pytestmark = pytest.mark.process
+
 CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1, "duration_s": 0.5}
 
 

@@ -14,6 +14,8 @@ from rigd.session import read_session
 from rigd.session.layout import Status
 from rigd.sim.wire import inject
 
+pytestmark = pytest.mark.process
+
 # Fast from the beginning, so that every fault is met while the motor moves.
 CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1}
 # For a reply that does not come a tick in lock-step waits half a second: where ten of them are what

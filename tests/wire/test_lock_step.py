@@ -14,6 +14,8 @@ from rigd.runtime import StopRequest
 from rigd.session import read_session
 from rigd.sim.wire import inject
 
+pytestmark = pytest.mark.process
+
 # Of the devices alone all of these are compared in tests/sim/wire/process: of whole sessions those
 # in which the loop itself does something else, or another line is read.
 AGAIN = pytest.mark.slow

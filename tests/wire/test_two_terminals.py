@@ -12,6 +12,8 @@ from processes import child_running, eventually
 from rigd.session import read_session, read_timings
 from rigd.session.layout import Status
 
+pytestmark = pytest.mark.process
+
 # Little torque: while the machine stands still it is held, and swings the motor out.
 CHIRP = ("--amplitude", "0.005", "--stop-hz", "5", "--duration", "1.5")
 LENGTHS = ("--rest", "0.2", "--ring-down", "0.3")

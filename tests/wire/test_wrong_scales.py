@@ -10,6 +10,8 @@ from rigd.runner import ProbeFailedError, Rig, RigError, Series
 from rigd.runtime import StopRequest
 from rigd.session import read_session
 
+pytestmark = pytest.mark.process
+
 SILENT = ("0x608F", "0x6091")
 """Objects that tell the scales of the encoder."""
 

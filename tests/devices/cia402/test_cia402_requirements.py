@@ -56,6 +56,7 @@ def test_what_an_object_may_hold_that_cannot_be_written():
     assert AllowedValue.ANY.allows(0, 1)
 
 
+@pytest.mark.process
 def test_the_table_loads_no_library():
     code = (
         "import sys, rigd.devices.cia402.requirements as r;"

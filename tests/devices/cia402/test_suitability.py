@@ -18,6 +18,8 @@ from rigd.devices.cia402.requirements import CORE, OPTIONAL, requirement
 from rigd.devices.eds import read_eds
 from rigd.profile import load_profile
 
+pytestmark = pytest.mark.fit
+
 
 @pytest.fixture(scope="module")
 def shipped():

@@ -18,6 +18,8 @@ from rigd.devices.contracts import DeviceError
 from rigd.devices.running_simulator import SimulatorAddress, ask_simulator, find_simulator
 from rigd.sim.wire import WrongUseError, parse_fault
 
+pytestmark = pytest.mark.process
+
 RUN = (
     "import typer\n"
     "from rigd.cli.simulate import inject, simulate\n"

@@ -21,6 +21,8 @@ from rigd.devices.running_simulator import ask_simulator, find_simulator
 from rigd.profile import load_profile
 from rigd.sim import SimulatedRig
 
+pytestmark = pytest.mark.process
+
 PERIOD_NS = 1_000_000
 PROFILES = Path(__file__).parents[4] / "hw_profiles"
 AND_AN_OBSTACLE = '0.0, source = "assumed" }\nobstacles = ["x=0.6,angle=0.01,stiffness=3000"]  # '
