@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns.pooling import by_structure
-from analysis.identify import tolerant_status
+from analysis.identify import effective_reason, tolerant_status
 from analysis.identify.profile_likelihood import WIDEST_FRACTION
 from analysis.identify.verdict import BIC_DECISIVE, too_few_modes
 from analysis.models import ORDER_RANGE, STRUCTURES
@@ -212,7 +212,10 @@ def tolerant_pooled_order(
     )
     if exact.mixture and exact.reason is not None:
         return replace(found.doubted(exact.reason), mixture=True)
-    return found if _adequate(verdicts) else found.doubted(_UNEXPLAINED)
+    if not _adequate(verdicts):
+        return found.doubted(_UNEXPLAINED)
+    effective = effective_reason(order, refused=refused)
+    return found if effective is None else found.doubted(effective)
 
 
 def _adequate(verdicts: Sequence[Verdict]) -> bool:

@@ -19,6 +19,7 @@ from ._fit import BAND_HZ as BAND_HZ
 from ._fit import fit_record as fit_record
 from ._headline_json import headline_json as headline_json
 from ._modal_fit import ModalFit as ModalFit
+from ._modal_headline import effective_reason as effective_reason
 from ._modal_headline import refused_reason as refused_reason
 from ._modal_headline import tolerant_sizes as tolerant_sizes
 from ._modal_headline import tolerant_status as tolerant_status

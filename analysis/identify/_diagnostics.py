@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Setting
     from analysis.identify._result import ModeEstimate
+    from analysis.identify._step_in_time import Step
     from analysis.identify.headline import Headline
     from analysis.identify.residual_tests import Harmonic, InputRelation, Whiteness
 
@@ -258,12 +259,27 @@ def mains(frequency_hz: float) -> str:
 
 
 def unexplained(
-    white: Whiteness, related: InputRelation, modes: tuple[ModeEstimate, ...]
+    white: Whiteness,
+    related: InputRelation,
+    modes: tuple[ModeEstimate, ...],
+    step: Step | None = None,
 ) -> Finding:
-    """Return the finding that describes the unexplained residual."""
+    """Return the finding that describes the unexplained residual.
+
+    `step` is the step of the stiffness that explains more of it than any effect of the amplitude.
+    """
     low, high = white.loudest_hz
     at_mode = [mode.number for mode in modes if low <= mode.frequency_hz <= high]
-    if related.related:
+    if step is not None:
+        what = (
+            f"The modes do not fit together. The likeliest cause is {step.words}, but one sweep "
+            "does not tell a change in time from one with the frequency."
+        )
+        remedy = (
+            "Fasten clamp and motor mount, and sweep again in both directions "
+            "(rigd run chirp --there-and-back)."
+        )
+    elif related.related:
         where = f"near {related.at_hz:.1f} Hz" if related.local else "all through the band"
         what = (
             f"Unmodelled linear dynamics {where}: part of the torque is a linear response to "

@@ -34,13 +34,13 @@ if TYPE_CHECKING:
     from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
 
 NOT_UNIFORM: Final = (
-    "an effective value: the modes are not those of a uniform beam, and what makes them differ may "
-    "change it"
+    "the modes are not those of a uniform beam, and what makes them differ may change this value"
 )
 NO_ORDER: Final = "no beam with one internal and one external order explains the losses"
 
-_EFFECTIVE: Final = (*OF_BEAM, "delay_s")
-"""Parameters that what makes a beam uneven may change by more than the tolerance."""
+_EFFECTIVE: Final = (*OF_BEAM, "delay_s", "gamma", "lambda")
+"""Parameters that an uneven beam may change by more than the tolerance. External damping is among
+them: it is relative to the inertia of each mode."""
 
 
 def refused_reason(test: UniformBeamTest) -> str | None:
@@ -79,7 +79,6 @@ def with_modal_model(
         Half width of the modes' 95 % intervals, in standard deviations.
     """
     refused = refused_reason(test)
-    effective = None if refused is None else NOT_UNIFORM
     condition = exact if refused is None else exact.doubted(refused)
     # What drag does depends on how a mode decays, which the beam takes into account.
     of_beam = test.status == "passed" and (tolerant is None or "drag" in exact.parameters)
@@ -95,7 +94,7 @@ def with_modal_model(
                 for name, quantity in condition.parameters.items()
                 if name not in PARAMETERS
             },
-            **_parameters(tolerant, doubt, effective),
+            **_parameters(tolerant, doubt, refused=refused is not None),
         },
         sizes=tuple(each.flagged(doubt) for each in tolerant_sizes(test, tolerant)),
         structures=_structures(condition, tolerant),
@@ -141,20 +140,20 @@ def _modes(
 
 
 def _parameters(
-    estimate: TolerantEstimate, doubt: str | None, effective: str | None
+    estimate: TolerantEstimate, doubt: str | None, *, refused: bool
 ) -> dict[str, ReportedValue]:
     """Return the parameters of the nearly uniform beam, with flags on undetermined ones.
 
-    `doubt` is the reason against every number. `effective` is the reason why stiffness, density and
-    delay are effective values: a tip mass or a compliant clamp changes all modes alike, by far more
-    than the tolerance.
+    `doubt` is the reason against every number. With `refused`, stiffness, density, delay and
+    external damping are effective values: a tip mass or a compliant clamp changes all modes alike,
+    by far more than the tolerance.
     """
     return {
         name: ReportedValue(
             estimate.values[name],
             estimate.std[name],
             estimate.interval[name],
-            doubt or (effective if name in _EFFECTIVE else None) or _reason(estimate, name),
+            doubt or effective_reason(name, refused=refused) or _reason(estimate, name),
         )
         for name in PARAMETERS
     }
@@ -229,6 +228,18 @@ def tolerant_sizes(
     return tuple(found)
 
 
+def effective_reason(name: str, *, refused: bool) -> str | None:
+    """Return why a parameter is an effective value; None if it is a property of the beam.
+
+    Parameters
+    ----------
+    name : str
+    refused : bool
+        Whether the test refused a uniform beam.
+    """
+    return NOT_UNIFORM if refused and name in _EFFECTIVE else None
+
+
 def tolerant_order(
     order: Order,
     estimate: TolerantEstimate,
@@ -247,6 +258,7 @@ def tolerant_order(
     if reason is not None:
         return OrderVerdict(order, status, None, None, reason, profile)
     value, ends = estimate.values[order], estimate.interval[order]
+    doubt = doubt or effective_reason(order, refused=refused)
     if doubt is not None:
         return OrderVerdict(order, "open", value, ends, doubt, profile)
     return OrderVerdict(order, status, value, ends, None, profile)

@@ -55,6 +55,7 @@ from analysis.identify.verdict import (
 )
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
+from rigd.beam import clamped_free_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
@@ -67,7 +68,9 @@ if TYPE_CHECKING:
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Setting
-    from analysis.identify._result import RecordFit
+    from analysis.identify._result import ModeEstimate, RecordFit
+    from analysis.identify._small_effects import SmallEffect
+    from analysis.identify._step_in_time import Step
     from analysis.identify._time_varying import TemporalChange
     from analysis.identify.profile_likelihood import Order
     from analysis.identify.residual_tests import Harmonic
@@ -75,6 +78,8 @@ if TYPE_CHECKING:
 
 
 _MODES_TO_TEST: Final = 2
+_ROUGH_DAMPING_RATIO: Final = 0.01
+"""Damping ratio from which the search for a mode begins if no beam provides one."""
 _TILTED: Final = "the axis is tilted, and fits to the whole record are of one that is plumb"
 _CLIPPED: Final = "the torque is clipped"
 INTEGER: Final = STRUCTURES["III"]
@@ -219,19 +224,27 @@ def _selected(
     forces: tuple[NonlinearForce, ...] = ()
     changes: tuple[TemporalChange, ...] = ()
     plain = modal is not None and _linear_and_constant(linear, modal, band_hz)
-    if not (plain or measurement.knocks):
-        for knock in knocks_in(linear, obvious=True):
-            with_impact = _selected(with_knock(measurement, knock), fixed, band_hz, None)
-            if with_impact.explained:
-                return with_impact
     if modal is not None:
         small = small_effect(linear.comparison, modal, modal.plant_like(linear.likeliest.plant))
     alone, suffices = modal, plain
     if small is not None:
         alone = _modal(linear, small.column[None])
         suffices = alone is not None and _linear_and_constant(linear, alone, band_hz)
+    if not (plain or suffices or measurement.knocks):
+        for knock in knocks_in(linear, obvious=True):
+            with_impact = _selected(with_knock(measurement, knock), fixed, band_hz, None)
+            if with_impact.explained:
+                return with_impact
+    step = None
+    if modal is not None and measurement.one_sweep:
+        if not (plain or suffices) or (small is not None and small.large):
+            step = _likely_step(linear, modal, small)
+        if step is not None:
+            small, alone, suffices = None, modal, plain
     if not (plain or suffices) or (small is not None and small.large):
-        candidate_set, forces, changes = _with_effects(linear, again=again is not None)
+        candidate_set, forces, changes = _with_effects(
+            linear, again=again is not None, of_amplitude=step is None
+        )
         modal = _modal(candidate_set)
         if suffices and not (
             modal is not None and _linear_and_constant(candidate_set, modal, band_hz)
@@ -286,7 +299,7 @@ def _selected(
         if modal is not None and test is not None and refused and wrong is None:
             found += _explanation(measurement, leading, modal, test)
         found = _with_doubts(found, along, wrong, doubt, numbers.flags, explained=explained)
-        found = _with_knocks_and_unexplained(leading, found, white, related)
+        found = _with_knocks_and_unexplained(leading, found, white, related, step)
         sentences = of_headline(numbers, orders, alone=doubt is None)
         advice = experiments(candidate_set, orders, visible, found, close)
     advice += [each.remedy for each in found if each.remedy]
@@ -328,17 +341,36 @@ def _modal(
     """
     if candidate_set.misread:
         return None
-    starts = [
-        (mode.number, mode.frequency_hz, mode.damping_ratio)
-        for mode in candidate_set.likeliest.modes
-        if mode.frequency_hz > 0
-    ]
+    starts = _mode_starts(candidate_set.likeliest.modes)
     columns, drag = candidate_set.columns, candidate_set.comparison.drag
     if further is not None:
         columns = np.concatenate([columns, further])
     if drag is not None:  # its size is not known exactly
         columns = np.concatenate([columns, drag.by_law])
     return fit_modes(candidate_set.comparison, candidate_set.noise, starts, columns)
+
+
+def _mode_starts(modes: Iterable[ModeEstimate]) -> list[tuple[int, float, float]]:
+    """Return number, frequency (Hz) and damping ratio of each mode where the search begins.
+
+    A beam that fits badly may have an overdamped mode below one that oscillates. That mode begins
+    at the frequency ratio of a uniform beam.
+    """
+    known = {mode.number: mode for mode in modes if mode.frequency_hz > 0}
+    if not known:
+        return []
+    numbers = range(1, max(known) + 1)
+    eigenvalues = clamped_free_eigenvalues(len(numbers)).tolist()
+    starts = []
+    for number in numbers:
+        mode = known.get(number)
+        if mode is not None:
+            starts.append((number, mode.frequency_hz, mode.damping_ratio))
+            continue
+        nearest = min(known.values(), key=lambda each: abs(each.number - number))
+        ratio = (eigenvalues[number - 1] / eigenvalues[nearest.number - 1]) ** 2
+        starts.append((number, nearest.frequency_hz * ratio, _ROUGH_DAMPING_RATIO))
+    return starts
 
 
 def _visible(candidate_set: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
@@ -412,13 +444,16 @@ def _linear_and_constant(
 
 
 def _with_effects(
-    linear: CandidateSet, *, again: bool
+    linear: CandidateSet, *, again: bool, of_amplitude: bool
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[TemporalChange, ...]]:
-    """Test for nonlinear and time-varying effects.
+    """Test for nonlinear and time-varying effects, or for the latter alone.
 
     Return the set with the best explanation, its nonlinear forces, and its changes along the
     record.
     """
+    if not of_amplitude:
+        candidate_set, changes = along_time(linear.with_orders_free())
+        return candidate_set, (), changes
     candidate_set = linear if again else with_evident_drag(linear)
     if candidate_set is linear:
         candidate_set = linear if linear.misread else with_air_drag(linear)
@@ -439,6 +474,13 @@ def _with_effects(
         if other_changes and other.bic < candidate_set.bic:
             return other, (), other_changes
     return candidate_set, forces, changes
+
+
+def _likely_step(linear: CandidateSet, modal: ModalFit, small: SmallEffect | None) -> Step | None:
+    """Return the step of the stiffness if it explains more than any effect of the amplitude."""
+    step = step_score(linear.comparison, modal)
+    rival = 0.0 if small is None else small.saved
+    return step if step.score > max(rival, LARGE) else None
 
 
 def freest_alone(
@@ -586,11 +628,12 @@ def _with_knocks_and_unexplained(
     found: tuple[Finding, ...],
     white: Whiteness,
     related: InputRelation,
+    step: Step | None = None,
 ) -> tuple[Finding, ...]:
     """Add impacts before the other findings, and the unexplained residual after them."""
     explained = white.white and not related.related
     knocks = of_knocks(candidate_set.comparison.measurement.knocks, explained=explained)
-    rest = () if explained else (unexplained(white, related, candidate_set.best.fit.modes),)
+    rest = () if explained else (unexplained(white, related, candidate_set.best.fit.modes, step),)
     return (*knocks, *found, *rest)
 
 
