@@ -282,7 +282,7 @@ def _converged(
             plant = unknowns.plant(x)
             # Without drag the beam seemed to be another, and so what the rest of the angle did.
             try:
-                comparison = candidate_set.comparison.with_incoherent_part_of(plant).with_drag(
+                comparison = candidate_set.comparison.recompute_incoherent_torque(plant).with_drag(
                     plant, law
                 )
             except DragError:

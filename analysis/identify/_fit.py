@@ -302,6 +302,6 @@ def _compared_jacobian(
     if comparison.measurement.torque_known.all():
         return projected.jacobian
     plant, chain = unknowns.plant_and_gradient(x)
-    lost = comparison.lost_gradient(plant, unknowns.gradient_names)
+    lost = comparison.gradient_at_unknown_torque(plant, unknowns.gradient_names)
     weighted = noise.weight * (chain.T @ lost)
     return projected.jacobian - weighted

@@ -179,7 +179,7 @@ def _from_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         fit, counts = analysis.fits[0], analysis.noise.counts
         if not whiteness(fit.residual[counts], analysis.comparison.frequency_hz[counts]).white:
             continue
-        plain = comparison.without_hum(()).with_incoherent_part_of(fit.plant)
+        plain = comparison.without_hum(()).recompute_incoherent_torque(fit.plant)
         unknowns = Unknowns.of(_FREEST, measurement.nominal, candidate_set.free)
         there = partial(
             Refit.descend, plain, unknowns, unknowns.vector(fit.plant), max_evaluations=1

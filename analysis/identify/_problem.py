@@ -132,7 +132,7 @@ class Objective:
             residual=residual,
             jacobian=jacobian,
             poles=poles,
-            columns=np.concatenate([comparison.nuisance(poles), self.columns]),
+            columns=np.concatenate([comparison.nuisance_spectra(poles), self.columns]),
         )
 
     def project(self, at: Linearisation, weight: NDArray[np.float64] | float) -> Projected:
