@@ -350,7 +350,7 @@ def _fit_all(candidate_set: CandidateSet, converged: Refit) -> CandidateSet:
         refit.further(_MANY).candidate() if refit.predicted_cost < most else candidate
         for candidate, refit in begun
     ]
-    found = other.ranked(candidates).cross_checked()
+    found = other.ranked(candidates).cross_check()
     return replace(found, drag=_estimate(found))
 
 

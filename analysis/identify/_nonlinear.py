@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify._candidates import INTEGER_INTERNAL
+from analysis.identify._candidates import INTEGER_INTERNAL_ORDER
 from analysis.identify._data import fast_length
 from analysis.identify._predictor import torque_channel
 from analysis.identify._refit import Refit
@@ -226,7 +226,7 @@ def _leads(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
     best = candidate_set.best
     if "alpha" not in best.structure.free:
         return (best,)
-    return (*(c for c in candidate_set.candidates if c.structure in INTEGER_INTERNAL), best)
+    return (*(c for c in candidate_set.candidates if c.structure in INTEGER_INTERNAL_ORDER), best)
 
 
 def _added(
