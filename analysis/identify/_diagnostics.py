@@ -302,8 +302,8 @@ def unexplained(
         remedy = "Sweep again at twice the amplitude, which halves the effect of quantisation."
     elif whiteness.loud and high < _SENSOR_DRIFT_LIMIT_HZ:
         description = (
-            f"The residual below {high:.2f} Hz is {whiteness.loudest_ratio:.1f} times the noise and "
-            "does not follow the motor: zero drift of the torque sensor."
+            f"The residual below {high:.2f} Hz is {whiteness.loudest_ratio:.1f} times the noise "
+            "and does not follow the motor: zero drift of the torque sensor."
         )
         remedy = ""
     else:
