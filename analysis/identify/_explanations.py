@@ -65,9 +65,9 @@ _STEP_REGULARIZATION: Final = 1e-3
 moves almost freely."""
 
 _NAMED_CHI_SQUARE_MARGIN: Final = 6.0
-"""Largest chi-square above the lowest of all causes for which a cause with a p-value below `_NAMED_P_VALUE`
-is still named, and least reduction of chi-square by a general cause relative to its special
-cases."""
+"""Chi-square above the lowest of all causes, up to which a cause is named whatever its p-value.
+
+A general cause is considered only if its chi-square is lower by this than in its special cases."""
 
 _NAMED_P_VALUE: Final = 0.05
 """p-value from which a cause is named, however well another cause explains the modes."""
@@ -310,7 +310,7 @@ class _CauseSearch:
         x, cause_unknowns = y[: self._beam_x.size], y[self._beam_x.size :].tolist()
         beam = self._problem.plant(x).beam
         altered = self._cause.altered(self._problem.stated, cause_unknowns, beam)
-        if altered.same_shapes(Alteration()):
+        if altered.has_same_shapes(Alteration()):
             return replace(self._plain, alteration=altered)
         terms = mode_terms(altered, beam, self._problem.modes)
         # The mass of a cause is a fraction of the beam's, so the mode shapes do not depend on it.
@@ -397,23 +397,23 @@ def finding(test: UniformBeamTest, causes: Sequence[CauseFit], step: Step | None
     phrases = [each.words for each in causes]
     if step is not None and step.named:
         phrases.append(step.words)
-    test_result = f"A plain uniform beam does not predict the modes ({test.summary.chance})."
+    refusal = f"A plain uniform beam does not predict the modes ({test.summary.chance})."
     if not phrases:
         return Finding(
             kind="rival explanations",
             sentence=(
-                f"{test_result} None of the simple causes tried explains them alone: tilt, a mass at "
+                f"{refusal} None of the simple causes tried explains them alone: tilt, a mass at "
                 "the tip or elsewhere, an uneven or tapered beam, a soft or lossy clamp, a filter "
                 "or resonance of the sensor, a relaxation of the material."
             ),
             remedy="Check the beam and its clamp for several of these at once.",
         )
     if len(phrases) == 1:
-        sentence = f"{test_result} This would: {phrases[0]}. It is not established by this record."
+        sentence = f"{refusal} This would: {phrases[0]}. It is not established by this record."
     else:
         sentence = (
-            f"{test_result} Each of these alone would: {'; '.join(phrases)}. None is established by this "
-            "record."
+            f"{refusal} Each of these alone would: {'; '.join(phrases)}. None is established by "
+            "this record."
         )
     return Finding(
         kind="rival explanations",
