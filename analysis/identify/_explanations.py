@@ -149,7 +149,7 @@ def explanations(
             continue
         # Of each name only the best fit, and no general cause if a special case suffices.
         rival_chi_squares = [
-            explained_by[name].chi_square for name in cause.special if name in explained_by
+            explained_by[name].chi_square for name in cause.special_cases if name in explained_by
         ]
         required_reduction = _NAMED_CHI_SQUARE_MARGIN
         if cause.name in explained_by:
@@ -196,7 +196,7 @@ def _fit_cause(
     if at_bound.any():
         return None
     plant = problem.plant(y[:beam_unknowns])
-    size, unit, phrase = cause.described(cause_unknowns.tolist(), plant.beam)
+    size, unit, phrase = cause.describe(cause_unknowns.tolist(), plant.beam)
     return CauseFit(
         name=cause.name,
         words=phrase,
@@ -309,10 +309,10 @@ class _CauseSearch:
         """Return the Galerkin coefficients of the modes for the unknowns of beam and cause."""
         x, cause_unknowns = y[: self._beam_x.size], y[self._beam_x.size :].tolist()
         beam = self._problem.plant(x).beam
-        altered = self._cause.altered(self._problem.stated, cause_unknowns, beam)
-        if altered.has_same_shapes(Alteration()):
-            return replace(self._plain, alteration=altered)
-        terms = mode_terms(altered, beam, self._problem.modes)
+        alteration = self._cause.alter(self._problem.stated, cause_unknowns, beam)
+        if alteration.has_same_shapes(Alteration()):
+            return replace(self._plain, alteration=alteration)
+        terms = mode_terms(alteration, beam, self._problem.modes)
         # The mass of a cause is a fraction of the beam's, so the mode shapes do not depend on it.
         return terms if self._problem.stated.lumps else replace(terms, density_kg_per_m=None)
 
