@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._channel_checks import clipping, drift_of_zero, stops
+from analysis.identify._channel_checks import clipping, torque_zero_drift_nm, stops
 from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify.residual_tests import SIGNIFICANT_STD
@@ -332,7 +332,7 @@ def _hum_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
     """Yield findings of torque-sensor drift and of narrow-band disturbances of the torque."""
     comparison = candidate_set.comparison
     duration_s = comparison.samples / comparison.decimation.rate_hz
-    drift_nm = drift_of_zero(candidate_set)
+    drift_nm = torque_zero_drift_nm(candidate_set)
     if drift_nm > 0:
         yield _drift_finding(drift_nm)
     period_s = repeats_after_s(comparison)

@@ -202,7 +202,7 @@ def identifiable(estimate: TolerantEstimate, order: str) -> bool:
 def _structure_status(
     exact: Estimates, estimate: TolerantEstimate
 ) -> tuple[tuple[str, StructureStatus], ...]:
-    """Return names and status of the structures by the damping ratios of the modes.
+    """Return names and status of the structures, assessed by the losses of the modes.
 
     Mode frequencies do not distinguish structures if the beam may deviate from a uniform one.
     """
