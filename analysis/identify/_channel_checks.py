@@ -85,7 +85,8 @@ def stops(measurement: Measurement) -> Iterator[Finding]:
         kind="stop",
         sentence=(
             f"The motor does not move from {first * _STANDSTILL_BLOCK_S:.1f} to "
-            f"{(first + count) * _STANDSTILL_BLOCK_S:.1f} s of the record, although its reference does."
+            f"{(first + count) * _STANDSTILL_BLOCK_S:.1f} s of the record, although its "
+            "reference does."
         ),
         value=count * _STANDSTILL_BLOCK_S,
         unit="s",
@@ -175,7 +176,8 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
     yield Finding(
         kind="unit",
         sentence=(
-            f"Torque over angle is {factor:.3g} times what the beam in the file gives, {explanation}. "
+            f"Torque over angle is {factor:.3g} times what the beam in the file gives, "
+            f"{explanation}. "
             "No number here is valid for the antenna."
         ),
         value=factor,

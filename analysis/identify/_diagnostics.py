@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._channel_checks import clipping, torque_zero_drift_nm, stops
+from analysis.identify._channel_checks import clipping, stops, torque_zero_drift_nm
 from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify.residual_tests import SIGNIFICANT_STD
