@@ -165,7 +165,7 @@ class CandidateSet:
         earlier_set = replace(candidate_set, candidates=tuple(earlier))
         refitted = (earlier_set._refit_in(candidate_set, c, MANY) for c in other_candidates)
         candidate_set = (
-            candidate_set.ranked((*candidate_set.candidates, *refitted))
+            candidate_set.with_candidates((*candidate_set.candidates, *refitted))
             ._exclude_leakage()
             .cross_check()
         )
@@ -258,9 +258,9 @@ class CandidateSet:
 
     def refit(self, candidate: Candidate, max_evaluations: int = MANY) -> Refit:
         """Return the minimum reached by a descent from the estimate of a candidate."""
-        return self.descent_from(candidate.fit.plant, candidate.structure, max_evaluations)
+        return self.descend_from_plant(candidate.fit.plant, candidate.structure, max_evaluations)
 
-    def descent_from(
+    def descend_from_plant(
         self, plant: Plant, structure: Structure, max_evaluations: int = MANY
     ) -> Refit:
         """Return the minimum reached by a descent from a plant, with a given structure."""
@@ -300,17 +300,17 @@ class CandidateSet:
         # The other candidates start from their former minima, under the new noise.
         others = (c for c in self.candidates if c is not self.best)
         refitted = (self._refit_in(candidate_set, c, MANY) for c in others)
-        return candidate_set.ranked((*candidate_set.candidates, *refitted)).cross_check()
+        return candidate_set.with_candidates((*candidate_set.candidates, *refitted)).cross_check()
 
     def _exclude_leakage(self) -> CandidateSet:
         """Exclude the bins into which a disturbance outside the band leaks, and fit again."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
-        return self.under(noise) if noise is not self.noise else self
+        return self.refit_under_noise(noise) if noise is not self.noise else self
 
-    def under(self, noise: NoiseSpectrum) -> CandidateSet:
+    def refit_under_noise(self, noise: NoiseSpectrum) -> CandidateSet:
         """Fit all candidates again under a slightly different noise spectrum."""
         new_set = replace(self, noise=noise)
-        return new_set.ranked(self._refit_in(new_set, c, FEW) for c in self.candidates)
+        return new_set.with_candidates(self._refit_in(new_set, c, FEW) for c in self.candidates)
 
     def _refit_in(
         self, new_set: CandidateSet, candidate: Candidate, max_evaluations: int
@@ -332,7 +332,7 @@ class CandidateSet:
         candidate_set = self
         for _ in range(_MAX_CROSS_CHECK_ROUNDS):
             best = candidate_set.best
-            candidate_set = candidate_set.ranked(
+            candidate_set = candidate_set.with_candidates(
                 c if c is best else candidate_set._refit_from_plant(c, best.fit.plant)
                 for c in candidate_set.candidates
             )
@@ -342,7 +342,9 @@ class CandidateSet:
 
     def restarted_from(self, plant: Plant) -> CandidateSet:
         """Start a descent of each candidate from a plant that another search found."""
-        return self.ranked(self._refit_from_plant(c, plant) for c in self.candidates).cross_check()
+        return self.with_candidates(
+            self._refit_from_plant(c, plant) for c in self.candidates
+        ).cross_check()
 
     def _refit_from_plant(self, candidate: Candidate, plant: Plant) -> Candidate:
         """Fit a candidate starting from another plant; return the better of old and new fit.
@@ -352,7 +354,7 @@ class CandidateSet:
         structure, damping = candidate.structure, plant.damping
         if (damping.zeta and not structure.internal) or (damping.gamma and not structure.external):
             return candidate
-        start = self.descent_from(plant, structure, 1)
+        start = self.descend_from_plant(plant, structure, 1)
         cost_to_beat = candidate.fit.cost * (1 - MISSED)
         if start.predicted_cost > cost_to_beat:
             return candidate
@@ -374,9 +376,9 @@ class CandidateSet:
         special_cases = [_INTEGER_ORDER] if not low <= 1 <= high else []
         special_cases += _one_damping_structures(fit)
         fitted = (
-            self.descent_from(fit.plant, structure).candidate() for structure in special_cases
+            self.descend_from_plant(fit.plant, structure).candidate() for structure in special_cases
         )
-        candidate_set = self.ranked((*self.candidates, *fitted)).cross_check()
+        candidate_set = self.with_candidates((*self.candidates, *fitted)).cross_check()
         return candidate_set.led_by(candidate_set.freest)
 
     def with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
@@ -434,7 +436,7 @@ class CandidateSet:
         added: list[Candidate] = []
 
         def fitted(structure: Structure) -> RecordFit:
-            refits.append(self.descent_from(best.fit.plant, structure))
+            refits.append(self.descend_from_plant(best.fit.plant, structure))
             added.append(refits[-1].candidate())
             return added[-1].fit
 
@@ -444,10 +446,10 @@ class CandidateSet:
                 fitted(structure)
         if not refits:
             return self
-        new_set = self.ranked((*self.candidates, *added))
+        new_set = self.with_candidates((*self.candidates, *added))
         if new_set.best.bic > best.bic - _MIN_BIC_REDUCTION_FOR_NEW_NOISE:
             return new_set.cross_check()
-        return new_set.under(min(refits, key=lambda refit: refit.cost).noise_here())
+        return new_set.refit_under_noise(min(refits, key=lambda refit: refit.cost).noise_here())
 
     def with_effect(self, columns: NDArray[np.complex128]) -> CandidateSet:
         """Fit all candidates with additional torque spectra of free amplitude.
@@ -464,9 +466,11 @@ class CandidateSet:
         The spectra represent effects in addition to the linear beam and replace `columns`.
         """
         new_set = replace(self, columns=columns, noise=noise)
-        return new_set.ranked(new_set.refit(c).candidate() for c in self.candidates).cross_check()
+        return new_set.with_candidates(
+            new_set.refit(c).candidate() for c in self.candidates
+        ).cross_check()
 
-    def ranked(self, candidates: Iterable[Candidate]) -> CandidateSet:
+    def with_candidates(self, candidates: Iterable[Candidate]) -> CandidateSet:
         """Return the candidate set with the given candidates, by rising BIC."""
         return replace(self, candidates=_by_rising_bic(candidates))
 

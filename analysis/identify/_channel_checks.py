@@ -37,7 +37,7 @@ _MAX_STANDSTILL_MOTION: Final = 0.02
 """Largest motion in a block with a standstill, relative to that of the reference."""
 
 
-def clipping(measurement: Measurement) -> Iterator[Finding]:
+def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
     """Yield a finding if the torque is clipped: several values lie exactly at its extremes."""
     torque, is_known = measurement.torque_nm, measurement.torque_known
     clipped = []
@@ -62,7 +62,7 @@ def clipping(measurement: Measurement) -> Iterator[Finding]:
     )
 
 
-def stops(measurement: Measurement) -> Iterator[Finding]:
+def standstill_findings(measurement: Measurement) -> Iterator[Finding]:
     """Yield a finding if the motor is at rest while its reference moves."""
     reference_rad = measurement.reference_rad
     if reference_rad is None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._data import Decimation, MeasurementError, fast_length_below
-from analysis.identify._instrument import following
+from analysis.identify._instrument import reference_coherent_part
 from analysis.identify._predictor import TorquePredictor
 from analysis.identify.drag_torque import DragExpansion, DragResponse
 from analysis.identify.free_decay import (
@@ -150,7 +150,7 @@ class Comparison:
         measurement.check(highest_hz)
         decimation = Decimation.to_band(measurement.rate_hz, highest_hz)
         angle_rad = decimation.apply(measurement.angle_from_rest(highest_hz))
-        usable = decimation.inside(measurement.angle_rad.size)
+        usable = decimation.samples_inside_record(measurement.angle_rad.size)
         samples = usable.stop - usable.start
         if samples > 0:
             samples = fast_length_below(samples)
@@ -301,7 +301,7 @@ class Comparison:
         end = self._recorded_samples
         reference_rad = self.decimation.apply(reference_rad - reference_rad[0])[:end]
         coherent_rad = angle_rad.copy()
-        coherent_rad[:end] = following(
+        coherent_rad[:end] = reference_coherent_part(
             angle_rad[:end], reference_rad, self.decimation.rate_hz, torque_nm
         )
         return coherent_rad
@@ -309,9 +309,9 @@ class Comparison:
     @property
     def _recorded_samples(self) -> int:
         """Return the number of decimated samples up to the end of the record."""
-        return int(self.decimation.inside(self.measurement.angle_rad.size).stop)
+        return int(self.decimation.samples_inside_record(self.measurement.angle_rad.size).stop)
 
-    def following_reference(self, plant: Plant | ModalModel) -> Comparison:
+    def use_reference_coherent_angle(self, plant: Plant | ModalModel) -> Comparison:
         """Use the part of the angle coherent with the reference as input (instrumental variable).
 
         The torque caused by the incoherent part of the angle is removed.
@@ -351,7 +351,7 @@ class Comparison:
             return self
         incoherent_prediction = self.prediction.of_other(self.incoherent_rad)
         incoherent_nm = incoherent_prediction.torque(plant)[0]
-        at_unknown_nm = incoherent_prediction.torque_between(
+        at_unknown_nm = incoherent_prediction.torque_at_fine_samples(
             plant, self.decimation.factor, self._decimated_indices(~self.measurement.torque_known)
         )[0]
         updated = replace(self, incoherent_nm=incoherent_nm, incoherent_at_unknown_nm=at_unknown_nm)
@@ -499,7 +499,7 @@ class Comparison:
             total += later.gradient(poles, amplitudes[number * decay_amplitudes :])
         return total
 
-    def filled(self, plant: Plant | ModalModel) -> Comparison:
+    def fill_unknown_torque(self, plant: Plant | ModalModel) -> Comparison:
         """Fill unknown torque with the prediction of a plant, so that it adds no residual.
 
         After convergence the sum of squares has the same minimum as that of the known samples
@@ -511,7 +511,7 @@ class Comparison:
         torque = self.measurement.torque_nm.copy()
         torque[~is_known] = (
             self.removed_at_unknown_nm
-            + self.prediction.torque_between(
+            + self.prediction.torque_at_fine_samples(
                 plant, self.decimation.factor, self._decimated_indices(~is_known)
             )[0]
         )
@@ -536,7 +536,7 @@ class Comparison:
         is_unknown = ~self.measurement.torque_known
         unknown_gradient = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
         if is_unknown.any():
-            _, gradient = self.prediction.torque_between(
+            _, gradient = self.prediction.torque_at_fine_samples(
                 plant, self.decimation.factor, self._decimated_indices(is_unknown), wrt
             )
             for row, values in zip(unknown_gradient, gradient, strict=True):

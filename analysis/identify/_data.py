@@ -368,7 +368,7 @@ class Measurement:
 
         `highest_hz` is the highest frequency that the angle contains.
         """
-        angle = bridged(self.angle_rad, self.angle_known, highest_hz / self.rate_hz)
+        angle = interpolate_gaps(self.angle_rad, self.angle_known, highest_hz / self.rate_hz)
         origin = angle[0] if self.rest_angle_rad is None else self.rest_angle_rad
         return angle - origin
 
@@ -385,7 +385,7 @@ _RELATIVE_NOISE_POWER: Final = 1e-6
 """Power of the white noise that the interpolation assumes, relative to that of the signal."""
 
 
-def bridged(
+def interpolate_gaps(
     values: NDArray[np.float64], known: NDArray[np.bool_], highest: float
 ) -> NDArray[np.float64]:
     """Estimate the unknown values of a band-limited signal from their known neighbours.
@@ -523,7 +523,7 @@ class Decimation:
         spectrum = np.fft.rfft(values, padded) * np.fft.rfft(self.kernel, padded)
         return np.fft.irfft(spectrum, padded)[: length : self.factor].copy()
 
-    def inside(self, ticks: int) -> slice:
+    def samples_inside_record(self, ticks: int) -> slice:
         """Return the decimated samples whose filter windows lie within the record, as a slice.
 
         `ticks` is the number of ticks of the record.

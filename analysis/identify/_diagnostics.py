@@ -9,9 +9,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._channel_checks import clipping, stops, torque_zero_drift_nm
+from analysis.identify._channel_checks import (
+    clipping_findings,
+    standstill_findings,
+    torque_zero_drift_nm,
+)
 from analysis.identify._finding import Finding
-from analysis.identify._leakage import repeats_after_s
+from analysis.identify._leakage import repetition_period_s
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.statistics import NORMAL_95, chi_square_deviate
 from rigd.units import interval_text, to_uncertainty
@@ -44,7 +48,11 @@ def findings(
         Residual at multiples of the sweep's frequency.
     """
     measurement = candidate_set.comparison.measurement
-    model_independent = (*candidate_set.misread, *clipping(measurement), *stops(measurement))
+    model_independent = (
+        *candidate_set.misread,
+        *clipping_findings(measurement),
+        *standstill_findings(measurement),
+    )
     if candidate_set.misread:
         return model_independent
     found = (
@@ -335,7 +343,7 @@ def _hum_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
     drift_nm = torque_zero_drift_nm(candidate_set)
     if drift_nm > 0:
         yield _drift_finding(drift_nm)
-    period_s = repeats_after_s(comparison)
+    period_s = repetition_period_s(comparison)
     for line in candidate_set.noise.lines:
         if line.frequency_hz * duration_s < _MIN_HUM_PERIODS:
             continue

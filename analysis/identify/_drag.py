@@ -408,7 +408,7 @@ def _fit_all_structures(candidate_set: CandidateSet, converged: Refit) -> Candid
         else candidate
         for candidate, refit in started
     ]
-    refitted = with_drag.ranked(candidates).cross_check()
+    refitted = with_drag.with_candidates(candidates).cross_check()
     return replace(refitted, drag=_drag_estimate(refitted))
 
 
@@ -488,7 +488,7 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAt, ...]
             continue
         for fraction in _RELATIVE_TIP_AMPLITUDES:
             amplitude = fraction * fit.plant.beam.length_m
-            ratio_by_law = by_law(
+            ratio_by_law = damping_ratio_by_drag_law(
                 mode.number,
                 2 * math.pi * mode.frequency_hz,
                 amplitude,
@@ -506,7 +506,7 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAt, ...]
     return tuple(estimates)
 
 
-def by_law(
+def damping_ratio_by_drag_law(
     mode: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
 ) -> NDArray[np.float64]:
     """Return a mode's damping ratio by air per unit of each number of a `DragLaw`, shape (2,)."""

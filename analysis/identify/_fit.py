@@ -110,7 +110,7 @@ def fit_record(
     reference = searches[closest].lowest()
     reference = reference.to_minimum(reference.noise(), _ROUGH_COST_TOLERANCE)
     whole_angle = reference.objective.comparison
-    comparison = whole_angle.following_reference(reference.plant)
+    comparison = whole_angle.use_reference_coherent_angle(reference.plant)
     searches = [search.on(comparison) for search in searches]
     reference = Descent(searches[closest].objective, reference.x)
     without_hum = reference.without_hum(_ROUGH_COST_TOLERANCE)
@@ -170,7 +170,7 @@ def refit_record(
     MeasurementError
         The record cannot be used.
     """
-    comparison = Comparison.of(measurement, band_hz).following_reference(plant)
+    comparison = Comparison.of(measurement, band_hz).use_reference_coherent_angle(plant)
     descent = Descent(Objective(comparison, unknowns), unknowns.vector(plant))
     descent = descent.to_minimum(descent.noise(), _ROUGH_COST_TOLERANCE)
     descent = descent.renewed(descent.noise(), _ROUGH_COST_TOLERANCE)
@@ -244,7 +244,7 @@ def _update_reference_following(descent: Descent, whole_angle: Comparison) -> De
     """
     hum, unknowns = descent.objective.comparison.hum, descent.objective.unknowns
     for _ in range(_MAX_REFERENCE_ESTIMATES):
-        comparison = whole_angle.following_reference(descent.plant).without_hum(hum)
+        comparison = whole_angle.use_reference_coherent_angle(descent.plant).without_hum(hum)
         descent = Descent(Objective(comparison, unknowns), descent.x)
         descent = descent.to_minimum(descent.noise(), _COST_TOLERANCE)
         hum = descent.hum() or hum

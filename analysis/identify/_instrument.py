@@ -5,10 +5,10 @@ motor moves with the noise of the sensor. A fit of the torque to the whole angle
 noise for response: in a closed loop noise and input are correlated, and a fit that omits everything
 beyond its band is biased by the noise [1]_: a chirp's tool inertia by 1.4 and its stiffness by 0.24
 standard deviations at 1e-2 N·m. The reference was known beforehand and does not depend on the
-noise, so the part of the angle that is coherent with the reference is used as input (`following`).
-The torque caused by the remaining angle is computed with the current estimate of the beam, and
-removed. The fit to the remaining torque is the instrumental-variable estimate with the reference as
-instrument. Where the remaining angle is noise, it is unbiased for any beam. But a beam that rings
+noise, so the part of the angle that is coherent with the reference is used as input
+(`reference_coherent_part`). The torque caused by the remaining angle is computed with the current
+estimate of the beam, and removed. The fit to the remaining torque is the instrumental-variable
+estimate with the reference as instrument. Where the remaining angle is noise, it is unbiased for any beam. But a beam that rings
 for long moves the motor in bands narrower than the smoothing of the response, and then the
 remaining angle is not noise: in a record of narrow sweeps with 0.2 g at the tip the first beam
 would bias the result by up to 45 standard deviations. So if a better beam predicts another torque,
@@ -46,7 +46,7 @@ _RELATIVE_POWER_FLOOR: Final = 1e-12
 """Least assumed power of the reference at a frequency, relative to its largest power."""
 
 
-def following(
+def reference_coherent_part(
     angle_rad: NDArray[np.float64],
     reference_rad: NDArray[np.float64],
     rate_hz: float,

@@ -126,7 +126,7 @@ def knocks_in(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator
     """
     if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_KNOCKS:
         return
-    found_in_whole = knock_in(candidate_set)
+    found_in_whole = find_impact(candidate_set)
     if found_in_whole is not None and found_in_whole.obvious:
         yield found_in_whole
         found_in_whole = None
@@ -140,7 +140,7 @@ def knocks_in(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator
         yield found_in_whole
 
 
-def knock_in(candidate_set: CandidateSet) -> DetectedImpact | None:
+def find_impact(candidate_set: CandidateSet) -> DetectedImpact | None:
     """Search for an impact in the residual of the candidate with the lowest cost."""
     likeliest = min(candidate_set.candidates, key=lambda each: each.fit.cost)
     return _find_impact_in_residual(candidate_set.refit(likeliest, 1))

@@ -75,7 +75,7 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
     return NoiseSpectrum(power, is_used, tuple(lines))
 
 
-def repeats_after_s(comparison: Comparison) -> float:
+def repetition_period_s(comparison: Comparison) -> float:
     """Return the period of the motor angle in seconds; 0 if the motion is not repeated."""
     angle = comparison.angle_rad[comparison.retained]
     angle = angle - angle.mean()

@@ -164,7 +164,7 @@ class ModalFit(ModalEstimate):
             Plant with a bare beam.
         """
         visible = self.visible
-        if not visible or any(plant.extras.values()) or len(visible) != visible[-1]:
+        if not visible or any(plant.optional_parameters.values()) or len(visible) != visible[-1]:
             return plant
         poles = dict(zip(self.numbers, self.model.poles_rad_s, strict=True))
         frequency_hz = [poles[number].imag / (2 * math.pi) for number in visible]
@@ -257,7 +257,7 @@ class _ModalSearch:
             problem = search.problem()
             model = problem.model(search.x)
             residual = problem.residual(search.x, model)
-            comparison = search.comparison.renewed(model, search.noise).filled(model)
+            comparison = search.comparison.renewed(model, search.noise).fill_unknown_torque(model)
             power = smooth_power(residual, finely=True)
             power = with_peaks(residual, power, ~search.is_near_mode())
             power /= comparison.measurement.known_torque_fraction

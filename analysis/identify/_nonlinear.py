@@ -45,10 +45,14 @@ if TYPE_CHECKING:
 
 # Torque by a force
 
-Kind = Literal["cubic stiffness", "quadratic stiffness", "quadratic drag"]
+ForceKind = Literal["cubic stiffness", "quadratic stiffness", "quadratic drag"]
 """Kind of a nonlinear restoring force."""
 
-KINDS: Final[tuple[Kind, ...]] = ("cubic stiffness", "quadratic stiffness", "quadratic drag")
+FORCE_KINDS: Final[tuple[ForceKind, ...]] = (
+    "cubic stiffness",
+    "quadratic stiffness",
+    "quadratic drag",
+)
 """All kinds of nonlinear restoring forces that are tested."""
 
 _OVERSAMPLING: Final = 3
@@ -75,12 +79,12 @@ class Term:
     Attributes
     ----------
     kind : str
-        Kind of the force.
+        ForceKind of the force.
     mode : int
         Mode number, from 1.
     """
 
-    kind: Kind
+    kind: ForceKind
     mode: int
 
 
@@ -128,7 +132,7 @@ class ModalForces:
         Parameters
         ----------
         term : Term
-            Kind and mode of the force.
+            ForceKind and mode of the force.
         size : float
             Size e of the force for which the motion of the mode is computed; 0 for the first order.
         """
@@ -181,7 +185,7 @@ class ModalForces:
         return k, damped.astype(np.complex128)
 
     def _force_transform(
-        self, kind: Kind, motion: NDArray[np.complex128], linear_motion: NDArray[np.complex128]
+        self, kind: ForceKind, motion: NDArray[np.complex128], linear_motion: NDArray[np.complex128]
     ) -> NDArray[np.complex128]:
         """Return the transform of n for a motion of a mode, shape (length // 2 + 1,).
 
@@ -243,7 +247,7 @@ class NonlinearForce:
     Attributes
     ----------
     term : Term
-        Kind and mode of the force.
+        ForceKind and mode of the force.
     size : float
         Change of the stiffness at the largest deflection, as a fraction, or change of the damping
         ratio at the largest speed.
@@ -342,7 +346,9 @@ def _best_first_order_force(
     forces = ModalForces(candidate_set.comparison, refit.plant)
     # If drag on the whole beam is significant, drag on a single mode is not tested.
     kinds = (
-        KINDS if candidate_set.drag is None else tuple(k for k in KINDS if k != "quadratic drag")
+        FORCE_KINDS
+        if candidate_set.drag is None
+        else tuple(k for k in FORCE_KINDS if k != "quadratic drag")
     )
     terms = [Term(kind, mode) for kind in kinds for mode in modes]
     terms = [term for term in terms if term not in excluded_terms]

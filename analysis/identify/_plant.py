@@ -36,7 +36,7 @@ def free_settings(fixed: Collection[Setting]) -> tuple[Setting, ...]:
     return tuple(name for name in SETTINGS if name not in fixed)
 
 
-EXTRAS: Final = (
+OPTIONAL_PARAMETERS: Final = (
     "root_compliance_rad_per_nm",
     "tip_mass_kg",
     "filter_time_constant_s",
@@ -91,16 +91,16 @@ class Plant:
     second_order_filter_time_constant_s: float = 0.0
 
     @property
-    def extras(self) -> dict[str, float]:
-        """Return the values of all `EXTRAS` by name."""
-        return {name: getattr(self, name) for name in EXTRAS}
+    def optional_parameters(self) -> dict[str, float]:
+        """Return the values of all `OPTIONAL_PARAMETERS` by name."""
+        return {name: getattr(self, name) for name in OPTIONAL_PARAMETERS}
 
     @property
     def parameters(self) -> dict[str, float]:
         """Return the parameters by name.
 
         The names are zeta, alpha, gamma, lambda, the `SETTINGS`, stiffness_offset_2, …, and those
-        of the `EXTRAS` that are not 0.
+        of the `OPTIONAL_PARAMETERS` that are not 0.
         """
         return {
             "zeta": self.damping.zeta,
@@ -115,5 +115,5 @@ class Plant:
                 f"stiffness_offset_{mode}": offset
                 for mode, offset in enumerate(self.stiffness_offsets, start=2)
             },
-            **{name: value for name, value in self.extras.items() if value},
+            **{name: value for name, value in self.optional_parameters.items() if value},
         }

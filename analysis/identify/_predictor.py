@@ -69,7 +69,7 @@ def torque_channel(
     at = s.astype(np.complex128, copy=False)
     response: NDArray[np.complex128] = np.exp(-plant.delay_s * at)
     for name in _FILTER_TIME_CONSTANTS:
-        constant_s = plant.extras[name]
+        constant_s = plant.optional_parameters[name]
         if constant_s:
             response /= _filter_denominator(name, constant_s, at)
     return response
@@ -279,7 +279,7 @@ class TorquePredictor:
             return (plant.response(self.s) * self._spectrum)[None]
         return self._response.evaluate(plant, wrt, self._spectrum)
 
-    def torque_between(
+    def torque_at_fine_samples(
         self,
         plant: Plant | ModalModel,
         factor: int,

@@ -217,7 +217,7 @@ class Objective:
         """
         x = start
         for _ in range(_MAX_FILLINGS):
-            objective = self._filled(x)
+            objective = self._fill_unknown_torque(x)
             minimum = descend(
                 partial(objective.normal_equations, weight=weight),
                 x,
@@ -234,9 +234,9 @@ class Objective:
                 break
         return objective, minimum
 
-    def _filled(self, x: NDArray[np.float64]) -> Objective:
+    def _fill_unknown_torque(self, x: NDArray[np.float64]) -> Objective:
         """Fill unknown torques with the prediction at `x`; return `self` if all are known."""
-        comparison = self.comparison.filled(self.unknowns.plant(x))
+        comparison = self.comparison.fill_unknown_torque(self.unknowns.plant(x))
         if comparison is self.comparison:
             return self
         return Objective(comparison, self.unknowns, self.columns)
