@@ -251,12 +251,16 @@ def _basis() -> _Basis:
 
 @lru_cache(maxsize=16)
 def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> ModeTerms:
-    """Return the Galerkin coefficients of the given modes of an altered beam."""
+    """Return the Galerkin coefficients of the given modes of an altered beam.
+
+    `modes` are mode numbers, from 1. The basis is extended by one mode for each point mass, which
+    represents all modes beyond the basis.
+    """
     basis = _basis()
     length, indices = beam.length_m, np.array(modes) - 1
     lump_count = len(alteration.lumps)
 
-    def padded(array: NDArray[np.float64], value: float = 0.0) -> NDArray[np.float64]:
+    def with_lump_modes(array: NDArray[np.float64], value: float = 0.0) -> NDArray[np.float64]:
         if not lump_count:
             return array
         found = np.zeros((_BASIS_MODES + lump_count,) * array.ndim)
@@ -266,38 +270,42 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
         return found
 
     density_deviation = basis.deviation(alteration.density)
-    mass = padded(
+    mass = with_lump_modes(
         np.eye(_BASIS_MODES) + basis.weighted_products(basis.shapes, density_deviation), 1.0
     )
-    mass_arm = padded(basis.arms + basis.shapes @ (basis.weights * density_deviation * basis.x))
+    mass_arm = with_lump_modes(
+        basis.arms + basis.shapes @ (basis.weights * density_deviation * basis.x)
+    )
     lump, lump_arm = np.zeros_like(mass), np.zeros_like(mass_arm)
-    tension, tension_arm = padded(basis.tension), padded(basis.arms_of_tension)
+    tension, tension_arm = with_lump_modes(basis.tension), with_lump_modes(basis.arms_of_tension)
     for index, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS_MODES):
-        fraction, shape = (
+        mass_fraction, shape = (
             mass_kg / (beam.density_kg_per_m * length),
-            padded(_basis_shapes_at_lump(position).copy()),
+            with_lump_modes(_basis_shapes_at_lump(position).copy()),
         )
         # All modes beyond the basis act on a point mass as one spring, and move as one mode.
         beyond = position**3 / 3 - float(np.sum((shape[:_BASIS_MODES] / basis.z**2) ** 2))
         shape[index] = math.sqrt(max(beyond, 0.0)) * _NEXT_EIGENVALUE**2
-        lump += fraction * np.outer(shape, shape)
-        lump_arm += fraction * position * shape
+        lump += mass_fraction * np.outer(shape, shape)
+        lump_arm += mass_fraction * position * shape
         if alteration.gravity_m_s2:
-            inside = np.where(basis.x < position, fraction, 0.0)
-            tension = tension + padded(basis.weighted_products(basis.slopes, inside))
-            tension_arm = tension_arm + fraction * shape
+            mass_outboard = np.where(basis.x < position, mass_fraction, 0.0)
+            tension = tension + with_lump_modes(
+                basis.weighted_products(basis.slopes, mass_outboard)
+            )
+            tension_arm = tension_arm + mass_fraction * shape
     # Flexibility of beam and clamp to loads with the shapes of the basis
     moments = basis.curvatures / basis.z[:, None] ** 4
     relative_flexibility = 1 / (1 + basis.deviation(alteration.stiffness))
-    beam_flexibility = padded(
+    beam_flexibility = with_lump_modes(
         basis.weighted_products(moments, relative_flexibility), _NEXT_EIGENVALUE**-4.0
     )
-    root_moments = padded(2 * (-1.0) ** np.arange(_BASIS_MODES) / basis.z**2)
+    root_moments = with_lump_modes(2 * (-1.0) ** np.arange(_BASIS_MODES) / basis.z**2)
     clamp_flexibility: Terms = alteration.clamp_compliance * np.outer(root_moments, root_moments)
-    elastic: Terms = np.linalg.inv(beam_flexibility + clamp_flexibility)
+    elastic_stiffness: Terms = np.linalg.inv(beam_flexibility + clamp_flexibility)
     gravity_factor = alteration.gravity_m_s2 * beam.density_over_stiffness * length**3
     # Eigenvalues are 1 / omega²: the largest ones, of the lowest modes, are the most exact.
-    inverse_factor = np.linalg.inv(np.linalg.cholesky(elastic + gravity_factor * tension))
+    inverse_factor = np.linalg.inv(np.linalg.cholesky(elastic_stiffness + gravity_factor * tension))
     inverse_squares, eigenvectors = np.linalg.eigh(
         inverse_factor @ (mass + lump) @ inverse_factor.T
     )
@@ -306,9 +314,9 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     shapes: Terms = all_shapes[:, indices]
     if alteration.clamp_loss:
         clamp_flexibility = clamp_flexibility / (1 + 1j * alteration.clamp_loss)
-        elastic = np.linalg.inv(beam_flexibility + clamp_flexibility)
-        shapes = _complex_shapes(elastic + gravity_factor * tension, mass + lump, shapes)
-    loads = elastic @ shapes
+        elastic_stiffness = np.linalg.inv(beam_flexibility + clamp_flexibility)
+        shapes = _complex_shapes(elastic_stiffness + gravity_factor * tension, mass + lump, shapes)
+    loads = elastic_stiffness @ shapes
     modal_masses = np.sum(shapes * shapes, axis=0)
     # Losses change the mode shapes to first order, and so the phase of the residues.
     eigenvalue_differences = 1 / inverse_squares[indices] - 1 / inverse_squares[:, None]
@@ -316,10 +324,10 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     mass_arms = (mass_arm + lump_arm) @ all_shapes
     turn_by_medium = mass_arms @ ((all_shapes.T @ shapes) / eigenvalue_differences)
     turn_by_internal = mass_arms @ (
-        ((elastic @ all_shapes).T @ beam_flexibility @ loads) / eigenvalue_differences
+        ((elastic_stiffness @ all_shapes).T @ beam_flexibility @ loads) / eigenvalue_differences
     )
 
-    def of_shapes(matrix: NDArray[np.float64]) -> Terms:
+    def modal_coefficients(matrix: NDArray[np.float64]) -> Terms:
         found: Terms = np.sum(shapes * (matrix @ shapes), axis=0) / modal_masses
         return found
 
@@ -328,12 +336,12 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     return ModeTerms(
         stiffness=np.sum(loads * (beam_flexibility @ loads), axis=0) / modal_masses / length**4,
         clamp=np.sum(loads * (clamp_flexibility @ loads), axis=0) / modal_masses / length**4,
-        mass=of_shapes(mass),
-        lump=of_shapes(lump),
-        tension=gravity_per_length * of_shapes(tension),
+        mass=modal_coefficients(mass),
+        lump=modal_coefficients(lump),
+        tension=gravity_per_length * modal_coefficients(tension),
         mass_arm=mass_arm @ shapes / root_modal_masses,
         lump_arm=lump_arm @ shapes / root_modal_masses,
-        medium_arm=padded(basis.arms) @ shapes / root_modal_masses,
+        medium_arm=with_lump_modes(basis.arms) @ shapes / root_modal_masses,
         tension_arm=gravity_per_length * (tension_arm @ shapes) / root_modal_masses,
         turn_by_medium=turn_by_medium / root_modal_masses * length**4,
         turn_by_internal=turn_by_internal / root_modal_masses,

@@ -154,14 +154,16 @@ class CandidateSet:
         MeasurementError
             The record cannot be used.
         """
-        first, *other_candidates = earlier
-        if first.columns:
+        first_candidate, *other_candidates = earlier
+        if first_candidate.columns:
             return None  # nonlinear effects are searched for again, in the whole record
-        unknowns = Unknowns.of(first.structure, measurement.nominal, free_settings(fixed))
-        analysis = refit_record(measurement, unknowns, first.fit.plant, band_hz=band_hz)
+        unknowns = Unknowns.of(first_candidate.structure, measurement.nominal, free_settings(fixed))
+        analysis = refit_record(measurement, unknowns, first_candidate.fit.plant, band_hz=band_hz)
         if analysis is None:
             return None
-        candidate_set = cls._from_analysis(analysis, fixed, (replace(first, fit=analysis.fits[0]),))
+        candidate_set = cls._from_analysis(
+            analysis, fixed, (replace(first_candidate, fit=analysis.fits[0]),)
+        )
         earlier_set = replace(candidate_set, candidates=tuple(earlier))
         refitted = (earlier_set._refit_in(candidate_set, c, MANY) for c in other_candidates)
         candidate_set = (
@@ -239,8 +241,8 @@ class CandidateSet:
 
     def led_by(self, candidate: Candidate) -> CandidateSet:
         """Return the candidate set with one candidate first, whose numbers are then reported."""
-        others = (c for c in self.candidates if c is not candidate)
-        return replace(self, candidates=(candidate, *others))
+        other_candidates = (c for c in self.candidates if c is not candidate)
+        return replace(self, candidates=(candidate, *other_candidates))
 
     @property
     def likeliest(self) -> RecordFit:
@@ -298,8 +300,12 @@ class CandidateSet:
         if candidate_set is self:
             return self
         # The other candidates start from their former minima, under the new noise.
-        others = (c for c in self.candidates if c is not self.best)
-        refitted = (self._refit_in(candidate_set, c, MANY) for c in others)
+        other_candidates = (
+            candidate for candidate in self.candidates if candidate is not self.best
+        )
+        refitted = (
+            self._refit_in(candidate_set, candidate, MANY) for candidate in other_candidates
+        )
         return candidate_set.with_candidates((*candidate_set.candidates, *refitted)).cross_check()
 
     def _exclude_leakage(self) -> CandidateSet:
@@ -398,14 +404,14 @@ class CandidateSet:
             set to one standard deviation, and the fit is not a minimum.
         """
         structure, own_fit = candidate.structure, candidate.fit
-        absent = [
+        absent_dampings = [
             (order, coefficient)
             for order, coefficient in COEFFICIENT_OF.items()
             if not structure.has(coefficient) or order in own_fit.at_bounds
         ]
-        if len(absent) != 1:
+        if len(absent_dampings) != 1:
             return own_fit, False
-        ((order, coefficient),) = absent
+        ((order, coefficient),) = absent_dampings
         fixed = {name: value for name, value in structure.fixed.items() if structure.has(name)}
         fixed[order] = 1.0  # type: ignore[index]
         free = tuple(name for name in PARAMETERS if name not in fixed)
@@ -413,12 +419,12 @@ class CandidateSet:
         unknowns = self.unknowns(both_dampings)
         index = unknowns.names.index(coefficient)
         start_point = self.descent(unknowns, unknowns.vector(own_fit.plant), 1)
-        growth = 1 + float(
+        coefficient_growth = 1 + float(
             start_point.predicted_step[index]
         )  # the step is linear in the coefficient, not in its logarithm
-        if growth > 1:
+        if coefficient_growth > 1:
             start = start_point.x.copy()
-            start[index] += math.log(growth)
+            start[index] += math.log(coefficient_growth)
             minimum = self.descent(unknowns, start, MANY)
             if minimum.x[index] > start_point.x[index]:
                 return minimum.fit(), False
@@ -433,20 +439,20 @@ class CandidateSet:
         best = self.best
         by_structure = {c.structure.name: c.fit for c in self.candidates}
         refits: list[Refit] = []
-        added: list[Candidate] = []
+        added_candidates: list[Candidate] = []
 
-        def fitted(structure: Structure) -> RecordFit:
+        def fit_structure(structure: Structure) -> RecordFit:
             refits.append(self.descend_from_plant(best.fit.plant, structure))
-            added.append(refits[-1].candidate())
-            return added[-1].fit
+            added_candidates.append(refits[-1].candidate())
+            return added_candidates[-1].fit
 
-        freest = by_structure.get(_FREEST.name) or fitted(_FREEST)
+        freest = by_structure.get(_FREEST.name) or fit_structure(_FREEST)
         for structure in _one_damping_structures(freest):
             if structure.name not in by_structure:
-                fitted(structure)
+                fit_structure(structure)
         if not refits:
             return self
-        new_set = self.with_candidates((*self.candidates, *added))
+        new_set = self.with_candidates((*self.candidates, *added_candidates))
         if new_set.best.bic > best.bic - _MIN_BIC_REDUCTION_FOR_NEW_NOISE:
             return new_set.cross_check()
         return new_set.refit_under_noise(min(refits, key=lambda refit: refit.cost).noise_here())

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 def findings(
     candidate_set: CandidateSet,
     forces: tuple[NonlinearForce, ...],
-    multiples: tuple[Harmonic, ...],
+    harmonics: tuple[Harmonic, ...],
 ) -> tuple[Finding, ...]:
     """Return the findings of a record; only those that need no model if a sign or unit is wrong.
 
@@ -44,7 +44,7 @@ def findings(
         Candidates for the record.
     forces : tuple of NonlinearForce
         Significant nonlinear forces.
-    multiples : tuple of Harmonic
+    harmonics : tuple of Harmonic
         Residual at multiples of the sweep's frequency.
     """
     measurement = candidate_set.comparison.measurement
@@ -55,14 +55,14 @@ def findings(
     )
     if candidate_set.misread:
         return model_independent
-    found = (
+    all_findings = (
         *model_independent,
         *_hum_findings(candidate_set),
         *_drag_findings(candidate_set),
         *map(_force_finding, forces),
-        *_harmonic_findings(multiples),
+        *_harmonic_findings(harmonics),
     )
-    return (*found, *search_limit_findings(candidate_set))
+    return (*all_findings, *search_limit_findings(candidate_set))
 
 
 # Settings at the limit of the search range, or different from the file
@@ -168,16 +168,16 @@ def _instrument_findings(candidate_set: CandidateSet, headline: Headline) -> Ite
 
 def _beam_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
     """Yield findings of density and stiffness that differ from the file."""
-    beam: tuple[tuple[Setting, str], ...] = (
+    beam_parameters: tuple[tuple[Setting, str], ...] = (
         ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)"),
         ("bending_stiffness_n_m2", "The bending stiffness (EI)"),
     )
-    for name, description in beam:
+    for name, description in beam_parameters:
         stated_value = _stated_value(candidate_set, name)
         deviation = _significant_deviation(candidate_set, headline, name)
         if deviation is None or abs(deviation[0]) < _MIN_REPORTED_BEAM_DEVIATION * stated_value:
             continue
-        relative, *interval = (part / stated_value for part in deviation)
+        relative, *interval = (each / stated_value for each in deviation)
         low, high = interval
         (size,) = to_uncertainty((abs(relative),), (high - low) / 2, 100)
         yield Finding(
@@ -442,9 +442,9 @@ def _force_finding(force: NonlinearForce) -> Finding:
     )
 
 
-def _harmonic_findings(multiples: tuple[Harmonic, ...]) -> Iterator[Finding]:
+def _harmonic_findings(harmonics: tuple[Harmonic, ...]) -> Iterator[Finding]:
     """Yield a finding for each multiple of the sweep frequency that is present in the residual."""
-    for harmonic in multiples:
+    for harmonic in harmonics:
         if harmonic.present:
             parity = "odd" if harmonic.multiple % 2 else "even"
             yield Finding(

@@ -209,10 +209,10 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
     if converged is None:
         return candidate_set
     # The freest structure starts from this fit: its fit without drag may be far off.
-    start_comparison, point = converged.objective.comparison, _DragFitStart.of(converged)
+    start_comparison, next_start = converged.objective.comparison, _DragFitStart.of(converged)
     for name in (_FREEST_STRUCTURE, _FIRST_STRUCTURE):
         converged = _converged_drag_fit(
-            candidate_set, point, STRUCTURES[name], start_comparison=start_comparison
+            candidate_set, next_start, STRUCTURES[name], start_comparison=start_comparison
         )
         if converged is not None:
             break
@@ -280,13 +280,13 @@ def _first_order_drag(refit: Refit) -> tuple[float, float]:
 
     All other parameters of the fit stay free.
     """
-    (column,), residual = refit.unexplained_columns(
+    (drag_spectrum,), residual = refit.unexplained_columns(
         small_drag(refit.objective.comparison, refit.plant)
     )
-    square = float(np.vdot(column, column).real)
+    square = float(np.vdot(drag_spectrum, drag_spectrum).real)
     if square <= 0:
         return 0.0, 0.0
-    projection = float(np.vdot(column, residual).real)
+    projection = float(np.vdot(drag_spectrum, residual).real)
     return -projection / square, projection**2 / square
 
 
@@ -306,21 +306,21 @@ def _first_order_start(candidate_set: CandidateSet, candidate: Candidate) -> _Dr
 
 def _converged_drag_fit(
     candidate_set: CandidateSet,
-    point: _DragFitStart,
+    fit_start: _DragFitStart,
     structure: Structure,
     *,
     tolerance: float = _COST_TOLERANCE,
     start_comparison: Comparison | None = None,
 ) -> Refit | None:
-    """Fit one structure with drag, starting from `point`, until the drag torque has converged.
+    """Fit one structure with drag, starting from `fit_start`, until the drag torque has converged.
 
-    `tolerance` is the largest cost reduction by a further step, `known` the comparison with the
-    drag of the start, if it has been computed. Return None if the drag is negative, is unstable or
-    does not converge.
+    `tolerance` is the largest cost reduction by a further step. `start_comparison` is the
+    comparison with the drag of the start, if it has been computed. Return None if the drag is
+    negative, is unstable or does not converge.
     """
     unknowns = candidate_set.unknowns(structure)
-    x = unknowns.vector(point.plant)
-    law, noise, two_numbers = point.law, point.noise, point.two_numbers
+    x = unknowns.vector(fit_start.plant)
+    law, noise, two_numbers = fit_start.law, fit_start.noise, fit_start.two_numbers
     comparison, is_rough, cost_reduction = start_comparison, tolerance > _COST_TOLERANCE, math.inf
     for _ in range(_MAX_DRAG_COMPUTATIONS):
         if comparison is None:
@@ -373,9 +373,9 @@ def _law_at_minimum(refit: Refit) -> DragLaw:
     """
     expansion = refit.objective.comparison.drag
     assert expansion is not None
-    step = refit.amplitudes()[0].tolist()
-    slowing = expansion.law.slowing + (step[1] if len(step) > 1 else 0.0)
-    return DragLaw(expansion.law.constant_m + step[0], slowing)
+    law_change = refit.amplitudes()[0].tolist()
+    slowing = expansion.law.slowing + (law_change[1] if len(law_change) > 1 else 0.0)
+    return DragLaw(expansion.law.constant_m + law_change[0], slowing)
 
 
 def _fit_all_structures(candidate_set: CandidateSet, converged: Refit) -> CandidateSet:
@@ -420,19 +420,21 @@ def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
     covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom
     expansion = refit.objective.comparison.drag
     assert expansion is not None
-    speed = expansion.speed_m_s
+    speed_m_s = expansion.speed_m_s
     weights = np.ones(1)
     if len(covariance) > 1:
-        pivot = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
-        top_speed = expansion.top_speed_m_s
-        speed = min(max(float(pivot**-1.5), _LOWEST_RELATIVE_SPEED * top_speed), top_speed)
-        weights = np.array([1.0, speed ** (-2 / 3)])
-    value, std = law.at(speed), math.sqrt(float(weights @ covariance @ weights))
+        pivot_weight = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
+        top_speed_m_s = expansion.top_speed_m_s
+        speed_m_s = min(
+            max(float(pivot_weight**-1.5), _LOWEST_RELATIVE_SPEED * top_speed_m_s), top_speed_m_s
+        )
+        weights = np.array([1.0, speed_m_s ** (-2 / 3)])
+    value, std = law.at(speed_m_s), math.sqrt(float(weights @ covariance @ weights))
     return DragEstimate(
         value_m=value,
         std_m=std,
         interval_95_m=(max(value - NORMAL_95 * std, 0.0), value + NORMAL_95 * std),
-        speed_m_s=speed,
+        speed_m_s=speed_m_s,
         law=law,
         covariance=tuple(tuple(row) for row in covariance.tolist()),
     )

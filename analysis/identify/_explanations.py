@@ -160,14 +160,14 @@ def explanations(
         ):
             explained_by[cause.name] = cause_fit
     lowest_chi_square = min((each.chi_square for each in explained_by.values()), default=0.0)
-    named = [
+    named_causes = [
         each
         for each in explained_by.values()
         if each.p_value >= _NAMED_P_VALUE
         or each.chi_square <= lowest_chi_square + _NAMED_CHI_SQUARE_MARGIN
     ]
-    named.sort(key=lambda each: -each.p_value)
-    return tuple(named[:_MAX_NAMED_CAUSES])
+    named_causes.sort(key=lambda each: -each.p_value)
+    return tuple(named_causes[:_MAX_NAMED_CAUSES])
 
 
 def _fit_cause(
@@ -247,7 +247,7 @@ class _CauseSearch:
         tolerance: float = _CONSTANT_TOLERANCES[0],
     ) -> None:
         self._problem, self._cause, self._beam_x = problem, cause, x
-        self._plain = mode_terms(Alteration(), problem.nominal.beam, problem.modes)
+        self._plain_terms = mode_terms(Alteration(), problem.nominal.beam, problem.modes)
         self._lower = np.concatenate([problem.lower, cause.lower])
         upper = np.where(x <= problem.lower, problem.lower, problem.upper)
         self._upper = np.concatenate([upper, cause.upper])
@@ -311,7 +311,7 @@ class _CauseSearch:
         beam = self._problem.plant(x).beam
         alteration = self._cause.alter(self._problem.stated, cause_unknowns, beam)
         if alteration.has_same_shapes(Alteration()):
-            return replace(self._plain, alteration=alteration)
+            return replace(self._plain_terms, alteration=alteration)
         terms = mode_terms(alteration, beam, self._problem.modes)
         # The mass of a cause is a fraction of the beam's, so the mode shapes do not depend on it.
         return terms if self._problem.stated.lumps else replace(terms, density_kg_per_m=None)
@@ -337,9 +337,11 @@ class _CauseSearch:
         self, y: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the whitened deviations and their derivatives by the beam's unknowns."""
-        count = self._beam_x.size
-        steps = np.concatenate([np.zeros((1, count)), _DERIVATIVE_STEP * np.eye(count)])
-        deviations = self._whitened_deviations(y[:count] + steps, self._mode_terms(y))
+        beam_unknowns = self._beam_x.size
+        steps = np.concatenate(
+            [np.zeros((1, beam_unknowns)), _DERIVATIVE_STEP * np.eye(beam_unknowns)]
+        )
+        deviations = self._whitened_deviations(y[:beam_unknowns] + steps, self._mode_terms(y))
         return deviations[0], (deviations[1:] - deviations[0]) / _DERIVATIVE_STEP
 
     def _deviations_by_all(

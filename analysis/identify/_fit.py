@@ -98,46 +98,48 @@ def fit_record(
     invalid_names = sorted(set(fixed) - set(SETTINGS))
     if invalid_names:
         raise ValueError(f"{invalid_names} cannot be fixed: choose from {SETTINGS}.")
-    free = free_settings(fixed)
+    free_names = free_settings(fixed)
     comparison = Comparison.of(measurement, band_hz)
     nominal = measurement.nominal
-    coarse = CoarseResponse(comparison)
+    coarse_response = CoarseResponse(comparison)
     searches = [
-        StructureSearch.of(Objective(comparison, unknowns), coarse)
-        for unknowns in (Unknowns.of(structure, nominal, free) for structure in structures)
+        StructureSearch.of(Objective(comparison, unknowns), coarse_response)
+        for unknowns in (Unknowns.of(structure, nominal, free_names) for structure in structures)
     ]
-    closest = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
-    reference = searches[closest].lowest()
-    reference = reference.to_minimum(reference.noise(), _ROUGH_COST_TOLERANCE)
-    whole_angle = reference.objective.comparison
-    comparison = whole_angle.use_reference_coherent_angle(reference.plant)
+    closest_index = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
+    reference_descent = searches[closest_index].lowest()
+    reference_descent = reference_descent.to_minimum(
+        reference_descent.noise(), _ROUGH_COST_TOLERANCE
+    )
+    whole_angle = reference_descent.objective.comparison
+    comparison = whole_angle.use_reference_coherent_angle(reference_descent.plant)
     searches = [search.on(comparison) for search in searches]
-    reference = Descent(searches[closest].objective, reference.x)
-    without_hum = reference.without_hum(_ROUGH_COST_TOLERANCE)
-    if without_hum is not reference:
-        reference = _update_reference_following(without_hum, whole_angle)
-        comparison = reference.objective.comparison
-        coarse = CoarseResponse(comparison)
+    reference_descent = Descent(searches[closest_index].objective, reference_descent.x)
+    without_hum = reference_descent.without_hum(_ROUGH_COST_TOLERANCE)
+    if without_hum is not reference_descent:
+        reference_descent = _update_reference_following(without_hum, whole_angle)
+        comparison = reference_descent.objective.comparison
+        coarse_response = CoarseResponse(comparison)
         searches = [
-            StructureSearch.of(Objective(comparison, search.unknowns), coarse)
+            StructureSearch.of(Objective(comparison, search.unknowns), coarse_response)
             for search in searches
         ]
     # The incoherent part of the angle may contain the beam's motion, and not noise alone. It is
     # re-estimated with the closest structure, before and after all others are fitted.
-    renewed = reference.renewed(reference.noise(), _ROUGH_COST_TOLERANCE)
+    updated_descent = reference_descent.renewed(reference_descent.noise(), _ROUGH_COST_TOLERANCE)
     descents: list[Descent] = []
     for _ in range(_MAX_REFERENCE_ESTIMATES):
-        if renewed is not reference:
-            reference = renewed
-            comparison = reference.objective.comparison
+        if updated_descent is not reference_descent:
+            reference_descent = updated_descent
+            comparison = reference_descent.objective.comparison
             searches = [search.on(comparison) for search in searches]
-        noise, descents = _descend_with_noise(searches, closest, reference, descents)
-        closest = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
-        reference = descents[closest]
-        if not _residual_is_noise(reference, noise):
+        noise, descents = _descend_with_noise(searches, closest_index, reference_descent, descents)
+        closest_index = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
+        reference_descent = descents[closest_index]
+        if not _residual_is_noise(reference_descent, noise):
             break  # none of these explains it, so a further pass does not distinguish them better
-        renewed = reference.renewed(noise, _ROUGH_COST_TOLERANCE)
-        if renewed is reference:
+        updated_descent = reference_descent.renewed(noise, _ROUGH_COST_TOLERANCE)
+        if updated_descent is reference_descent:
             break
     fits = (summary(descent.objective, descent.x, noise) for descent in descents)
     return RecordAnalysis.of(fits, noise, comparison)
@@ -186,27 +188,29 @@ def refit_record(
 
 def _descend_with_noise(
     searches: list[StructureSearch],
-    closest: int,
-    reference: Descent,
+    closest_index: int,
+    reference_descent: Descent,
     earlier_descents: list[Descent],
 ) -> tuple[NoiseSpectrum, list[Descent]]:
     """Fit all structures under the noise estimated from the residual of the closest structure.
 
-    `searches` holds one search for each structure; `closest` is the index of the closest one, and
-    `reference` its descent. `earlier_descents` holds those before the part that follows the
-    reference was re-estimated, and is empty the first time: a structure that was far behind then is
-    not searched for again.
+    `searches` holds one search for each structure; `closest_index` is the index of the closest
+    structure, and `reference_descent` its descent. `earlier_descents` are the descents before the
+    part that follows the reference was re-estimated; it is empty the first time. A structure that
+    was far behind in them is not searched for again.
     """
     # Lines are searched for once, in the residual of a fit to every bin.
-    noise = reference.noise(with_lines=True)
-    hum = reference.objective.comparison.hum
+    noise = reference_descent.noise(with_lines=True)
+    hum = reference_descent.objective.comparison.hum
     noise = replace(noise, lines=(*noise.lines, *(each.line for each in hum)))
-    closest_descent = searches[closest].under(noise, reference).to_minimum(noise, _COST_TOLERANCE)
+    closest_descent = (
+        searches[closest_index].under(noise, reference_descent).to_minimum(noise, _COST_TOLERANCE)
+    )
     far_behind_ratio = math.exp(FAR_BEHIND / (2 * np.count_nonzero(noise.counts)))
     cost_limit = far_behind_ratio * closest_descent.cost(noise)
     descents = []
     for i, search in enumerate(searches):
-        descent = closest_descent if i == closest else None
+        descent = closest_descent if i == closest_index else None
         if descent is None and earlier_descents:
             descent = _descent_if_still_worse(
                 Descent(search.objective, earlier_descents[i].x), noise, cost_limit
@@ -272,11 +276,11 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
     # Where the torque is unknown the residual is 0 and adds nothing to the cost.
     compared_values = round(2 * np.sum(noise.counts) * comparison.measurement.known_torque_fraction)
     degrees_of_freedom = compared_values - x.size - projected.amplitudes.size
-    scatter = projected.cost / degrees_of_freedom
+    residual_variance = projected.cost / degrees_of_freedom
     lower, upper = unknowns.bounds
     at_bound = (x <= lower) | (x >= upper)
     jacobian = _compared_jacobian(objective, x, projected, noise)
-    covariance, determined = covariance_of_unknowns(jacobian, scatter, at_bound)
+    covariance, determined = covariance_of_unknowns(jacobian, residual_variance, at_bound)
     names, plant = unknowns.names, unknowns.plant(x)
     values = unknowns.parameters(x)
     uncertainty = parameter_uncertainty(unknowns, x, at_bound, covariance, determined)
@@ -285,7 +289,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
     if tool_inertia in names and at_bound[names.index(tool_inertia)]:
         index = names.index(tool_inertia)
         other_at_bound = at_bound & (np.arange(at_bound.size) != index)
-        free_covariance, _ = covariance_of_unknowns(jacobian, scatter, other_at_bound)
+        free_covariance, _ = covariance_of_unknowns(jacobian, residual_variance, other_at_bound)
         estimates_by_unknowns = unknowns.estimates_by_unknowns(x)
         std[tool_inertia] = float(
             estimates_by_unknowns[index, index] * free_covariance[index, index] ** 0.5
@@ -309,7 +313,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
         ringing=ringing(
             linearisation.poles,
             projected,
-            scatter,
+            residual_variance,
             linearisation.columns * noise.weight,
             hum_spectra,
         ),

@@ -135,24 +135,24 @@ def hum_near_modes(
     measured = comparison.torque_nm[comparison.retained] + comparison.hum_nm
     hz = comparison.frequency_hz
     blocks = _Blocks(comparison.samples, comparison.decimation.rate_hz)
-    found: list[Hum] = []
+    hums: list[Hum] = []
     for pole in poles:
         if not pole.oscillates:
             continue
-        at_hz = pole.at_rad_s.imag / (2 * np.pi)
+        mode_hz = pole.at_rad_s.imag / (2 * np.pi)
         reach_hz = _SEARCH_HALF_WIDTHS * resonance_reach_hz(pole, float(hz[1] - hz[0]))
-        search_range_hz = (max(at_hz - reach_hz, hz[0]), min(at_hz + reach_hz, hz[-1]))
+        search_range_hz = (max(mode_hz - reach_hz, hz[0]), min(mode_hz + reach_hz, hz[-1]))
         if search_range_hz[1] - search_range_hz[0] < reach_hz / 2:
             continue  # a wrong model may have modes outside the band
-        variance = float(np.interp(at_hz, hz, noise.power)) / comparison.samples
+        variance = float(np.interp(mode_hz, hz, noise.power)) / comparison.samples
         hum = blocks.find_steady_hum(
             measured - predicted, predicted, decaying_nm, search_range_hz, variance
         )
         if hum is not None and all(
-            abs(hum.frequency_hz - other.frequency_hz) > hz[1] - hz[0] for other in found
+            abs(hum.frequency_hz - other_hum.frequency_hz) > hz[1] - hz[0] for other_hum in hums
         ):
-            found.append(hum)
-    return tuple(found)
+            hums.append(hum)
+    return tuple(hums)
 
 
 class _Blocks:
@@ -161,17 +161,17 @@ class _Blocks:
     def __init__(self, samples: int, rate_hz: float) -> None:
         self.rate_hz = rate_hz
         self.time_s = np.arange(samples) / rate_hz
-        half = round(_BLOCK_S * rate_hz / 2)
-        self.window = np.hanning(2 * half + 1)[:-1]
-        self.block_indices = np.arange(0, samples - 2 * half + 1, half)[:, None] + np.arange(
-            2 * half
-        )
+        half_block = round(_BLOCK_S * rate_hz / 2)
+        self.window = np.hanning(2 * half_block + 1)[:-1]
+        self.block_indices = np.arange(0, samples - 2 * half_block + 1, half_block)[
+            :, None
+        ] + np.arange(2 * half_block)
 
     def find_steady_hum(
         self,
         residual: NDArray[np.float64],
         predicted: NDArray[np.float64],
-        decaying: NDArray[np.float64],
+        free_decay: NDArray[np.float64],
         range_hz: tuple[float, float],
         variance: float,
     ) -> Hum | None:
@@ -179,7 +179,7 @@ class _Blocks:
 
         Parameters
         ----------
-        residual, predicted, decaying : ndarray, shape (samples,)
+        residual, predicted, free_decay : ndarray, shape (samples,)
             Torque in N·m: residual, prediction, and estimated free decay.
         near_hz : tuple of float
             Lowest and highest frequency of the search.
@@ -195,19 +195,21 @@ class _Blocks:
             noise_power
             + (_ASSUMED_MODEL_ERROR * self._largest_block_magnitudes(predicted, *range_hz)) ** 2
         )
-        block_power += self._largest_block_magnitudes(decaying, *range_hz) ** 2
-        weight = np.zeros(residual.size)
-        for part, ratio in zip(self.block_indices, noise_power / block_power, strict=True):
-            weight[part] += ratio * self.window
-        if weight.mean() < _MIN_SILENT_FRACTION:
+        block_power += self._largest_block_magnitudes(free_decay, *range_hz) ** 2
+        time_weight = np.zeros(residual.size)
+        for indices, block_weight in zip(
+            self.block_indices, noise_power / block_power, strict=True
+        ):
+            time_weight[indices] += block_weight * self.window
+        if time_weight.mean() < _MIN_SILENT_FRACTION:
             return None
-        hum, growth_per_s = self._fit_strongest_sinusoid(residual, weight, range_hz)
+        hum, growth_per_s = self._fit_strongest_sinusoid(residual, time_weight, range_hz)
         if abs(growth_per_s) * residual.size > _MAX_RELATIVE_GROWTH * self.rate_hz:
             return None
-        if abs(hum.phasor_nm) ** 2 * weight.sum() < 4 * variance * _MIN_HUM_POWER_RATIO:
+        if abs(hum.phasor_nm) ** 2 * time_weight.sum() < 4 * variance * _MIN_HUM_POWER_RATIO:
             return None
         if abs(hum.phasor_nm) < _MIN_HUM_OVER_PREDICTION * self._largest_amplitude(
-            predicted, weight, hum.frequency_hz
+            predicted, time_weight, hum.frequency_hz
         ):
             return None
         block_phasor = hum.phasor_nm / 2 * self.window.sum()
@@ -229,8 +231,8 @@ class _Blocks:
         hz = np.linspace(first_hz, last_hz, count)
         rotation = np.exp(-2j * np.pi * np.outer(np.arange(self.window.size) / self.rate_hz, hz))
         spectra = values[self.block_indices] @ (self.window[:, None] * rotation)
-        largest: NDArray[np.float64] = np.abs(spectra).max(axis=1)
-        return largest
+        magnitudes: NDArray[np.float64] = np.abs(spectra).max(axis=1)
+        return magnitudes
 
     def _largest_amplitude(
         self, values: NDArray[np.float64], weight: NDArray[np.float64], at_hz: float

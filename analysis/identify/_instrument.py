@@ -8,12 +8,12 @@ standard deviations at 1e-2 N·m. The reference was known beforehand and does no
 noise, so the part of the angle that is coherent with the reference is used as input
 (`reference_coherent_part`). The torque caused by the remaining angle is computed with the current
 estimate of the beam, and removed. The fit to the remaining torque is the instrumental-variable
-estimate with the reference as instrument. Where the remaining angle is noise, it is unbiased for any beam. But a beam that rings
-for long moves the motor in bands narrower than the smoothing of the response, and then the
-remaining angle is not noise: in a record of narrow sweeps with 0.2 g at the tip the first beam
-would bias the result by up to 45 standard deviations. So if a better beam predicts another torque,
-the part of the angle that follows the reference is re-estimated, with the torque on the motor as a
-second input (`Comparison.renewed`).
+estimate with the reference as instrument. Where the remaining angle is noise, the estimate is
+unbiased for any beam. But a beam that rings for long moves the motor in bands narrower than the
+smoothing of the response, and then the remaining angle is not noise: in a record of narrow sweeps
+with 0.2 g at the tip the first beam would bias the result by up to 45 standard deviations. So if a
+better beam predicts another torque, the part of the angle that follows the reference is
+re-estimated, with the torque on the motor as a second input (`Comparison.renewed`).
 
 References
 ----------
@@ -72,19 +72,19 @@ def reference_coherent_part(
     )
     length = fast_length(2 * (angle_rad.size + return_to_zero.size))
 
-    def transformed(values: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def spectrum_of(values: NDArray[np.float64]) -> NDArray[np.complex128]:
         return np.fft.rfft(np.concatenate([values, values[-1] * return_to_zero]), length)
 
     lag_s = np.fft.fftfreq(length) * (length / rate_hz)
     window = np.exp(-0.5 * (lag_s / _LAG_WINDOW_S) ** 2)
 
-    def smoothed(power: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def smooth_over_frequency(power: NDArray[np.complex128]) -> NDArray[np.complex128]:
         return np.fft.rfft(window * np.fft.irfft(power, length))
 
-    angle, reference = transformed(angle_rad), transformed(reference_rad)
+    angle, reference = spectrum_of(angle_rad), spectrum_of(reference_rad)
     cross_spectrum, reference_power = (
-        smoothed(angle * reference.conj()),
-        smoothed(np.abs(reference) ** 2).real,
+        smooth_over_frequency(angle * reference.conj()),
+        smooth_over_frequency(np.abs(reference) ** 2).real,
     )
     if not reference_power.max() > 0:
         return np.zeros(angle_rad.size)
@@ -92,16 +92,18 @@ def reference_coherent_part(
     spectrum = cross_spectrum / reference_power * reference
     if torque_nm is not None:
         # Use the part of the torque that is no smooth response to the reference.
-        torque = transformed(torque_nm)
-        torque_by_reference = smoothed(torque * reference.conj()) / reference_power
+        torque = spectrum_of(torque_nm)
+        torque_by_reference = smooth_over_frequency(torque * reference.conj()) / reference_power
         independent_torque_power = (
-            smoothed(np.abs(torque) ** 2).real - np.abs(torque_by_reference) ** 2 * reference_power
+            smooth_over_frequency(np.abs(torque) ** 2).real
+            - np.abs(torque_by_reference) ** 2 * reference_power
         )
         independent_torque_power = np.maximum(
             independent_torque_power, _RELATIVE_POWER_FLOOR * independent_torque_power.max()
         )
         response_to_torque = (
-            smoothed(angle * torque.conj()) - cross_spectrum * torque_by_reference.conj()
+            smooth_over_frequency(angle * torque.conj())
+            - cross_spectrum * torque_by_reference.conj()
         ) / independent_torque_power
         spectrum += response_to_torque * (torque - torque_by_reference * reference)
     coherent_rad: NDArray[np.float64] = np.fft.irfft(spectrum, length)[: angle_rad.size]

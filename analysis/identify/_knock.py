@@ -148,21 +148,24 @@ def find_impact(candidate_set: CandidateSet) -> DetectedImpact | None:
 
 def _find_impact_in_residual(refit: Refit) -> DetectedImpact | None:
     """Search for an impact in the residual of a refit; return None if there is none."""
-    sample = _likeliest_start(refit)
-    if sample is None:
+    start_sample = _likeliest_start(refit)
+    if start_sample is None:
         return None
     comparison = refit.objective.comparison
     for width_s in _WINDOW_HALF_WIDTHS_S:
         half_width = math.ceil(width_s * comparison.decimation.rate_hz)
-        first, last = max(sample - half_width, 0), min(sample + half_width, comparison.samples)
-        cleaned = _fit_around_impact(refit, first, last)
-        extent = _impact_extent(cleaned, first, last)
+        window_start, window_end = (
+            max(start_sample - half_width, 0),
+            min(start_sample + half_width, comparison.samples),
+        )
+        refit_around_impact = _fit_around_impact(refit, window_start, window_end)
+        extent = _impact_extent(refit_around_impact, window_start, window_end)
         if extent is None:
             return None
-        impact = _with_amplitudes(cleaned, *extent)
+        impact = _with_amplitudes(refit_around_impact, *extent)
         if impact.explained_fraction < _WORTHWHILE_FRACTION:
             return None
-        if extent[0] > first:
+        if extent[0] > window_start:
             return impact
         if impact.explained_fraction < _EVIDENT_FRACTION:
             return None
@@ -180,7 +183,7 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
     band_hz = (0.0 if comparison.bins.start == 1 else float(hz[0]), float(hz[-1]))
     middle = measurement.angle_rad.size // 2
     for half in (slice(0, middle), slice(middle, None)):
-        part = replace(
+        half_measurement = replace(
             measurement,
             angle_rad=measurement.angle_rad[half],
             torque_nm=measurement.torque_nm[half],
@@ -192,7 +195,7 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
             knocks=(),
         )
         try:
-            analysis = fit_record(part, (_FREEST_STRUCTURE,), band_hz=band_hz)
+            analysis = fit_record(half_measurement, (_FREEST_STRUCTURE,), band_hz=band_hz)
         except MeasurementError:
             continue
         fit, is_used = analysis.fits[0], analysis.noise.counts
@@ -210,23 +213,23 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         yield refit_at_start(noise=noise_of_all_bins)
 
 
-def with_knock(measurement: Measurement, found: DetectedImpact) -> Measurement:
+def with_knock(measurement: Measurement, impact: DetectedImpact) -> Measurement:
     """Return the measurement with a detected impact added to its known impacts."""
-    return replace(measurement, knocks=(*measurement.knocks, found.knock))
+    return replace(measurement, knocks=(*measurement.knocks, impact.knock))
 
 
-def of_knocks(knocks: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
+def of_knocks(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
     """Yield a finding for each known impact of a record.
 
     `explained` states whether the model with the impacts explains the record.
     """
-    for knock in knocks:
-        tolerance_s = knock.resolution_s
+    for impact in impacts:
+        tolerance_s = impact.resolution_s
         yield Finding(
             kind="knock",
             sentence=(
-                f"The beam was struck at {knock.first_s:.2f} s (to within {tolerance_s:.2g} s): "
-                f"{1e3 * knock.largest_nm:.3g} mN·m in the torque, and from then on the free "
+                f"The beam was struck at {impact.first_s:.2f} s (to within {tolerance_s:.2g} s): "
+                f"{1e3 * impact.largest_nm:.3g} mN·m in the torque, and from then on the free "
                 "decay of its modes. "
                 + (
                     "It was fitted too, and biases nothing."
@@ -234,8 +237,8 @@ def of_knocks(knocks: tuple[RecordedImpact, ...], *, explained: bool) -> Iterato
                     else "It was fitted too, but is not all that is in the record."
                 )
             ),
-            value=knock.first_s,
-            interval=(knock.first_s - tolerance_s, knock.first_s + tolerance_s),
+            value=impact.first_s,
+            interval=(impact.first_s - tolerance_s, impact.first_s + tolerance_s),
             unit="s",
             remedy="Keep clear of the beam while it is recorded.",
         )
@@ -266,8 +269,8 @@ def _likeliest_start(refit: Refit) -> int | None:
     cost_reductions = np.sum(
         projections * np.linalg.solve(gram + 1e-9 * np.eye(lengths.size), projections), axis=0
     )
-    sample = int(np.argmax(cost_reductions))
-    deviate = chi_square_deviate(float(cost_reductions[sample]), lengths.size)
+    start_sample = int(np.argmax(cost_reductions))
+    deviate = chi_square_deviate(float(cost_reductions[start_sample]), lengths.size)
     if deviate < math.sqrt(2 * largest_of(comparison.samples)):
         return None
     # The residual of a wrong model rises and falls with the sweep; an impact begins abruptly.
@@ -277,19 +280,22 @@ def _likeliest_start(refit: Refit) -> int | None:
         math.ceil(each * rate_hz)
         for each in (_GAP_BEFORE_IMPACT_S, _GAP_BEFORE_IMPACT_S + _COMPARED_DURATION_S)
     )
-    earlier = power[max(sample - window_end, 0) : max(sample - gap_samples, 0)]
-    later = power[sample : sample + window_end]
-    is_abrupt = earlier.size == 0 or earlier.mean() < _MAX_POWER_BEFORE_OVER_AFTER * later.mean()
-    return sample if is_abrupt else None
+    power_before = power[max(start_sample - window_end, 0) : max(start_sample - gap_samples, 0)]
+    power_after = power[start_sample : start_sample + window_end]
+    is_abrupt = (
+        power_before.size == 0
+        or power_before.mean() < _MAX_POWER_BEFORE_OVER_AFTER * power_after.mean()
+    )
+    return start_sample if is_abrupt else None
 
 
-def _fit_around_impact(refit: Refit, first: int, last: int) -> Refit:
+def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refit:
     """Fit with an impact between two samples, and return the fit without it under the new noise."""
     comparison, columns_before = refit.objective.comparison, refit.columns
     for _ in range(_IMPACT_FIT_ROUNDS):
-        knock = _impact_between(refit, first, last)
+        impact = _impact_between(refit, first_sample, end_sample)
         columns = np.concatenate(
-            [columns_before, comparison.spectrum(_impact_torques(comparison, knock))]
+            [columns_before, comparison.spectrum(_impact_torques(comparison, impact))]
         )
         refit = Refit.descend(
             comparison, refit.objective.unknowns, refit.x, refit.noise, columns,
@@ -306,23 +312,23 @@ def _fit_around_impact(refit: Refit, first: int, last: int) -> Refit:
     )
 
 
-def _impact_between(refit: Refit, first: int, last: int) -> RecordedImpact:
+def _impact_between(refit: Refit, first_sample: int, end_sample: int) -> RecordedImpact:
     """Return an impact between two samples with unknown amplitudes, and the poles of a refit."""
     comparison = refit.objective.comparison
     rate_hz = comparison.decimation.rate_hz
     poles = comparison.poles(refit.plant)
     return RecordedImpact(
-        first_s=comparison.first_s + first / rate_hz,
-        last_s=comparison.first_s + last / rate_hz,
+        first_s=comparison.first_s + first_sample / rate_hz,
+        last_s=comparison.first_s + end_sample / rate_hz,
         # The soft beginning of a touch is not visible before the torque has grown.
-        resolution_s=max(2, last - first) / rate_hz,
+        resolution_s=max(2, end_sample - first_sample) / rate_hz,
         poles_rad_s=tuple(pole.at_rad_s for pole in poles),
     )
 
 
-def _impact_torques(comparison: Comparison, knock: RecordedImpact) -> NDArray[np.float64]:
+def _impact_torques(comparison: Comparison, impact: RecordedImpact) -> NDArray[np.float64]:
     """Return the torques of an impact per unit amplitude at the compared samples, (c, samples)."""
-    return knock.columns(comparison.times_s(), comparison.decimation.rate_hz)
+    return impact.columns(comparison.times_s(), comparison.decimation.rate_hz)
 
 
 def _successive_cost_reductions(refit: Refit, columns: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -346,7 +352,7 @@ _DEPENDENT_LENGTH: Final = 1e-6
 linear combination of them."""
 
 
-def _impact_extent(refit: Refit, first: int, last: int) -> tuple[int, int] | None:
+def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[int, int] | None:
     """Return first sample and end of an impact within a window; None if there is no impact.
 
     Each sample of unknown torque has to reduce the cost by the BIC penalty of a parameter. If the
@@ -355,29 +361,29 @@ def _impact_extent(refit: Refit, first: int, last: int) -> tuple[int, int] | Non
     penalty = math.log(2 * np.count_nonzero(refit.noise.counts))
     comparison = refit.objective.comparison
     # Beginning: decays from the window's end on, then single samples backwards from there.
-    knock = _impact_between(refit, last, last)
-    decays = _impact_torques(comparison, knock)
-    single_samples = np.zeros((last - first, comparison.samples))
-    single_samples[np.arange(last - first), np.arange(first, last)] = 1.0
+    impact = _impact_between(refit, window_end, window_end)
+    decays = _impact_torques(comparison, impact)
+    single_samples = np.zeros((window_end - window_start, comparison.samples))
+    single_samples[np.arange(window_end - window_start), np.arange(window_start, window_end)] = 1.0
     cost_reductions = _successive_cost_reductions(
         refit, np.concatenate([decays, single_samples[::-1]])
     )[len(decays) :]
     net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - penalty)])
-    begin = last - max(int(np.argmax(net_reduction)), 1)
+    begin = window_end - max(int(np.argmax(net_reduction)), 1)
     # End: decays from the beginning on, then single samples forwards.
-    knock = _impact_between(refit, begin, begin)
-    decays = _impact_torques(comparison, knock)
+    impact = _impact_between(refit, begin, begin)
+    decays = _impact_torques(comparison, impact)
     cost_reductions = _successive_cost_reductions(
-        refit, np.concatenate([decays, single_samples[begin - first :]])
+        refit, np.concatenate([decays, single_samples[begin - window_start :]])
     )[len(decays) :]
     net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - penalty)])
     end = begin + int(np.argmax(net_reduction))
     with_samples_first = _successive_cost_reductions(
-        refit, np.concatenate([single_samples[begin - first : end - first], decays])
+        refit, np.concatenate([single_samples[begin - window_start : end - window_start], decays])
     )
     reduction_by_decays = float(with_samples_first[end - begin :].sum())
-    deviate = chi_square_deviate(reduction_by_decays, len(decays))
-    is_significant = deviate > math.sqrt(2 * largest_of(comparison.samples))
+    normal_deviate = chi_square_deviate(reduction_by_decays, len(decays))
+    is_significant = normal_deviate > math.sqrt(2 * largest_of(comparison.samples))
     return (
         (begin, end)
         if is_significant
@@ -386,11 +392,11 @@ def _impact_extent(refit: Refit, first: int, last: int) -> tuple[int, int] | Non
     )
 
 
-def _with_amplitudes(refit: Refit, first: int, last: int) -> DetectedImpact:
+def _with_amplitudes(refit: Refit, first_sample: int, end_sample: int) -> DetectedImpact:
     """Return an impact with its amplitudes and the fraction of the cost that it explains."""
     comparison = refit.objective.comparison
-    knock = _impact_between(refit, first, last)
-    in_time = _impact_torques(comparison, knock)
+    impact = _impact_between(refit, first_sample, end_sample)
+    in_time = _impact_torques(comparison, impact)
     cost, expected_cost = refit.cost, refit.expected_cost
     beam_free = bool(cost < _OVERWHELMING_COST_RATIO * expected_cost)
     whitened, residual = refit.unexplained_columns(
@@ -405,14 +411,16 @@ def _with_amplitudes(refit: Refit, first: int, last: int) -> DetectedImpact:
     remaining_cost = float(np.vdot(remaining, remaining).real)
     sizes /= lengths
     torque_nm = sizes @ in_time
-    first_second = slice(first, first + math.ceil(comparison.decimation.rate_hz))
+    first_second = slice(first_sample, first_sample + math.ceil(comparison.decimation.rate_hz))
     remaining_in_time = comparison.in_time(remaining)
     before_impact = remaining_in_time[
-        max(first - math.ceil(_QUIET_DURATION_S * comparison.decimation.rate_hz), 0) : first
+        max(
+            first_sample - math.ceil(_QUIET_DURATION_S * comparison.decimation.rate_hz), 0
+        ) : first_sample
     ]
     return DetectedImpact(
         knock=replace(
-            knock,
+            impact,
             sizes=tuple(sizes.tolist()),
             largest_nm=float(np.abs(torque_nm[first_second]).max()),
         ),

@@ -275,11 +275,11 @@ class _ModalSearch:
         hz = self.comparison.frequency_hz[:, None]
         frequencies, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
         bins_hz = _MODE_REACH_MARGIN_BINS * float(hz[1, 0] - hz[0, 0])
-        reach = (
+        reach_hz = (
             np.maximum(_MODE_REACH_HALF_WIDTHS * eta / 2, _LEAST_RELATIVE_MODE_REACH) * frequencies
             + bins_hz
         )
-        is_near: NDArray[np.bool_] = np.any(np.abs(hz - frequencies) < reach, axis=1)
+        is_near: NDArray[np.bool_] = np.any(np.abs(hz - frequencies) < reach_hz, axis=1)
         return is_near
 
     def cost(self) -> float:
@@ -318,8 +318,8 @@ class _ModalSearch:
         """Return whether the last mode lies within the width of another mode."""
         frequencies = np.exp(self.x[::2])
         half_widths = frequencies * self.x[1::2] / 2
-        reach = _MODE_REACH_HALF_WIDTHS * (half_widths[:-1] + half_widths[-1])
-        return bool(np.any(np.abs(frequencies[:-1] - frequencies[-1]) < reach))
+        least_distances = _MODE_REACH_HALF_WIDTHS * (half_widths[:-1] + half_widths[-1])
+        return bool(np.any(np.abs(frequencies[:-1] - frequencies[-1]) < least_distances))
 
     def remove_unexcited_modes(self) -> _ModalSearch:
         """Remove modes that hardly reduce the cost at first and lose their damping in a descent.
@@ -459,7 +459,7 @@ class _ModalProblem:
         self._effect_spectra = effect_spectra
         self._s = comparison.prediction.s
         self.scale_rad_s = 2 * math.pi * float(comparison.frequency_hz[-1])
-        self._measured = self._whiten(
+        self._measured_torque = self._whiten(
             comparison.spectrum(comparison.torque_nm[comparison.retained])
         )
         background = np.array([(self._s / self.scale_rad_s) ** n for n in range(BACKGROUND)])
@@ -541,9 +541,9 @@ class _ModalProblem:
         drag, *drag_jacobian = self._whiten(self._drag_change(poles))
         columns = np.concatenate([spectra[:numerator_count], self._background, nuisance_spectra])
         span, factor = _orthonormal_rows(columns)
-        measured = self._measured - drag
-        projections = span @ measured
-        residual = projections @ span - measured
+        measured_torque = self._measured_torque - drag
+        projections = span @ measured_torque
+        residual = projections @ span - measured_torque
         linear_parameters = np.linalg.solve(factor.T, projections)
         nuisance_amplitudes = linear_parameters[numerator_count + BACKGROUND :]
         jacobian = np.array(drag_jacobian).reshape(x.size, residual.size)

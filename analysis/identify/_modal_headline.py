@@ -122,7 +122,7 @@ def with_modal_model(
 
 
 def _reported_modes(
-    numbers: Estimates,
+    estimates: Estimates,
     modal: ModalEstimate,
     doubt: str | None,
     half_width: float,
@@ -134,7 +134,7 @@ def _reported_modes(
     With `from_beam`, frequency and damping ratio of visible modes are also those of the beam.
     """
     visible = modal.visible
-    modes: dict[int, ReportedMode] = {mode.number: mode for mode in numbers.modes}
+    modes: dict[int, ReportedMode] = {mode.number: mode for mode in estimates.modes}
     for number in visible:
         modal_mode = modal.mode(number)
         inertia, relative_std = modal.inertia(number)
@@ -207,9 +207,9 @@ def _structure_status(
     Mode frequencies do not distinguish structures if the beam may deviate from a uniform one.
     """
 
-    def status_of(name: str, before: StructureStatus) -> StructureStatus:
-        if before == "selected":
-            return before
+    def status_of(name: str, exact_status: StructureStatus) -> StructureStatus:
+        if exact_status == "selected":
+            return exact_status
         structure = STRUCTURES[name.partition(",")[0]]
         for order, coefficient in COEFFICIENT_OF.items():
             if not structure.has(coefficient):
@@ -222,7 +222,7 @@ def _structure_status(
                 return "excluded"
         return "compatible"
 
-    return tuple((name, status_of(name, before)) for name, before in exact.structures)
+    return tuple((name, status_of(name, exact_status)) for name, exact_status in exact.structures)
 
 
 def tolerant_sizes(

@@ -139,9 +139,11 @@ class ModalForces:
         k, stiffness = self._modal_stiffness(term.mode)
         dynamic_stiffness = self._inertia_and_external + stiffness
         angle = self._comparison.angle_rad
-        decayed = angle / self._growth[::_OVERSAMPLING]
+        decaying_angle = angle / self._growth[::_OVERSAMPLING]
         linear_motion = (
-            -self._inertia_and_external / dynamic_stiffness * np.fft.rfft(decayed, self._length)
+            -self._inertia_and_external
+            / dynamic_stiffness
+            * np.fft.rfft(decaying_angle, self._length)
         )
         force = self._force_transform(term.kind, linear_motion, linear_motion)
         if size:
@@ -180,9 +182,9 @@ class ModalForces:
     def _modal_stiffness(self, mode: int) -> tuple[float, NDArray[np.complex128]]:
         """Return k⁴ of a mode in 1/m⁴, and k⁴ with internal damping at each s."""
         plant = self._plant
-        k = float(clamped_free_eigenvalues(mode)[-1] / plant.beam.length_m) ** 4
-        damped = k * (1 + plant.damping.zeta * self._s**plant.damping.alpha)
-        return k, damped.astype(np.complex128)
+        stiffness = float(clamped_free_eigenvalues(mode)[-1] / plant.beam.length_m) ** 4
+        damped_stiffness = stiffness * (1 + plant.damping.zeta * self._s**plant.damping.alpha)
+        return stiffness, damped_stiffness.astype(np.complex128)
 
     def _force_transform(
         self, kind: ForceKind, motion: NDArray[np.complex128], linear_motion: NDArray[np.complex128]
@@ -199,8 +201,8 @@ class ModalForces:
         else:
             deflection = self._oversampled_values(motion)
             largest = np.abs(self._oversampled_values(linear_motion)).max()
-            power = 3 if kind == "cubic stiffness" else 2
-            n = deflection**power / largest ** (power - 1)
+            exponent = 3 if kind == "cubic stiffness" else 2
+            n = deflection**exponent / largest ** (exponent - 1)
         n /= self._growth
         spectrum = np.fft.rfft(n, _OVERSAMPLING * self._length)[: self._s.size]
         return spectrum / _OVERSAMPLING

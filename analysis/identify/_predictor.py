@@ -229,9 +229,9 @@ class TorquePredictor:
 
     def of_other(self, angle_rad: NDArray[np.float64]) -> TorquePredictor:
         """Return the predictor for another angle of the same length, shape (n,)."""
-        other = copy(self)
-        other._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
-        return other
+        predictor = copy(self)
+        predictor._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
+        return predictor
 
     @property
     def s(self) -> NDArray[np.complex128]:

@@ -123,18 +123,22 @@ class Objective:
         """Return residual and derivatives at `x`, without the cache."""
         comparison, unknowns = self.comparison, self.unknowns
         names = unknowns.gradient_names
-        plant, chain = unknowns.plant_and_gradient(x)
+        plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
         torque, gradient = comparison.prediction.torque(plant, names)
         poles = tuple(
-            Pole(pole.mode, pole.at_rad_s, pole.derivative @ chain)
+            Pole(pole.mode, pole.at_rad_s, pole.derivative @ parameters_by_unknowns)
             for pole in comparison.poles(plant, names)
         )
         residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
-        jacobian = (chain.T @ _as_real_rows(comparison.spectrum(gradient))).view(np.complex128)
+        jacobian = (parameters_by_unknowns.T @ _as_real_rows(comparison.spectrum(gradient))).view(
+            np.complex128
+        )
         if comparison.drag is not None:
-            change, slopes = comparison.drag.change_to(plant, poles, unknowns.names, chain)
-            residual += change
-            jacobian += slopes
+            drag_change, drag_derivatives = comparison.drag.change_to(
+                plant, poles, unknowns.names, parameters_by_unknowns
+            )
+            residual += drag_change
+            jacobian += drag_derivatives
         return Linearisation(
             residual=residual,
             jacobian=jacobian,
@@ -161,11 +165,11 @@ class Objective:
         lengths[lengths == 0] = 1.0  # the spectrum of a decay that ends at once
         columns /= lengths[:, None]
         gram = columns @ columns.T
-        inverse = np.linalg.inv(gram + 1e-12 * np.eye(lengths.size))
-        amplitudes = -inverse @ (columns @ _as_real_rows(residual))
+        inverse_gram = np.linalg.inv(gram + 1e-12 * np.eye(lengths.size))
+        amplitudes = -inverse_gram @ (columns @ _as_real_rows(residual))
         jacobian += weight * self.comparison.decay_gradient(at.poles, amplitudes / lengths)
         real_jacobian = _as_real_rows(jacobian)
-        real_jacobian -= ((real_jacobian @ columns.T) @ inverse) @ columns
+        real_jacobian -= ((real_jacobian @ columns.T) @ inverse_gram) @ columns
         return Projected(
             residual=residual + (amplitudes @ columns).view(np.complex128),
             jacobian=jacobian,
@@ -247,5 +251,5 @@ def _as_real_rows(values: NDArray[np.complex128]) -> NDArray[np.float64]:
 
     Products of such rows are the real parts of complex products, at half the cost.
     """
-    parts: NDArray[np.float64] = np.ascontiguousarray(values).view(np.float64)
-    return parts
+    real_rows: NDArray[np.float64] = np.ascontiguousarray(values).view(np.float64)
+    return real_rows
