@@ -46,20 +46,23 @@ _POINTS_PER_HALF: Final = 32
 """Number of quadrature points in each half of the beam."""
 
 _SLOPE_STEP: Final = 1e-5
-"""Step of the relative position for slopes of mode shapes, whose relative error is then 1e-8."""
+"""Step of the relative position for numerical slopes of mode shapes, which are exact to a relative
+error of 1e-8."""
 
 _INVERSE_ITERATIONS: Final = 2
 """Number of inverse iterations for a mode shape with a lossy clamp."""
 
 _RELATIVE_SHIFT: Final = 1e-7
-"""Relative distance of the shift of inverse iterations from the eigenvalue."""
+"""Shift of an inverse iteration relative to the eigenvalue: the matrix is not singular."""
 
 Terms = NDArray[np.inexact[Any]]
-"""Real or complex array of coefficients."""
+"""Array of real or complex Galerkin coefficients."""
 
 Profile = Literal["taper", "outer half", "wave"]
-"""Course of a deviation along the beam: "taper" rises from -1/2 to 1/2, "outer half" is 0 in the
-inner and 1 in the outer half, and "wave" is a cosine of one period."""
+"""Course of a relative deviation along the beam.
+
+"taper" rises from -1/2 to 1/2, "outer half" is 0 in the inner and 1 in the outer half, and "wave"
+is a cosine of one period."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +228,7 @@ def _basis_shapes_at_lump(position: float) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def _basis() -> _Basis:
-    """Return the basis modes of the uniform beam, which are computed once."""
+    """Return the cached basis: the first modes of the uniform beam, with their integrals."""
     nodes, weights = np.polynomial.legendre.leggauss(_POINTS_PER_HALF)
     x = np.concatenate([0.25 * (nodes + 1), 0.25 * (nodes + 3)])
     weights = np.tile(weights / 4, 2)

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 
 FAR_BEHIND: Final = 1000.0
-"""Difference of BIC from the best candidate from which a candidate cannot become the best, however
-exactly its minimum is found."""
+"""Difference of BIC to the best candidate above which a candidate is only fitted roughly. It cannot
+become the best one, however exactly its minimum is found."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Candidate:
 
     @property
     def values(self) -> int:
-        """Return the number of real values of the record that the fit is compared with."""
+        """Return the number of real values of the record to which the candidate is fitted."""
         fit = self.fit
         decays = fit.ringing.degrees_of_freedom
         return fit.degrees_of_freedom + len(fit.interval) + decays + self.columns

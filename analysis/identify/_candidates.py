@@ -35,38 +35,40 @@ if TYPE_CHECKING:
 
 
 INTEGER_INTERNAL_ORDER: Final = (STRUCTURES["III"], STRUCTURES["VII"])
-"""Structures with internal and external damping whose internal damping has an integer order."""
+"""Structures with internal and external damping whose internal damping has order 1."""
 
 _MIN_BIC_REDUCTION_FOR_NEW_NOISE: Final = 10.0
-"""Least BIC reduction by free orders for which the noise is estimated again."""
+"""Minimum reduction of the BIC, by structures with free orders, for which the noise spectrum is
+estimated again."""
 
 _MIN_DEVIANCE_OF_DAMPING: Final = 4.0
-"""Least reduction of the deviance for which a damping stays in the freest structure. A damping with
-a smaller reduction moves no other parameter by more than two standard deviations, and only makes
-the others uncertain."""
+"""Minimum reduction of the deviance by an internal or external damping in the freest structure. A
+damping with a smaller reduction is omitted: it moves no other parameter by more than two
+standard deviations, and only makes the others uncertain."""
 
 _CERTAIN_COEFFICIENT_OVER_STD: Final = 5.0
-"""Ratio of a damping coefficient to its standard deviation from which the damping is certainly
-significant."""
+"""Ratio of a damping coefficient to its standard deviation above which the damping is certainly
+significant, so that no structure without it is fitted."""
 
 _FREEST: Final = STRUCTURES["VI"]
-"""Structure with both dampings and free orders."""
+"""Structure with internal and external damping, both of free order."""
 
 _ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
 """Structures with only internal or only external damping, of free order."""
 
 _INTEGER_ORDER: Final = STRUCTURES["VII"]
-"""Structure with both dampings whose internal damping has an integer order."""
+"""Structure with internal and external damping whose internal damping has order 1."""
 
 _ROUGH_FIT_EVALUATIONS: Final = 3
-"""Maximum number of evaluations for a candidate whose BIC is far higher than the lowest."""
+"""Maximum number of evaluations in a descent for a candidate whose BIC is far above the lowest BIC.
+"""
 
 _MAX_CROSS_CHECK_ROUNDS: Final = 3
-"""Maximum number of rounds in which all candidates are started from the best candidate."""
+"""Maximum number of rounds in which all candidates are restarted from the best candidate."""
 
 _CONTINUATION_COST_TOLERANCE: Final = 1e-3
-"""Relative cost above that of a candidate at which the first descent from another plant is still
-continued."""
+"""Relative excess of the cost, after a short descent from another plant, up to which the descent is
+continued; it is relative to the present cost of the candidate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,16 +218,18 @@ class CandidateSet:
 
     @property
     def best(self) -> Candidate:
-        """Return the first candidate: the lowest BIC, unless `led_by` put another one first."""
+        """Return the first candidate: the one with the lowest BIC, unless `led_by` was called."""
         return self.candidates[0]
 
     @property
     def freest(self) -> Candidate:
-        """Return the candidate with the freest structure, without an insignificant damping.
+        """Return the candidate with the freest significant damping structure.
 
-        All its orders are free, so its intervals are valid whichever simpler structure is the true
-        one. The intervals of the candidate with the lowest BIC are valid only if its structure is
-        true. If no structure was fitted with free orders, return the best candidate.
+        This is internal and external damping, both of free order, or only one of them if the other
+        is insignificant. Since all orders are free, its intervals are valid whichever simpler
+        structure is the true one. The intervals of the candidate with the lowest BIC are valid only
+        if its structure is true. If no structure was fitted with free orders, return the best
+        candidate.
         """
         by_structure = {c.structure.name: c for c in self.candidates}
         freest = by_structure.get(_FREEST.name)
@@ -240,18 +244,22 @@ class CandidateSet:
         )
 
     def led_by(self, candidate: Candidate) -> CandidateSet:
-        """Return the candidate set with one candidate first, whose numbers are then reported."""
+        """Return the set with one candidate moved to the front, so that it is reported."""
         other_candidates = (c for c in self.candidates if c is not candidate)
         return replace(self, candidates=(candidate, *other_candidates))
 
     @property
     def likeliest(self) -> RecordFit:
-        """Return the fit with the lowest cost, whatever its number of parameters."""
+        """Return the fit of the candidate with the lowest cost."""
         return min((candidate.fit for candidate in self.candidates), key=lambda fit: fit.cost)
 
     @property
     def bic(self) -> float:
-        """Return the lowest BIC; it is comparable between candidate sets with different noise."""
+        """Return the lowest BIC of the candidates.
+
+        It includes the level of the noise, and so is comparable between candidate sets with
+        different noise.
+        """
         return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
 
     def unknowns(self, structure: Structure) -> Unknowns:
@@ -309,7 +317,7 @@ class CandidateSet:
         return candidate_set.with_candidates((*candidate_set.candidates, *refitted)).cross_check()
 
     def _exclude_leakage(self) -> CandidateSet:
-        """Exclude the bins into which a disturbance outside the band leaks, and fit again."""
+        """Refit all candidates without the bins into which a disturbance outside the band leaks."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
         return self.refit_under_noise(noise) if noise is not self.noise else self
 
@@ -321,9 +329,9 @@ class CandidateSet:
     def _refit_in(
         self, new_set: CandidateSet, candidate: Candidate, max_evaluations: int
     ) -> Candidate:
-        """Fit one candidate again in a slightly different candidate set.
+        """Fit one candidate again with the data of another candidate set.
 
-        If its BIC is far higher than the lowest, it is fitted only roughly.
+        A candidate whose BIC is far above the lowest one is fitted only roughly.
         """
         bic_difference = candidate.bic - min(each.bic for each in self.candidates)
         return new_set.refit(
@@ -331,9 +339,9 @@ class CandidateSet:
         ).candidate()
 
     def cross_check(self) -> CandidateSet:
-        """Restart each candidate from the plant of the best one, until the best one stays the same.
+        """Restart each candidate from the plant of the best candidate, until the best one is final.
 
-        A search may have missed a flat minimum.
+        An earlier search of a candidate may have missed a flat minimum.
         """
         candidate_set = self
         for _ in range(_MAX_CROSS_CHECK_ROUNDS):
@@ -347,7 +355,7 @@ class CandidateSet:
         return candidate_set
 
     def restarted_from(self, plant: Plant) -> CandidateSet:
-        """Start a descent of each candidate from a plant that another search found."""
+        """Refit each candidate, starting from a plant that another search found."""
         return self.with_candidates(
             self._refit_from_plant(c, plant) for c in self.candidates
         ).cross_check()
@@ -371,11 +379,12 @@ class CandidateSet:
         return candidate if minimum.cost > cost_to_beat else minimum.candidate()
 
     def with_special_cases(self) -> CandidateSet:
-        """Fit special cases of the freest structure from its estimate, if they may be better.
+        """Add fits of special cases of the freest structure, which start from its estimate.
 
-        An internal damping with an order near 2 acts as an inertia. It has a separate minimum,
-        which the search for the freest structure may mistake for the lowest one. A search from an
-        order of 1 avoids that minimum. An insignificant damping is omitted, as in `freest`.
+        The special cases have an internal damping of order 1, or lack an insignificant damping. An
+        internal damping with an order near 2 acts as an inertia. It has a separate minimum, which
+        the search for the freest structure may mistake for the lowest one. A search from an order
+        of 1 avoids that minimum.
         """
         fit = next(each.fit for each in self.candidates if each.structure is _FREEST)
         low, high = fit.interval["alpha"] or (math.inf, -math.inf)
@@ -487,7 +496,7 @@ class CandidateSet:
 
 
 def _one_damping_structures(fit: RecordFit) -> list[Structure]:
-    """Return the structures with one damping, where the other is not clearly significant."""
+    """Return the structures without one of the dampings that is not clearly significant."""
     pairs = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
     return [
         structure

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 # Clipping and stops
 
 _MIN_CLIPPED_VALUES: Final = 4
-"""Least number of values next to an equal one at the extreme of a clipped channel: noise does not
-repeat its largest value."""
+"""Minimum number of samples at the extreme of the torque, each next to another one, that is
+reported as clipping. Noise does not repeat its largest value."""
 
 _STANDSTILL_BLOCK_S: Final = 0.5
-"""Duration of the blocks in which a standstill of the motor is searched for."""
+"""Duration in seconds of the blocks in which a standstill of the motor is searched for."""
 
 _MAX_STANDSTILL_MOTION: Final = 0.02
-"""Largest motion in a block with a standstill, relative to that of the reference."""
+"""Largest motion of a motor at standstill within a block, relative to its reference."""
 
 
 def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
@@ -63,7 +63,7 @@ def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
 
 
 def standstill_findings(measurement: Measurement) -> Iterator[Finding]:
-    """Yield a finding if the motor is at rest while its reference moves."""
+    """Yield a finding if the motor does not move while its reference moves."""
     reference_rad = measurement.reference_rad
     if reference_rad is None:
         return
@@ -103,8 +103,8 @@ _MIN_DRIVEN_POWER: Final = 1e-3
 """Least power of the angle at a frequency that is used, relative to the largest power."""
 
 _MIN_PHASE_COSINE: Final = 0.7
-"""Least magnitude of the median cosine of the phase difference to the beam with which a sign is
-certain."""
+"""Minimum magnitude of the median cosine of the phase, relative to the response of the beam, at
+which the sign of torque over angle is certain."""
 
 _UNIT_FACTORS: Final = (
     (180 / math.pi, "degrees for radians"),
@@ -118,15 +118,16 @@ _UNIT_FACTORS: Final = (
 """Factors by which a wrong unit changes torque over angle, each with its description."""
 
 _LOG_FACTOR_TOLERANCE: Final = math.log(1.1)
-"""Largest logarithmic deviation from a known factor that still identifies a wrong unit."""
+"""Largest difference between the logarithms of a measured factor and of a known unit factor that
+are considered equal."""
 
 _MIN_LOG_FACTOR: Final = math.log(2.0)
-"""Least logarithm of a factor that is a wrong unit; a smaller one is an error of the beam's data.
-"""
+"""Logarithm of the smallest factor that is attributed to a wrong unit. A smaller one is attributed
+to wrong data of the beam."""
 
 _CERTAIN_LOG_FACTOR: Final = math.log(5.0)
-"""Least logarithm of a factor that is a wrong unit even if it is not a known one: no fit searches
-for a stiffness so far from that of the file."""
+"""Logarithm of the factor above which an unknown factor is attributed to a wrong unit, too: no fit
+searches for a stiffness so far from that of the file."""
 
 
 def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
@@ -188,10 +189,11 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
 # Drift of the zero
 
 _DRIFT_SEGMENTS: Final = 16
-"""Number of segments of a record whose mean residuals are compared."""
+"""Number of segments of a record whose mean residual torques are compared."""
 
 _MIN_SCATTER_RATIO: Final = 10.0
-"""Least scatter of the means, relative to the scatter due to noise, that is a drift."""
+"""Minimum scatter of the mean residual torques that is reported as drift, relative to the scatter
+due to noise."""
 
 
 def torque_zero_drift_nm(candidate_set: CandidateSet) -> float:

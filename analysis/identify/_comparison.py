@@ -38,19 +38,19 @@ if TYPE_CHECKING:
     from analysis.identify.noise import NoiseSpectrum
 
 _MIN_BINS: Final = 50
-"""Least number of frequency bins in the band."""
+"""Minimum number of frequency bins in the compared band."""
 
 _MAX_REMOVED_TORQUE_CHANGE: Final = 0.1
-"""Largest change of the removed torque, as a sum of whitened squares, for which the removed torque
-is not computed again."""
+"""Change of the torque caused by the incoherent angle, as a sum of whitened squares, up to which
+this torque is not recomputed."""
 
 _FEEDBACK_ITERATIONS: Final = 3
 """Number of iterations between the torque of the ringing beam and the part of the angle that
 follows the reference."""
 
 _MAX_INCOHERENT_FRACTION: Final = 0.3
-"""Largest fraction of the angle's power that may be incoherent with the reference. If it is larger,
-the motor followed another reference."""
+"""Largest fraction of the power of the motor's speed that may be incoherent with the reference. If
+it is larger, the motor followed another reference, and the whole angle is used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +244,7 @@ class Comparison:
 
     @property
     def samples(self) -> int:
-        """Return the number of compared samples."""
+        """Return the number of compared samples, at the decimated rate."""
         return int(self.retained.stop - self.retained.start)
 
     def poles(self, plant: Plant, wrt: Sequence[str] = ()) -> tuple[Pole, ...]:
@@ -294,7 +294,10 @@ class Comparison:
     def _coherent_part(
         self, angle_rad: NDArray[np.float64], torque_nm: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the part of an angle that follows the reference and, optionally, a torque."""
+        """Return the part of an angle that is coherent with the reference, shape (m,).
+
+        With a torque, the part of the angle that follows the torque is included.
+        """
         reference_rad = self.measurement.reference_rad
         assert reference_rad is not None
         # The samples after the record are the filter's response to its end; none is compared.
@@ -346,7 +349,11 @@ class Comparison:
         ).recompute_incoherent_torque(plant)
 
     def recompute_incoherent_torque(self, plant: Plant | ModalModel) -> Comparison:
-        """Recompute the removed torque of the incoherent angle with another plant."""
+        """Recompute and remove the torque caused by the incoherent part of the angle.
+
+        `plant` predicts the torque. Return `self` if the whole angle is coherent with the
+        reference.
+        """
         if not isinstance(self.incoherent_rad, np.ndarray):
             return self
         incoherent_prediction = self.prediction.of_other(self.incoherent_rad)
@@ -360,7 +367,7 @@ class Comparison:
         )
 
     def renewed(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
-        """Re-estimate the part of the angle that follows the reference, with a better plant.
+        """Re-estimate the part of the angle coherent with the reference, with a better plant.
 
         Parameters
         ----------
@@ -400,7 +407,7 @@ class Comparison:
         return self._hum_torque_at(np.arange(self.samples) / self.decimation.rate_hz)
 
     def without_hum(self, hum: tuple[Hum, ...]) -> Comparison:
-        """Remove the given hum, and restore the hum that was removed before."""
+        """Return the comparison with only the given hum removed; restore hum removed before."""
         with_new_hum = replace(self, hum=hum)
         ticks = self._decimated_indices(~self.measurement.torque_known)
         first_s = self.retained.start / self.decimation.rate_hz
@@ -500,10 +507,9 @@ class Comparison:
         return total
 
     def fill_unknown_torque(self, plant: Plant | ModalModel) -> Comparison:
-        """Fill unknown torque with the prediction of a plant, so that it adds no residual.
+        """Fill unknown torque with the prediction of a plant, so that its residual is 0.
 
-        After convergence the sum of squares has the same minimum as that of the known samples
-        alone.
+        After convergence the cost has the same minimum as the cost of the known samples alone.
         """
         is_known = self.measurement.torque_known
         if is_known.all():
@@ -548,7 +554,7 @@ class Comparison:
     def _decimated_indices(self, is_marked: NDArray[np.bool_]) -> NDArray[np.intp]:
         """Return the full-rate indices of marked ticks, counted from the first decimated sample.
 
-        `ticks` is a mask over the record's ticks.
+        `is_marked` is a mask over the ticks of the record.
         """
         return np.flatnonzero(is_marked) + self.decimation.reach * self.decimation.factor
 

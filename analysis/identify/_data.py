@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 # Measurement
 
 _START_TOLERANCE_S: Final = 1e-7
-"""Time before the start of an impact within which a sample still belongs to its decay."""
+"""Tolerance in seconds for rounding: a sample by this much before an impact already belongs to its
+decay."""
 
 MAX_ANGLE_GAP_PERIODS: Final = 0.4
 """Longest gap of the angle that is interpolated, in periods of the band's highest frequency."""
@@ -86,9 +87,9 @@ class RecordedImpact:
     largest_nm: float = 0.0
 
     def decays(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the free decays of all modes, each also multiplied by the time since the impact.
+        """Return the free decays of all modes, and these times the time since the impact, (d, n).
 
-        The latter represent small errors of the poles. Returns shape (d, n).
+        The decays times the time represent small errors of the poles.
 
         Parameters
         ----------
@@ -376,13 +377,15 @@ class Measurement:
 # Interpolation of gaps
 
 _NEIGHBOUR_REACH_PERIODS: Final = 2.0
-"""Time to either side of a gap from which values are used, in periods of the highest frequency."""
+"""Duration to either side of a gap from which values are used to interpolate the gap, in periods of
+the highest frequency."""
 
 _BANDWIDTH_MARGIN: Final = 1.2
-"""Bandwidth that the interpolation assumes, relative to the highest frequency."""
+"""Bandwidth of the signal that the interpolation of gaps assumes, over its highest frequency."""
 
 _RELATIVE_NOISE_POWER: Final = 1e-6
-"""Power of the white noise that the interpolation assumes, relative to that of the signal."""
+"""Power of white noise that the interpolation of gaps assumes, relative to the power of the signal.
+"""
 
 
 def interpolate_gaps(
@@ -441,7 +444,7 @@ def _interpolation_weights(
 
 
 def _runs_of_true(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first index of each run of True, and the index after its end."""
+    """Return the start index of each run of True in a mask, and the index after its end."""
     edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
 
@@ -452,8 +455,8 @@ _STOP_BAND_ATTENUATION_DB: Final = 100.0
 """Attenuation of the decimation filter in its stop band, in decibels."""
 
 _MIN_RATE_OVER_BAND: Final = 2.4
-"""Least decimated sampling rate relative to the highest frequency: below 2.4 the filter becomes
-long."""
+"""Minimum decimated sampling rate relative to the highest frequency: at lower rates the decimation
+filter becomes long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -524,9 +527,10 @@ class Decimation:
         return np.fft.irfft(spectrum, padded)[: length : self.factor].copy()
 
     def samples_inside_record(self, ticks: int) -> slice:
-        """Return the decimated samples whose filter windows lie within the record, as a slice.
+        """Return the slice of decimated samples that depend on samples of the record only.
 
-        `ticks` is the number of ticks of the record.
+        `ticks` is the number of ticks of the record. The filter window of other samples extends
+        beyond the record.
         """
         return slice(2 * self.reach, (ticks - 1) // self.factor + 1)
 

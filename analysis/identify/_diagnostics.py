@@ -36,7 +36,9 @@ def findings(
     forces: tuple[NonlinearForce, ...],
     harmonics: tuple[Harmonic, ...],
 ) -> tuple[Finding, ...]:
-    """Return the findings of a record; only those that need no model if a sign or unit is wrong.
+    """Return the effects found in a record, in addition to the linear beam.
+
+    If a sign or unit of the record is wrong, only findings that need no model are returned.
 
     Parameters
     ----------
@@ -68,15 +70,15 @@ def findings(
 # Settings at the limit of the search range, or different from the file
 
 _MIN_REPORTED_DELAY_S: Final = 1e-4
-"""Smallest deviation of the delay from the file that is reported: backlash of a few tenths of a
-milliradian resembles a shorter delay."""
+"""Smallest deviation of the torque delay from the file that is reported, in seconds. Backlash of a
+few tenths of a milliradian resembles a shorter delay."""
 
 _MIN_REPORTED_BEAM_DEVIATION: Final = 0.003
 """Smallest relative deviation of stiffness or density from the file that is reported."""
 
 
 def search_limit_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
-    """Yield findings of parameters at the limit of the search range, which no real rig reaches."""
+    """Yield a finding for each fitted parameter at the limit of its search range."""
     fit = candidate_set.best.fit
     for name, quantity, factor, unit in (
         ("delay_s", "The delay between the channels", 1e3, "ms"),
@@ -195,9 +197,9 @@ def _beam_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[
 
 
 def _equivalent_causes(candidate_set: CandidateSet, name: Setting) -> str:
-    """Return the end of a sentence, which names other causes of the same deviation.
+    """Return the end of a sentence that names other causes of a deviating density or stiffness.
 
-    It is empty if there are none.
+    Return an empty string if there are none.
     """
     if name == "bending_stiffness_n_m2":
         return ", or the torque's gain is"
@@ -245,7 +247,7 @@ def _initial_ringing_findings(candidate_set: CandidateSet, headline: Headline) -
 
 
 def _stated_value(candidate_set: CandidateSet, name: Setting) -> float:
-    """Return the value of a setting that the file states."""
+    """Return the value that the file states for a setting."""
     measurement = candidate_set.comparison.measurement
     return {
         "density_over_stiffness": measurement.beam.density_over_stiffness,
@@ -258,14 +260,15 @@ def _stated_value(candidate_set: CandidateSet, name: Setting) -> float:
 # Disturbances, forces, and what remains
 
 _MAINS_FREQUENCY_TOLERANCE: Final = 0.005
-"""Largest relative deviation of a line from a multiple of the mains frequency."""
+"""Largest relative difference between a multiple of the mains frequency and a hum that is
+attributed to the mains."""
 
 _SENSOR_DRIFT_LIMIT_HZ: Final = 0.5
 """Frequency below which a loud residual is attributed to a drift of the torque sensor."""
 
 _MIN_HUM_PERIODS: Final = 5.0
-"""Least number of periods of a hum in the record. A slower line is attributed to a drift of the
-sensor."""
+"""Minimum number of periods of a hum within the record. A slower disturbance is attributed to a
+drift of the sensor."""
 
 _HARMONIC_PHASE_TOLERANCE_TURNS: Final = 0.5
 """Largest phase difference over the whole record, in turns, between a line and a harmonic of the
@@ -273,7 +276,10 @@ excitation."""
 
 
 def mains(frequency_hz: float) -> str:
-    """Describe the mains as the possible source of a frequency; return "" if it is not."""
+    """Return "the mains" or a multiple of the mains frequency if a frequency is near it, else "".
+
+    The text describes the possible source of a disturbance with this frequency.
+    """
     for mains_hz in (50, 60):
         for n in range(1, 9):
             if abs(frequency_hz - n * mains_hz) < _MAINS_FREQUENCY_TOLERANCE * n * mains_hz:
@@ -377,7 +383,7 @@ def _hum_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
 
 
 def _drift_finding(size_nm: float) -> Finding:
-    """Return the finding of a drift of the torque sensor, for its size in newton metres."""
+    """Return the finding of a zero drift of the torque sensor by `size_nm` newton metres."""
     return Finding(
         kind="sensor drift",
         sentence=(

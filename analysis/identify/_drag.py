@@ -46,17 +46,18 @@ _TESTED_STRUCTURES: Final = ("III", "VI", "VII")
 """Names of the structures with which drag is tested: those with internal and external damping."""
 
 _MIN_EVIDENT_COST_REDUCTION: Final = 100.0
-"""Least reduction of the cost by a small drag that is evident."""
+"""Minimum reduction of the cost by a small drag for which drag is evident."""
 
 _MIN_EVIDENT_FRACTION: Final = 0.8
-"""Least fraction of the cost beyond noise that a small drag removes where it is evident.
+"""Minimum fraction of the cost beyond noise that a small drag removes if drag is evident.
 
-In records with other defects of a rig (`benchmarks/wrong_models.py`) the spectrum of a small drag
-removes less than a third, or its amplitude is negative. With drag it removes more than the whole
-cost beyond noise, since a part of the residual due to drag counts as noise."""
+In records with other defects of a rig (`benchmarks/wrong_models.py`) a small drag removes less than
+a third, or its amplitude is negative. In records with drag it removes more than the whole cost
+beyond noise, since a part of the residual due to drag counts as noise."""
 
 _FIRST_ORDER_BIC_MARGIN: Final = 6.0
-"""Margin of the BIC for the error of the cost reduction that is predicted to first order."""
+"""Amount by which the predicted BIC with drag may exceed the lowest BIC for drag to be fitted. The
+prediction is of first order, and has an error."""
 
 _MAX_DRAG_COMPUTATIONS: Final = 15
 """Maximum number of computations of the drag torque in a fit."""
@@ -65,30 +66,34 @@ _SHORT_DESCENT_EVALUATIONS: Final = 12
 """Maximum number of evaluations of a descent before the drag torque is recomputed."""
 
 _EARLY_EVALUATIONS: Final = 4
-"""Evaluations after which the cost of a structure shows whether its descent is worthwhile."""
+"""Number of evaluations after which the descent of a structure with drag ends if its cost is still
+far above that of the best structure."""
 
 _LONG_DESCENT_EVALUATIONS: Final = 40
-"""Maximum number of further evaluations of a promising descent."""
+"""Maximum number of evaluations of a descent that continues a promising short descent."""
 
 _GIVE_UP_DEVIANCE: Final = 50.0
-"""Deviance above that of the converged structure from which the descent of another structure ends
-early."""
+"""Deviance, relative to that of the converged structure, above which the descent of another
+structure with drag ends early."""
 
 _COST_TOLERANCE: Final = 2.0
 """Predicted reduction of the cost below which the drag torque is not recomputed."""
 
 _ROUGH_COST_TOLERANCE: Final = 500.0
-"""The same for the rough first fit of the drag; the last step is still taken, by all fits at this
-drag (`_fit_all_structures`).
+"""Predicted reduction of the cost below which the drag torque is not recomputed in the first, rough
+fit.
 
-The two numbers of a law and external damping can compensate each other along a flat direction.
-There each recomputation predicted a step of half a standard deviation in the same direction, for
-ten rounds and more: away from the true value, at a second a round."""
+The last step is still taken by all fits at this drag (`_fit_all_structures`). The two numbers of a
+law and external damping can compensate each other along a flat direction. There each recomputation
+predicted a step of half a standard deviation in the same direction, for ten rounds and more: away
+from the true value, at a second a round."""
 
 _STAGNATION_COST_REDUCTION: Final = 20.0
-"""Reduction of the cost below which a step may be the last one, if the step before reduced the cost
-by no more than twice as much. Where external damping has vanished or acts as an inertia, each
-step along its order predicts a reduction that the recomputed drag does not confirm."""
+"""Predicted reduction of the cost below which a fit with drag may end if it stagnates: if the step
+before reduced the cost by no more than twice as much.
+
+Where external damping has vanished or acts as an inertia, each step along its order predicts a
+reduction that the recomputed drag does not confirm."""
 
 _FIRST_STRUCTURE: Final = "III"
 """Structure of the first fit with drag: both dampings with order 1."""
@@ -105,7 +110,8 @@ certain coefficient gets a second number, whether or not that differs from 0, si
 would be too narrow otherwise."""
 
 _LOWEST_RELATIVE_SPEED: Final = 0.02
-"""Lowest speed at which the drag coefficient is reported, relative to the highest speed."""
+"""Lowest speed at which C_D d is reported, relative to the highest speed: below it the record
+contains no information."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,10 +145,10 @@ class DragEstimate:
 
 
 def with_evident_drag(uniform: CandidateSet) -> CandidateSet:
-    """Refit with air drag if it is evident before any other explanation has been tested.
+    """Refit with air drag if drag is evident before any other explanation has been tested.
 
-    To first order, drag then explains the whole residual of a uniform beam, which no other defect
-    of a rig does, and with drag only noise remains.
+    Drag is evident if, to first order, it explains the whole residual of a uniform beam, and only
+    noise remains after the refit. No other defect of a rig has this effect.
 
     Parameters
     ----------
@@ -196,7 +202,7 @@ def with_air_drag(candidate_set: CandidateSet) -> CandidateSet:
 
 
 def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
-    """Fit all structures with drag; return the given candidate set if its BIC is lower."""
+    """Fit all structures with drag; return the given candidate set unless drag lowers the BIC."""
     lead_candidate = next(
         (c for c in candidate_set.candidates if c.structure.name == _FIRST_STRUCTURE), None
     )
@@ -242,7 +248,7 @@ class _DragFitStart:
 
     @classmethod
     def of(cls, refit: Refit) -> _DragFitStart:
-        """Return the point at the minimum of a refit."""
+        """Return the minimum of a refit as the start of the next fit with drag."""
         structure = refit.objective.unknowns.structure
         two_numbers = len(refit.columns) > 1
         return cls(refit.plant, structure, _law_at_minimum(refit), refit.noise, two_numbers)
@@ -361,7 +367,7 @@ def _converged_drag_fit(
 
 
 def _relative_std(refit: Refit) -> float:
-    """Return the relative standard deviation of the coefficient of a drag law with one number."""
+    """Return the relative standard deviation of C_D d in a refit whose drag law has one number."""
     law, (_, std) = _law_at_minimum(refit), refit.amplitudes()
     return float(std[0]) / max(float(law.constant_m), float(np.finfo(float).tiny))
 
@@ -413,7 +419,10 @@ def _fit_all_structures(candidate_set: CandidateSet, converged: Refit) -> Candid
 
 
 def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
-    """Return the drag with its uncertainty, estimated together with all damping parameters."""
+    """Return the air drag with its uncertainty, from a refit of the freest candidate.
+
+    All possible damping parameters are free in it.
+    """
     freest = max(candidate_set.candidates, key=lambda c: (len(c.structure.free), -c.bic))
     refit = candidate_set.refit(freest)
     law, covariance = _law_at_minimum(refit), refit.amplitude_covariance()[1]
@@ -443,16 +452,17 @@ def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
 # Damping of a mode against its amplitude
 
 _REPORTED_MODES: Final = (1, 2)
-"""Numbers of the modes for which the damping by amplitude is computed."""
+"""Numbers of the modes whose damping ratio is reported at several amplitudes."""
 
 _RELATIVE_TIP_AMPLITUDES: Final = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
-"""Deflections of the tip relative to the length, up to the limit of small slopes."""
+"""Amplitudes of the tip, relative to the length of the beam, at which damping ratios are reported,
+up to the limit of small slopes."""
 
 _SPEED_EXPONENTS: Final = (2.0, 4 / 3)
 """Exponents of the speed in the drag force, for the two numbers of a `DragLaw`."""
 
 _QUADRATURE_POINTS: Final = 64
-"""Number of points of the quadrature along the beam."""
+"""Number of points of the Gauss quadrature along the beam."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -477,7 +487,10 @@ class DampingAt:
 
 
 def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAt, ...]:
-    """Return the damping of the first visible modes at several amplitudes; empty without drag."""
+    """Return the damping ratios of the first visible modes at several amplitudes of the tip.
+
+    The result is empty if the candidates include no drag.
+    """
     drag = candidate_set.drag
     if drag is None:
         return ()
@@ -511,7 +524,10 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAt, ...]
 def damping_ratio_by_drag_law(
     mode: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
 ) -> NDArray[np.float64]:
-    """Return a mode's damping ratio by air per unit of each number of a `DragLaw`, shape (2,)."""
+    """Return the damping ratio by air drag per unit of each number of a `DragLaw`, shape (2,).
+
+    It is that of a mode in free vibration with a given amplitude of the tip.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     shape = np.abs(mode_shape(mode, 0.5 * (nodes + 1)) / mode_shape(mode, 1.0))
     speed = tip_amplitude_m * omega_rad_s

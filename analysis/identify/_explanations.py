@@ -41,39 +41,40 @@ _GIVE_UP_CHI_SQUARE: Final = 6.0
 """Chi-square per degree of freedom, with a tolerance, above which a cause is given up."""
 
 _DERIVATIVE_STEP: Final = 1e-6
-"""Step of an unknown for numerical derivatives. The step for an unknown of a cause is relative to
-its range."""
+"""Step of an unknown for numerical derivatives. Steps of the unknowns of a cause are relative to
+their range."""
 
 _MAX_STEPS: Final = 12
-"""Maximum number of Gauss-Newton steps."""
+"""Maximum number of Gauss-Newton steps in the fit of a cause."""
 
 _MAX_RELATIVE_STEP: Final = 1.0
-"""Largest step in any unknown, relative to its scale."""
+"""Largest Gauss-Newton step of any unknown, relative to the scale of the unknown."""
 
 _MAX_CHI_SQUARE_RISE: Final = 10.0
-"""Largest factor by which chi-square may rise in one step."""
+"""Largest factor by which chi-square may rise in one Gauss-Newton step."""
 
 _MAX_HALVINGS: Final = 3
-"""Maximum number of times that a step is halved."""
+"""Maximum number of times that a Gauss-Newton step is halved."""
 
 _CONVERGED_REDUCTION: Final = 0.02
-"""Least predicted reduction of chi-square for another step, relative to chi-square or to 1 if that
-is larger."""
+"""Predicted reduction of chi-square below which the fit of a cause has converged, relative to
+chi-square or to 1 if that is larger."""
 
 _STEP_REGULARIZATION: Final = 1e-3
-"""Regularization of a step: an unknown without effect stays where it is, and a determined unknown
-moves almost freely."""
+"""Regularization of Gauss-Newton steps: an unknown without effect keeps its value, and a determined
+unknown moves almost freely."""
 
 _NAMED_CHI_SQUARE_MARGIN: Final = 6.0
-"""Chi-square above the lowest of all causes, up to which a cause is named whatever its p-value.
+"""Excess of chi-square over the lowest of all causes, up to which a cause is named anyway.
 
-A general cause is considered only if its chi-square is lower by this than in its special cases."""
+A general cause is considered only if its chi-square is lower than that of its special cases by more
+than this."""
 
 _NAMED_P_VALUE: Final = 0.05
-"""p-value from which a cause is named, however well another cause explains the modes."""
+"""p-value above which a cause is named, however well another cause explains the modes."""
 
 _MAX_NAMED_CAUSES: Final = 5
-"""Maximum number of causes that are named."""
+"""Maximum number of causes that the finding names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,7 +258,7 @@ class _CauseSearch:
         self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def best_start(self) -> tuple[float, NDArray[np.float64]]:
-        """Return the best start of the cause after one step of the beam's unknowns.
+        """Return the best point after one step of the beam's unknowns from each start of the cause.
 
         The result is chi-square, and the unknowns of beam and cause.
         """
@@ -277,7 +278,7 @@ class _CauseSearch:
         return min(steps, key=lambda pair: pair[0])
 
     def descend(self, y: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Take Gauss-Newton steps from `y`; return the lowest chi-square and its unknowns.
+        """Take Gauss-Newton steps from `y`; return the lowest chi-square and the unknowns there.
 
         Steps are not shortened as a rule, even where chi-square rises a little: along a curved flat
         direction it rises first and then falls further.
@@ -360,7 +361,7 @@ def _limited_step(
     low: NDArray[np.float64],
     high: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the Gauss-Newton step within limits, and the chi-square that it predicts.
+    """Return the Gauss-Newton step within limits, and the chi-square predicted after the step.
 
     The deviations themselves are solved by least squares. Frequencies are known a thousand times
     more precisely than residues, and normal equations would square that ratio.

@@ -44,19 +44,21 @@ _COST_TOLERANCE: Final = 1e-9
 standard deviation."""
 
 _ROUGH_COST_TOLERANCE: Final = 1e-4
-"""The same before noise and lines have been estimated: it moves the minimum by about a standard
-deviation."""
+"""Relative tolerance of the cost in a descent before noise and lines have been estimated: it moves
+the minimum by about a standard deviation."""
 
 _FAR_BEHIND_EVALUATIONS: Final = 20
-"""Evaluations after which the descent of a structure far behind the closest one ends. It converges
-slowly along a flat direction that damping of the wrong kind causes."""
+"""Number of evaluations after which the descent of a structure ends if its cost is far above that
+of the closest structure. Such a descent converges slowly, along a flat direction that damping of
+the wrong kind causes."""
 
 _EARLY_EVALUATIONS: Final = 4
-"""The same for a structure that was far behind in the descent before."""
+"""Number of evaluations after which the descent of a structure ends if its cost was, and still is,
+far above that of the closest structure."""
 
 _MAX_REFERENCE_ESTIMATES: Final = 3
-"""Maximum number of estimates of the part of the angle that follows the reference. Each leaves a
-fifth of the bias that a narrow-band disturbance caused."""
+"""Maximum number of estimates of the part of the angle that follows the reference. Each estimate
+leaves a fifth of the bias that a narrow-band disturbance caused."""
 
 
 def fit_record(
@@ -234,7 +236,7 @@ def _residual_is_noise(descent: Descent, noise: NoiseSpectrum) -> bool:
 def _descent_if_still_worse(
     earlier: Descent, noise: NoiseSpectrum, cost_limit: float
 ) -> Descent | None:
-    """Return the descent of a structure if its cost stays above a limit, else None."""
+    """Return a short descent of a structure if its cost stays above a limit, else None."""
     if earlier.cost(noise) <= cost_limit:
         return None
     descent = earlier.to_minimum(noise, _COST_TOLERANCE, (_EARLY_EVALUATIONS, cost_limit))

@@ -33,29 +33,29 @@ _MIN_RESONANCE_BINS: Final = 20
 
 _SEARCH_HALF_WIDTHS: Final = 3.0
 """Half width of the frequency range in which a hum is searched for, in half widths of the
-resonance. A hum beyond it does not affect the mode."""
+resonance. A hum outside this range does not affect the mode."""
 
 _BLOCK_S: Final = 4.0
-"""Duration of the overlapping blocks of the record."""
+"""Duration in seconds of the overlapping blocks of the record in which a hum is searched for."""
 
 _ASSUMED_MODEL_ERROR: Final = 0.3
-"""Relative error of the model's prediction that the test assumes."""
+"""Relative error of the predicted torque that the test for hum assumes."""
 
 _MIN_HUM_POWER_RATIO: Final = 25.0
-"""Least power of a hum over that of the noise: chance exceeds it at one frequency in 7e10, and
-hundreds are tested."""
+"""Minimum power of a hum relative to the noise. Chance exceeds this power at one frequency in 7e10,
+and hundreds are tested."""
 
 _MAX_UNSTEADY_POWER_RATIO: Final = 0.3
-"""Largest power of the difference between blocks and a steady hum, beyond chance, relative to the
-power of the hum."""
+"""Largest power of the difference between the blocks of a record and a steady hum, beyond noise,
+relative to the power of the hum."""
 
 _MIN_SILENT_FRACTION: Final = 0.2
 """Least fraction of the record in which the beam has to be silent: at other times the signal may be
 the response of the beam to a steady excitation."""
 
 _MAX_RELATIVE_GROWTH: Final = 0.3
-"""Largest change of the amplitude over the record, relative to its mean. A slow decay that a wrong
-model does not predict changes more."""
+"""Largest change of the amplitude of a hum over the record, relative to its mean. The slow decay of
+a mode, which a wrong model does not predict, changes more."""
 
 _MIN_HUM_OVER_PREDICTION: Final = 3.0
 """Least amplitude of a hum relative to the predicted torque of that frequency in the silent times.

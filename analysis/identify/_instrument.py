@@ -33,17 +33,19 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _LAG_WINDOW_S: Final = 0.4
-"""Standard deviation of the window over the lags of the correlations, and so the time for which the
-loop may depend on its past reference: 0.4 Hz in frequency. A longer window takes noise for
-response. A shorter one misses sharp features of the loop, and those of a beam that rings for
-long; its torque, given as a second input, provides the latter."""
+"""Standard deviation in seconds of the window over the lags of the correlations: the time for which
+the loop may depend on its past reference (0.4 Hz in frequency).
+
+A longer window takes noise for response. A shorter window misses sharp features of the loop, and
+those of a beam that rings for long. The torque, given as a second input, provides the features of
+the beam."""
 
 _RETURN_TO_ZERO_S: Final = 4.0
-"""Duration after the record in which angle and reference are assumed to return to 0. A reference
-that fell to 0 at once would do so without the lag of the loop."""
+"""Duration in seconds after the record in which angle and reference are assumed to return to 0. A
+reference that fell to 0 at once would do so without the lag of the loop."""
 
 _RELATIVE_POWER_FLOOR: Final = 1e-12
-"""Least assumed power of the reference at a frequency, relative to its largest power."""
+"""Minimum assumed power of the reference at a frequency, relative to its largest power."""
 
 
 def reference_coherent_part(

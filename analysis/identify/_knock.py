@@ -45,13 +45,14 @@ _WINDOW_HALF_WIDTHS_S: Final = (0.08, 0.5)
 second for a touch."""
 
 _GAP_BEFORE_IMPACT_S: Final = 0.1
-"""Time between an impact and the samples before it that are compared with those after it."""
+"""Duration in seconds between an impact and the samples before it that are tested for noise."""
 
 _COMPARED_DURATION_S: Final = 0.4
-"""Duration before and after an impact over which the power of the residual is compared."""
+"""Duration in seconds, before and after an impact, over which the powers of the residual are
+compared."""
 
 _MAX_POWER_BEFORE_OVER_AFTER: Final = 0.5
-"""Largest power of the residual before an impact, relative to the power after it."""
+"""Largest power of the residual before an impact, relative to the power after the impact."""
 
 _IMPACT_FIT_ROUNDS: Final = 2
 """Number of rounds that estimate poles and noise with the impact as part of the fit."""
@@ -70,15 +71,15 @@ _MIN_DECAY_FRACTION: Final = 0.5
 """Least fraction of the cost reduction that is due to the decays after the impact."""
 
 _OVERWHELMING_COST_RATIO: Final = 10.0
-"""Ratio of cost to expected cost from which the part that both impact and beam could explain is
-attributed to the impact. Below it that part is attributed to the beam: the residual of a wrong
-model is at most 3 times the noise, and decays would explain all of it."""
+"""Ratio of the cost to the cost of noise above which a torque that both impact and beam could
+explain is attributed to the impact. Below this ratio it is attributed to the beam: the residual
+of a wrong model is at most 3 times the noise, and decays would explain all of that residual."""
 
 _QUIET_DURATION_S: Final = 2.0
-"""Duration before an impact in which the residual should be noise."""
+"""Duration in seconds before an impact in which the residual should be noise."""
 
 _MAX_QUIET_POWER_RATIO: Final = 1.5
-"""Largest power of the residual in that time before an impact, relative to the noise."""
+"""Largest power of the residual before an impact, relative to the noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,9 +175,9 @@ def _find_impact_in_residual(refit: Refit) -> DetectedImpact | None:
 
 
 def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
-    """Fit the freest structure to each half of the record, and yield it as a fit to the whole.
+    """Fit the freest structure to each half of the record, and apply the plant to the whole one.
 
-    Only fits whose residual in their half is white are yielded.
+    A half is skipped if its residual is not white.
     """
     comparison = candidate_set.comparison
     measurement, hz = comparison.measurement, comparison.frequency_hz
@@ -248,9 +249,10 @@ def of_knocks(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> Iterat
 
 
 def _likeliest_start(refit: Refit) -> int | None:
-    """Return the sample from which decays of all modes explain most; None if chance may do so.
+    """Return the sample from which free decays of all modes explain most of the residual.
 
-    This takes one correlation per decay: the sums for a decay from the first sample on, reversed in
+    Return None if chance may explain as much, or if the residual does not rise abruptly. The search
+    takes one correlation per decay: the sums for a decay from the first sample on, reversed in
     time, give those for all samples at once.
     """
     comparison, weight = refit.objective.comparison, refit.noise.weight
@@ -290,7 +292,10 @@ def _likeliest_start(refit: Refit) -> int | None:
 
 
 def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refit:
-    """Fit with an impact between two samples, and return the fit without it under the new noise."""
+    """Estimate plant and noise with an impact between two samples as part of the model.
+
+    Return the refit without the impact, under the new noise.
+    """
     comparison, columns_before = refit.objective.comparison, refit.columns
     for _ in range(_IMPACT_FIT_ROUNDS):
         impact = _impact_between(refit, first_sample, end_sample)
@@ -348,8 +353,8 @@ def _successive_cost_reductions(refit: Refit, columns: NDArray[np.float64]) -> N
 
 
 _DEPENDENT_LENGTH: Final = 1e-6
-"""Length of a scaled torque after the earlier torques are projected out, below which it counts as a
-linear combination of them."""
+"""Length of a torque of length 1, after its projection on earlier torques is removed, below which
+it is a linear combination of these."""
 
 
 def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[int, int] | None:

@@ -50,39 +50,39 @@ _LARGEST_ETA: Final = 1.0
 """Upper bound of eta, which is twice the damping ratio of a mode."""
 
 _MAX_LOG_FREQUENCY_CHANGE: Final = 0.15
-"""Largest difference of the logarithm of a mode frequency from its start value."""
+"""Largest change of the logarithm of a mode frequency in the search."""
 
 _LOWEST_RELATIVE_FREQUENCY: Final = 0.12
-"""Lowest frequency compared, relative to the first mode. Below it the record contains sensor drift
-and 1/f noise, but nothing that determines a mode."""
+"""Lowest frequency compared, relative to that of the first mode. At lower frequencies the record
+contains sensor drift and 1/f noise, but nothing that determines a mode."""
 
 _MODE_REACH_HALF_WIDTHS: Final = 3.0
 """Distance from a mode, in half-widths of its resonance, within which the noise has no narrow peak.
 """
 
 _LEAST_RELATIVE_MODE_REACH: Final = 0.02
-"""Least distance from a mode, relative to its frequency, within which the noise has no narrow peak.
-"""
+"""Minimum distance from a mode, relative to its frequency, within which the noise has no narrow
+peak."""
 
 _MODE_REACH_MARGIN_BINS: Final = 24
-"""Frequency bins added to that distance."""
+"""Number of frequency bins added to the distance from a mode within which the noise has no narrow
+peak."""
 
 _MAX_NOISE_ESTIMATES: Final = 3
 """Maximum number of estimates of the noise spectrum, each followed by a descent."""
 
 _NOISE_LOG_TOLERANCE: Final = 0.02
-"""Mean change of the logarithm of the noise power below which it is not estimated again."""
+"""Mean change of the logarithm of the noise power below which the noise spectrum has converged."""
 
 _MAX_ADDITIONAL_RESONANCES: Final = 2
-"""Maximum number of resonances that are added to those of the beam; they belong to the sensor or
-the mount."""
+"""Maximum number of resonances, of the sensor or the mount, that are added to those of the beam."""
 
 _MIN_DEVIANCE_REDUCTION: Final = 60.0
-"""Least reduction of the deviance for which a mode or an additional resonance is retained."""
+"""Minimum reduction of the deviance by a mode or an additional resonance that is retained."""
 
 _MIN_VISIBLE_DEVIANCE_REDUCTION: Final = 400.0
-"""Least reduction of the deviance by a mode that counts as visible. Its damping ratio is then known
-to a tenth."""
+"""Minimum reduction of the deviance by a mode that counts as visible: its damping ratio is then
+known to a tenth."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,10 +37,10 @@ NOT_UNIFORM: Final = (
     "an effective value: the modes are not those of a uniform beam, and what makes them differ may "
     "change it"
 )
-"""Flag of a parameter whose value may be affected by a deviation from a uniform beam."""
+"""Reason for a flag on parameters that a deviation from a uniform beam may change."""
 
 NO_ORDER: Final = "no beam with one internal and one external order explains the losses"
-"""Flag of a parameter if no beam with fractional orders explains the losses of the modes."""
+"""Reason for a flag on damping parameters: no beam with fractional orders explains the losses."""
 
 _EFFECTIVE_PARAMETERS: Final = (*OF_BEAM, "delay_s")
 """Parameters that a deviation from a uniform beam may change by more than the tolerance of the
@@ -159,7 +159,7 @@ def _reported_modes(
 def _reported_parameters(
     estimate: TolerantEstimate, doubt: str | None, effective_reason: str | None
 ) -> dict[str, ReportedValue]:
-    """Return the parameters of the beam with a tolerance, with flags on undetermined ones.
+    """Return the parameters of the beam with a tolerance of the geometry, flagged if undetermined.
 
     `doubt` is the reason against every number. `effective_reason` is the reason why stiffness,
     density and delay are effective values: a tip mass or a compliant clamp changes all modes alike,
@@ -179,7 +179,7 @@ def _reported_parameters(
 
 
 def _reason_undetermined(estimate: TolerantEstimate, name: str) -> str | None:
-    """Return the reason why a parameter is not determined; None if it is determined."""
+    """Return the reason why the modes do not determine a parameter; None if they do."""
     if estimate.basis == "none":
         return NO_ORDER
     for order, coefficient in COEFFICIENT_OF.items():
@@ -189,9 +189,9 @@ def _reason_undetermined(estimate: TolerantEstimate, name: str) -> str | None:
 
 
 def identifiable(estimate: TolerantEstimate, order: str) -> bool:
-    """Return whether the modes determine a damping order: to less than half of its range.
+    """Return whether the modes determine a damping order.
 
-    The damping of that order must also be significant.
+    Its 95 % interval must be narrower than a quarter of its range, and its damping significant.
     """
     low, high = estimate.interval[order]
     widest = WIDEST_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])

@@ -56,20 +56,21 @@ FORCE_KINDS: Final[tuple[ForceKind, ...]] = (
 """All kinds of nonlinear restoring forces that are tested."""
 
 _OVERSAMPLING: Final = 3
-"""Factor by which the sampling rate is raised to compute a force. The band ends at 0.4 of the rate:
-harmonics up to three times its end do not fold back into it."""
+"""Factor by which the sampling rate is raised to compute a nonlinear force. The band ends at 0.4 of
+the rate, so harmonics up to three times its end do not alias into the band."""
 
 _PADDED_LENGTH_RATIO: Final = 1.5
-"""Length of the transforms relative to the record."""
+"""Length of the padded Fourier transforms relative to the record."""
 
 _WRAPPED_DECAY_EXPONENT: Final = 9.0
-"""Decay exponent over the padded length by which a wrapped response is attenuated."""
+"""Product of the damping rate sigma and the padded duration: the response that wraps around is
+attenuated by its exponential."""
 
 _MAX_SUBSTITUTIONS: Final = 12
-"""Maximum number of substitutions for the motion of a mode with its force."""
+"""Maximum number of substitutions that compute the motion of a mode with its nonlinear force."""
 
 _FORCE_TOLERANCE: Final = 1e-3
-"""Relative change of the force at which the substitution has converged."""
+"""Relative change of a nonlinear force below which the repeated substitution has converged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,26 +221,26 @@ _MAX_FORCES: Final = 2
 """Maximum number of nonlinear forces in a fit."""
 
 _MAX_SIZE_ITERATIONS: Final = 6
-"""Maximum number of fits that determine the sizes of the forces."""
+"""Maximum number of fits that determine the sizes of nonlinear forces."""
 
 _RELATIVE_SIZE_TOLERANCE: Final = 0.005
-"""Relative change of a size at which it has converged."""
+"""Relative change of the size of a nonlinear force below which it has converged."""
 
 _MIN_DEVIANCE_REDUCTION: Final = SIGNIFICANT_STD**2 + 2 * math.log(30)
-"""Least reduction of the deviance by a force. The margin accounts for the test of three forces on
-three modes in three rounds."""
+"""Minimum reduction of the deviance by a nonlinear force. It accounts for the test of three forces
+on three modes in three rounds."""
 
 _MIN_PREDICTED_DEVIANCE_REDUCTION: Final = 6.0
-"""Predicted reduction of the deviance by the best force from which forces are fitted. Chance
-reaches it in one record of ten."""
+"""Minimum predicted reduction of the deviance by the best nonlinear force for which forces are
+fitted. Chance reaches it in one record of ten."""
 
 _GIVE_UP_DEVIANCE: Final = 2000.0
-"""Deviance to first order, above that of the best candidate, from which repeated substitution
-cannot make a force the best explanation."""
+"""Deviance, relative to that of the best candidate, above which a force is not fitted: the
+first-order prediction is then too far off for repeated substitution to make up for it."""
 
 _MIN_EXPLAINED_FRACTION: Final = 0.5
-"""Least fraction of the cost beyond noise that the forces must explain; otherwise the residual has
-another cause."""
+"""Minimum fraction of the cost beyond noise that nonlinear forces must explain. Otherwise the
+residual has another cause."""
 
 
 @dataclass(frozen=True, slots=True)

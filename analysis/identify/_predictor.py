@@ -176,13 +176,14 @@ class ResponseGrid:
 # Prediction
 
 _PADDED_LENGTH_RATIO: Final = 1.1
-"""Length of the padded transforms relative to the record."""
+"""Length of the padded Fourier transforms relative to the record."""
 
 _WRAPPED_DECAY_EXPONENT: Final = 6.6
-"""Product of sigma and the padded duration. The part that wraps around shrinks by exp(-6.6), to
-1e-3 of the response of a beam after a whole record. It has the form of a free decay, which no
-fit mistakes for the response. Rounding errors and what the decimation left beyond the band grow
-by exp(6.6 / 1.1) = 400."""
+"""Product of the damping rate sigma and the padded duration.
+
+The part that wraps around shrinks by exp(-6.6), to 1e-3 of the response of a beam after a whole
+record. It has the form of a free decay, which no fit mistakes for the response. Rounding errors and
+what the decimation left beyond the band grow by exp(6.6 / 1.1) = 400."""
 
 
 class TorquePredictor:

@@ -79,10 +79,10 @@ class Projected:
 
 
 _MAX_FILLINGS: Final = 8
-"""Maximum number of times that unknown torques are filled with the prediction."""
+"""Maximum number of times that a descent is repeated with unknown torques filled again."""
 
 _UNKNOWNS_TOLERANCE: Final = 1e-6
-"""Change of the unknowns below which unknown torques are not filled again."""
+"""Change of the unknowns below which the filling of unknown torques has converged."""
 
 
 class Objective:
