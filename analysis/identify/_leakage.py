@@ -17,23 +17,24 @@ if TYPE_CHECKING:
     from analysis.identify._result import RecordFit
 
 _SEARCH_RANGE_HZ: Final = 5.0
-"""Distance from the band's end within which lines are searched for."""
+"""Distance in hertz from the upper end of the band within which lines are searched for."""
 
 _SAME_LINE_HZ: Final = 0.1
-"""Distance within which two lines count as the same."""
+"""Distance in hertz within which two lines are considered the same line."""
 
 _DIFFERENT_MOTION_CORRELATION: Final = 0.5
-"""Correlation of the angle with itself at a lag, below which the motion is different."""
+"""Correlation of the motor angle with itself, at a time lag, below which the motions are different.
+"""
 
 _REPEATED_MOTION_CORRELATION: Final = 0.9
-"""Correlation of the angle with itself at a lag, above which the motion is repeated."""
+"""Correlation of the motor angle with itself, at a time lag, above which the motion is repeated."""
 
 _HARMLESS_LEAKAGE_RATIO: Final = 0.3
-"""Largest harmless power of leakage, relative to that of the noise."""
+"""Largest power that leaks into a bin without harm, relative to the noise."""
 
 
 def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit) -> NoiseSpectrum:
-    """Return the noise without bins into which a line beyond the band leaks, and with that line.
+    """Exclude bins into which a disturbance beyond the band leaks; add it to the noise lines.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
 
 
 def repetition_period_s(comparison: Comparison) -> float:
-    """Return the period of the motor angle in seconds; 0 if the motion is not repeated."""
+    """Return the period in seconds of the motion of the motor; 0 if the motion does not repeat."""
     angle = comparison.angle_rad[comparison.retained]
     angle = angle - angle.mean()
     count = angle.size
