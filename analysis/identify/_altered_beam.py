@@ -127,11 +127,11 @@ class Alteration:
 
     def channel(self, s: NDArray[np.complex128]) -> NDArray[np.complex128] | float:
         """Return the transfer function of the torque channel's lags at `s` in rad/s."""
-        time_s, over_quality = self.sensor
+        time_s, inverse_quality = self.sensor
         response: NDArray[np.complex128] | float = 1.0
         if time_s:
             q = s * time_s
-            response = 1 / (1 + over_quality * q + q * q)
+            response = 1 / (1 + inverse_quality * q + q * q)
         return response / (1 + self.lag_s * s) if self.lag_s else response
 
 
@@ -266,11 +266,11 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     def with_lump_modes(array: NDArray[np.float64], value: float = 0.0) -> NDArray[np.float64]:
         if not lump_count:
             return array
-        found = np.zeros((_BASIS_MODES + lump_count,) * array.ndim)
-        found[(slice(_BASIS_MODES),) * array.ndim] = array
-        beyond = range(_BASIS_MODES, _BASIS_MODES + lump_count)
-        found[(beyond,) * array.ndim] = value
-        return found
+        extended = np.zeros((_BASIS_MODES + lump_count,) * array.ndim)
+        extended[(slice(_BASIS_MODES),) * array.ndim] = array
+        lump_indices = range(_BASIS_MODES, _BASIS_MODES + lump_count)
+        extended[(lump_indices,) * array.ndim] = value
+        return extended
 
     density_deviation = basis.deviation(alteration.density)
     mass = with_lump_modes(
@@ -287,8 +287,10 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
             with_lump_modes(_basis_shapes_at_lump(position).copy()),
         )
         # All modes beyond the basis act on a point mass as one spring, and move as one mode.
-        beyond = position**3 / 3 - float(np.sum((shape[:_BASIS_MODES] / basis.z**2) ** 2))
-        shape[index] = math.sqrt(max(beyond, 0.0)) * _NEXT_EIGENVALUE**2
+        flexibility_beyond_basis = position**3 / 3 - float(
+            np.sum((shape[:_BASIS_MODES] / basis.z**2) ** 2)
+        )
+        shape[index] = math.sqrt(max(flexibility_beyond_basis, 0.0)) * _NEXT_EIGENVALUE**2
         lump += mass_fraction * np.outer(shape, shape)
         lump_arm += mass_fraction * position * shape
         if alteration.gravity_m_s2:
@@ -331,8 +333,8 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
     )
 
     def modal_coefficients(matrix: NDArray[np.float64]) -> Terms:
-        found: Terms = np.sum(shapes * (matrix @ shapes), axis=0) / modal_masses
-        return found
+        coefficients: Terms = np.sum(shapes * (matrix @ shapes), axis=0) / modal_masses
+        return coefficients
 
     root_modal_masses = np.sqrt(modal_masses)
     gravity_per_length = alteration.gravity_m_s2 / length

@@ -206,7 +206,7 @@ class CandidateSet:
     def _from_analysis(
         cls, analysis: RecordAnalysis, fixed: tuple[Setting, ...], candidates: Iterable[Candidate]
     ) -> CandidateSet:
-        """Return a candidate set with the given candidates, under the noise of an analysis."""
+        """Return a candidate set of given candidates, with comparison and noise of an analysis."""
         comparison = analysis.comparison
         return cls(
             comparison=comparison,
@@ -232,15 +232,15 @@ class CandidateSet:
         candidate.
         """
         by_structure = {c.structure.name: c for c in self.candidates}
-        freest = by_structure.get(_FREEST.name)
-        if freest is None:
+        freest_candidate = by_structure.get(_FREEST.name)
+        if freest_candidate is None:
             return self.best
         one_damping = [by_structure[s.name] for s in _ONE_DAMPING if s.name in by_structure]
-        best_one_damping = min(one_damping, key=lambda c: c.deviance, default=freest)
+        best_one_damping = min(one_damping, key=lambda c: c.deviance, default=freest_candidate)
         return (
             best_one_damping
-            if best_one_damping.deviance - freest.deviance < _MIN_DEVIANCE_OF_DAMPING
-            else freest
+            if best_one_damping.deviance - freest_candidate.deviance < _MIN_DEVIANCE_OF_DAMPING
+            else freest_candidate
         )
 
     def led_by(self, candidate: Candidate) -> CandidateSet:
@@ -301,10 +301,12 @@ class CandidateSet:
             comparison = candidate_set.comparison.renewed(best.fit.plant, candidate_set.noise)
             if comparison is candidate_set.comparison:
                 break
-            only_best = replace(candidate_set, comparison=comparison, candidates=(best,))
-            noise = only_best.refit(best, FEW).noise_here()
-            only_best = replace(only_best, noise=noise)
-            candidate_set = replace(only_best, candidates=(only_best.refit(best, FEW).candidate(),))
+            set_of_best = replace(candidate_set, comparison=comparison, candidates=(best,))
+            noise = set_of_best.refit(best, FEW).noise_here()
+            set_of_best = replace(set_of_best, noise=noise)
+            candidate_set = replace(
+                set_of_best, candidates=(set_of_best.refit(best, FEW).candidate(),)
+            )
         if candidate_set is self:
             return self
         # The other candidates start from their former minima, under the new noise.
@@ -444,7 +446,7 @@ class CandidateSet:
         return self.descent(unknowns, x, 1).fit(), True
 
     def with_orders_free(self) -> CandidateSet:
-        """Fit the structures with free orders that have not been fitted yet."""
+        """Add fits of the structures with free orders, unless the set contains them."""
         best = self.best
         by_structure = {c.structure.name: c.fit for c in self.candidates}
         refits: list[Refit] = []
@@ -455,8 +457,8 @@ class CandidateSet:
             added_candidates.append(refits[-1].candidate())
             return added_candidates[-1].fit
 
-        freest = by_structure.get(_FREEST.name) or fit_structure(_FREEST)
-        for structure in _one_damping_structures(freest):
+        freest_fit = by_structure.get(_FREEST.name) or fit_structure(_FREEST)
+        for structure in _one_damping_structures(freest_fit):
             if structure.name not in by_structure:
                 fit_structure(structure)
         if not refits:
@@ -486,7 +488,7 @@ class CandidateSet:
         ).cross_check()
 
     def with_candidates(self, candidates: Iterable[Candidate]) -> CandidateSet:
-        """Return the candidate set with the given candidates, by rising BIC."""
+        """Return the set with its candidates replaced by the given ones, sorted by rising BIC."""
         return replace(self, candidates=_by_rising_bic(candidates))
 
     def all_but_white(self, fit: RecordFit) -> bool:
@@ -497,14 +499,15 @@ class CandidateSet:
 
 def _one_damping_structures(fit: RecordFit) -> list[Structure]:
     """Return the structures without one of the dampings that is not clearly significant."""
-    pairs = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
+    structures_and_missing = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
     return [
         structure
-        for structure, missing in pairs
-        if missing is None or missing.value < _CERTAIN_COEFFICIENT_OVER_STD * missing.std
+        for structure, missing_damping in structures_and_missing
+        if missing_damping is None
+        or missing_damping.value < _CERTAIN_COEFFICIENT_OVER_STD * missing_damping.std
     ]
 
 
 def _by_rising_bic(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
-    """Return candidates by rising BIC."""
+    """Return the candidates sorted by rising BIC."""
     return tuple(sorted(candidates, key=lambda candidate: candidate.bic))

@@ -58,9 +58,11 @@ class Cause:
     special_cases: tuple[str, ...] = ()
 
 
-def _set_tilt(stated: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
+def _set_tilt(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
     """Return an alteration with the axis tilted by an unknown angle in degrees."""
-    return replace(stated, gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(unknowns[0])))
+    return replace(
+        stated_alteration, gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(unknowns[0]))
+    )
 
 
 def _describe_tilt(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
@@ -78,9 +80,11 @@ def _mass_kg(fraction: float, beam: Beam) -> float:
     return fraction * beam.density_kg_per_m * beam.length_m
 
 
-def _set_tip_mass(stated: Alteration, unknowns: Sequence[float], beam: Beam) -> Alteration:
+def _set_tip_mass(
+    stated_alteration: Alteration, unknowns: Sequence[float], beam: Beam
+) -> Alteration:
     """Return an alteration with a tip mass as a fraction of the beam's mass."""
-    return replace(stated, lumps=((1.0, _mass_kg(unknowns[0], beam)),))
+    return replace(stated_alteration, lumps=((1.0, _mass_kg(unknowns[0], beam)),))
 
 
 def _describe_tip_mass(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
@@ -89,9 +93,12 @@ def _describe_tip_mass(unknowns: Sequence[float], beam: Beam) -> tuple[float, st
     return mass_kg, "kg", f"a mass of {_two_digits(1e3 * mass_kg)} g at the tip"
 
 
-def _add_lump(stated: Alteration, unknowns: Sequence[float], beam: Beam) -> Alteration:
+def _add_lump(stated_alteration: Alteration, unknowns: Sequence[float], beam: Beam) -> Alteration:
     """Return an alteration with a further point mass: its relative position and mass fraction."""
-    return replace(stated, lumps=(*stated.lumps, (unknowns[0], _mass_kg(unknowns[1], beam))))
+    return replace(
+        stated_alteration,
+        lumps=(*stated_alteration.lumps, (unknowns[0], _mass_kg(unknowns[1], beam))),
+    )
 
 
 def _describe_lump(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
@@ -102,14 +109,21 @@ def _describe_lump(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, s
 
 
 def _compliance_rad_per_nm(unknowns: Sequence[float], beam: Beam) -> float:
-    """Return the compliance of the clamp in rad/(N·m), from that relative to the beam."""
+    """Return the compliance of the clamp in rad/(N·m), for a compliance relative to L/EI."""
     return unknowns[0] * beam.length_m / beam.bending_stiffness_n_m2
 
 
-def _set_clamp_compliance(stated: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
-    """Return an alteration with a compliant clamp and, optionally, a loss factor of the clamp."""
+def _set_clamp_compliance(
+    stated_alteration: Alteration, unknowns: Sequence[float], _: Beam
+) -> Alteration:
+    """Return an alteration with a compliant clamp and, optionally, a loss factor of the clamp.
+
+    The compliance is relative to that of the beam, L/EI.
+    """
     return replace(
-        stated, clamp_compliance=unknowns[0], clamp_loss=unknowns[1] if len(unknowns) > 1 else 0.0
+        stated_alteration,
+        clamp_compliance=unknowns[0],
+        clamp_loss=unknowns[1] if len(unknowns) > 1 else 0.0,
     )
 
 
@@ -146,15 +160,15 @@ def _describe_second_order_filter(unknowns: Sequence[float], _: Beam) -> tuple[f
 
 def _plant_with_first_order_filter(unknowns: Sequence[float], plant: Plant) -> Plant | None:
     """Return the plant with a first-order filter; None if the file already states a filter."""
-    stated = plant.filter_time_constant_s
-    return None if stated else replace(plant, filter_time_constant_s=1e-3 * unknowns[0])
+    stated_s = plant.filter_time_constant_s
+    return None if stated_s else replace(plant, filter_time_constant_s=1e-3 * unknowns[0])
 
 
 def _plant_with_second_order_filter(unknowns: Sequence[float], plant: Plant) -> Plant | None:
     """Return the plant with a second-order filter; None if the file already states a filter."""
-    stated = plant.second_order_filter_time_constant_s
+    stated_s = plant.second_order_filter_time_constant_s
     return (
-        None if stated else replace(plant, second_order_filter_time_constant_s=1e-3 * unknowns[0])
+        None if stated_s else replace(plant, second_order_filter_time_constant_s=1e-3 * unknowns[0])
     )
 
 
@@ -165,7 +179,7 @@ def _describe_resonance(unknowns: Sequence[float], _: Beam) -> tuple[float, str,
 
 
 def _frequency_hz(unknowns: Sequence[float]) -> float:
-    """Return the frequency in hertz of a time constant in milliseconds, the first unknown."""
+    """Return the corner or resonance frequency in hertz for a time constant in milliseconds."""
     return 1e3 / (2 * math.pi * unknowns[0])
 
 
@@ -180,15 +194,15 @@ def _describe_relaxation(unknowns: Sequence[float], _: Beam) -> tuple[float, str
 
 
 def _two_digits(value: float) -> str:
-    """Format a value with two significant digits, since its interval is not known."""
+    """Format a value with two significant digits."""
     return f"{value:.2g}" if abs(value) < 100 else f"{float(f'{value:.2g}'):.0f}"
 
 
 def _uneven_mass_cause(profile: Profile, phrase: str) -> Cause:
-    """Return the cause of a mass per length that deviates from uniform with a profile."""
+    """Return the cause that the mass per length deviates with a profile along the beam."""
 
-    def alter(stated: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
-        return replace(stated, density=((profile, unknowns[0]),))
+    def alter(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
+        return replace(stated_alteration, density=((profile, unknowns[0]),))
 
     return Cause(
         "uneven mass", _STARTS_OF_EITHER_SIGN, (-0.3,), (0.3,), alter, _describe_deviation(phrase)
@@ -196,10 +210,10 @@ def _uneven_mass_cause(profile: Profile, phrase: str) -> Cause:
 
 
 def _uneven_stiffness_cause(profile: Profile, phrase: str) -> Cause:
-    """Return the cause of a bending stiffness that deviates from uniform with a profile."""
+    """Return the cause that the bending stiffness deviates with a profile along the beam."""
 
-    def alter(stated: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
-        return replace(stated, stiffness=((profile, unknowns[0]),))
+    def alter(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
+        return replace(stated_alteration, stiffness=((profile, unknowns[0]),))
 
     return Cause(
         "uneven stiffness",
@@ -281,7 +295,7 @@ CAUSES: Final = (
         ((0.2,), (0.6,), (2.0,)),
         (0.0,),
         (20.0,),
-        lambda stated, unknowns, _: replace(stated, lag_s=1e-3 * unknowns[0]),
+        lambda stated_alteration, unknowns, _: replace(stated_alteration, lag_s=1e-3 * unknowns[0]),
         _describe_first_order_filter,
         _plant_with_first_order_filter,
     ),
@@ -290,7 +304,9 @@ CAUSES: Final = (
         ((0.2,), (0.6,), (2.0,)),
         (0.0,),
         (10.0,),
-        lambda stated, unknowns, _: replace(stated, sensor=(1e-3 * unknowns[0], _BUTTERWORTH_LOSS)),
+        lambda stated_alteration, unknowns, _: replace(
+            stated_alteration, sensor=(1e-3 * unknowns[0], _BUTTERWORTH_LOSS)
+        ),
         _describe_second_order_filter,
         _plant_with_second_order_filter,
     ),
@@ -299,7 +315,9 @@ CAUSES: Final = (
         tuple((size, loss) for size in (0.3, 0.6, 1.0, 1.6) for loss in (0.05, 0.5)),
         (0.0, 0.0),
         (3.0, 2.0),
-        lambda stated, unknowns, _: replace(stated, sensor=(1e-3 * unknowns[0], unknowns[1])),
+        lambda stated_alteration, unknowns, _: replace(
+            stated_alteration, sensor=(1e-3 * unknowns[0], unknowns[1])
+        ),
         _describe_resonance,
         special_cases=("torque filter of second order",),
     ),
@@ -312,8 +330,8 @@ CAUSES: Final = (
         ),
         (math.log(1e-4), 0.0),
         (math.log(3.0), 0.5),
-        lambda stated, unknowns, _: replace(
-            stated, relaxation=(unknowns[1], math.exp(unknowns[0]))
+        lambda stated_alteration, unknowns, _: replace(
+            stated_alteration, relaxation=(unknowns[1], math.exp(unknowns[0]))
         ),
         _describe_relaxation,
     ),

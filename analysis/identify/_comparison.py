@@ -150,8 +150,8 @@ class Comparison:
         measurement.check(highest_hz)
         decimation = Decimation.to_band(measurement.rate_hz, highest_hz)
         angle_rad = decimation.apply(measurement.angle_from_rest(highest_hz))
-        usable = decimation.samples_inside_record(measurement.angle_rad.size)
-        samples = usable.stop - usable.start
+        usable_samples = decimation.samples_inside_record(measurement.angle_rad.size)
+        samples = usable_samples.stop - usable_samples.start
         if samples > 0:
             samples = fast_length_below(samples)
         all_hz = np.arange(samples // 2 + 1) * (decimation.rate_hz / max(samples, 1))
@@ -164,7 +164,7 @@ class Comparison:
                 f"{max(bins.stop - bins.start, 0)} frequencies, at least {_MIN_BINS} are "
                 "needed; record longer or widen the band."
             )
-        retained = slice(usable.start, usable.start + samples)
+        retained = slice(usable_samples.start, usable_samples.start + samples)
         frequency_hz = all_hz[bins]
         beam = measurement.beam
         gaps = measurement.long_gaps(highest_hz)
@@ -279,14 +279,14 @@ class Comparison:
         """
         if self.measurement.reference_rad is None:
             return self.angle_rad
-        coherent = self._coherent_part(self.angle_rad)
+        coherent_angle_rad = self._coherent_part(self.angle_rad)
         # The speeds are compared, since a slow drift of the angle does not disturb the estimate.
         angle_power, incoherent_power = (
             np.sum(np.diff(angle_rad[self.retained]) ** 2)
-            for angle_rad in (self.angle_rad, self.angle_rad - coherent)
+            for angle_rad in (self.angle_rad, self.angle_rad - coherent_angle_rad)
         )
         return (
-            coherent
+            coherent_angle_rad
             if incoherent_power < _MAX_INCOHERENT_FRACTION * angle_power
             else self.angle_rad
         )
@@ -417,7 +417,7 @@ class Comparison:
             with_new_hum._hum_torque_at(time_s) - self._hum_torque_at(time_s),
         )
 
-    def with_drag(self, plant: Plant, law: DragLaw) -> Comparison:
+    def remove_drag_torque(self, plant: Plant, law: DragLaw) -> Comparison:
         """Compute the torque by drag, remove it, and store its derivatives.
 
         Parameters

@@ -81,7 +81,7 @@ class RecordedImpact:
 
     first_s: float
     last_s: float
-    resolution_s: float
+    start_uncertainty_s: float
     poles_rad_s: tuple[complex, ...]
     sizes: tuple[float, ...] = ()
     largest_nm: float = 0.0

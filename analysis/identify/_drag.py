@@ -144,7 +144,7 @@ class DragEstimate:
     covariance: tuple[tuple[float, ...], ...]
 
 
-def with_evident_drag(uniform: CandidateSet) -> CandidateSet:
+def with_evident_drag(candidate_set: CandidateSet) -> CandidateSet:
     """Refit with air drag if drag is evident before any other explanation has been tested.
 
     Drag is evident if, to first order, it explains the whole residual of a uniform beam, and only
@@ -152,28 +152,30 @@ def with_evident_drag(uniform: CandidateSet) -> CandidateSet:
 
     Parameters
     ----------
-    uniform : CandidateSet
+    candidate_set : CandidateSet
         Candidates without drag, on a uniform beam.
 
     Returns
     -------
     CandidateSet
-        `uniform` unless drag is evident; else the candidates with drag.
+        `candidate_set` unless drag is evident; else the candidates with drag.
     """
-    if uniform.misread or not _drag_is_evident(uniform):
-        return uniform
-    refitted = _refit_with_drag(uniform)
+    if candidate_set.misread or not _drag_is_evident(candidate_set):
+        return candidate_set
+    refitted = _refit_with_drag(candidate_set)
     return (
         refitted
         if refitted.drag is not None and refitted.all_but_white(refitted.likeliest)
-        else uniform
+        else candidate_set
     )
 
 
-def _drag_is_evident(uniform: CandidateSet) -> bool:
+def _drag_is_evident(candidate_set: CandidateSet) -> bool:
     """Return whether a small drag would explain the residual of the freest structure."""
-    freest = next(c for c in uniform.candidates if c.structure.name == _FREEST_STRUCTURE)
-    refit = uniform.refit(freest, 1)
+    freest_candidate = next(
+        c for c in candidate_set.candidates if c.structure.name == _FREEST_STRUCTURE
+    )
+    refit = candidate_set.refit(freest_candidate, 1)
     size, cost_reduction = _first_order_drag(refit)
     return size > 0 and cost_reduction > max(
         _MIN_EVIDENT_COST_REDUCTION, _MIN_EVIDENT_FRACTION * (refit.cost - refit.expected_cost)
@@ -206,25 +208,27 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
     lead_candidate = next(
         (c for c in candidate_set.candidates if c.structure.name == _FIRST_STRUCTURE), None
     )
-    start = None if lead_candidate is None else _first_order_start(candidate_set, lead_candidate)
-    if start is None:
-        return candidate_set
-    converged = _converged_drag_fit(
-        candidate_set, start, STRUCTURES[_FIRST_STRUCTURE], tolerance=_ROUGH_COST_TOLERANCE
+    first_start = (
+        None if lead_candidate is None else _first_order_start(candidate_set, lead_candidate)
     )
-    if converged is None:
+    if first_start is None:
+        return candidate_set
+    drag_fit = _converged_drag_fit(
+        candidate_set, first_start, STRUCTURES[_FIRST_STRUCTURE], tolerance=_ROUGH_COST_TOLERANCE
+    )
+    if drag_fit is None:
         return candidate_set
     # The freest structure starts from this fit: its fit without drag may be far off.
-    start_comparison, next_start = converged.objective.comparison, _DragFitStart.of(converged)
+    start_comparison, next_start = drag_fit.objective.comparison, _DragFitStart.of(drag_fit)
     for name in (_FREEST_STRUCTURE, _FIRST_STRUCTURE):
-        converged = _converged_drag_fit(
+        drag_fit = _converged_drag_fit(
             candidate_set, next_start, STRUCTURES[name], start_comparison=start_comparison
         )
-        if converged is not None:
+        if drag_fit is not None:
             break
     else:
         return candidate_set
-    refitted = _fit_all_structures(candidate_set, converged)
+    refitted = _fit_all_structures(candidate_set, drag_fit)
     assert refitted.drag is not None
     return (
         refitted
@@ -235,9 +239,9 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
 
 @dataclass(frozen=True, slots=True)
 class _DragFitStart:
-    """Start of a fit with drag: plant, structure, drag law and noise.
+    """Start of a fit with drag: plant, damping structure, drag law and noise spectrum.
 
-    `two_numbers` states whether both numbers of the law are estimated.
+    `two_numbers` states whether both numbers of the drag law are estimated.
     """
 
     plant: Plant
@@ -333,9 +337,9 @@ def _converged_drag_fit(
             plant = unknowns.plant(x)
             # With drag the plant is different, and so is the torque of the incoherent angle.
             try:
-                comparison = candidate_set.comparison.recompute_incoherent_torque(plant).with_drag(
-                    plant, law
-                )
+                comparison = candidate_set.comparison.recompute_incoherent_torque(
+                    plant
+                ).remove_drag_torque(plant, law)
             except DragError:
                 return None
         drag = comparison.drag
@@ -384,37 +388,39 @@ def _law_at_minimum(refit: Refit) -> DragLaw:
     return DragLaw(expansion.law.constant_m + law_change[0], slowing)
 
 
-def _fit_all_structures(candidate_set: CandidateSet, converged: Refit) -> CandidateSet:
+def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> CandidateSet:
     """Fit all structures with the drag torque of a converged fit, and estimate the drag."""
-    with_drag = replace(
+    set_with_drag = replace(
         candidate_set,
-        comparison=converged.objective.comparison,
-        columns=converged.columns,
-        noise=converged.noise_here(),
+        comparison=converged_fit.objective.comparison,
+        columns=converged_fit.columns,
+        noise=converged_fit.noise_here(),
     )
-    converged_cost = with_drag.descent(converged.objective.unknowns, converged.x, 1).cost
+    converged_cost = set_with_drag.descent(
+        converged_fit.objective.unknowns, converged_fit.x, 1
+    ).cost
     cost_limit = converged_cost * math.exp(_GIVE_UP_DEVIANCE / candidate_set.best.values)
-    started = []
+    short_descents = []
     for candidate_without in candidate_set.candidates:
-        unknowns = with_drag.unknowns(candidate_without.structure)
+        unknowns = set_with_drag.unknowns(candidate_without.structure)
         refit = Refit.descend(
-            with_drag.comparison,
+            set_with_drag.comparison,
             unknowns,
-            unknowns.vector(converged.plant),
-            with_drag.noise,
-            with_drag.columns,
+            unknowns.vector(converged_fit.plant),
+            set_with_drag.noise,
+            set_with_drag.columns,
             max_evaluations=_SHORT_DESCENT_EVALUATIONS,
             relative_tolerance=MISSED,
             hopeless=(_EARLY_EVALUATIONS, cost_limit),
         )
-        started.append((refit.candidate(), refit))
+        short_descents.append((refit.candidate(), refit))
     candidates = [
         refit.further(_LONG_DESCENT_EVALUATIONS).candidate()
         if refit.predicted_cost < cost_limit
         else candidate
-        for candidate, refit in started
+        for candidate, refit in short_descents
     ]
-    refitted = with_drag.with_candidates(candidates).cross_check()
+    refitted = set_with_drag.with_candidates(candidates).cross_check()
     return replace(refitted, drag=_drag_estimate(refitted))
 
 
@@ -423,10 +429,10 @@ def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
 
     All possible damping parameters are free in it.
     """
-    freest = max(candidate_set.candidates, key=lambda c: (len(c.structure.free), -c.bic))
-    refit = candidate_set.refit(freest)
+    freest_candidate = max(candidate_set.candidates, key=lambda c: (len(c.structure.free), -c.bic))
+    refit = candidate_set.refit(freest_candidate)
     law, covariance = _law_at_minimum(refit), refit.amplitude_covariance()[1]
-    covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom
+    covariance = covariance * freest_candidate.fit.cost / freest_candidate.fit.degrees_of_freedom
     expansion = refit.objective.comparison.drag
     assert expansion is not None
     speed_m_s = expansion.speed_m_s

@@ -87,14 +87,14 @@ _INTERVAL_PATTERN: Final = re.compile(r" \((?:[^()]*; 95 %|± [^()]*)\)")
 """Interval in parentheses in a sentence."""
 
 
-def doubted(finding: Finding, because: str) -> Finding:
+def doubted(finding: Finding, reason: str) -> Finding:
     """Return a finding marked as not established, for a reason.
 
     Parameters
     ----------
     finding : Finding
         Finding to be marked.
-    because : str
+    reason : str
         Reason why it is not established.
 
     Returns
@@ -116,6 +116,6 @@ def doubted(finding: Finding, because: str) -> Finding:
         sentence = sentence[0].lower() + sentence[1:]
     return replace(
         finding,
-        sentence=f"Not established, because {because}: {sentence}",
+        sentence=f"Not established, because {reason}: {sentence}",
         interval=None,
     )

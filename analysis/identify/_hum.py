@@ -26,10 +26,11 @@ if TYPE_CHECKING:
     from analysis.identify.noise import NoiseSpectrum
 
 _RESONANCE_HALF_WIDTHS: Final = 3.0
-"""Half width of a resonance, in multiples of damping ratio times frequency."""
+"""Half width of the frequency range that counts as a resonance, in multiples of damping ratio times
+frequency."""
 
 _MIN_RESONANCE_BINS: Final = 20
-"""Least half width of a resonance, in frequency bins."""
+"""Minimum half width, in bins, of the frequency range that counts as a resonance."""
 
 _SEARCH_HALF_WIDTHS: Final = 3.0
 """Half width of the frequency range in which a hum is searched for, in half widths of the
@@ -237,7 +238,10 @@ class _Blocks:
     def _largest_amplitude(
         self, values: NDArray[np.float64], weight: NDArray[np.float64], at_hz: float
     ) -> float:
-        """Return the largest amplitude of a sinusoid within one bin of a frequency."""
+        """Return the largest amplitude of a sinusoid near a frequency in a weighted torque.
+
+        Frequencies within one bin of `at_hz` are considered.
+        """
         frequency_steps = np.linspace(-1, 1, 2 * _FREQUENCY_OVERSAMPLING + 1) / values.size
         rotation = np.exp(
             -2j * np.pi * np.outer(at_hz / self.rate_hz + frequency_steps, np.arange(values.size))

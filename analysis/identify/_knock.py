@@ -58,17 +58,19 @@ _IMPACT_FIT_ROUNDS: Final = 2
 """Number of rounds that estimate poles and noise with the impact as part of the fit."""
 
 _EVIDENT_FRACTION: Final = 0.8
-"""Least fraction of the unexplained cost that an evident impact explains."""
+"""Minimum fraction of the unexplained cost that an evident impact explains."""
 
 _WORTHWHILE_FRACTION: Final = 0.5
-"""Least fraction of the unexplained cost for which a fit with the impact removed is worthwhile."""
+"""Minimum fraction of the unexplained cost that an impact explains for a fit with the impact
+removed."""
 
 _OBVIOUS_FRACTION: Final = 0.95
-"""Least fraction of the unexplained cost for which an impact is accepted before any other
-explanation is tested."""
+"""Minimum fraction of the unexplained cost for which an impact is accepted before any other effect
+is tested."""
 
 _MIN_DECAY_FRACTION: Final = 0.5
-"""Least fraction of the cost reduction that is due to the decays after the impact."""
+"""Minimum fraction of the cost reduction by an impact that is due to the free decays after the
+contact."""
 
 _OVERWHELMING_COST_RATIO: Final = 10.0
 """Ratio of the cost to the cost of noise above which a torque that both impact and beam could
@@ -103,7 +105,7 @@ class DetectedImpact:
 
     @property
     def evident(self) -> bool:
-        """Return whether the impact explains most of the residual and began abruptly."""
+        """Return whether the impact explains most of the residual and begins abruptly."""
         return (
             self.explained_fraction > _EVIDENT_FRACTION
             and self.power_ratio_before < _MAX_QUIET_POWER_RATIO
@@ -111,7 +113,7 @@ class DetectedImpact:
 
     @property
     def obvious(self) -> bool:
-        """Return whether no explanation other than the impact needs to be tested first."""
+        """Return whether the impact explains so much that no other effect is tested first."""
         return (
             self.explained_fraction > _OBVIOUS_FRACTION
             and self.power_ratio_before < _MAX_QUIET_POWER_RATIO
@@ -182,8 +184,8 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
     comparison = candidate_set.comparison
     measurement, hz = comparison.measurement, comparison.frequency_hz
     band_hz = (0.0 if comparison.bins.start == 1 else float(hz[0]), float(hz[-1]))
-    middle = measurement.angle_rad.size // 2
-    for half in (slice(0, middle), slice(middle, None)):
+    middle_tick = measurement.angle_rad.size // 2
+    for half in (slice(0, middle_tick), slice(middle_tick, None)):
         half_measurement = replace(
             measurement,
             angle_rad=measurement.angle_rad[half],
@@ -202,10 +204,14 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         fit, is_used = analysis.fits[0], analysis.noise.counts
         if not whiteness(fit.residual[is_used], analysis.comparison.frequency_hz[is_used]).white:
             continue
-        restored = comparison.without_hum(()).recompute_incoherent_torque(fit.plant)
+        comparison_with_hum = comparison.without_hum(()).recompute_incoherent_torque(fit.plant)
         unknowns = Unknowns.of(_FREEST_STRUCTURE, measurement.nominal, candidate_set.free)
         refit_at_start = partial(
-            Refit.descend, restored, unknowns, unknowns.vector(fit.plant), max_evaluations=1
+            Refit.descend,
+            comparison_with_hum,
+            unknowns,
+            unknowns.vector(fit.plant),
+            max_evaluations=1,
         )
         first_refit = refit_at_start(noise=candidate_set.noise)
         noise_of_all_bins = replace(
@@ -225,7 +231,7 @@ def of_knocks(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> Iterat
     `explained` states whether the model with the impacts explains the record.
     """
     for impact in impacts:
-        tolerance_s = impact.resolution_s
+        tolerance_s = impact.start_uncertainty_s
         yield Finding(
             kind="knock",
             sentence=(
@@ -318,7 +324,7 @@ def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refi
 
 
 def _impact_between(refit: Refit, first_sample: int, end_sample: int) -> RecordedImpact:
-    """Return an impact between two samples with unknown amplitudes, and the poles of a refit."""
+    """Return an impact between two samples, with the poles of a refit and no amplitudes yet."""
     comparison = refit.objective.comparison
     rate_hz = comparison.decimation.rate_hz
     poles = comparison.poles(refit.plant)
@@ -326,7 +332,7 @@ def _impact_between(refit: Refit, first_sample: int, end_sample: int) -> Recorde
         first_s=comparison.first_s + first_sample / rate_hz,
         last_s=comparison.first_s + end_sample / rate_hz,
         # The soft beginning of a touch is not visible before the torque has grown.
-        resolution_s=max(2, end_sample - first_sample) / rate_hz,
+        start_uncertainty_s=max(2, end_sample - first_sample) / rate_hz,
         poles_rad_s=tuple(pole.at_rad_s for pole in poles),
     )
 
@@ -383,16 +389,16 @@ def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[in
     )[len(decays) :]
     net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - penalty)])
     end = begin + int(np.argmax(net_reduction))
-    with_samples_first = _successive_cost_reductions(
+    reductions_samples_first = _successive_cost_reductions(
         refit, np.concatenate([single_samples[begin - window_start : end - window_start], decays])
     )
-    reduction_by_decays = float(with_samples_first[end - begin :].sum())
+    reduction_by_decays = float(reductions_samples_first[end - begin :].sum())
     normal_deviate = chi_square_deviate(reduction_by_decays, len(decays))
     is_significant = normal_deviate > math.sqrt(2 * largest_of(comparison.samples))
     return (
         (begin, end)
         if is_significant
-        and reduction_by_decays > _MIN_DECAY_FRACTION * float(with_samples_first.sum())
+        and reduction_by_decays > _MIN_DECAY_FRACTION * float(reductions_samples_first.sum())
         else None
     )
 

@@ -438,12 +438,12 @@ def _unit_pole(eta: float) -> complex:
 
 
 def _unit_pole_derivative(eta: float) -> complex:
-    """Return the derivative of `_unit_pole` with respect to eta."""
+    """Return the derivative, with respect to eta, of the upper root of ``1 + eta q + q²``."""
     return complex(-0.5, -eta / (4 * math.sqrt(1 - eta * eta / 4)))
 
 
 class _ModalProblem:
-    """Least-squares problem of the modal model, for mode frequencies and damping."""
+    """Least-squares problem of the modal model: its unknowns are mode frequencies and damping."""
 
     def __init__(
         self,
@@ -554,8 +554,10 @@ class _ModalProblem:
             mode_derivatives = spectra[numerator_count + 4 * k : numerator_count + 4 * k + 4]
             jacobian[2 * k] += a * mode_derivatives[0] + b * mode_derivatives[2]
             jacobian[2 * k + 1] += a * mode_derivatives[1] + b * mode_derivatives[3]
-        projected = jacobian - (jacobian @ span.T) @ span
-        return _LinearSolution(residual, linear_parameters, columns, span, jacobian, projected)
+        projected_jacobian = jacobian - (jacobian @ span.T) @ span
+        return _LinearSolution(
+            residual, linear_parameters, columns, span, jacobian, projected_jacobian
+        )
 
     def model(self, x: NDArray[np.float64]) -> ModalModel:
         """Return the modal model at a point, with the best linear parameters."""
@@ -596,7 +598,7 @@ class _ModalProblem:
     def ringing(self, point: _LinearSolution, covariance: NDArray[np.float64]) -> Ringing:
         """Return the free decay at the beginning of the record, with its chi-square.
 
-        The decay of each mode has two amplitudes.
+        The decay of each mode has two amplitudes, which are free linear parameters of the fit.
         """
         mode_count = len(self._numbers)
         first_decay = 2 * mode_count + BACKGROUND

@@ -55,7 +55,7 @@ def refused_reason(test: UniformBeamTest) -> str | None:
 
 
 _EstimatesT = TypeVar("_EstimatesT", bound=Estimates)
-"""Type of the estimates that are given and returned."""
+"""Type variable for `Estimates` or a subclass, which `with_modal_model` takes and returns."""
 
 
 def with_modal_model(
@@ -68,7 +68,9 @@ def with_modal_model(
     *,
     half_width: float = NORMAL_95,
 ) -> _EstimatesT:
-    """Replace modes and parameters of an exactly uniform beam by the estimates with a tolerance.
+    """Replace the estimates for an exactly uniform beam by those of more general models.
+
+    Modes come from the modal model. Parameters come from the beam with a tolerance of the geometry.
 
     Parameters
     ----------
@@ -202,7 +204,7 @@ def identifiable(estimate: TolerantEstimate, order: str) -> bool:
 def _structure_status(
     exact: Estimates, estimate: TolerantEstimate
 ) -> tuple[tuple[str, StructureStatus], ...]:
-    """Return names and status of the structures, assessed by the losses of the modes.
+    """Return the name and status of each damping structure, assessed by the losses of the modes.
 
     Mode frequencies do not distinguish structures if the beam may deviate from a uniform one.
     """

@@ -80,7 +80,7 @@ class Term:
     Attributes
     ----------
     kind : str
-        ForceKind of the force.
+        Kind of the force.
     mode : int
         Mode number, from 1.
     """
@@ -133,7 +133,7 @@ class ModalForces:
         Parameters
         ----------
         term : Term
-            ForceKind and mode of the force.
+            Kind and mode of the force.
         size : float
             Size e of the force for which the motion of the mode is computed; 0 for the first order.
         """
@@ -250,7 +250,7 @@ class NonlinearForce:
     Attributes
     ----------
     term : Term
-        ForceKind and mode of the force.
+        Kind and mode of the force.
     size : float
         Change of the stiffness at the largest deflection, as a fraction, or change of the damping
         ratio at the largest speed.
@@ -305,7 +305,7 @@ def _start_candidates(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
 def _add_forces(
     candidate_set: CandidateSet, start_candidate: Candidate, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
-    """Add forces to one candidate one by one, then refit all candidates with these forces."""
+    """Add significant forces to one candidate one by one, then refit all candidates with them."""
     terms: list[Term] = []
     sizes = std = np.zeros(0)
     best = candidate_set.best
@@ -335,7 +335,7 @@ def _add_forces(
 
 
 def _deviance_reduction(candidate: Candidate, cost_before: float, cost_after: float) -> float:
-    """Return by how much the deviance falls between two costs, for the values of a candidate."""
+    """Return the reduction of the deviance between two costs of a candidate."""
     return candidate.values * math.log(cost_before / cost_after)
 
 
@@ -367,10 +367,10 @@ def _best_first_order_force(
 def _fit_with_forces(
     candidate_set: CandidateSet, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
 ) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]] | None:
-    """Fit a plant with the given forces and their sizes, with updates of the torque spectra.
+    """Fit a plant with the given forces, starting from given sizes of the forces.
 
-    Return the fit, the sizes and their standard deviations, or None if a size is so large that its
-    torque cannot be computed.
+    The torque spectra of the forces are updated with the sizes. Return the fit, the sizes and their
+    standard deviations, or None if a size is so large that its torque cannot be computed.
     """
     std = np.zeros(sizes.size)
     for _ in range(_MAX_SIZE_ITERATIONS):

@@ -156,7 +156,7 @@ class ResponseGrid:
         """
         beam_names = [name for name in wrt if name in PARAMETERS]
         if plant.tip_mass_kg or plant.stiffness_offsets:
-            differentiated, derivatives = differentiated_response(
+            loaded_response, derivatives = differentiated_response(
                 self._log_s,
                 self._s_squared,
                 plant.beam,
@@ -164,7 +164,7 @@ class ResponseGrid:
                 plant.tip_mass_kg,
                 plant.stiffness_offsets,
             )
-            return differentiated.response, {name: derivatives[name]() for name in beam_names}
+            return loaded_response.response, {name: derivatives[name]() for name in beam_names}
         if not beam_names:
             return self._beam.evaluate(plant.beam, plant.damping), {}
         response, gradient = self._beam.evaluate_with_gradient(
@@ -309,13 +309,17 @@ class TorquePredictor:
         spectra = self._torque_spectra(plant, wrt)
         # One short transform for each sample of the higher rate within a sample of the lower one:
         # they fit into the cache, and take less than half the time of one long transform.
-        shifts = np.ones((factor, spectra.shape[1]), dtype=np.complex128)
-        shifts[1:] = np.exp(2j * np.pi / (factor * self._length) * np.arange(spectra.shape[1]))
-        np.cumprod(shifts, axis=0, out=shifts)
+        shift_factors = np.ones((factor, spectra.shape[1]), dtype=np.complex128)
+        shift_factors[1:] = np.exp(
+            2j * np.pi / (factor * self._length) * np.arange(spectra.shape[1])
+        )
+        np.cumprod(shift_factors, axis=0, out=shift_factors)
         if self._length % 2 == 0:
-            shifts[:, -1] *= 2  # at the higher rate this bin and its mirror image are distinct
+            shift_factors[:, -1] *= (
+                2  # at the higher rate this bin and its mirror image are distinct
+            )
         values = np.empty((len(spectra), indices.size))
         for row, spectrum in zip(values, spectra, strict=True):
-            row[:] = np.fft.irfft(shifts * spectrum, self._length).T.ravel()[indices]
+            row[:] = np.fft.irfft(shift_factors * spectrum, self._length).T.ravel()[indices]
         values *= growth
         return values[0], values[1:]
