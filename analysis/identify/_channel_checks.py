@@ -100,7 +100,7 @@ _ASSUMED_INTERNAL_DAMPING_S: Final = 1e-4
 """Assumed coefficient of internal damping of order 1, in seconds: a loss of a few per cent."""
 
 _MIN_DRIVEN_POWER: Final = 1e-3
-"""Least power of the angle at a frequency that is used, relative to the largest power."""
+"""Minimum power of the angle at a frequency that is used, relative to the largest power."""
 
 _MIN_PHASE_COSINE: Final = 0.7
 """Minimum magnitude of the median cosine of the phase, relative to the response of the beam, at
@@ -197,7 +197,7 @@ due to noise."""
 
 
 def torque_zero_drift_nm(candidate_set: CandidateSet) -> float:
-    """Return the drift of the torque sensor's zero in N·m; 0 if noise explains the drift.
+    """Return how far the torque sensor's zero drifts in N·m; 0 if noise explains the drift.
 
     It is the range of the mean residuals of segments of the record.
     """

@@ -348,7 +348,7 @@ class Measurement:
 
     @property
     def nominal(self) -> Plant:
-        """Return the plant of rig and specimen as the file states them, without damping."""
+        """Return the plant with the properties that the file states, and without damping."""
         return Plant(
             beam=self.beam,
             damping=Damping(),

@@ -261,7 +261,7 @@ def _update_reference_following(descent: Descent, whole_angle: Comparison) -> De
 
 
 def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) -> RecordFit:
-    """Return parameters, uncertainty, modes and residual at a minimum.
+    """Return a fit with parameters, uncertainties, modes and residual at a minimum of the cost.
 
     Parameters
     ----------
