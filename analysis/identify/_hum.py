@@ -51,16 +51,17 @@ _MAX_UNSTEADY_POWER_RATIO: Final = 0.3
 relative to the power of the hum."""
 
 _MIN_SILENT_FRACTION: Final = 0.2
-"""Minimum fraction of the record in which the beam has to be silent: at other times the signal may be
-the response of the beam to a steady excitation."""
+"""Minimum fraction of the record in which the beam has to be silent. At other times a sinusoid may
+be the response of the beam to a steady excitation."""
 
 _MAX_RELATIVE_GROWTH: Final = 0.3
 """Largest change of the amplitude of a hum over the record, relative to its mean. The slow decay of
 a mode, which a wrong model does not predict, changes more."""
 
 _MIN_HUM_OVER_PREDICTION: Final = 3.0
-"""Minimum amplitude of a hum relative to the predicted torque of that frequency in the silent times.
-A steadily driven beam, as by a multisine, leaves a steady residual wherever the model is wrong."""
+"""Minimum amplitude of a hum relative to the predicted torque of that frequency in the silent
+times. A steadily driven beam, as by a multisine, leaves a steady residual wherever the model is
+wrong."""
 
 _FREQUENCY_OVERSAMPLING: Final = 4
 """Number of frequency points per bin in the search for a hum."""
