@@ -430,9 +430,8 @@ class CandidateSet:
         unknowns = self.unknowns(both_dampings)
         index = unknowns.names.index(coefficient)
         start_point = self.descent(unknowns, unknowns.vector(own_fit.plant), 1)
-        coefficient_growth = 1 + float(
-            start_point.predicted_step[index]
-        )  # the step is linear in the coefficient, not in its logarithm
+        # The predicted step of the logarithm is taken as linear in the coefficient itself.
+        coefficient_growth = 1 + float(start_point.predicted_step[index])
         if coefficient_growth > 1:
             start = start_point.x.copy()
             start[index] += math.log(coefficient_growth)

@@ -314,7 +314,7 @@ class _CauseSearch:
         if alteration.has_same_shapes(Alteration()):
             return replace(self._plain_terms, alteration=alteration)
         terms = mode_terms(alteration, beam, self._problem.modes)
-        # The mass of a cause is a fraction of the beam's, so the mode shapes do not depend on it.
+        # The mass of a cause is a fraction of the beam's: the mode shapes do not change with that.
         return terms if self._problem.stated.lumps else replace(terms, density_kg_per_m=None)
 
     def _whitened_deviations(self, x: NDArray[np.float64], terms: ModeTerms) -> NDArray[np.float64]:

@@ -619,9 +619,7 @@ class _ModalProblem:
         """
         mode_count = x.size // 2
         constants = np.empty(4 * mode_count)
-        first_background = (
-            x.size + 2 * mode_count
-        )  # index of the first coefficient of the background
+        first_background = x.size + 2 * mode_count
         derivatives = np.zeros((4 * mode_count + BACKGROUND, first_background + BACKGROUND))
         background_rows = derivatives[4 * mode_count :]
         background_rows[:, first_background:] = np.diag(

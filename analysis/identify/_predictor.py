@@ -315,9 +315,8 @@ class TorquePredictor:
         )
         np.cumprod(shift_factors, axis=0, out=shift_factors)
         if self._length % 2 == 0:
-            shift_factors[:, -1] *= (
-                2  # at the higher rate this bin and its mirror image are distinct
-            )
+            # At the higher rate this bin and its mirror image are distinct.
+            shift_factors[:, -1] *= 2
         values = np.empty((len(spectra), indices.size))
         for row, spectrum in zip(values, spectra, strict=True):
             row[:] = np.fft.irfft(shift_factors * spectrum, self._length).T.ravel()[indices]
