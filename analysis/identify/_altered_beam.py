@@ -1,17 +1,18 @@
-"""Modes of a beam that is nearly the plain uniform one: tilted, loaded, uneven or softly clamped.
+"""Modes of a beam that deviates slightly from a uniform one: tilted, loaded, uneven or softly held.
 
-By Galerkin's method in the first modes of the uniform beam, which turns with the clamp as it does.
-Relative to the stiffness of the beam, mode k then solves ``D(s) = 0``::
+They are computed by Galerkin's method with the first modes of the uniform beam as basis; the basis
+turns with the clamp. Relative to the stiffness of the beam, mode k then solves ``D(s) = 0``::
 
     D = c K + (1 + j eta) C + rho/EI s² M + gamma s^lambda I + rho/EI g T,    c = 1 + zeta s^alpha
 
-with numbers K (stiffness), C (of the clamp), M (mass), I (medium) and T (tension by gravity) that
-its shape gives, and the residue of the torque includes its arms about the motor axis. The plain
-beam has ``K = k⁴``, ``M = I = 1``, ``C = T = 0``. The effect of damping on a shape is of the order
-of the damping times the alteration: it moves poles by the square, and the arms to first order.
+The coefficients K (stiffness), C (clamp), M (mass), I (external damping) and T (tension by gravity)
+follow from the mode shape. The residue of the torque includes the arms of these forces about the
+motor axis. The plain beam has ``K = k⁴``, ``M = I = 1``, ``C = T = 0``. The effect of damping on a
+mode shape is of the order of the damping times the alteration. It changes poles by the square of
+that, and the arms to first order.
 
-A local compliance adds to the flexibility, not to the stiffness: the moment
-along a clamped-free beam follows from its loads alone, so few modes suffice there.
+A local compliance adds to the flexibility of the beam, not to its stiffness. The moment along a
+clamped-free beam follows from its loads alone, so few modes suffice.
 """
 
 from __future__ import annotations
@@ -33,19 +34,35 @@ if TYPE_CHECKING:
     from rigd.beam import Beam
 
 GRAVITY_M_S2: Final = 9.81
-_BASIS: Final = 14
-_NEXT: Final = float(clamped_free_eigenvalues(_BASIS + 1)[-1])
-_NODES_OF_HALF: Final = 32
-_STEP: Final = 1e-5
-"""For slopes of shapes: exact to 1e-8 of them."""
+"""Acceleration of gravity, in m/s²."""
 
-_ITERATIONS: Final = 2
-_APART: Final = 1e-7
-"""Relative distance of the shift of inverse iterations from the eigenvalue."""
+_BASIS_MODES: Final = 14
+"""Number of modes of the uniform beam in the basis."""
+
+_NEXT_EIGENVALUE: Final = float(clamped_free_eigenvalues(_BASIS_MODES + 1)[-1])
+"""Eigenvalue k L of the first mode of the uniform beam that is not in the basis."""
+
+_POINTS_PER_HALF: Final = 32
+"""Number of quadrature points in each half of the beam."""
+
+_SLOPE_STEP: Final = 1e-5
+"""Step of the relative position for numerical slopes of mode shapes, which are exact to a relative
+error of 1e-8."""
+
+_INVERSE_ITERATIONS: Final = 2
+"""Number of inverse iterations for a mode shape with a lossy clamp."""
+
+_RELATIVE_SHIFT: Final = 1e-7
+"""Shift of an inverse iteration relative to the eigenvalue: the matrix is not singular."""
 
 Terms = NDArray[np.inexact[Any]]
+"""Array of real or complex Galerkin coefficients."""
+
 Profile = Literal["taper", "outer half", "wave"]
-"""Deviation along the beam: from -1/2 to 1/2; 0 and 1; a cosine of one period."""
+"""Course of a relative deviation along the beam.
+
+"taper" rises from -1/2 to 1/2, "outer half" is 0 in the inner and 1 in the outer half, and "wave"
+is a cosine of one period."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,22 +72,23 @@ class Alteration:
     Attributes
     ----------
     lumps : tuple of (float, float)
-        Position relative to the length, and mass in kg.
+        Added point masses: position relative to the length, and mass in kg.
     gravity_m_s2 : float
-        Component along the beam at rest, positive towards the tip.
+        Component of gravity along the beam at rest, positive towards the tip.
     density, stiffness : tuple of (str, float)
-        Profile and size of a relative deviation of the mass per length, of the bending stiffness.
+        Relative deviations of the mass per length and of the bending stiffness: profile and size.
     clamp_compliance : float
         Compliance of the clamp, times EI over the length.
     clamp_loss : float
         Loss factor of the clamp.
     relaxation : tuple of (float, float)
-        Strength and time constant (s): the stiffness gains ``strength s t / (1 + s t)``.
+        Strength and time constant (s) of a relaxation of the material: the stiffness gains
+        ``strength s t / (1 + s t)``.
     sensor : tuple of (float, float)
-        Reciprocal of the undamped frequency (s) and of the quality of a second-order lag in the
-        torque's channel.
+        Second-order lag in the torque channel: reciprocal of its undamped frequency (s), and of its
+        quality factor.
     lag_s : float
-        Time constant of a first-order lag there.
+        Time constant of a first-order lag in the torque channel.
     """
 
     lumps: tuple[tuple[float, float], ...] = ()
@@ -90,6 +108,7 @@ class Alteration:
         Parameters
         ----------
         nominal : Plant
+            Rig and specimen as the file states them.
         tilt_deg : float, optional
             Inclination of the plane of motion along the beam at rest, positive where the tip is
             lower than the motor's axis.
@@ -100,39 +119,42 @@ class Alteration:
             gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(tilt_deg or 0.0)),
         )
 
-    def same_shapes(self, other: Alteration) -> bool:
-        """Return whether another alteration changes the mode shapes in the same way."""
+    def has_same_shapes(self, other: Alteration) -> bool:
+        """Return whether another alteration leads to the same mode shapes."""
         return self == replace(
             other, relaxation=self.relaxation, sensor=self.sensor, lag_s=self.lag_s
         )
 
     def channel(self, s: NDArray[np.complex128]) -> NDArray[np.complex128] | float:
-        """Return the factor by which the lags of the torque channel multiply a torque."""
-        time_s, over_quality = self.sensor
-        through: NDArray[np.complex128] | float = 1.0
+        """Return the transfer function of the torque channel's lags at `s` in rad/s."""
+        time_s, inverse_quality = self.sensor
+        response: NDArray[np.complex128] | float = 1.0
         if time_s:
             q = s * time_s
-            through = 1 / (1 + over_quality * q + q * q)
-        return through / (1 + self.lag_s * s) if self.lag_s else through
+            response = 1 / (1 + inverse_quality * q + q * q)
+        return response / (1 + self.lag_s * s) if self.lag_s else response
 
 
 @dataclass(frozen=True, slots=True)
 class ModeTerms:
-    """Galerkin coefficients of some modes of an altered beam, each of shape (n,); see the module.
+    """Galerkin coefficients of n modes of an altered beam; the module defines D and its terms.
 
     Attributes
     ----------
     stiffness, clamp, mass, lump, tension : ndarray, shape (n,)
-        Over the length to the fourth power, or the third and g times it, where D has that; the
-        lumps' part of the mass is that of a beam of the density `density_kg_per_m`, and of any
-        beam in proportion to it where that is None.
+        Coefficients of D: K and C divided by the length to the fourth power, M without and of the
+        point masses, and g T divided by the length. The point masses' part is relative to the
+        density `density_kg_per_m`; if that is None, the point masses are proportional to the
+        density.
     mass_arm, lump_arm, medium_arm, tension_arm : ndarray, shape (n,)
-        About the motor's axis, over the length; complex where the clamp has a loss.
+        Arms about the motor's axis, divided by the length; complex if the clamp has a loss.
     turn_by_medium, turn_by_internal : ndarray, shape (n,)
-        Contributions of ``gamma s^lambda`` and ``zeta s^alpha`` to the arm of the mass, by their
-        change of the shape.
+        Changes of the mass's arm by ``gamma s^lambda`` and ``zeta s^alpha``, which alter the mode
+        shape.
     density_kg_per_m : float or None
+        Mass per length for which `lump` is valid.
     alteration : Alteration
+        Alteration of the beam.
     """
 
     stiffness: Terms
@@ -152,7 +174,13 @@ class ModeTerms:
 
 @dataclass(frozen=True, slots=True)
 class _Basis:
-    """First modes of the uniform beam at the nodes of a quadrature, and their integrals."""
+    """First modes of the uniform beam at the points of a quadrature, and their integrals.
+
+    `z` are the eigenvalues k L, and `x` the relative positions with `weights`. `shapes`, `slopes`
+    and `curvatures` have the shape (N, points). `arms` and `arms_of_tension`, (N,), are integrals
+    of shape times position and of slope times 1 - x, and `tension`, (N, N), those of products of
+    slopes.
+    """
 
     z: NDArray[np.float64]
     x: NDArray[np.float64]
@@ -164,57 +192,61 @@ class _Basis:
     arms_of_tension: NDArray[np.float64]
     tension: NDArray[np.float64]
 
-    def weighted(
+    def weighted_products(
         self, rows: NDArray[np.float64], profile: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return integrals of products of rows, weighted by a profile, shape (N, N)."""
-        found: NDArray[np.float64] = (rows * (self.weights * profile)) @ rows.T
-        return found
+        """Return the integrals of products of two rows, weighted by a profile, shape (N, N)."""
+        integrals: NDArray[np.float64] = (rows * (self.weights * profile)) @ rows.T
+        return integrals
 
-    def deviation(self, parts: Sequence[tuple[Profile, float]]) -> NDArray[np.float64]:
-        """Return the relative deviation at the nodes."""
+    def deviation(self, deviations: Sequence[tuple[Profile, float]]) -> NDArray[np.float64]:
+        """Return the sum of relative deviations at the quadrature points, shape (points,)."""
         total = np.zeros(self.x.size)
-        for profile, size in parts:
-            total += size * _PROFILES[profile](self.x)
+        for profile, size in deviations:
+            total += size * _PROFILE_FUNCTIONS[profile](self.x)
         return total
 
 
-_PROFILES: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = {
+_PROFILE_FUNCTIONS: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = {
     "taper": lambda x: x - 0.5,
     "outer half": lambda x: np.where(x > 0.5, 1.0, 0.0),
     "wave": lambda x: np.cos(2 * np.pi * x),
 }
+"""Deviation as a function of the relative position along the beam, for each profile."""
 
 
-def _at(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the basis shapes at positions along the beam, (N, …)."""
-    return np.array([mode_shape(number, x) for number in range(1, _BASIS + 1)])
+def _basis_shapes(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the shapes of the basis modes at relative positions along the beam, (N, …)."""
+    return np.array([mode_shape(number, x) for number in range(1, _BASIS_MODES + 1)])
 
 
 @lru_cache(maxsize=32)
-def _at_lump(position: float) -> NDArray[np.float64]:
-    """Return the basis shapes at one position, (N,); the array is read-only."""
-    return _at(np.array(position))
+def _basis_shapes_at_lump(position: float) -> NDArray[np.float64]:
+    """Return the shapes of the basis modes at one relative position, (N,); read-only and cached."""
+    return _basis_shapes(np.array(position))
 
 
 @lru_cache(maxsize=1)
 def _basis() -> _Basis:
-    """Return the basis; it is computed once."""
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES_OF_HALF)
+    """Return the cached basis: the first modes of the uniform beam, with their integrals."""
+    nodes, weights = np.polynomial.legendre.leggauss(_POINTS_PER_HALF)
     x = np.concatenate([0.25 * (nodes + 1), 0.25 * (nodes + 3)])
     weights = np.tile(weights / 4, 2)
-    z = clamped_free_eigenvalues(_BASIS)
-    sign = (-1.0) ** np.arange(_BASIS)
-    shapes, slopes = _at(x), (_at(x + _STEP) - _at(x - _STEP)) / (2 * _STEP)
+    z = clamped_free_eigenvalues(_BASIS_MODES)
+    signs = (-1.0) ** np.arange(_BASIS_MODES)
+    shapes, slopes = (
+        _basis_shapes(x),
+        (_basis_shapes(x + _SLOPE_STEP) - _basis_shapes(x - _SLOPE_STEP)) / (2 * _SLOPE_STEP),
+    )
     return _Basis(
         z=z,
         x=x,
         weights=weights,
         shapes=shapes,
         slopes=slopes,
-        # A clamped-free mode seen from its tip is the moment of a clamped-free mode.
-        curvatures=(sign * z**2)[:, None] * _at(1 - x),
-        arms=2 * sign / z**2,
+        # The moment of a clamped-free mode is the shape of a clamped-free mode seen from its tip.
+        curvatures=(signs * z**2)[:, None] * _basis_shapes(1 - x),
+        arms=2 * signs / z**2,
         arms_of_tension=slopes @ (weights * (1 - x)),
         tension=(slopes * (weights * (1 - x))) @ slopes.T,
     )
@@ -222,84 +254,102 @@ def _basis() -> _Basis:
 
 @lru_cache(maxsize=16)
 def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> ModeTerms:
-    """Return the Galerkin coefficients of some modes of a beam that is altered."""
+    """Return the Galerkin coefficients of the given modes of an altered beam.
+
+    `modes` are mode numbers, from 1. The basis is extended by one mode for each point mass, which
+    represents all modes beyond the basis.
+    """
     basis = _basis()
     length, indices = beam.length_m, np.array(modes) - 1
-    count = len(alteration.lumps)
+    lump_count = len(alteration.lumps)
 
-    def padded(array: NDArray[np.float64], value: float = 0.0) -> NDArray[np.float64]:
-        if not count:
+    def with_lump_modes(array: NDArray[np.float64], value: float = 0.0) -> NDArray[np.float64]:
+        if not lump_count:
             return array
-        found = np.zeros((_BASIS + count,) * array.ndim)
-        found[(slice(_BASIS),) * array.ndim] = array
-        beyond = range(_BASIS, _BASIS + count)
-        found[(beyond,) * array.ndim] = value
-        return found
+        extended = np.zeros((_BASIS_MODES + lump_count,) * array.ndim)
+        extended[(slice(_BASIS_MODES),) * array.ndim] = array
+        lump_indices = range(_BASIS_MODES, _BASIS_MODES + lump_count)
+        extended[(lump_indices,) * array.ndim] = value
+        return extended
 
-    heavier = basis.deviation(alteration.density)
-    mass = padded(np.eye(_BASIS) + basis.weighted(basis.shapes, heavier), 1.0)
-    mass_arm = padded(basis.arms + basis.shapes @ (basis.weights * heavier * basis.x))
+    density_deviation = basis.deviation(alteration.density)
+    mass = with_lump_modes(
+        np.eye(_BASIS_MODES) + basis.weighted_products(basis.shapes, density_deviation), 1.0
+    )
+    mass_arm = with_lump_modes(
+        basis.arms + basis.shapes @ (basis.weights * density_deviation * basis.x)
+    )
     lump, lump_arm = np.zeros_like(mass), np.zeros_like(mass_arm)
-    tension, tension_arm = padded(basis.tension), padded(basis.arms_of_tension)
-    for index, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS):
-        fraction, shape = (
+    tension, tension_arm = with_lump_modes(basis.tension), with_lump_modes(basis.arms_of_tension)
+    for index, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS_MODES):
+        mass_fraction, shape = (
             mass_kg / (beam.density_kg_per_m * length),
-            padded(_at_lump(position).copy()),
+            with_lump_modes(_basis_shapes_at_lump(position).copy()),
         )
-        # All modes beyond the basis give way to a lump as one spring, and move as one mode.
-        beyond = position**3 / 3 - float(np.sum((shape[:_BASIS] / basis.z**2) ** 2))
-        shape[index] = math.sqrt(max(beyond, 0.0)) * _NEXT**2
-        lump += fraction * np.outer(shape, shape)
-        lump_arm += fraction * position * shape
+        # All modes beyond the basis act on a point mass as one spring, and move as one mode.
+        flexibility_beyond_basis = position**3 / 3 - float(
+            np.sum((shape[:_BASIS_MODES] / basis.z**2) ** 2)
+        )
+        shape[index] = math.sqrt(max(flexibility_beyond_basis, 0.0)) * _NEXT_EIGENVALUE**2
+        lump += mass_fraction * np.outer(shape, shape)
+        lump_arm += mass_fraction * position * shape
         if alteration.gravity_m_s2:
-            inside = np.where(basis.x < position, fraction, 0.0)
-            tension = tension + padded(basis.weighted(basis.slopes, inside))
-            tension_arm = tension_arm + fraction * shape
-    # Flexibility to loads of the basis' shapes: of the beam, of the clamp
+            mass_outboard = np.where(basis.x < position, mass_fraction, 0.0)
+            tension = tension + with_lump_modes(
+                basis.weighted_products(basis.slopes, mass_outboard)
+            )
+            tension_arm = tension_arm + mass_fraction * shape
+    # Flexibility of beam and clamp to loads with the shapes of the basis
     moments = basis.curvatures / basis.z[:, None] ** 4
-    softer = 1 / (1 + basis.deviation(alteration.stiffness))
-    bends = padded(basis.weighted(moments, softer), _NEXT**-4.0)
-    at_root = padded(2 * (-1.0) ** np.arange(_BASIS) / basis.z**2)
-    turns: Terms = alteration.clamp_compliance * np.outer(at_root, at_root)
-    elastic: Terms = np.linalg.inv(bends + turns)
-    pull = alteration.gravity_m_s2 * beam.density_over_stiffness * length**3
-    # Largest 1 / omega²: the lowest modes are the most exact
-    lower = np.linalg.inv(np.linalg.cholesky(elastic + pull * tension))
-    inverse, vectors = np.linalg.eigh(lower @ (mass + lump) @ lower.T)
-    inverse, vectors = inverse[::-1], vectors[:, ::-1]
-    every = lower.T @ vectors / np.sqrt(inverse)  # of modal mass 1
-    shapes: Terms = every[:, indices]
+    relative_flexibility = 1 / (1 + basis.deviation(alteration.stiffness))
+    beam_flexibility = with_lump_modes(
+        basis.weighted_products(moments, relative_flexibility), _NEXT_EIGENVALUE**-4.0
+    )
+    root_moments = with_lump_modes(2 * (-1.0) ** np.arange(_BASIS_MODES) / basis.z**2)
+    clamp_flexibility: Terms = alteration.clamp_compliance * np.outer(root_moments, root_moments)
+    elastic_stiffness: Terms = np.linalg.inv(beam_flexibility + clamp_flexibility)
+    gravity_factor = alteration.gravity_m_s2 * beam.density_over_stiffness * length**3
+    # Eigenvalues are 1 / omega²: the largest ones, of the lowest modes, are the most exact.
+    inverse_factor = np.linalg.inv(np.linalg.cholesky(elastic_stiffness + gravity_factor * tension))
+    inverse_squares, eigenvectors = np.linalg.eigh(
+        inverse_factor @ (mass + lump) @ inverse_factor.T
+    )
+    inverse_squares, eigenvectors = inverse_squares[::-1], eigenvectors[:, ::-1]
+    all_shapes = inverse_factor.T @ eigenvectors / np.sqrt(inverse_squares)  # of modal mass 1
+    shapes: Terms = all_shapes[:, indices]
     if alteration.clamp_loss:
-        turns = turns / (1 + 1j * alteration.clamp_loss)
-        elastic = np.linalg.inv(bends + turns)
-        shapes = _complex_shapes(elastic + pull * tension, mass + lump, shapes)
-    loads = elastic @ shapes
-    size = np.sum(shapes * shapes, axis=0)
-    # What the losses change in the shapes, to first order, turns the residues a little.
-    separation = 1 / inverse[indices] - 1 / inverse[:, None]
-    separation[indices, np.arange(indices.size)] = np.inf
-    arms = (mass_arm + lump_arm) @ every
-    medium = arms @ ((every.T @ shapes) / separation)
-    internal = arms @ (((elastic @ every).T @ bends @ loads) / separation)
+        clamp_flexibility = clamp_flexibility / (1 + 1j * alteration.clamp_loss)
+        elastic_stiffness = np.linalg.inv(beam_flexibility + clamp_flexibility)
+        shapes = _complex_shapes(elastic_stiffness + gravity_factor * tension, mass + lump, shapes)
+    loads = elastic_stiffness @ shapes
+    modal_masses = np.sum(shapes * shapes, axis=0)
+    # Losses change the mode shapes to first order, and so the phase of the residues.
+    eigenvalue_differences = 1 / inverse_squares[indices] - 1 / inverse_squares[:, None]
+    eigenvalue_differences[indices, np.arange(indices.size)] = np.inf
+    mass_arms = (mass_arm + lump_arm) @ all_shapes
+    turn_by_medium = mass_arms @ ((all_shapes.T @ shapes) / eigenvalue_differences)
+    turn_by_internal = mass_arms @ (
+        ((elastic_stiffness @ all_shapes).T @ beam_flexibility @ loads) / eigenvalue_differences
+    )
 
-    def of_shapes(matrix: NDArray[np.float64]) -> Terms:
-        found: Terms = np.sum(shapes * (matrix @ shapes), axis=0) / size
-        return found
+    def modal_coefficients(matrix: NDArray[np.float64]) -> Terms:
+        coefficients: Terms = np.sum(shapes * (matrix @ shapes), axis=0) / modal_masses
+        return coefficients
 
-    root = np.sqrt(size)
-    gravity = alteration.gravity_m_s2 / length
+    root_modal_masses = np.sqrt(modal_masses)
+    gravity_per_length = alteration.gravity_m_s2 / length
     return ModeTerms(
-        stiffness=np.sum(loads * (bends @ loads), axis=0) / size / length**4,
-        clamp=np.sum(loads * (turns @ loads), axis=0) / size / length**4,
-        mass=of_shapes(mass),
-        lump=of_shapes(lump),
-        tension=gravity * of_shapes(tension),
-        mass_arm=mass_arm @ shapes / root,
-        lump_arm=lump_arm @ shapes / root,
-        medium_arm=padded(basis.arms) @ shapes / root,
-        tension_arm=gravity * (tension_arm @ shapes) / root,
-        turn_by_medium=medium / root * length**4,
-        turn_by_internal=internal / root,
+        stiffness=np.sum(loads * (beam_flexibility @ loads), axis=0) / modal_masses / length**4,
+        clamp=np.sum(loads * (clamp_flexibility @ loads), axis=0) / modal_masses / length**4,
+        mass=modal_coefficients(mass),
+        lump=modal_coefficients(lump),
+        tension=gravity_per_length * modal_coefficients(tension),
+        mass_arm=mass_arm @ shapes / root_modal_masses,
+        lump_arm=lump_arm @ shapes / root_modal_masses,
+        medium_arm=with_lump_modes(basis.arms) @ shapes / root_modal_masses,
+        tension_arm=gravity_per_length * (tension_arm @ shapes) / root_modal_masses,
+        turn_by_medium=turn_by_medium / root_modal_masses * length**4,
+        turn_by_internal=turn_by_internal / root_modal_masses,
         density_kg_per_m=beam.density_kg_per_m,
         alteration=alteration,
     )
@@ -308,11 +358,16 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> Mo
 def _complex_shapes(
     elastic: Terms, mass: NDArray[np.float64], shapes: Terms
 ) -> NDArray[np.complex128]:
-    """Return the shapes with a lossy clamp, (N, n), by inverse iteration from the lossless ones."""
-    found = shapes.astype(np.complex128)
-    for mode in found.T:
-        for _ in range(_ITERATIONS):
-            square = (mode @ elastic @ mode) / (mode @ mass @ mode)
-            following = np.linalg.solve(elastic - square * (1 + _APART) * mass, mass @ mode)
-            mode[:] = following / np.sqrt(following @ mass @ following)
-    return found
+    """Return the complex mode shapes with a lossy clamp in the basis, shape (N, n).
+
+    They follow by inverse iteration from `shapes`, those without the loss.
+    """
+    complex_shapes = shapes.astype(np.complex128)
+    for mode in complex_shapes.T:
+        for _ in range(_INVERSE_ITERATIONS):
+            eigenvalue = (mode @ elastic @ mode) / (mode @ mass @ mode)
+            next_shape = np.linalg.solve(
+                elastic - eigenvalue * (1 + _RELATIVE_SHIFT) * mass, mass @ mode
+            )
+            mode[:] = next_shape / np.sqrt(next_shape @ mass @ next_shape)
+    return complex_shapes

@@ -12,19 +12,22 @@ if TYPE_CHECKING:
 
 
 FAR_BEHIND: Final = 1000.0
-"""Difference of BIC from which a candidate stays behind wherever exactly its minimum is."""
+"""Difference of BIC to the best candidate above which a candidate is only fitted roughly. It cannot
+become the best one, however exactly its minimum is found."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """Fit of one structure on a uniform beam.
+    """One damping structure fitted to one record, on a uniform beam.
 
     Attributes
     ----------
     structure : Structure
+        Damping structure.
     fit : RecordFit
+        Fit of this structure to the record.
     columns : int
-        Number of nonlinear terms, in addition to the parameters of the fit.
+        Number of nonlinear effects with a free amplitude, in addition to the parameters of the fit.
     """
 
     structure: Structure
@@ -41,27 +44,36 @@ class Candidate:
 
     @property
     def values(self) -> int:
-        """Return the number of real values compared."""
+        """Return the number of real values of the record to which the candidate is fitted."""
         fit = self.fit
         decays = fit.ringing.degrees_of_freedom
         return fit.degrees_of_freedom + len(fit.interval) + decays + self.columns
 
     @property
     def deviance(self) -> float:
-        """Return ``-2 ln`` likelihood up to a constant, for noise of known shape and free level."""
+        """Return ``-2 ln`` of the likelihood, up to a constant.
+
+        The noise spectrum is known up to its level, which is estimated.
+        """
         return self.values * math.log(self.fit.cost / self.values)
 
     @property
     def bic(self) -> float:
-        """Return the BIC (Schwarz, Annals of Statistics 6 (1978) 461-464)."""
+        """Return the Bayesian information criterion.
+
+        G. Schwarz, Annals of Statistics 6 (1978) 461-464.
+        """
         return self.deviance + self.parameters * math.log(self.values)
 
     @property
     def aic(self) -> float:
-        """Return Akaike's criterion (IEEE Trans. Automatic Control 19 (1974) 716-723)."""
+        """Return Akaike's information criterion.
+
+        H. Akaike, IEEE Trans. Automatic Control 19 (1974) 716-723.
+        """
         return self.deviance + 2 * self.parameters
 
     @property
     def name(self) -> str:
-        """Return the name that tables show."""
+        """Return the name of the structure, as tables show it."""
         return self.structure.name

@@ -1,4 +1,4 @@
-"""Candidate set of a record: all structures fitted under one noise spectrum, ranked by BIC."""
+"""Candidates for one record: all structures fitted under one noise spectrum, ranked by BIC."""
 
 from __future__ import annotations
 
@@ -34,48 +34,62 @@ if TYPE_CHECKING:
     from analysis.models import Structure
 
 
-INTEGER_INTERNAL: Final = (STRUCTURES["III"], STRUCTURES["VII"])
-"""Structures of both dampings whose material has an integer order."""
+INTEGER_INTERNAL_ORDER: Final = (STRUCTURES["III"], STRUCTURES["VII"])
+"""Structures with internal and external damping whose internal damping has order 1."""
 
-_DISMISSED: Final = 10.0
-"""Difference of BIC by which orders that are freed must be better for the noise to be estimated
-again."""
+_MIN_BIC_REDUCTION_FOR_NEW_NOISE: Final = 10.0
+"""Minimum reduction of the BIC, by structures with free orders, for which the noise spectrum is
+estimated again."""
 
-_SHOWS: Final = 4.0
-"""Deviance reduction that a damping needs to stay in the freest structure: with less it moves no
-other parameter by more than two standard deviations, and only makes them uncertain."""
+_MIN_DEVIANCE_OF_DAMPING: Final = 4.0
+"""Minimum reduction of the deviance by an internal or external damping in the freest structure. A
+damping with a smaller reduction is omitted: it moves no other parameter by more than two
+standard deviations, and only makes the others uncertain."""
 
-_CERTAIN: Final = 5.0
-"""Size of a damping, in its standard deviations, from which it shows in any case."""
+_CERTAIN_COEFFICIENT_OVER_STD: Final = 5.0
+"""Ratio of a damping coefficient to its standard deviation above which the damping is certainly
+significant, so that no structure without it is fitted."""
 
 _FREEST: Final = STRUCTURES["VI"]
+"""Structure with internal and external damping, both of free order."""
+
 _ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
-_INTEGER: Final = STRUCTURES["VII"]
+"""Structures with only internal or only external damping, of free order."""
 
-_A_STEP: Final = 3
-"""Evaluations that bring such a candidate next to it."""
+_INTEGER_ORDER: Final = STRUCTURES["VII"]
+"""Structure with internal and external damping whose internal damping has order 1."""
 
-_CROSS_CHECKS: Final = 3
-_NEARLY: Final = 1e-3
+_ROUGH_FIT_EVALUATIONS: Final = 3
+"""Maximum number of evaluations in a descent for a candidate whose BIC is far above the lowest BIC.
+"""
+
+_MAX_CROSS_CHECK_ROUNDS: Final = 3
+"""Maximum number of rounds in which all candidates are restarted from the best candidate."""
+
+_CONTINUATION_COST_TOLERANCE: Final = 1e-3
+"""Relative excess of the cost, after a short descent from another plant, up to which the descent is
+continued; it is relative to the present cost of the candidate."""
 
 
 @dataclass(frozen=True, slots=True)
 class CandidateSet:
-    """All candidates on one record, with the data that another fit needs.
+    """All candidates for one record, with the data that a further fit needs.
 
     Attributes
     ----------
     comparison : Comparison
-    noise : Noise
-        Noise under which all of them were fitted.
+        Record, reduced to the band.
+    noise : NoiseSpectrum
+        Noise under which all candidates were fitted.
     free : tuple of str
-        Settings that are free.
+        Settings that are estimated.
     candidates : tuple of Candidate
-        The lowest BIC first.
+        Candidates by rising BIC.
     columns : ndarray of complex, shape (c, K)
-        Spectra that all of them include in addition to the linear beam.
+        Torque spectra, with free amplitudes, that all candidates include in addition to the linear
+        beam.
     drag : DragEstimate, optional
-        Air drag, if the record shows it; all candidates then include it.
+        Air drag, if it is significant; all candidates then include it.
     misread : tuple of Finding
         Findings of a wrong sign or unit, which invalidates every number; usually empty.
     """
@@ -95,7 +109,9 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet:
-        """Fit every structure on a uniform beam; only the freest one if a sign or unit is wrong.
+        """Fit every structure to a record, on a uniform beam.
+
+        If a sign or unit of the record is wrong, only the freest structure is fitted.
 
         Raises
         ------
@@ -103,10 +119,12 @@ class CandidateSet:
             The record cannot be used.
         """
         if misread := tuple(wrong_scale(Comparison.of(measurement, band_hz))):
-            # No beam explains such a record: one structure shows what remains as well as all.
+            # No beam explains such a record, so all structures leave much the same residual.
             return replace(cls.of_freest(measurement, fixed, band_hz), misread=misread)
-        candidate_set = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
-        return candidate_set._without_leakage()
+        candidate_set = cls._of_uniform_beam(
+            fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed
+        )
+        return candidate_set._exclude_leakage()
 
     @classmethod
     def from_earlier(
@@ -116,42 +134,46 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet | None:
-        """Fit the candidates of an earlier part of the record again, each from its last estimate.
+        """Fit the candidates of an earlier part of the record to the longer record.
+
+        Each descent starts from the last estimate of the candidate. Return None if the residual of
+        the first candidate exceeds the noise, or if it includes nonlinear effects: then a full
+        search is needed.
 
         Parameters
         ----------
         earlier : sequence of Candidate
-            The lowest BIC first.
+            Earlier candidates by rising BIC.
         measurement : Measurement
+            Longer record.
         fixed : tuple of str
+            Settings that stay at the values the file states.
         band_hz : tuple of float
-
-        Returns
-        -------
-        CandidateSet or None
-            None if the residual of the first exceeds the noise: then a search is needed.
+            First and last frequency compared.
 
         Raises
         ------
         MeasurementError
             The record cannot be used.
         """
-        first, *others = earlier
-        if first.columns:
-            return None  # what was not linear is searched for again, in all of the record
-        unknowns = Unknowns.of(first.structure, measurement.nominal, free_settings(fixed))
-        found = refit_record(measurement, unknowns, first.fit.plant, band_hz=band_hz)
-        if found is None:
+        first_candidate, *other_candidates = earlier
+        if first_candidate.columns:
+            return None  # nonlinear effects are searched for again, in the whole record
+        unknowns = Unknowns.of(first_candidate.structure, measurement.nominal, free_settings(fixed))
+        analysis = refit_record(measurement, unknowns, first_candidate.fit.plant, band_hz=band_hz)
+        if analysis is None:
             return None
-        candidate_set = cls._fitted(found, fixed, (replace(first, fit=found.fits[0]),))
-        before = replace(candidate_set, candidates=tuple(earlier))
-        every = (before._refitted(candidate_set, c, MANY) for c in others)
-        candidate_set = (
-            candidate_set.ranked((*candidate_set.candidates, *every))
-            ._without_leakage()
-            .cross_checked()
+        candidate_set = cls._from_analysis(
+            analysis, fixed, (replace(first_candidate, fit=analysis.fits[0]),)
         )
-        return candidate_set._renewed()
+        earlier_set = replace(candidate_set, candidates=tuple(earlier))
+        refitted = (earlier_set._refit_in(candidate_set, c, MANY) for c in other_candidates)
+        candidate_set = (
+            candidate_set.with_candidates((*candidate_set.candidates, *refitted))
+            ._exclude_leakage()
+            .cross_check()
+        )
+        return candidate_set._update_reference_following()
 
     @classmethod
     def of_freest(
@@ -161,7 +183,7 @@ class CandidateSet:
         band_hz: tuple[float, float],
         additional: tuple[Structure, ...] = (),
     ) -> CandidateSet:
-        """Fit the structure with every order free, and some additional ones, on a uniform beam.
+        """Fit the structure with free orders, and the `additional` structures, on a uniform beam.
 
         Raises
         ------
@@ -169,84 +191,96 @@ class CandidateSet:
             The record cannot be used.
         """
         structures = (_FREEST, *additional)
-        return cls._uniform(
+        return cls._of_uniform_beam(
             fit_record(measurement, structures, fixed=fixed, band_hz=band_hz), fixed
         )
 
     @classmethod
-    def _uniform(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> CandidateSet:
-        """Return the candidates of fits to a uniform beam."""
-        return cls._fitted(uniform, fixed, (Candidate(fit.structure, fit) for fit in uniform.fits))
+    def _of_uniform_beam(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> CandidateSet:
+        """Return the candidate set of fits to a uniform beam."""
+        return cls._from_analysis(
+            uniform, fixed, (Candidate(fit.structure, fit) for fit in uniform.fits)
+        )
 
     @classmethod
-    def _fitted(
+    def _from_analysis(
         cls, analysis: RecordAnalysis, fixed: tuple[Setting, ...], candidates: Iterable[Candidate]
     ) -> CandidateSet:
-        """Return a set with given fits as its candidates."""
+        """Return a candidate set of given candidates, with comparison and noise of an analysis."""
         comparison = analysis.comparison
         return cls(
             comparison=comparison,
             noise=analysis.noise,
             free=free_settings(fixed),
-            candidates=_ranked(candidates),
+            candidates=_by_rising_bic(candidates),
             columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
         )
 
     @property
     def best(self) -> Candidate:
-        """Return the first candidate: the lowest BIC, unless `led_by` put another first."""
+        """Return the first candidate: the one with the lowest BIC, unless `led_by` was called."""
         return self.candidates[0]
 
     @property
     def freest(self) -> Candidate:
-        """Return the freest structure that the record supports, without insignificant dampings.
+        """Return the candidate with the freest significant damping structure.
 
-        All orders are free, so its intervals are valid whichever simpler structure is the true one.
-        The intervals of the lowest BIC are valid only if that structure is true. If no structure
-        was fitted with free orders, this is the best one.
+        This is internal and external damping, both of free order, or only one of them if the other
+        is insignificant. Since all orders are free, its intervals are valid whichever simpler
+        structure is the true one. The intervals of the candidate with the lowest BIC are valid only
+        if its structure is true. If no structure was fitted with free orders, return the best
+        candidate.
         """
-        alike = {c.structure.name: c for c in self.candidates}
-        freest = alike.get(_FREEST.name)
-        if freest is None:
+        by_structure = {c.structure.name: c for c in self.candidates}
+        freest_candidate = by_structure.get(_FREEST.name)
+        if freest_candidate is None:
             return self.best
-        lesser = [alike[s.name] for s in _ONE_DAMPING if s.name in alike]
-        least = min(lesser, key=lambda c: c.deviance, default=freest)
-        return least if least.deviance - freest.deviance < _SHOWS else freest
+        one_damping = [by_structure[s.name] for s in _ONE_DAMPING if s.name in by_structure]
+        best_one_damping = min(one_damping, key=lambda c: c.deviance, default=freest_candidate)
+        return (
+            best_one_damping
+            if best_one_damping.deviance - freest_candidate.deviance < _MIN_DEVIANCE_OF_DAMPING
+            else freest_candidate
+        )
 
     def led_by(self, candidate: Candidate) -> CandidateSet:
-        """Return the set with one candidate first: the one whose numbers are reported."""
-        others = (c for c in self.candidates if c is not candidate)
-        return replace(self, candidates=(candidate, *others))
+        """Return the set with one candidate moved to the front, so that it is reported."""
+        other_candidates = (c for c in self.candidates if c is not candidate)
+        return replace(self, candidates=(candidate, *other_candidates))
 
     @property
     def likeliest(self) -> RecordFit:
-        """Return the candidate with the lowest sum of squares, whatever its parameters."""
+        """Return the fit of the candidate with the lowest cost."""
         return min((candidate.fit for candidate in self.candidates), key=lambda fit: fit.cost)
 
     @property
     def bic(self) -> float:
-        """Return the lowest BIC; it is comparable between sets with different noise."""
+        """Return the lowest BIC of the candidates.
+
+        It includes the level of the noise, and so is comparable between candidate sets with
+        different noise.
+        """
         return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
 
     def unknowns(self, structure: Structure) -> Unknowns:
-        """Return the search space of a structure on this record."""
+        """Return the unknowns of a structure on this record, as the coordinates of a search."""
         return Unknowns.of(structure, self.comparison.measurement.nominal, self.free)
 
     def refit(self, candidate: Candidate, max_evaluations: int = MANY) -> Refit:
-        """Descend from the estimate of a candidate."""
-        return self.descent_from(candidate.fit.plant, candidate.structure, max_evaluations)
+        """Return the minimum reached by a descent from the estimate of a candidate."""
+        return self.descend_from_plant(candidate.fit.plant, candidate.structure, max_evaluations)
 
-    def descent_from(
+    def descend_from_plant(
         self, plant: Plant, structure: Structure, max_evaluations: int = MANY
     ) -> Refit:
-        """Descend from a plant with a structure."""
+        """Return the minimum reached by a descent from a plant, with a given structure."""
         unknowns = self.unknowns(structure)
         return self.descent(unknowns, unknowns.vector(plant), max_evaluations)
 
     def descent(
         self, unknowns: Unknowns, start: NDArray[np.float64], max_evaluations: int
     ) -> Refit:
-        """Descend from a vector of unknowns."""
+        """Return the minimum reached by a descent from a vector of unknowns."""
         return Refit.descend(
             self.comparison,
             unknowns,
@@ -256,47 +290,66 @@ class CandidateSet:
             max_evaluations=max_evaluations,
         )
 
-    def _renewed(self) -> CandidateSet:
-        """Re-estimate the angle that follows the reference; `self` after convergence."""
+    def _update_reference_following(self) -> CandidateSet:
+        """Re-estimate the part of the angle that follows the reference, and refit all candidates.
+
+        Return `self` if that part has converged.
+        """
         candidate_set = self
         for _ in range(RENEWALS):
             best = candidate_set.best
             comparison = candidate_set.comparison.renewed(best.fit.plant, candidate_set.noise)
             if comparison is candidate_set.comparison:
                 break
-            alone = replace(candidate_set, comparison=comparison, candidates=(best,))
-            noise = alone.refit(best, FEW).noise_here()
-            alone = replace(alone, noise=noise)
-            candidate_set = replace(alone, candidates=(alone.refit(best, FEW).candidate(),))
+            set_of_best = replace(candidate_set, comparison=comparison, candidates=(best,))
+            noise = set_of_best.refit(best, FEW).noise_here()
+            set_of_best = replace(set_of_best, noise=noise)
+            candidate_set = replace(
+                set_of_best, candidates=(set_of_best.refit(best, FEW).candidate(),)
+            )
         if candidate_set is self:
             return self
-        # The others from where they were: they have seen their best's noise only.
-        others = (c for c in self.candidates if c is not self.best)
-        every = (self._refitted(candidate_set, c, MANY) for c in others)
-        return candidate_set.ranked((*candidate_set.candidates, *every)).cross_checked()
+        # The other candidates start from their former minima, under the new noise.
+        other_candidates = (
+            candidate for candidate in self.candidates if candidate is not self.best
+        )
+        refitted = (
+            self._refit_in(candidate_set, candidate, MANY) for candidate in other_candidates
+        )
+        return candidate_set.with_candidates((*candidate_set.candidates, *refitted)).cross_check()
 
-    def _without_leakage(self) -> CandidateSet:
-        """Exclude the bins that a disturbance beyond the band leaks into."""
+    def _exclude_leakage(self) -> CandidateSet:
+        """Refit all candidates without the bins into which a disturbance outside the band leaks."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
-        return self.under(noise) if noise is not self.noise else self
+        return self.refit_under_noise(noise) if noise is not self.noise else self
 
-    def under(self, noise: NoiseSpectrum) -> CandidateSet:
-        """Fit again under a slightly different noise spectrum."""
-        other = replace(self, noise=noise)
-        return other.ranked(self._refitted(other, c, FEW) for c in self.candidates)
+    def refit_under_noise(self, noise: NoiseSpectrum) -> CandidateSet:
+        """Fit all candidates again under a slightly different noise spectrum."""
+        new_set = replace(self, noise=noise)
+        return new_set.with_candidates(self._refit_in(new_set, c, FEW) for c in self.candidates)
 
-    def _refitted(self, other: CandidateSet, c: Candidate, max_evaluations: int) -> Candidate:
-        """Fit a candidate in a slightly different set; only roughly if its BIC is far higher."""
-        behind = c.bic - min(each.bic for each in self.candidates)
-        return other.refit(c, max_evaluations if behind < FAR_BEHIND else _A_STEP).candidate()
+    def _refit_in(
+        self, new_set: CandidateSet, candidate: Candidate, max_evaluations: int
+    ) -> Candidate:
+        """Fit one candidate again with the data of another candidate set.
 
-    def cross_checked(self) -> CandidateSet:
-        """Start each candidate from the best one: a search may miss a flat minimum."""
+        A candidate whose BIC is far above the lowest one is fitted only roughly.
+        """
+        bic_difference = candidate.bic - min(each.bic for each in self.candidates)
+        return new_set.refit(
+            candidate, max_evaluations if bic_difference < FAR_BEHIND else _ROUGH_FIT_EVALUATIONS
+        ).candidate()
+
+    def cross_check(self) -> CandidateSet:
+        """Restart each candidate from the plant of the best candidate, until the best one is final.
+
+        An earlier search of a candidate may have missed a flat minimum.
+        """
         candidate_set = self
-        for _ in range(_CROSS_CHECKS):
+        for _ in range(_MAX_CROSS_CHECK_ROUNDS):
             best = candidate_set.best
-            candidate_set = candidate_set.ranked(
-                c if c is best else candidate_set._from_plant(c, best.fit.plant)
+            candidate_set = candidate_set.with_candidates(
+                c if c is best else candidate_set._refit_from_plant(c, best.fit.plant)
                 for c in candidate_set.candidates
             )
             if candidate_set.best is best:
@@ -304,137 +357,156 @@ class CandidateSet:
         return candidate_set
 
     def restarted_from(self, plant: Plant) -> CandidateSet:
-        """Start each candidate from a plant that another search found."""
-        return self.ranked(self._from_plant(c, plant) for c in self.candidates).cross_checked()
+        """Refit each candidate, starting from a plant that another search found."""
+        return self.with_candidates(
+            self._refit_from_plant(c, plant) for c in self.candidates
+        ).cross_check()
 
-    def _from_plant(self, candidate: Candidate, plant: Plant) -> Candidate:
-        """Fit a candidate from the plant of another, unless that has other dampings."""
+    def _refit_from_plant(self, candidate: Candidate, plant: Plant) -> Candidate:
+        """Fit a candidate starting from another plant; return the better of old and new fit.
+
+        The candidate is unchanged if the plant has a damping that its structure lacks.
+        """
         structure, damping = candidate.structure, plant.damping
         if (damping.zeta and not structure.internal) or (damping.gamma and not structure.external):
             return candidate
-        outlook = self.descent_from(plant, structure, 1)
-        least = candidate.fit.cost * (1 - MISSED)
-        if outlook.predicted_cost > least:
+        start = self.descend_from_plant(plant, structure, 1)
+        cost_to_beat = candidate.fit.cost * (1 - MISSED)
+        if start.predicted_cost > cost_to_beat:
             return candidate
-        first = outlook.further(FEW)
-        if first.cost > candidate.fit.cost * (1 + _NEARLY):
+        first_descent = start.further(FEW)
+        if first_descent.cost > candidate.fit.cost * (1 + _CONTINUATION_COST_TOLERANCE):
             return candidate
-        found = first.further(MANY)
-        return candidate if found.cost > least else found.candidate()
+        minimum = first_descent.further(MANY)
+        return candidate if minimum.cost > cost_to_beat else minimum.candidate()
 
     def with_special_cases(self) -> CandidateSet:
-        """Fit special cases of the freest structure from its estimate, if they may be better.
+        """Add fits of special cases of the freest structure, which start from its estimate.
 
-        An internal damping whose order is near 2 is an inertia. It has a minimum of its own, and
-        the search for the freest structure may take it for the lowest; from an order of 1 this
-        minimum does not exist. An insignificant damping is left out, as in `freest`.
+        The special cases have an internal damping of order 1, or lack an insignificant damping. An
+        internal damping with an order near 2 acts as an inertia. It has a separate minimum, which
+        the search for the freest structure may mistake for the lowest one. A search from an order
+        of 1 avoids that minimum.
         """
         fit = next(each.fit for each in self.candidates if each.structure is _FREEST)
         low, high = fit.interval["alpha"] or (math.inf, -math.inf)
-        doubtful = [_INTEGER] if not low <= 1 <= high else []
-        doubtful += _may_lack_one(fit)
-        found = (self.descent_from(fit.plant, structure).candidate() for structure in doubtful)
-        candidate_set = self.ranked((*self.candidates, *found)).cross_checked()
+        special_cases = [_INTEGER_ORDER] if not low <= 1 <= high else []
+        special_cases += _one_damping_structures(fit)
+        fitted = (
+            self.descend_from_plant(fit.plant, structure).candidate() for structure in special_cases
+        )
+        candidate_set = self.with_candidates((*self.candidates, *fitted)).cross_check()
         return candidate_set.led_by(candidate_set.freest)
 
     def with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
         """Fit a candidate with the damping that it lacks, for the uncertainty of its modes.
 
-        An insignificant damping may still exist, and the damping ratio of a mode is the sum of
-        both. If the mode was excited for less time than it rings, this dominates its uncertainty.
-        So the other damping is estimated as well, with order 1. A damping whose order is at the
-        edge of its range is an inertia or a stiffness, and counts as absent, too.
+        An insignificant damping may still exist, and the damping ratio of a mode is the sum of both
+        dampings. If the mode was excited for less time than it rings, this dominates its
+        uncertainty. So the other damping is estimated as well, with order 1. A damping whose order
+        is at the limit of its range acts as an inertia or a stiffness, and also counts as absent.
 
         Returns
         -------
         fit : RecordFit
-            The fit of the candidate itself if it lacks none.
+            The candidate's own fit if it lacks no damping.
         bounded : bool
-            Whether the other damping would have to be negative. It is then one standard
-            deviation, and the fit is not a minimum.
+            Whether the best coefficient of the other damping is negative. The coefficient is then
+            set to one standard deviation, and the fit is not a minimum.
         """
-        structure, own = candidate.structure, candidate.fit
-        absent = [
+        structure, own_fit = candidate.structure, candidate.fit
+        absent_dampings = [
             (order, coefficient)
             for order, coefficient in COEFFICIENT_OF.items()
-            if not structure.has(coefficient) or order in own.at_bounds
+            if not structure.has(coefficient) or order in own_fit.at_bounds
         ]
-        if len(absent) != 1:
-            return own, False
-        ((order, coefficient),) = absent
+        if len(absent_dampings) != 1:
+            return own_fit, False
+        ((order, coefficient),) = absent_dampings
         fixed = {name: value for name, value in structure.fixed.items() if structure.has(name)}
         fixed[order] = 1.0  # type: ignore[index]
         free = tuple(name for name in PARAMETERS if name not in fixed)
-        both = replace(structure, free=free, fixed=fixed)
-        unknowns = self.unknowns(both)
+        both_dampings = replace(structure, free=free, fixed=fixed)
+        unknowns = self.unknowns(both_dampings)
         index = unknowns.names.index(coefficient)
-        little = self.descent(unknowns, unknowns.vector(own.plant), 1)
-        growth = 1 + float(little.predicted_step[index])  # linear in the loss, not in its logarithm
-        if growth > 1:
-            start = little.x.copy()
-            start[index] += math.log(growth)
-            found = self.descent(unknowns, start, MANY)
-            if found.x[index] > little.x[index]:
-                return found.fit(), False
-        scaled, scale = little.equations.scaled_hessian()
-        spread = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))[index, index] ** 0.5
-        x = little.x.copy()
-        x[index] += max(math.log(spread / scale[index]), 0.0)
+        start_point = self.descent(unknowns, unknowns.vector(own_fit.plant), 1)
+        # The predicted step of the logarithm is taken as linear in the coefficient itself.
+        coefficient_growth = 1 + float(start_point.predicted_step[index])
+        if coefficient_growth > 1:
+            start = start_point.x.copy()
+            start[index] += math.log(coefficient_growth)
+            minimum = self.descent(unknowns, start, MANY)
+            if minimum.x[index] > start_point.x[index]:
+                return minimum.fit(), False
+        scaled_hessian, scale = start_point.equations.scaled_hessian()
+        scaled_std = np.linalg.inv(scaled_hessian + 1e-12 * np.eye(scale.size))[index, index] ** 0.5
+        x = start_point.x.copy()
+        x[index] += max(math.log(scaled_std / scale[index]), 0.0)
         return self.descent(unknowns, x, 1).fit(), True
 
     def with_orders_free(self) -> CandidateSet:
-        """Fit the structures with free orders, unless they have been fitted."""
+        """Add fits of the structures with free orders, unless the set contains them."""
         best = self.best
-        alike = {c.structure.name: c.fit for c in self.candidates}
-        found: list[Refit] = []
-        added: list[Candidate] = []
+        by_structure = {c.structure.name: c.fit for c in self.candidates}
+        refits: list[Refit] = []
+        added_candidates: list[Candidate] = []
 
-        def fitted(structure: Structure) -> RecordFit:
-            found.append(self.descent_from(best.fit.plant, structure))
-            added.append(found[-1].candidate())
-            return added[-1].fit
+        def fit_structure(structure: Structure) -> RecordFit:
+            refits.append(self.descend_from_plant(best.fit.plant, structure))
+            added_candidates.append(refits[-1].candidate())
+            return added_candidates[-1].fit
 
-        freest = alike.get(_FREEST.name) or fitted(_FREEST)
-        for structure in _may_lack_one(freest):
-            if structure.name not in alike:
-                fitted(structure)
-        if not found:
+        freest_fit = by_structure.get(_FREEST.name) or fit_structure(_FREEST)
+        for structure in _one_damping_structures(freest_fit):
+            if structure.name not in by_structure:
+                fit_structure(structure)
+        if not refits:
             return self
-        freed = self.ranked((*self.candidates, *added))
-        if freed.best.bic > best.bic - _DISMISSED:
-            return freed.cross_checked()
-        return freed.under(min(found, key=lambda refit: refit.cost).noise_here())
+        new_set = self.with_candidates((*self.candidates, *added_candidates))
+        if new_set.best.bic > best.bic - _MIN_BIC_REDUCTION_FOR_NEW_NOISE:
+            return new_set.cross_check()
+        return new_set.refit_under_noise(min(refits, key=lambda refit: refit.cost).noise_here())
 
     def with_effect(self, columns: NDArray[np.complex128]) -> CandidateSet:
-        """Fit all with spectra of unknown size, under the noise estimated from the new residual."""
-        every = np.concatenate([self.columns, columns])
-        best = replace(self, columns=every).refit(self.best)
-        return self.with_columns(every, best.noise_here())
+        """Fit all candidates with additional torque spectra of free amplitude.
+
+        The noise is estimated again from the residual of the best candidate with these spectra.
+        """
+        all_columns = np.concatenate([self.columns, columns])
+        best_refit = replace(self, columns=all_columns).refit(self.best)
+        return self.with_columns(all_columns, best_refit.noise_here())
 
     def with_columns(self, columns: NDArray[np.complex128], noise: NoiseSpectrum) -> CandidateSet:
-        """Fit all again with columns of nonlinear effects in addition to the beam."""
-        other = replace(self, columns=columns, noise=noise)
-        return other.ranked(other.refit(c).candidate() for c in self.candidates).cross_checked()
+        """Refit all candidates with given torque spectra of free amplitude, under a given noise.
 
-    def ranked(self, candidates: Iterable[Candidate]) -> CandidateSet:
-        """Return the set with these candidates, the lowest BIC first."""
-        return replace(self, candidates=_ranked(candidates))
+        The spectra represent effects in addition to the linear beam and replace `columns`.
+        """
+        new_set = replace(self, columns=columns, noise=noise)
+        return new_set.with_candidates(
+            new_set.refit(c).candidate() for c in self.candidates
+        ).cross_check()
+
+    def with_candidates(self, candidates: Iterable[Candidate]) -> CandidateSet:
+        """Return the set with its candidates replaced by the given ones, sorted by rising BIC."""
+        return replace(self, candidates=_by_rising_bic(candidates))
 
     def all_but_white(self, fit: RecordFit) -> bool:
-        """Return whether chance exceeds the residual of a fit in one record of 100."""
-        counts = self.noise.counts
-        return whiteness(fit.residual[counts], self.comparison.frequency_hz[counts]).all_but_white
+        """Return whether the residual of a fit passes the test of whiteness at the 1 % level."""
+        is_used = self.noise.counts
+        return whiteness(fit.residual[is_used], self.comparison.frequency_hz[is_used]).all_but_white
 
 
-def _may_lack_one(fit: RecordFit) -> list[Structure]:
+def _one_damping_structures(fit: RecordFit) -> list[Structure]:
     """Return the structures without one of the dampings that is not clearly significant."""
-    additional = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
+    structures_and_missing = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
     return [
         structure
-        for structure, other in additional
-        if other is None or other.value < _CERTAIN * other.std
+        for structure, missing_damping in structures_and_missing
+        if missing_damping is None
+        or missing_damping.value < _CERTAIN_COEFFICIENT_OVER_STD * missing_damping.std
     ]
 
 
-def _ranked(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
+def _by_rising_bic(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
+    """Return the candidates sorted by rising BIC."""
     return tuple(sorted(candidates, key=lambda candidate: candidate.bic))

@@ -1,6 +1,6 @@
 """Simple causes of modes that no plain uniform beam has, each with one or two unknowns.
 
-See `analysis.identify._explanations`, which fits them.
+`analysis.identify._explanations` fits them to the modes of a record.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ if TYPE_CHECKING:
     from analysis.identify._plant import Plant
     from rigd.beam import Beam
 
-_BUTTERWORTH: Final = 2**0.5
+_BUTTERWORTH_LOSS: Final = 2**0.5
+"""Reciprocal quality factor of a second-order Butterworth filter."""
+
 RELAXATION: Final = "relaxation"
-"""It may be all of the internal damping."""
+"""Name of the cause that may explain all of the internal damping."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,17 +32,19 @@ class Cause:
     Attributes
     ----------
     name : str
+        Name of the cause.
     starts : sequence of tuple of float
         Unknowns from which searches begin.
     lower, upper : tuple of float
         Plausible range; a result at an outer bound is discarded.
-    altered : callable
-        Function of the stated alteration, the unknowns and the beam that returns an alteration.
-    described : callable
-        Function of the unknowns and the fitted beam that returns size, unit and words.
+    alter : callable
+        Function of the stated alteration, the unknowns and the beam that returns the alteration
+        with this cause.
+    describe : callable
+        Function of the unknowns and the fitted beam that returns size, unit and a phrase.
     plant : callable, optional
         Function of the unknowns and the fitted plant that returns the plant with this cause.
-    special : tuple of str
+    special_cases : tuple of str
         Names of causes that this one includes as special cases.
     """
 
@@ -48,171 +52,274 @@ class Cause:
     starts: Sequence[tuple[float, ...]]
     lower: tuple[float, ...]
     upper: tuple[float, ...]
-    altered: Callable[[Alteration, Sequence[float], Beam], Alteration]
-    described: Callable[[Sequence[float], Beam], tuple[float, str, str]]
+    alter: Callable[[Alteration, Sequence[float], Beam], Alteration]
+    describe: Callable[[Sequence[float], Beam], tuple[float, str, str]]
     plant: Callable[[Sequence[float], Plant], Plant | None] | None = None
-    special: tuple[str, ...] = ()
+    special_cases: tuple[str, ...] = ()
 
 
-def _with_tilt(stated: Alteration, own: Sequence[float], _: Beam) -> Alteration:
-    return replace(stated, gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(own[0])))
+def _set_tilt(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
+    """Return an alteration with the axis tilted by an unknown angle in degrees."""
+    return replace(
+        stated_alteration, gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(unknowns[0]))
+    )
 
 
-def _tilt(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    lower = "lower" if own[0] > 0 else "higher"
-    words = f"an axis {_digits(abs(own[0]))}° off plumb (the tip at rest {lower} than the axis)"
-    return own[0], "deg", words
+def _describe_tilt(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
+    """Describe a tilt of the axis: size in degrees, unit and phrase."""
+    direction = "lower" if unknowns[0] > 0 else "higher"
+    phrase = (
+        f"an axis {_two_digits(abs(unknowns[0]))}° off plumb "
+        f"(the tip at rest {direction} than the axis)"
+    )
+    return unknowns[0], "deg", phrase
 
 
 def _mass_kg(fraction: float, beam: Beam) -> float:
+    """Return a mass in kilograms that is a given fraction of the beam's mass."""
     return fraction * beam.density_kg_per_m * beam.length_m
 
 
-def _with_tip_mass(stated: Alteration, own: Sequence[float], beam: Beam) -> Alteration:
-    return replace(stated, lumps=((1.0, _mass_kg(own[0], beam)),))
+def _set_tip_mass(
+    stated_alteration: Alteration, unknowns: Sequence[float], beam: Beam
+) -> Alteration:
+    """Return an alteration with a tip mass as a fraction of the beam's mass."""
+    return replace(stated_alteration, lumps=((1.0, _mass_kg(unknowns[0], beam)),))
 
 
-def _tip_mass(own: Sequence[float], beam: Beam) -> tuple[float, str, str]:
-    mass_kg = _mass_kg(own[0], beam)
-    return mass_kg, "kg", f"a mass of {_digits(1e3 * mass_kg)} g at the tip"
+def _describe_tip_mass(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
+    """Describe a mass at the tip: size in kilograms, unit and phrase."""
+    mass_kg = _mass_kg(unknowns[0], beam)
+    return mass_kg, "kg", f"a mass of {_two_digits(1e3 * mass_kg)} g at the tip"
 
 
-def _with_lump(stated: Alteration, own: Sequence[float], beam: Beam) -> Alteration:
-    return replace(stated, lumps=(*stated.lumps, (own[0], _mass_kg(own[1], beam))))
+def _add_lump(stated_alteration: Alteration, unknowns: Sequence[float], beam: Beam) -> Alteration:
+    """Return an alteration with a further point mass: its relative position and mass fraction."""
+    return replace(
+        stated_alteration,
+        lumps=(*stated_alteration.lumps, (unknowns[0], _mass_kg(unknowns[1], beam))),
+    )
 
 
-def _lump(own: Sequence[float], beam: Beam) -> tuple[float, str, str]:
-    mass_kg = _mass_kg(own[1], beam)
-    at = f"{100 * own[0]:.0f} % of the length"
-    return mass_kg, "kg", f"a mass of {_digits(1e3 * mass_kg)} g on the beam at {at}"
+def _describe_lump(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
+    """Describe a point mass on the beam: size in kilograms, unit and phrase."""
+    mass_kg = _mass_kg(unknowns[1], beam)
+    position = f"{100 * unknowns[0]:.0f} % of the length"
+    return mass_kg, "kg", f"a mass of {_two_digits(1e3 * mass_kg)} g on the beam at {position}"
 
 
-def _compliance(own: Sequence[float], beam: Beam) -> float:
-    return own[0] * beam.length_m / beam.bending_stiffness_n_m2
+def _compliance_rad_per_nm(unknowns: Sequence[float], beam: Beam) -> float:
+    """Return the compliance of the clamp in rad/(N·m), for a compliance relative to L/EI."""
+    return unknowns[0] * beam.length_m / beam.bending_stiffness_n_m2
 
 
-def _with_clamp(stated: Alteration, own: Sequence[float], _: Beam) -> Alteration:
-    return replace(stated, clamp_compliance=own[0], clamp_loss=own[1] if len(own) > 1 else 0.0)
+def _set_clamp_compliance(
+    stated_alteration: Alteration, unknowns: Sequence[float], _: Beam
+) -> Alteration:
+    """Return an alteration with a compliant clamp and, optionally, a loss factor of the clamp.
+
+    The compliance is relative to that of the beam, L/EI.
+    """
+    return replace(
+        stated_alteration,
+        clamp_compliance=unknowns[0],
+        clamp_loss=unknowns[1] if len(unknowns) > 1 else 0.0,
+    )
 
 
-def _clamp(own: Sequence[float], beam: Beam) -> tuple[float, str, str]:
-    stiffness = 1 / _compliance(own, beam)
-    loss = f" and a loss factor of {_digits(own[1])}" if len(own) > 1 else ""
+def _describe_clamp(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
+    """Describe a compliant clamp: stiffness in N·m/rad, unit and phrase."""
+    stiffness = 1 / _compliance_rad_per_nm(unknowns, beam)
+    loss = f" and a loss factor of {_two_digits(unknowns[1])}" if len(unknowns) > 1 else ""
     return (
         stiffness,
         "N·m/rad",
-        f"a clamp with a stiffness of {_digits(stiffness)} N·m/rad{loss}",
+        f"a clamp with a stiffness of {_two_digits(stiffness)} N·m/rad{loss}",
     )
 
 
-def _corner(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    hz = _hz(own)
-    return hz, "Hz", f"a low-pass filter of first order at {_digits(hz)} Hz in the torque channel"
+def _describe_first_order_filter(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
+    """Describe a first-order filter of the torque channel: corner in Hz, unit and phrase."""
+    hz = _frequency_hz(unknowns)
+    return (
+        hz,
+        "Hz",
+        f"a low-pass filter of first order at {_two_digits(hz)} Hz in the torque channel",
+    )
 
 
-def _second_corner(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    hz = _hz(own)
-    return hz, "Hz", f"a low-pass filter of second order at {_digits(hz)} Hz in the torque channel"
+def _describe_second_order_filter(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
+    """Describe a second-order filter of the torque channel: corner in Hz, unit and phrase."""
+    hz = _frequency_hz(unknowns)
+    return (
+        hz,
+        "Hz",
+        f"a low-pass filter of second order at {_two_digits(hz)} Hz in the torque channel",
+    )
 
 
-def _with_filter(own: Sequence[float], plant: Plant) -> Plant | None:
+def _plant_with_first_order_filter(unknowns: Sequence[float], plant: Plant) -> Plant | None:
     """Return the plant with a first-order filter; None if the file already states a filter."""
-    stated = plant.filter_time_constant_s
-    return None if stated else replace(plant, filter_time_constant_s=1e-3 * own[0])
+    stated_s = plant.filter_time_constant_s
+    return None if stated_s else replace(plant, filter_time_constant_s=1e-3 * unknowns[0])
 
 
-def _with_second_filter(own: Sequence[float], plant: Plant) -> Plant | None:
+def _plant_with_second_order_filter(unknowns: Sequence[float], plant: Plant) -> Plant | None:
     """Return the plant with a second-order filter; None if the file already states a filter."""
-    stated = plant.second_order_filter_time_constant_s
-    return None if stated else replace(plant, second_order_filter_time_constant_s=1e-3 * own[0])
-
-
-def _resonance(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    hz = _hz(own)
-    return hz, "Hz", f"a resonance of sensor or mount near {_digits(hz)} Hz"
-
-
-def _hz(own: Sequence[float]) -> float:
-    return 1e3 / (2 * math.pi * own[0])
-
-
-def _relaxation(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    time_s = math.exp(own[0])
-    words = (
-        f"a relaxation of the material in {_digits(1e3 * time_s)} ms that stiffens it by "
-        f"{_digits(100 * own[1])} %"
+    stated_s = plant.second_order_filter_time_constant_s
+    return (
+        None if stated_s else replace(plant, second_order_filter_time_constant_s=1e-3 * unknowns[0])
     )
-    return own[1], "1", words
 
 
-def _digits(value: float) -> str:
-    """Round to two digits: the interval is not known."""
+def _describe_resonance(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
+    """Describe a resonance of the sensor: frequency in Hz, unit and phrase."""
+    hz = _frequency_hz(unknowns)
+    return hz, "Hz", f"a resonance of sensor or mount near {_two_digits(hz)} Hz"
+
+
+def _frequency_hz(unknowns: Sequence[float]) -> float:
+    """Return the corner or resonance frequency in hertz for a time constant in milliseconds."""
+    return 1e3 / (2 * math.pi * unknowns[0])
+
+
+def _describe_relaxation(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
+    """Describe a relaxation of the material: relative stiffening, unit and phrase."""
+    time_s = math.exp(unknowns[0])
+    phrase = (
+        f"a relaxation of the material in {_two_digits(1e3 * time_s)} ms that stiffens it by "
+        f"{_two_digits(100 * unknowns[1])} %"
+    )
+    return unknowns[1], "1", phrase
+
+
+def _two_digits(value: float) -> str:
+    """Format a value with two significant digits."""
     return f"{value:.2g}" if abs(value) < 100 else f"{float(f'{value:.2g}'):.0f}"
 
 
-def _uneven_mass(profile: Profile, words: str) -> Cause:
-    def altered(stated: Alteration, own: Sequence[float], _: Beam) -> Alteration:
-        return replace(stated, density=((profile, own[0]),))
+def _uneven_mass_cause(profile: Profile, phrase: str) -> Cause:
+    """Return the cause that the mass per length deviates with a profile along the beam."""
 
-    return Cause("uneven mass", _EITHER, (-0.3,), (0.3,), altered, _deviation(words))
+    def alter(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
+        return replace(stated_alteration, density=((profile, unknowns[0]),))
 
-
-def _uneven_stiffness(profile: Profile, words: str) -> Cause:
-    def altered(stated: Alteration, own: Sequence[float], _: Beam) -> Alteration:
-        return replace(stated, stiffness=((profile, own[0]),))
-
-    return Cause("uneven stiffness", _EITHER, (-0.3,), (0.3,), altered, _deviation(words))
+    return Cause(
+        "uneven mass", _STARTS_OF_EITHER_SIGN, (-0.3,), (0.3,), alter, _describe_deviation(phrase)
+    )
 
 
-def _deviation(words: str) -> Callable[[Sequence[float], Beam], tuple[float, str, str]]:
-    return lambda own, _: (own[0], "1", words.format(f"{float(f'{100 * own[0]:.2g}'):+g} %"))
+def _uneven_stiffness_cause(profile: Profile, phrase: str) -> Cause:
+    """Return the cause that the bending stiffness deviates with a profile along the beam."""
+
+    def alter(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
+        return replace(stated_alteration, stiffness=((profile, unknowns[0]),))
+
+    return Cause(
+        "uneven stiffness",
+        _STARTS_OF_EITHER_SIGN,
+        (-0.3,),
+        (0.3,),
+        alter,
+        _describe_deviation(phrase),
+    )
 
 
-_EITHER: Final = ((-0.01,), (0.01,))
+def _describe_deviation(phrase: str) -> Callable[[Sequence[float], Beam], tuple[float, str, str]]:
+    """Return a function that describes a relative deviation: size, unit and phrase.
+
+    `phrase` is the text, with ``{}`` for the size in per cent.
+    """
+    return lambda unknowns, _: (
+        unknowns[0],
+        "1",
+        phrase.format(f"{float(f'{100 * unknowns[0]:.2g}'):+g} %"),
+    )
+
+
+_STARTS_OF_EITHER_SIGN: Final = ((-0.01,), (0.01,))
+"""Start values of a relative deviation of either sign."""
+
 CAUSES: Final = (
-    Cause("tilt", ((-2.0,), (2.0,)), (-10.0,), (10.0,), _with_tilt, _tilt),
+    Cause("tilt", ((-2.0,), (2.0,)), (-10.0,), (10.0,), _set_tilt, _describe_tilt),
     Cause(
-        "tip mass", ((0.003,), (0.02,), (0.1,), (0.25,)), (0.0,), (1.0,), _with_tip_mass, _tip_mass,
-        lambda own, plant: replace(plant, tip_mass_kg=_mass_kg(own[0], plant.beam)),
+        "tip mass",
+        ((0.003,), (0.02,), (0.1,), (0.25,)),
+        (0.0,),
+        (1.0,),
+        _set_tip_mass,
+        _describe_tip_mass,
+        lambda unknowns, plant: replace(plant, tip_mass_kg=_mass_kg(unknowns[0], plant.beam)),
     ),
     Cause(
-        "lump", tuple((0.05 * index, 0.01) for index in range(3, 20, 2)),
-        (0.02, 0.0), (0.99, 0.5), _with_lump, _lump, special=("tip mass",),
+        "lump",
+        tuple((0.05 * index, 0.01) for index in range(3, 20, 2)),
+        (0.02, 0.0),
+        (0.99, 0.5),
+        _add_lump,
+        _describe_lump,
+        special_cases=("tip mass",),
     ),
-    _uneven_mass("taper", "a mass per length that changes by {} from root to tip"),
-    _uneven_mass("outer half", "an outer half with {} mass per length"),
-    _uneven_mass("wave", "a mass per length with {} at both ends and the opposite in the middle"),
-    _uneven_stiffness("taper", "a bending stiffness that changes by {} from root to tip"),
-    _uneven_stiffness("outer half", "an outer half with {} bending stiffness"),
-    _uneven_stiffness(
+    _uneven_mass_cause("taper", "a mass per length that changes by {} from root to tip"),
+    _uneven_mass_cause("outer half", "an outer half with {} mass per length"),
+    _uneven_mass_cause(
+        "wave", "a mass per length with {} at both ends and the opposite in the middle"
+    ),
+    _uneven_stiffness_cause("taper", "a bending stiffness that changes by {} from root to tip"),
+    _uneven_stiffness_cause("outer half", "an outer half with {} bending stiffness"),
+    _uneven_stiffness_cause(
         "wave", "a bending stiffness with {} at both ends and the opposite in the middle"
     ),
     Cause(
-        "elastic clamp", ((1e-4,), (1e-3,), (1e-2,)), (0.0,), (0.2,), _with_clamp, _clamp,
-        lambda own, plant: replace(plant, root_compliance_rad_per_nm=_compliance(own, plant.beam)),
+        "elastic clamp",
+        ((1e-4,), (1e-3,), (1e-2,)),
+        (0.0,),
+        (0.2,),
+        _set_clamp_compliance,
+        _describe_clamp,
+        lambda unknowns, plant: replace(
+            plant, root_compliance_rad_per_nm=_compliance_rad_per_nm(unknowns, plant.beam)
+        ),
     ),
     Cause(
         "lossy clamp",
         tuple((size, loss) for size in (1e-4, 1e-3, 1e-2) for loss in (0.02, 0.1)),
-        (0.0, 0.0), (0.2, 0.5), _with_clamp, _clamp, special=("elastic clamp",),
+        (0.0, 0.0),
+        (0.2, 0.5),
+        _set_clamp_compliance,
+        _describe_clamp,
+        special_cases=("elastic clamp",),
     ),
     Cause(
-        "torque filter of first order", ((0.2,), (0.6,), (2.0,)), (0.0,), (20.0,),
-        lambda stated, own, _: replace(stated, lag_s=1e-3 * own[0]), _corner,
-        _with_filter,
+        "torque filter of first order",
+        ((0.2,), (0.6,), (2.0,)),
+        (0.0,),
+        (20.0,),
+        lambda stated_alteration, unknowns, _: replace(stated_alteration, lag_s=1e-3 * unknowns[0]),
+        _describe_first_order_filter,
+        _plant_with_first_order_filter,
     ),
     Cause(
-        "torque filter of second order", ((0.2,), (0.6,), (2.0,)), (0.0,), (10.0,),
-        lambda stated, own, _: replace(stated, sensor=(1e-3 * own[0], _BUTTERWORTH)),
-        _second_corner,
-        _with_second_filter,
+        "torque filter of second order",
+        ((0.2,), (0.6,), (2.0,)),
+        (0.0,),
+        (10.0,),
+        lambda stated_alteration, unknowns, _: replace(
+            stated_alteration, sensor=(1e-3 * unknowns[0], _BUTTERWORTH_LOSS)
+        ),
+        _describe_second_order_filter,
+        _plant_with_second_order_filter,
     ),
     Cause(
         "sensor resonance",
         tuple((size, loss) for size in (0.3, 0.6, 1.0, 1.6) for loss in (0.05, 0.5)),
-        (0.0, 0.0), (3.0, 2.0),
-        lambda stated, own, _: replace(stated, sensor=(1e-3 * own[0], own[1])), _resonance,
-        special=("torque filter of second order",),
+        (0.0, 0.0),
+        (3.0, 2.0),
+        lambda stated_alteration, unknowns, _: replace(
+            stated_alteration, sensor=(1e-3 * unknowns[0], unknowns[1])
+        ),
+        _describe_resonance,
+        special_cases=("torque filter of second order",),
     ),
     Cause(
         RELAXATION,
@@ -221,7 +328,12 @@ CAUSES: Final = (
             for time_s in (5e-4, 2e-3, 8e-3, 0.03, 0.1, 0.3)
             for strength in (0.003, 0.015, 0.08)
         ),
-        (math.log(1e-4), 0.0), (math.log(3.0), 0.5),
-        lambda stated, own, _: replace(stated, relaxation=(own[1], math.exp(own[0]))), _relaxation,
+        (math.log(1e-4), 0.0),
+        (math.log(3.0), 0.5),
+        lambda stated_alteration, unknowns, _: replace(
+            stated_alteration, relaxation=(unknowns[1], math.exp(unknowns[0]))
+        ),
+        _describe_relaxation,
     ),
-)  # fmt: skip
+)
+"""All causes that are fitted to the modes; a special case comes before its general cause."""

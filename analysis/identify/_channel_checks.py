@@ -1,8 +1,8 @@
 """Checks of the recorded channels: clipping, stopped motor, wrong sign or unit, sensor drift.
 
-Sign and unit are checked by the ratio of torque and angle to the response of the beam that the
-file states, as a median over the band. The median depends neither on the exact mode frequencies
-nor on the damping.
+Sign and unit are checked by the ratio of torque and angle to the response of the beam that the file
+states, as a median over the band. The median depends neither on the exact mode frequencies nor on
+the damping.
 """
 
 from __future__ import annotations
@@ -26,63 +26,69 @@ if TYPE_CHECKING:
 
 # Clipping and stops
 
-_FEWEST_FLAT: Final = 4
-"""Number of adjacent values at the extreme: noise does not repeat its largest value."""
+_MIN_CLIPPED_VALUES: Final = 4
+"""Minimum number of samples at the extreme of the torque, each next to another one, that is
+reported as clipping. Noise does not repeat its largest value."""
 
-_STILL_S: Final = 0.5
-_STILL: Final = 0.02
-"""Shortest standstill that is reported, and the motion during it relative to the reference."""
+_STANDSTILL_BLOCK_S: Final = 0.5
+"""Duration in seconds of the blocks in which a standstill of the motor is searched for."""
+
+_MAX_STANDSTILL_MOTION: Final = 0.02
+"""Largest motion of a motor at standstill within a block, relative to its reference."""
 
 
-def clipping(measurement: Measurement) -> Iterator[Finding]:
-    """Yield a finding if the torque stays at its extreme values."""
-    torque, known = measurement.torque_nm, measurement.torque_known
-    flat = []
-    for limit in (torque[known].max(), torque[known].min()):
-        at = known & (torque == limit)
-        repeated = at & (np.roll(at, 1) | np.roll(at, -1))
-        if limit != 0 and np.count_nonzero(repeated) >= _FEWEST_FLAT:
-            flat.append((float(limit), int(np.count_nonzero(at))))
-    if not flat:
+def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
+    """Yield a finding if the torque is clipped: several values lie exactly at its extremes."""
+    torque, is_known = measurement.torque_nm, measurement.torque_known
+    clipped = []
+    for limit in (torque[is_known].max(), torque[is_known].min()):
+        is_at_limit = is_known & (torque == limit)
+        is_repeated = is_at_limit & (np.roll(is_at_limit, 1) | np.roll(is_at_limit, -1))
+        if limit != 0 and np.count_nonzero(is_repeated) >= _MIN_CLIPPED_VALUES:
+            clipped.append((float(limit), int(np.count_nonzero(is_at_limit))))
+    if not clipped:
         return
-    limits = " and ".join(f"{limit:+.3g} N·m" for limit, _ in flat)
-    count = sum(ticks for _, ticks in flat)
+    limits = " and ".join(f"{limit:+.3g} N·m" for limit, _ in clipped)
+    count = sum(ticks for _, ticks in clipped)
     yield Finding(
         kind="clipping",
         sentence=(
             f"The torque is clipped at {limits}: {count} values lie exactly there and none "
             "beyond, and no flag says so."
         ),
-        value=max(abs(limit) for limit, _ in flat),
+        value=max(abs(limit) for limit, _ in clipped),
         unit="N·m",
         remedy="Use a larger range of the sensor, or a smaller amplitude; flag clipped values.",
     )
 
 
-def stops(measurement: Measurement) -> Iterator[Finding]:
-    """Yield a finding if the motor is at rest although the reference moves."""
+def standstill_findings(measurement: Measurement) -> Iterator[Finding]:
+    """Yield a finding if the motor does not move while its reference moves."""
     reference_rad = measurement.reference_rad
     if reference_rad is None:
         return
-    length = max(round(_STILL_S * measurement.rate_hz), 2)
+    length = max(round(_STANDSTILL_BLOCK_S * measurement.rate_hz), 2)
     blocks = reference_rad.size // length
     if blocks == 0:
         return
-    moved, wanted = (
+    motion, reference_motion = (
         np.ptp(values[: blocks * length].reshape(blocks, length), axis=1)
         for values in (measurement.angle_rad, reference_rad)
     )
-    still = (wanted > np.median(wanted)) & (moved < _STILL * wanted)
-    if not still.any():
+    is_still = (reference_motion > np.median(reference_motion)) & (
+        motion < _MAX_STANDSTILL_MOTION * reference_motion
+    )
+    if not is_still.any():
         return
-    count, first = longest_run(still)
+    count, first = longest_run(is_still)
     yield Finding(
         kind="stop",
         sentence=(
-            f"The motor does not move from {first * _STILL_S:.1f} to "
-            f"{(first + count) * _STILL_S:.1f} s of the record, although its reference does."
+            f"The motor does not move from {first * _STANDSTILL_BLOCK_S:.1f} to "
+            f"{(first + count) * _STANDSTILL_BLOCK_S:.1f} s of the record, although its "
+            "reference does."
         ),
-        value=count * _STILL_S,
+        value=count * _STANDSTILL_BLOCK_S,
         unit="s",
         remedy="Find what held the shaft or switched the drive off, and sweep again.",
     )
@@ -90,16 +96,17 @@ def stops(measurement: Measurement) -> Iterator[Finding]:
 
 # Sign and unit
 
-_LOSS_S: Final = 1e-4
-"""Assumed internal damping of order 1, in s: some per cent."""
+_ASSUMED_INTERNAL_DAMPING_S: Final = 1e-4
+"""Assumed coefficient of internal damping of order 1, in seconds: a loss of a few per cent."""
 
-_DRIVEN: Final = 1e-3
-"""Power of the angle over its largest from which a frequency counts."""
+_MIN_DRIVEN_POWER: Final = 1e-3
+"""Minimum power of the angle at a frequency that is used, relative to the largest power."""
 
-_ALIGNED: Final = 0.7
-"""Median cosine of the phase against the beam's from which a sign is certain."""
+_MIN_PHASE_COSINE: Final = 0.7
+"""Minimum magnitude of the median cosine of the phase, relative to the response of the beam, at
+which the sign of torque over angle is certain."""
 
-_FACTORS: Final = (
+_UNIT_FACTORS: Final = (
     (180 / math.pi, "degrees for radians"),
     (1000.0, "thousandths (m, mm or N·m, mN·m)"),
     (9.80665, "kilograms or kilopond for newtons"),
@@ -108,12 +115,19 @@ _FACTORS: Final = (
     (1 / 1.3558179, "pound-force feet for N·m"),
     (2 * math.pi, "turns for radians"),
 )
-_NEAR: Final = math.log(1.1)
-_OFF: Final = math.log(2.0)
-"""Below a factor of 2 it is the beam's data that are wrong."""
+"""Factors by which a wrong unit changes torque over angle, each with its description."""
 
-_BEYOND: Final = math.log(5.0)
-"""Above a factor of 5 it is not: no fit searches for a stiffness so far from the file's."""
+_LOG_FACTOR_TOLERANCE: Final = math.log(1.1)
+"""Largest difference between the logarithms of a measured factor and of a known unit factor that
+are considered equal."""
+
+_MIN_LOG_FACTOR: Final = math.log(2.0)
+"""Logarithm of the smallest factor that is attributed to a wrong unit. A smaller one is attributed
+to wrong data of the beam."""
+
+_CERTAIN_LOG_FACTOR: Final = math.log(5.0)
+"""Logarithm of the factor above which an unknown factor is attributed to a wrong unit, too: no fit
+searches for a stiffness so far from that of the file."""
 
 
 def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
@@ -121,13 +135,17 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
     angle = comparison.spectrum(comparison.angle_rad[comparison.retained])
     torque = comparison.spectrum(comparison.torque_nm[comparison.retained])
     power = np.abs(angle) ** 2
-    driven = power > _DRIVEN * power.max()
+    is_driven = power > _MIN_DRIVEN_POWER * power.max()
     beam = comparison.measurement.nominal.beam
-    expected = transfer(2j * np.pi * comparison.frequency_hz[driven], beam, Damping(zeta=_LOSS_S))
-    torque_ratio = torque[driven] / (angle[driven] * expected)
-    size = np.abs(torque_ratio)
-    cosine = float(np.median(torque_ratio.real / np.maximum(size, np.finfo(float).tiny)))
-    if abs(cosine) < _ALIGNED:
+    expected = transfer(
+        2j * np.pi * comparison.frequency_hz[is_driven],
+        beam,
+        Damping(zeta=_ASSUMED_INTERNAL_DAMPING_S),
+    )
+    torque_ratio = torque[is_driven] / (angle[is_driven] * expected)
+    magnitude = np.abs(torque_ratio)
+    cosine = float(np.median(torque_ratio.real / np.maximum(magnitude, np.finfo(float).tiny)))
+    if abs(cosine) < _MIN_PHASE_COSINE:
         return
     if cosine < 0:
         yield Finding(
@@ -141,25 +159,26 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
                 "the beam towards positive angles."
             ),
         )
-    factor = float(np.median(size))
-    if not factor > 0 or abs(math.log(factor)) < _OFF:
+    factor = float(np.median(magnitude))
+    if not factor > 0 or abs(math.log(factor)) < _MIN_LOG_FACTOR:
         return
-    named = [
-        words
-        for ratio, words in _FACTORS
-        if abs(abs(math.log(factor)) - abs(math.log(ratio))) < _NEAR
+    matching_units = [
+        description
+        for ratio, description in _UNIT_FACTORS
+        if abs(abs(math.log(factor)) - abs(math.log(ratio))) < _LOG_FACTOR_TOLERANCE
     ]
-    if not named and abs(math.log(factor)) < _BEYOND:
+    if not matching_units and abs(math.log(factor)) < _CERTAIN_LOG_FACTOR:
         return
-    which = (
-        f"which is the factor of {named[0]}: a wrong unit"
-        if named
+    explanation = (
+        f"which is the factor of {matching_units[0]}: a wrong unit"
+        if matching_units
         else "more than a beam may deviate from its data: a wrong unit or gain, or another beam"
     )
     yield Finding(
         kind="unit",
         sentence=(
-            f"Torque over angle is {factor:.3g} times what the beam in the file gives, {which}. "
+            f"Torque over angle is {factor:.3g} times what the beam in the file gives, "
+            f"{explanation}. "
             "No number here is valid for the antenna."
         ),
         value=factor,
@@ -169,19 +188,25 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
 
 # Drift of the zero
 
-_PARTS: Final = 16
-_BEYOND_CHANCE: Final = 10.0
-"""Scatter of the means relative to the scatter that noise alone causes."""
+_DRIFT_SEGMENTS: Final = 16
+"""Number of segments of a record whose mean residual torques are compared."""
+
+_MIN_SCATTER_RATIO: Final = 10.0
+"""Minimum scatter of the mean residual torques that is reported as drift, relative to the scatter
+due to noise."""
 
 
-def drift_of_zero(candidate_set: CandidateSet) -> float:
-    """Return the range of the means over parts of the record in N·m; 0 if noise explains it."""
+def torque_zero_drift_nm(candidate_set: CandidateSet) -> float:
+    """Return how far the torque sensor's zero drifts in N·m; 0 if noise explains the drift.
+
+    It is the range of the mean residuals of segments of the record.
+    """
     comparison = candidate_set.comparison
     torque, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
-    left = comparison.torque_nm[comparison.retained] - torque
-    length = left.size // _PARTS
-    means = left[: _PARTS * length].reshape(_PARTS, length).mean(axis=1)
-    # White noise as loud as that of the band's upper half.
-    upper = candidate_set.noise.power[candidate_set.noise.power.size // 2 :]
-    chance = math.sqrt(float(np.median(upper)) / comparison.samples / length)
-    return float(np.ptp(means)) if float(means.std()) > _BEYOND_CHANCE * chance else 0.0
+    residual = comparison.torque_nm[comparison.retained] - torque
+    length = residual.size // _DRIFT_SEGMENTS
+    means = residual[: _DRIFT_SEGMENTS * length].reshape(_DRIFT_SEGMENTS, length).mean(axis=1)
+    # Expected scatter for white noise with the power of the band's upper half.
+    upper_half_power = candidate_set.noise.power[candidate_set.noise.power.size // 2 :]
+    std_by_noise = math.sqrt(float(np.median(upper_half_power)) / comparison.samples / length)
+    return float(np.ptp(means)) if float(means.std()) > _MIN_SCATTER_RATIO * std_by_noise else 0.0

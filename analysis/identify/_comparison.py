@@ -1,4 +1,4 @@
-"""Comparison of one record in one band with any plant: compared samples and removed parts.
+"""Data of one record in one band, ready to be compared with the torque that a plant predicts.
 
 `analysis.identify._instrument` selects the part of the motor angle that is used as input.
 """
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._data import Decimation, MeasurementError, fast_length_below
-from analysis.identify._instrument import following
+from analysis.identify._instrument import reference_coherent_part
 from analysis.identify._predictor import TorquePredictor
 from analysis.identify.drag_torque import DragExpansion, DragResponse
 from analysis.identify.free_decay import (
@@ -37,21 +37,25 @@ if TYPE_CHECKING:
     from analysis.identify.free_decay import Pole
     from analysis.identify.noise import NoiseSpectrum
 
-_FEWEST_BINS: Final = 50
-_LARGEST_CHANGE: Final = 0.1
-"""Whitened squares that a change of the removed torque may add before it is computed again."""
+_MIN_BINS: Final = 50
+"""Minimum number of frequency bins in the compared band."""
 
-_FEEDBACKS: Final = 3
-"""Iterations between the ringing torque and the part of the angle that follows the reference."""
+_MAX_REMOVED_TORQUE_CHANGE: Final = 0.1
+"""Change of the torque caused by the incoherent angle, as a sum of whitened squares, up to which
+this torque is not recomputed."""
 
-_LARGEST_REST: Final = 0.3
-"""Largest fraction of the angle's power that may be incoherent with the reference. With more the
-motor followed another reference."""
+_FEEDBACK_ITERATIONS: Final = 3
+"""Number of iterations between the torque of the ringing beam and the part of the angle that
+follows the reference."""
+
+_MAX_INCOHERENT_FRACTION: Final = 0.3
+"""Largest fraction of the power of the motor's speed that may be incoherent with the reference. If
+it is larger, the motor followed another reference, and the whole angle is used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Data of one record in one band, to be compared with any plant.
+    """Data of one record in one band, ready to be compared with the torque that a plant predicts.
 
     Attributes
     ----------
@@ -60,12 +64,15 @@ class Comparison:
     angle_rad, torque_nm : ndarray, shape (m,)
         Both channels in the band at the decimated rate; unknown torque is filled by the prediction.
     decimation : Decimation
+        Low-pass filter and downsampling from the full rate.
     retained : slice
         Samples that are compared.
     prediction : TorquePredictor
+        Prediction of the torque from `angle_rad`.
     bins : slice
         Bins of the residual's transform that lie in the band.
     frequency_hz : ndarray, shape (K,)
+        Frequencies of these bins.
     visible_modes : int
         Number of modes of the nominal beam in the band; their free decay is projected out.
     decays : DecaySpectra
@@ -73,21 +80,23 @@ class Comparison:
     later_decays : tuple of LaterDecaySpectra
         Spectra of the free decay after each gap of the angle that is too long to interpolate.
     removed_nm : ndarray, shape (samples,)
-        Torque by impacts and drag that was removed, at the retained samples.
+        Torque by impacts, drag, hum and the incoherent angle that was removed, at the retained
+        samples.
     removed_at_unknown_nm : ndarray, shape (u,)
-        The same at the ticks with unknown torque.
+        The same torque at the ticks with unknown torque.
     hum : tuple of Hum
         Hum that was removed, as estimated; its remainder is projected out.
     incoherent_rad : ndarray, shape (m,), or float
-        Part of the angle that is incoherent with the reference; 0 if all of the angle is used.
+        Part of the angle that is incoherent with the reference; 0 if the whole angle is used.
     incoherent_nm, incoherent_at_unknown_nm : ndarray or float
-        Torque that was removed for it, at the retained samples and at the ticks without torque.
+        Torque caused by that part of the angle, which was removed, at the retained samples and at
+        the ticks with unknown torque.
     drag : DragExpansion, optional
         Removed torque by drag, and its derivatives with respect to the beam.
     impact_spectra : ndarray of complex, shape (k, K), or None
-        Spectra of the torque by impacts, of unknown sizes, in addition to the removed torque.
+        Spectra of the torque by impacts with unknown amplitudes, in addition to the removed torque.
     last_poles_rad_s : list of complex
-        Poles of the last plant; other plants that explain the record have similar ones.
+        Poles of the last plant, from which the search for the poles of the next plant starts.
     """
 
     measurement: Measurement
@@ -113,9 +122,10 @@ class Comparison:
 
     @classmethod
     def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
-        """Return a measurement reduced to a band.
+        """Reduce a measurement to a band.
 
-        The mean of the residual is never compared: it is the zero of the torque sensor.
+        The mean of the residual is never compared, since it contains the zero offset of the torque
+        sensor.
 
         Parameters
         ----------
@@ -140,29 +150,31 @@ class Comparison:
         measurement.check(highest_hz)
         decimation = Decimation.to_band(measurement.rate_hz, highest_hz)
         angle_rad = decimation.apply(measurement.angle_from_rest(highest_hz))
-        inside = decimation.inside(measurement.angle_rad.size)
-        samples = inside.stop - inside.start
+        usable_samples = decimation.samples_inside_record(measurement.angle_rad.size)
+        samples = usable_samples.stop - usable_samples.start
         if samples > 0:
             samples = fast_length_below(samples)
         all_hz = np.arange(samples // 2 + 1) * (decimation.rate_hz / max(samples, 1))
-        first = max(int(np.searchsorted(all_hz, lowest_hz)), 1)
-        bins = slice(first, int(np.searchsorted(all_hz, highest_hz, side="right")))
-        if bins.stop - bins.start < _FEWEST_BINS:
+        first_bin = max(int(np.searchsorted(all_hz, lowest_hz)), 1)
+        bins = slice(first_bin, int(np.searchsorted(all_hz, highest_hz, side="right")))
+        if bins.stop - bins.start < _MIN_BINS:
             raise MeasurementError(
                 f"{measurement.name}: {measurement.angle_rad.size / measurement.rate_hz:.3g} s of "
                 f"record are too short for the band {lowest_hz:g}-{highest_hz:g} Hz: "
-                f"{max(bins.stop - bins.start, 0)} frequencies, at least {_FEWEST_BINS} are "
+                f"{max(bins.stop - bins.start, 0)} frequencies, at least {_MIN_BINS} are "
                 "needed; record longer or widen the band."
             )
-        retained = slice(inside.start, inside.start + samples)
+        retained = slice(usable_samples.start, usable_samples.start + samples)
         frequency_hz = all_hz[bins]
         beam = measurement.beam
         gaps = measurement.long_gaps(highest_hz)
         if gaps:
             measurement = measurement.without_torque_in(gaps)
-        known, torque = measurement.torque_known, measurement.torque_nm
+        is_known, torque = measurement.torque_known, measurement.torque_nm
         ticks = np.arange(torque.size)
-        interpolated = torque if known.all() else np.interp(ticks, ticks[known], torque[known])
+        interpolated = (
+            torque if is_known.all() else np.interp(ticks, ticks[is_known], torque[is_known])
+        )
         omega_rad_s = 2 * np.pi * frequency_hz
         comparison = cls(
             measurement=measurement,
@@ -178,122 +190,134 @@ class Comparison:
             ),
             decays=DecaySpectra(samples, decimation.rate_hz, omega_rad_s),
         )
-        begin_s = [end / measurement.rate_hz - comparison.first_s for _, end in gaps]
-        later = tuple(
+        gap_end_s = [end / measurement.rate_hz - comparison.first_s for _, end in gaps]
+        later_decays = tuple(
             LaterDecaySpectra(
                 samples, decimation.rate_hz, omega_rad_s, first_s, 1 / measurement.rate_hz
             )
-            for first_s in begin_s
+            for first_s in gap_end_s
             if 0 < first_s < (samples - 1) / decimation.rate_hz
         )
-        comparison = replace(comparison, later_decays=later)
-        return comparison._without_impacts() if measurement.knocks else comparison
+        comparison = replace(comparison, later_decays=later_decays)
+        return comparison._remove_impacts() if measurement.knocks else comparison
 
-    def _without_impacts(self) -> Comparison:
-        """Remove the impacts as estimated; their remainder is projected out."""
+    def _remove_impacts(self) -> Comparison:
+        """Remove the torque of the known impacts as estimated.
+
+        Errors of this estimate are projected out with `impact_spectra`.
+        """
         rate_hz, knocks = self.decimation.rate_hz, self.measurement.knocks
         grid_s = self.times_s()
         ticks = self._decimated_indices(~self.measurement.torque_known)
         reach_s = self.decimation.reach / rate_hz
         unknown_s = ticks / self.measurement.rate_hz - reach_s
-        taken_nm, at_unknown_nm = (
+        impact_nm, impact_at_unknown_nm = (
             np.sum([each.torque(time_s, grid_s, rate_hz) for each in knocks], axis=0)
             for time_s in (grid_s, unknown_s)
         )
-        columns = np.concatenate([each.columns(grid_s, rate_hz) for each in knocks])
-        return replace(self, impact_spectra=self.spectrum(columns))._without(
-            taken_nm, at_unknown_nm
+        impact_torques = np.concatenate([each.columns(grid_s, rate_hz) for each in knocks])
+        return replace(self, impact_spectra=self.spectrum(impact_torques))._remove_torque(
+            impact_nm, impact_at_unknown_nm
         )
 
-    def _without(
+    def _remove_torque(
         self, torque_nm: NDArray[np.float64] | float, at_unknown_nm: NDArray[np.float64] | float
     ) -> Comparison:
         """Remove torque at the retained samples and at the ticks with unknown torque."""
-        left_nm = self.torque_nm.copy()
-        left_nm[self.retained] -= torque_nm
+        remaining_nm = self.torque_nm.copy()
+        remaining_nm[self.retained] -= torque_nm
         return replace(
             self,
-            torque_nm=left_nm,
+            torque_nm=remaining_nm,
             removed_nm=self.removed_nm + torque_nm,
             removed_at_unknown_nm=self.removed_at_unknown_nm + at_unknown_nm,
         )
 
     def times_s(self) -> NDArray[np.float64]:
-        """Return the times of the compared samples since the first tick, (samples,)."""
+        """Return the times of the compared samples since the record's first tick, (samples,)."""
         return self.first_s + np.arange(self.samples) / self.decimation.rate_hz
 
     @property
     def first_s(self) -> float:
-        """Return the time of the first compared sample."""
+        """Return the time in seconds from the record's first tick to the first compared sample."""
         return float(self.retained.start - self.decimation.reach) / self.decimation.rate_hz
 
     @property
     def samples(self) -> int:
-        """Return the number of compared samples."""
+        """Return the number of compared samples, at the decimated rate."""
         return int(self.retained.stop - self.retained.start)
 
     def poles(self, plant: Plant, wrt: Sequence[str] = ()) -> tuple[Pole, ...]:
-        """Return the poles of a plant whose free decay is projected out, as `mode_poles` does.
+        """Return the poles of a plant's visible modes, whose free decay is projected out.
 
         Parameters
         ----------
         plant : Plant
+            Plant with the poles.
         wrt : sequence of str
-            Parameters to differentiate by.
+            Parameters with respect to which the poles are differentiated, as for `mode_poles`.
         """
-        found = mode_poles(plant, self.visible_modes, wrt, self.last_poles_rad_s)
-        self.last_poles_rad_s[:] = [pole.at_rad_s for pole in found]
-        return found
+        poles = mode_poles(plant, self.visible_modes, wrt, self.last_poles_rad_s)
+        self.last_poles_rad_s[:] = [pole.at_rad_s for pole in poles]
+        return poles
 
     def spectrum(self, values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Transform retained samples, shape (..., samples), to the band: (..., K)."""
+        """Transform retained samples, shape (..., samples), to spectra in the band, (..., K)."""
         return np.fft.rfft(values)[..., self.bins]
 
     def in_time(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Transform a spectrum in the band, shape (K,), to the retained samples."""
-        every = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
-        every[self.bins] = spectrum
-        return np.fft.irfft(every, self.samples)
+        """Transform a spectrum in the band, shape (K,), to the retained samples, (samples,)."""
+        full_spectrum = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
+        full_spectrum[self.bins] = spectrum
+        return np.fft.irfft(full_spectrum, self.samples)
 
     def coherent_rad(self) -> NDArray[np.float64]:
         """Return the part of the angle that is coherent with the reference, shape (m,).
 
-        This is the whole angle if there is no reference, or if the reference does not explain it.
+        The whole angle is returned if there is no reference, or if the reference does not explain
+        the angle.
         """
         if self.measurement.reference_rad is None:
             return self.angle_rad
-        followed = self._followed(self.angle_rad)
-        # By its speed: an angle that drifts follows no reference, and disturbs nothing.
-        own, apart = (
+        coherent_angle_rad = self._coherent_part(self.angle_rad)
+        # The speeds are compared, since a slow drift of the angle does not disturb the estimate.
+        angle_power, incoherent_power = (
             np.sum(np.diff(angle_rad[self.retained]) ** 2)
-            for angle_rad in (self.angle_rad, self.angle_rad - followed)
+            for angle_rad in (self.angle_rad, self.angle_rad - coherent_angle_rad)
         )
-        return followed if apart < _LARGEST_REST * own else self.angle_rad
+        return (
+            coherent_angle_rad
+            if incoherent_power < _MAX_INCOHERENT_FRACTION * angle_power
+            else self.angle_rad
+        )
 
-    def _followed(
-        self, moved_rad: NDArray[np.float64], torque_nm: NDArray[np.float64] | None = None
+    def _coherent_part(
+        self, angle_rad: NDArray[np.float64], torque_nm: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the part of an angle that follows the reference and, optionally, a torque."""
+        """Return the part of an angle that is coherent with the reference, shape (m,).
+
+        With a torque, the part of the angle that follows the torque is included.
+        """
         reference_rad = self.measurement.reference_rad
         assert reference_rad is not None
-        # Later samples fall to 0 with the filter's end, behind everything that is compared.
-        end = self._recorded
+        # The samples after the record are the filter's response to its end; none is compared.
+        end = self._recorded_samples
         reference_rad = self.decimation.apply(reference_rad - reference_rad[0])[:end]
-        followed = moved_rad.copy()
-        followed[:end] = following(
-            moved_rad[:end], reference_rad, self.decimation.rate_hz, torque_nm
+        coherent_rad = angle_rad.copy()
+        coherent_rad[:end] = reference_coherent_part(
+            angle_rad[:end], reference_rad, self.decimation.rate_hz, torque_nm
         )
-        return followed
+        return coherent_rad
 
     @property
-    def _recorded(self) -> int:
-        """Return the slice of decimated samples up to the end of the record."""
-        return int(self.decimation.inside(self.measurement.angle_rad.size).stop)
+    def _recorded_samples(self) -> int:
+        """Return the number of decimated samples up to the end of the record."""
+        return int(self.decimation.samples_inside_record(self.measurement.angle_rad.size).stop)
 
-    def following_reference(self, plant: Plant | ModalModel) -> Comparison:
+    def use_reference_coherent_angle(self, plant: Plant | ModalModel) -> Comparison:
         """Use the part of the angle coherent with the reference as input (instrumental variable).
 
-        The torque by the remaining part of the angle is removed.
+        The torque caused by the incoherent part of the angle is removed.
 
         Parameters
         ----------
@@ -303,216 +327,244 @@ class Comparison:
         Returns
         -------
         Comparison
-            `self` if all of the angle is coherent: see `coherent_rad`.
+            `self` if the whole angle is coherent: see `coherent_rad`.
         """
-        followed = self.coherent_rad()
-        if followed is self.angle_rad:
+        coherent_rad = self.coherent_rad()
+        if coherent_rad is self.angle_rad:
             return self
-        return self._split(self.angle_rad, followed, plant)
+        return self._use_coherent_part(self.angle_rad, coherent_rad, plant)
 
-    def _split(
+    def _use_coherent_part(
         self,
-        moved_rad: NDArray[np.float64],
-        followed: NDArray[np.float64],
+        angle_rad: NDArray[np.float64],
+        coherent_rad: NDArray[np.float64],
         plant: Plant | ModalModel,
     ) -> Comparison:
-        """Use a part of the angle as input, and remove the torque of a plant by the other part."""
+        """Use one part of the angle as input, and remove the torque caused by the other part."""
         return replace(
             self,
-            angle_rad=followed,
-            prediction=self.prediction.of_other(followed),
-            incoherent_rad=moved_rad - followed,
-        ).with_incoherent_part_of(plant)
+            angle_rad=coherent_rad,
+            prediction=self.prediction.of_other(coherent_rad),
+            incoherent_rad=angle_rad - coherent_rad,
+        ).recompute_incoherent_torque(plant)
 
-    def with_incoherent_part_of(self, plant: Plant | ModalModel) -> Comparison:
-        """Replace the removed torque of the incoherent angle by the prediction of a plant."""
+    def recompute_incoherent_torque(self, plant: Plant | ModalModel) -> Comparison:
+        """Recompute and remove the torque caused by the incoherent part of the angle.
+
+        `plant` predicts the torque. Return `self` if the whole angle is coherent with the
+        reference.
+        """
         if not isinstance(self.incoherent_rad, np.ndarray):
             return self
-        rest = self.prediction.of_other(self.incoherent_rad)
-        incoherent_nm = rest.torque(plant)[0]
-        at_unknown_nm = rest.torque_between(
+        incoherent_prediction = self.prediction.of_other(self.incoherent_rad)
+        incoherent_nm = incoherent_prediction.torque(plant)[0]
+        at_unknown_nm = incoherent_prediction.torque_at_fine_samples(
             plant, self.decimation.factor, self._decimated_indices(~self.measurement.torque_known)
         )[0]
         updated = replace(self, incoherent_nm=incoherent_nm, incoherent_at_unknown_nm=at_unknown_nm)
-        return updated._without(
+        return updated._remove_torque(
             incoherent_nm - self.incoherent_nm, at_unknown_nm - self.incoherent_at_unknown_nm
         )
 
     def renewed(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
-        """Re-estimate the part of the angle that follows the reference, with a better plant.
+        """Re-estimate the part of the angle coherent with the reference, with a better plant.
 
         Parameters
         ----------
         plant : Plant
             Plant fitted to this comparison.
-        noise : Noise
+        noise : NoiseSpectrum
+            Noise under which the plant was fitted.
 
         Returns
         -------
         Comparison
-            `self` if the new torque of the incoherent part would move no parameter by more than
-            a third of its standard deviation.
+            `self` if the new torque of the incoherent part would move no parameter by more than a
+            third of its standard deviation.
         """
-        other = self.with_incoherent_part_of(plant)
-        if other is self:
+        updated = self.recompute_incoherent_torque(plant)
+        if updated is self:
             return self
-        change = self.spectrum(other.incoherent_nm - np.asarray(self.incoherent_nm)) * noise.weight
-        if np.vdot(change, change).real <= _LARGEST_CHANGE:
+        change = (
+            self.spectrum(updated.incoherent_nm - np.asarray(self.incoherent_nm)) * noise.weight
+        )
+        if np.vdot(change, change).real <= _MAX_REMOVED_TORQUE_CHANGE:
             return self
-        moved_rad, followed = self.angle_rad + self.incoherent_rad, self.angle_rad
-        felt = TorquePredictor(followed, self.decimation.rate_hz, slice(0, self._recorded))
-        # What rings moves the motor, which makes it ring otherwise.
-        for _ in range(_FEEDBACKS):
-            followed = self._followed(moved_rad, felt.of_other(followed).torque(plant)[0])
-        return self._split(moved_rad, followed, plant)
+        whole_angle_rad, coherent_rad = self.angle_rad + self.incoherent_rad, self.angle_rad
+        coherent_prediction = TorquePredictor(
+            coherent_rad, self.decimation.rate_hz, slice(0, self._recorded_samples)
+        )
+        # The torque of a ringing beam moves the motor, and that motion changes the ringing.
+        for _ in range(_FEEDBACK_ITERATIONS):
+            coherent_rad = self._coherent_part(
+                whole_angle_rad, coherent_prediction.of_other(coherent_rad).torque(plant)[0]
+            )
+        return self._use_coherent_part(whole_angle_rad, coherent_rad, plant)
 
     @property
     def hum_nm(self) -> NDArray[np.float64] | float:
-        """Return the removed hum at the retained samples."""
-        return self._hum_at(np.arange(self.samples) / self.decimation.rate_hz)
+        """Return the removed hum in newton metres at the retained samples; 0 if there is none."""
+        return self._hum_torque_at(np.arange(self.samples) / self.decimation.rate_hz)
 
     def without_hum(self, hum: tuple[Hum, ...]) -> Comparison:
-        """Remove hum, and restore the hum that was removed before."""
-        other = replace(self, hum=hum)
+        """Return the comparison with only the given hum removed; restore hum removed before."""
+        with_new_hum = replace(self, hum=hum)
         ticks = self._decimated_indices(~self.measurement.torque_known)
         first_s = self.retained.start / self.decimation.rate_hz
         time_s = ticks / self.measurement.rate_hz - first_s
-        return other._without(
-            other.hum_nm - self.hum_nm, other._hum_at(time_s) - self._hum_at(time_s)
+        return with_new_hum._remove_torque(
+            with_new_hum.hum_nm - self.hum_nm,
+            with_new_hum._hum_torque_at(time_s) - self._hum_torque_at(time_s),
         )
 
-    def with_drag(self, plant: Plant, law: DragLaw) -> Comparison:
-        """Remove the torque by drag, and store its derivatives.
+    def remove_drag_torque(self, plant: Plant, law: DragLaw) -> Comparison:
+        """Compute the torque by drag, remove it, and store its derivatives.
 
         Parameters
         ----------
         plant : Plant
             Beam on which the drag acts.
         law : DragLaw
+            Drag coefficient as a function of the speed.
 
         Raises
         ------
         DragError
             The drag is too large for the time steps.
         """
-        # All that moves is braked, whether or not it followed a reference.
-        moved_rad = self.angle_rad + self.incoherent_rad
-        response = DragResponse(moved_rad, self.decimation.rate_hz, plant)
-        found = response.torque(law, range(1, self.visible_modes + 1))
+        # Drag acts on the whole motion, whether or not it followed a reference.
+        whole_angle_rad = self.angle_rad + self.incoherent_rad
+        response = DragResponse(whole_angle_rad, self.decimation.rate_hz, plant)
+        drag_torque = response.torque(law, range(1, self.visible_modes + 1))
 
         def band(values: NDArray[np.float64]) -> NDArray[np.complex128]:
             return self.spectrum(values[..., self.retained])
 
-        unknown = self._decimated_indices(~self.measurement.torque_known)
-        between = np.fft.irfft(
-            self.decimation.factor * np.fft.rfft(found.torque_nm),
-            self.decimation.factor * found.torque_nm.size,
+        unknown_indices = self._decimated_indices(~self.measurement.torque_known)
+        full_rate_nm = np.fft.irfft(
+            self.decimation.factor * np.fft.rfft(drag_torque.torque_nm),
+            self.decimation.factor * drag_torque.torque_nm.size,
         )
         return replace(
             self,
-            torque_nm=self.torque_nm - found.torque_nm,
-            removed_nm=self.removed_nm + found.torque_nm[self.retained],
-            removed_at_unknown_nm=self.removed_at_unknown_nm + between[unknown],
+            torque_nm=self.torque_nm - drag_torque.torque_nm,
+            removed_nm=self.removed_nm + drag_torque.torque_nm[self.retained],
+            removed_at_unknown_nm=self.removed_at_unknown_nm + full_rate_nm[unknown_indices],
             drag=DragExpansion(
                 plant=plant,
                 law=law,
                 response=response,
                 band=band,
-                by_pole={mode: band(rows) for mode, rows in found.by_pole.items()},
-                by_external=band(found.by_external),
-                by_ln_density=band(found.by_ln_density),
-                by_delay=band(found.by_delay),
-                by_law=band(found.by_law),
-                speed_m_s=found.speed_m_s,
-                top_speed_m_s=found.top_speed_m_s,
+                by_pole={mode: band(rows) for mode, rows in drag_torque.by_pole.items()},
+                by_external=band(drag_torque.by_external),
+                by_ln_density=band(drag_torque.by_ln_density),
+                by_delay=band(drag_torque.by_delay),
+                by_law=band(drag_torque.by_law),
+                speed_m_s=drag_torque.speed_m_s,
+                top_speed_m_s=drag_torque.top_speed_m_s,
             ),
         )
 
-    def _hum_at(self, time_s: NDArray[np.float64]) -> NDArray[np.float64] | float:
+    def _hum_torque_at(self, time_s: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        """Return the torque of the removed hum in N·m at times since the first compared sample."""
         return sum((hum.torque(time_s) for hum in self.hum), start=0.0)
 
-    def nuisance(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Return spectra of terms of unknown amplitude, shape (m, K).
+    def nuisance_spectra(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Return the spectra of disturbing torques with unknown amplitudes, shape (m, K).
 
-        These are the free decays from the beginning and from each long gap, hum, impacts, and last
-        a linear drift of the torque sensor's zero. Without it the jump from the end of the record
-        to its beginning would leak into all bins.
+        They are, in this order, the free decays from the beginning and from each long gap, hum,
+        impacts, and a linear drift of the torque sensor's zero. Without the drift, the step from
+        the end of the record to its beginning would leak into all bins.
         """
-        hum = self.decays.hum([hum.frequency_hz for hum in self.hum])
-        drift = _drift(self.samples)[None, self.bins]
+        hum_spectra = self.decays.hum([hum_spectra.frequency_hz for hum_spectra in self.hum])
+        drift = _drift_spectrum(self.samples)[None, self.bins]
         impact_spectra = drift[:0] if self.impact_spectra is None else self.impact_spectra
         decays = [each.columns(poles) for each in (self.decays, *self.later_decays)]
-        return np.concatenate([*decays, hum, impact_spectra, drift])
+        return np.concatenate([*decays, hum_spectra, impact_spectra, drift])
 
     def decay_gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        """Differentiate the free decays among ``amplitudes @ nuisance(poles)`` through the poles.
+        """Return the derivatives of the free decays with given amplitudes, through the poles.
+
+        Differentiates the free decays in ``amplitudes @ nuisance_spectra(poles)``.
 
         Parameters
         ----------
         poles : sequence of Pole
+            Poles with their derivatives by k parameters.
         amplitudes : ndarray, shape (m,)
+            Amplitudes of the spectra that `nuisance_spectra` returns.
 
         Returns
         -------
         ndarray of complex, shape (k, K)
         """
         total = self.decays.gradient(poles, amplitudes)
-        each = decay_columns(poles)
+        decay_amplitudes = decay_columns(poles)
         for number, later in enumerate(self.later_decays, start=1):
-            total += later.gradient(poles, amplitudes[number * each :])
+            total += later.gradient(poles, amplitudes[number * decay_amplitudes :])
         return total
 
-    def filled(self, plant: Plant | ModalModel) -> Comparison:
-        """Fill unknown torque with the prediction of `plant`, so that it adds no residual.
+    def fill_unknown_torque(self, plant: Plant | ModalModel) -> Comparison:
+        """Fill unknown torque with the prediction of a plant, so that its residual is 0.
 
-        After convergence the remaining squares have the same minimum as those of the known samples.
+        After convergence the cost has the same minimum as the cost of the known samples alone.
         """
-        known = self.measurement.torque_known
-        if known.all():
+        is_known = self.measurement.torque_known
+        if is_known.all():
             return self
         torque = self.measurement.torque_nm.copy()
-        torque[~known] = (
+        torque[~is_known] = (
             self.removed_at_unknown_nm
-            + self.prediction.torque_between(
-                plant, self.decimation.factor, self._decimated_indices(~known)
+            + self.prediction.torque_at_fine_samples(
+                plant, self.decimation.factor, self._decimated_indices(~is_known)
             )[0]
         )
         torque_nm = self.decimation.apply(torque)
         torque_nm[self.retained] -= self.removed_nm
         return replace(self, torque_nm=torque_nm)
 
-    def lost_gradient(self, plant: Plant, wrt: tuple[str, ...]) -> NDArray[np.complex128]:
-        """Return the contribution of the unknown torques to the gradient's spectra, (k, K).
+    def gradient_at_unknown_torque(
+        self, plant: Plant, wrt: tuple[str, ...]
+    ) -> NDArray[np.complex128]:
+        """Return the derivatives of the predicted torque at ticks without torque, (k, K).
+
+        They are spectra of a torque that is 0 at all other ticks.
 
         Parameters
         ----------
         plant : Plant
             Beam and rig.
         wrt : tuple of str
-            Names of the derivatives, k of them.
+            Names of the k parameters with respect to which the torque is differentiated.
         """
-        unknown = ~self.measurement.torque_known
-        lost = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
-        if unknown.any():
-            _, gradient = self.prediction.torque_between(
-                plant, self.decimation.factor, self._decimated_indices(unknown), wrt
+        is_unknown = ~self.measurement.torque_known
+        unknown_gradient = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
+        if is_unknown.any():
+            _, gradient = self.prediction.torque_at_fine_samples(
+                plant, self.decimation.factor, self._decimated_indices(is_unknown), wrt
             )
-            for row, values in zip(lost, gradient, strict=True):
-                only = np.zeros(unknown.size)
-                only[unknown] = values
-                row[:] = self.spectrum(self.decimation.apply(only)[self.retained])
-        return lost
+            for row, values in zip(unknown_gradient, gradient, strict=True):
+                unknown_nm = np.zeros(is_unknown.size)
+                unknown_nm[is_unknown] = values
+                row[:] = self.spectrum(self.decimation.apply(unknown_nm)[self.retained])
+        return unknown_gradient
 
-    def _decimated_indices(self, ticks: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Return the indices of ticks at full rate, counted from the first decimated sample."""
-        return np.flatnonzero(ticks) + self.decimation.reach * self.decimation.factor
+    def _decimated_indices(self, is_marked: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Return the full-rate indices of marked ticks, counted from the first decimated sample.
+
+        `is_marked` is a mask over the ticks of the record.
+        """
+        return np.flatnonzero(is_marked) + self.decimation.reach * self.decimation.factor
 
 
 @lru_cache(maxsize=2)
-def _drift(samples: int) -> NDArray[np.complex128]:
-    """Return the transform of a drift of 1 over all samples; it is cached and read-only."""
-    drift: NDArray[np.complex128] = np.fft.rfft(np.linspace(-0.5, 0.5, samples))
-    drift.flags.writeable = False
-    return drift
+def _drift_spectrum(samples: int) -> NDArray[np.complex128]:
+    """Return the spectrum of a linear drift from -0.5 to 0.5 over all samples.
+
+    The array is cached and read-only.
+    """
+    spectrum: NDArray[np.complex128] = np.fft.rfft(np.linspace(-0.5, 0.5, samples))
+    spectrum.flags.writeable = False
+    return spectrum

@@ -1,10 +1,10 @@
 """Measured angle and torque for the estimators: gaps interpolated, decimated to the band.
 
-A missing angle is interpolated, since the convolution with the response needs one at every tick; a
-missing torque is not compared. After a longer gap of the angle the beam may ring from the motor's
-motion in the gap. This ringing is estimated like the free decay at the beginning of a record.
-Decimation is by a linear-phase FIR filter (Kaiser window), so that the whole band is retained and
-neither channel is delayed against the other.
+A missing angle is interpolated, since the convolution with the response needs an angle at every
+tick. A missing torque is not compared. After a longer gap of the angle the beam may ring because
+the motor moved during the gap. This ringing is estimated like the free decay at the beginning of a
+record. Decimation is by a linear-phase FIR filter (Kaiser window), so that the whole band is
+retained and neither channel is delayed relative to the other.
 
 References
 ----------
@@ -36,115 +36,125 @@ if TYPE_CHECKING:
 
 # Measurement
 
-_SAME_INSTANT_S: Final = 1e-7
+_START_TOLERANCE_S: Final = 1e-7
+"""Tolerance in seconds for rounding: a sample by this much before an impact already belongs to its
+decay."""
 
 MAX_ANGLE_GAP_PERIODS: Final = 0.4
-"""Longest gap of the angle that is interpolated, in periods of the band's upper end."""
+"""Longest gap of the angle that is interpolated, in periods of the band's highest frequency."""
 
-MOST_LONG_GAPS: Final = 8
-"""Limit of longer gaps: after each of them every mode has an unknown amplitude and phase."""
+MAX_LONG_GAPS: Final = 8
+"""Maximum number of gaps of the angle that are too long to interpolate. Each adds an unknown
+amplitude and phase of every mode."""
 
-_FILTERS_FORGET: Final = 5.0
-"""Time constants after which a filter has forgotten what was before."""
+_FILTER_SETTLING_TIME_CONSTANTS: Final = 5.0
+"""Settling time of a filter of the torque channel, in multiples of its time constant."""
 
 MAX_TORQUE_GAP_S: Final = 1.0
-"""Longest gap of the torque: a longer one may swallow a resonance."""
+"""Longest tolerated gap of the torque: a longer gap may hide a whole resonance."""
 
 
 class MeasurementError(ValueError):
-    """A record that the whole-record estimator cannot use; the message says why and what to do."""
+    """Error for a record that the estimator cannot use; the message states reason and remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedImpact:
-    """Impact on the beam: any torque while it lasts, and free decays from its beginning.
+    """Impact on the beam during a record.
+
+    The torque is unknown while the contact lasts. The free decays of the modes start with the
+    contact.
 
     Attributes
     ----------
     first_s, last_s : float
-        Its first instant, and the first one after it, since the record's first tick.
+        Beginning and end of the contact, since the record's first tick.
     resolution_s : float
-        Uncertainty of the first instant.
+        Uncertainty of the beginning.
     poles_rad_s : tuple of complex
-        Poles of the ringing modes: the upper one of a conjugate pair, or a real one.
+        Poles of the ringing modes: the upper pole of a conjugate pair, or a real pole.
     sizes : tuple of float
-        Estimated size of each column (`columns`).
+        Estimated amplitude of each row of `columns`; empty before they are estimated.
     largest_nm : float
-        Largest torque within a second.
+        Largest torque within one second from the beginning.
     """
 
     first_s: float
     last_s: float
-    resolution_s: float
+    start_uncertainty_s: float
     poles_rad_s: tuple[complex, ...]
     sizes: tuple[float, ...] = ()
     largest_nm: float = 0.0
 
     def decays(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the decays of all modes, then the decays times the time since the impact.
+        """Return the free decays of all modes, and these times the time since the impact, (d, n).
+
+        The decays times the time represent small errors of the poles.
 
         Parameters
         ----------
         time_s : ndarray, shape (n,)
-            Since the record's first tick.
+            Times since the record's first tick.
         """
         since_s = time_s - self.first_s
-        later = since_s > -_SAME_INSTANT_S
-        since_s = np.where(later, since_s, 0.0)
+        has_begun = since_s > -_START_TOLERANCE_S
+        since_s = np.where(has_begun, since_s, 0.0)
         rows = []
         for pole in self.poles_rad_s:
-            decay = np.where(later, np.exp(pole * since_s), 0.0)
-            for part in (decay.real, decay.imag)[: 1 + (pole.imag != 0)]:
-                rows += [part, part * since_s]
+            decay = np.where(has_begun, np.exp(pole * since_s), 0.0)
+            for real_decay in (decay.real, decay.imag)[: 1 + (pole.imag != 0)]:
+                rows += [real_decay, real_decay * since_s]
         return np.array(rows).reshape(len(rows), time_s.size)
 
     def columns(self, time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
-        """Return the torque per unknown size: decays, then single samples of the contact.
+        """Return the torque of the impact per unit of each unknown amplitude.
+
+        The rows are the free decays, then the single samples during the contact.
 
         Parameters
         ----------
         time_s : ndarray, shape (n,)
-            Instants of samples, since the record's first tick.
+            Times of the samples, since the record's first tick.
         rate_hz : float
-            Their rate.
+            Sampling rate of these samples.
 
         Returns
         -------
         ndarray, shape (c, n)
         """
         half_s = 0.5 / rate_hz
-        touched = (time_s > self.first_s - half_s) & (time_s < self.last_s - half_s)
-        indices = np.flatnonzero(touched)
-        single = np.zeros((indices.size, time_s.size))
-        single[np.arange(indices.size), indices] = 1.0
-        return np.concatenate([self.decays(time_s), single])
+        in_contact = (time_s > self.first_s - half_s) & (time_s < self.last_s - half_s)
+        indices = np.flatnonzero(in_contact)
+        single_samples = np.zeros((indices.size, time_s.size))
+        single_samples[np.arange(indices.size), indices] = 1.0
+        return np.concatenate([self.decays(time_s), single_samples])
 
     def torque(
         self, time_s: NDArray[np.float64], grid_s: NDArray[np.float64], rate_hz: float
     ) -> NDArray[np.float64]:
-        """Return the estimated torque at some times, shape (n,).
+        """Return the estimated torque of the impact in N·m at given times, shape (n,).
 
         Parameters
         ----------
         time_s : ndarray, shape (n,)
-            Since the record's first tick.
+            Times since the record's first tick.
         grid_s : ndarray, shape (m,)
-            Instants of the samples to which `sizes` refers.
+            Times of the samples for which `sizes` was estimated.
         rate_hz : float
-            Their rate.
+            Sampling rate of these samples.
         """
         if not self.sizes:
             return np.zeros(time_s.size)
         decays = self.decays(time_s)
         sizes = np.array(self.sizes)
-        single = sizes[len(decays) :] @ self.columns(grid_s, rate_hz)[len(decays) :]
-        torque: NDArray[np.float64] = sizes[: len(decays)] @ decays
-        return torque + np.interp(time_s, grid_s, single)
+        contact_nm = sizes[len(decays) :] @ self.columns(grid_s, rate_hz)[len(decays) :]
+        decay_nm: NDArray[np.float64] = sizes[: len(decays)] @ decays
+        return decay_nm + np.interp(time_s, grid_s, contact_nm)
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """Angle and torque of one session, with the stated data of rig and specimen.
+    """Angle and torque of one session, with the stated properties of rig and specimen.
 
     Attributes
     ----------
@@ -155,33 +165,34 @@ class Measurement:
     rate_hz : float
         Ticks per second.
     beam : Beam
-        Beam in the file: the start of the search for density and stiffness.
+        Beam that the file states: start of the search for density and stiffness.
     angle_known, torque_known : ndarray of bool, shape (n,)
         False where a tick was missed or its value is flagged (held, saturated). Such a torque is
-        not compared; such an angle is bridged, since the convolution needs one.
+        not compared. Such an angle is interpolated, since the convolution needs one at every tick.
     rest_angle_rad : float or None
-        Angle at which the beam rested before the record, None if not known: then the first angle.
+        Angle at which the beam rested before the record; None if unknown, and the first angle is
+        used.
     delay_s : float
-        Age of the torque relative to the angle at one time stamp, as the file states it.
+        Age of the torque relative to the angle with the same time stamp, as the file states it.
     tool_inertia_kg_m2 : float
         Inertia between torque sensor and beam, as the file states it.
     filter_time_constant_s, second_order_filter_time_constant_s : float
-        Low-pass filter of the torque's channel, as the file states it: see `Plant`.
+        Low-pass filters of the torque channel, as the file states them: see `Plant`.
     reference_rad : ndarray, shape (n,), or None
-        Reference of the motor's controller, if there was one: the part of the angle that does
-        not follow it is attributed to the noise.
+        Reference of the motor's controller; None without a controller. The part of the angle that
+        does not follow the reference is attributed to the noise.
     knocks : tuple of RecordedImpact
-                    Known impacts on the beam. Their sizes stay free.
+        Known impacts on the beam. Their amplitudes are estimated in each fit.
     uniformity : float
         Relative standard deviation of each mode's frequency from that of a uniform beam.
     tip_mass_kg : float or None
-        Point mass at the beam's tip as the file states it, None if it is not known.
+        Point mass at the beam's tip as the file states it; None if it is not known.
     axis_tilt_deg : float or None
         Inclination of the plane of motion along the beam at rest as the file states it, positive
         where the tip is lower than the motor's axis; None if it was not measured.
     one_sweep : bool
-        Whether the motor passed each frequency once, in their order: changes with time and with
-        frequency are then not distinguishable.
+        Whether the motor passed each frequency once, in rising or falling order. An effect of time
+        then cannot be distinguished from an effect of frequency.
     """
 
     name: str
@@ -205,7 +216,7 @@ class Measurement:
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
-        """Return the measurement of a record that was read from a session file.
+        """Return the measurement in a record that was read from a session file.
 
         Raises
         ------
@@ -248,44 +259,44 @@ class Measurement:
             gap, or the angle never moves.
         """
         n = len(self.angle_rad)
-        for other in (self.torque_nm, self.angle_known, self.torque_known):
-            if len(other) != n:
+        for array in (self.torque_nm, self.angle_known, self.torque_known):
+            if len(array) != n:
                 raise MeasurementError(
-                    f"{self.name}: angle, torque and their masks hold {n} and {len(other)} values, "
+                    f"{self.name}: angle, torque and their masks hold {n} and {len(array)} values, "
                     "but must be of one length."
                 )
-        for channel, unit, values, known in (
+        for channel, unit, values, is_known in (
             ("angle", "rad", self.angle_rad, self.angle_known),
             ("torque", "N·m", self.torque_nm, self.torque_known),
         ):
-            bad = np.flatnonzero(known & ~np.isfinite(values))
+            bad = np.flatnonzero(is_known & ~np.isfinite(values))
             if bad.size:
                 raise MeasurementError(
                     f"{self.name}: the {channel} is {values[bad[0]]} {unit} at tick {bad[0]} and "
                     f"not finite at {bad.size} of {n} ticks; mask them as unknown or record the "
                     "session again."
                 )
-            much = too_much_unknown(f"the {channel}", int(np.count_nonzero(~known)), n)
-            if much:
-                raise MeasurementError(f"{self.name}: {much}")
-        for channel, known, allowed_s in (
+            complaint = too_much_unknown(f"the {channel}", int(np.count_nonzero(~is_known)), n)
+            if complaint:
+                raise MeasurementError(f"{self.name}: {complaint}")
+        for channel, is_known, allowed_s in (
             ("angle", self.angle_known, MAX_GAP_S),
             ("torque", self.torque_known, MAX_TORQUE_GAP_S),
         ):
-            run, start = longest_run(~known)
-            if run > allowed_s * self.rate_hz:
+            gap, start = longest_run(~is_known)
+            if gap > allowed_s * self.rate_hz:
                 raise MeasurementError(
-                    f"{self.name}: the {channel} is missing or flagged for {run} ticks from tick "
-                    f"{start} on ({1e3 * run / self.rate_hz:.3g} ms), longer than the "
+                    f"{self.name}: the {channel} is missing or flagged for {gap} ticks from tick "
+                    f"{start} on ({1e3 * gap / self.rate_hz:.3g} ms), longer than the "
                     f"{1e3 * allowed_s:.3g} ms that an analysis tolerates; record the session "
                     "again."
                 )
         gaps = len(self.long_gaps(highest_hz))
-        if gaps > MOST_LONG_GAPS:
+        if gaps > MAX_LONG_GAPS:
             raise MeasurementError(
                 f"{self.name}: the angle is missing or flagged {gaps} times for longer than the "
                 f"{1e3 * MAX_ANGLE_GAP_PERIODS / highest_hz:.3g} ms that a band up to "
-                f"{highest_hz:g} Hz interpolates, more often than the {MOST_LONG_GAPS} times that "
+                f"{highest_hz:g} Hz interpolates, more often than the {MAX_LONG_GAPS} times that "
                 "an analysis tolerates; record the session again or lower --band."
             )
         angles = self.angle_rad[self.angle_known]
@@ -298,12 +309,12 @@ class Measurement:
     def long_gaps(self, highest_hz: float) -> tuple[tuple[int, int], ...]:
         """Return the gaps of the angle that are too long to interpolate.
 
-        The beam may ring after them.
+        The beam may ring after such a gap.
 
         Parameters
         ----------
         highest_hz : float
-            End of the band.
+            Highest frequency of the band.
 
         Returns
         -------
@@ -311,32 +322,33 @@ class Measurement:
             First tick of each gap, and the first tick after it at which the filters of the torque
             channel have settled.
         """
-        longest = MAX_ANGLE_GAP_PERIODS / highest_hz * self.rate_hz
-        late_s = abs(self.delay_s) + _FILTERS_FORGET * (
+        longest_ticks = MAX_ANGLE_GAP_PERIODS / highest_hz * self.rate_hz
+        settling_s = abs(self.delay_s) + _FILTER_SETTLING_TIME_CONSTANTS * (
             self.filter_time_constant_s + self.second_order_filter_time_constant_s
         )
-        late = int(np.ceil(late_s * self.rate_hz))
+        settling_ticks = int(np.ceil(settling_s * self.rate_hz))
         return tuple(
-            (int(start), min(int(end) + late, len(self.angle_rad)))
-            for start, end in zip(*_runs(~self.angle_known), strict=True)
-            if end - start > longest
+            (int(start), min(int(end) + settling_ticks, len(self.angle_rad)))
+            for start, end in zip(*_runs_of_true(~self.angle_known), strict=True)
+            if end - start > longest_ticks
         )
 
     def without_torque_in(self, gaps: Iterable[tuple[int, int]]) -> Measurement:
-        """Mark the torque as unknown in gaps, each from a first tick to one after its last.
+        """Return the measurement with the torque marked as unknown in given gaps.
 
         Parameters
         ----------
         gaps : iterable of (int, int)
+            First tick of each gap, and the first tick after it.
         """
-        known = self.torque_known.copy()
+        is_known = self.torque_known.copy()
         for start, end in gaps:
-            known[start:end] = False
-        return replace(self, torque_known=known)
+            is_known[start:end] = False
+        return replace(self, torque_known=is_known)
 
     @property
     def nominal(self) -> Plant:
-        """Return rig and specimen as the file states them, without damping."""
+        """Return the plant with the properties that the file states, and without damping."""
         return Plant(
             beam=self.beam,
             damping=Damping(),
@@ -349,85 +361,107 @@ class Measurement:
 
     @property
     def known_torque_fraction(self) -> float:
-        """Return the fraction of the samples whose torque is known."""
+        """Return the fraction of the ticks at which the torque is known."""
         return float(np.mean(self.torque_known))
 
     def angle_from_rest(self, highest_hz: float) -> NDArray[np.float64]:
-        """Return the angle relative to rest, shape (n,), with unknown values interpolated."""
-        angle = bridged(self.angle_rad, self.angle_known, highest_hz / self.rate_hz)
+        """Return the motor angle relative to its rest position, with gaps interpolated, shape (n,).
+
+        `highest_hz` is the highest frequency that the angle contains.
+        """
+        angle = interpolate_gaps(self.angle_rad, self.angle_known, highest_hz / self.rate_hz)
         origin = angle[0] if self.rest_angle_rad is None else self.rest_angle_rad
         return angle - origin
 
 
 # Interpolation of gaps
 
-_REACH_PERIODS: Final = 2.0
-_MARGIN: Final = 1.2
-_NOISE_POWER: Final = 1e-6
+_NEIGHBOUR_REACH_PERIODS: Final = 2.0
+"""Duration to either side of a gap from which values are used to interpolate the gap, in periods of
+the highest frequency."""
+
+_BANDWIDTH_MARGIN: Final = 1.2
+"""Bandwidth of the signal that the interpolation of gaps assumes, over its highest frequency."""
+
+_RELATIVE_NOISE_POWER: Final = 1e-6
+"""Power of white noise that the interpolation of gaps assumes, relative to the power of the signal.
+"""
 
 
-def bridged(
+def interpolate_gaps(
     values: NDArray[np.float64], known: NDArray[np.bool_], highest: float
 ) -> NDArray[np.float64]:
     """Estimate the unknown values of a band-limited signal from their known neighbours.
 
-    The best linear estimate for a signal with a flat spectrum up to its highest frequency and a
-    little white noise (N. Wiener; here over two periods to either side). A gap of a quarter of a
-    period loses less than 1e-3 of the signal; a straight line would lose a third.
+    This is the best linear estimate for a signal with a flat spectrum up to its highest frequency
+    and a little white noise (N. Wiener; here over two periods to either side). In a gap of a
+    quarter of a period its error is less than 1e-3 of the signal; that of a straight line would be
+    a third.
 
     Parameters
     ----------
     values : ndarray, shape (n,)
-        Unknown values are ignored.
+        Signal; unknown values are ignored.
     known : ndarray of bool, shape (n,)
+        Whether each value is known.
     highest : float
         Highest frequency, in cycles per sample.
 
     Returns
     -------
     ndarray, shape (n,)
-        The values themselves where known.
+        The given values where known, the estimates elsewhere.
     """
     filled = np.where(known, values, 0.0)
-    reach = int(np.ceil(_REACH_PERIODS / highest))
-    for start, end in zip(*_runs(~known), strict=True):
-        first = max(start - reach, 0)
-        neighbours = first + np.flatnonzero(known[first : end + reach])
+    reach_samples = int(np.ceil(_NEIGHBOUR_REACH_PERIODS / highest))
+    for start, end in zip(*_runs_of_true(~known), strict=True):
+        first_neighbour = max(start - reach_samples, 0)
+        neighbours = first_neighbour + np.flatnonzero(known[first_neighbour : end + reach_samples])
         if neighbours.size == 0:
             continue
-        weights = _weights(tuple(neighbours - start), int(end - start), _MARGIN * highest)
-        level = float(values[neighbours].mean())
-        filled[start:end] = level + weights @ (values[neighbours] - level)
+        weights = _interpolation_weights(
+            tuple(neighbours - start), int(end - start), _BANDWIDTH_MARGIN * highest
+        )
+        mean_value = float(values[neighbours].mean())
+        filled[start:end] = mean_value + weights @ (values[neighbours] - mean_value)
     return filled
 
 
 @lru_cache(maxsize=64)
-def _weights(neighbours: tuple[int, ...], length: int, highest: float) -> NDArray[np.float64]:
-    """Return the weights of the neighbours in each of `length` values from index 0 on."""
+def _interpolation_weights(
+    neighbours: tuple[int, ...], length: int, highest: float
+) -> NDArray[np.float64]:
+    """Return the weights of known neighbours in the estimates for a gap, (length, neighbours).
+
+    `neighbours` are the indices of the known values relative to the start of the gap.
+    """
     indices = np.array(neighbours)
-    among = np.sinc(2 * highest * np.subtract.outer(indices, indices))
-    among += _NOISE_POWER * np.eye(indices.size)
-    across = np.sinc(2 * highest * np.subtract.outer(np.arange(length), indices))
-    weights: NDArray[np.float64] = np.linalg.solve(among, across.T).T
+    neighbour_covariance = np.sinc(2 * highest * np.subtract.outer(indices, indices))
+    neighbour_covariance += _RELATIVE_NOISE_POWER * np.eye(indices.size)
+    gap_covariance = np.sinc(2 * highest * np.subtract.outer(np.arange(length), indices))
+    weights: NDArray[np.float64] = np.linalg.solve(neighbour_covariance, gap_covariance.T).T
     return weights
 
 
-def _runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first indices of the runs of True, and the indices after their last."""
+def _runs_of_true(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the start index of each run of True in a mask, and the index after its end."""
     edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
 
 
 # Decimation
 
-_ATTENUATION_DB: Final = 100.0
-_RATE_OVER_BAND: Final = 2.4
-"""Least decimated rate per highest frequency: below 2.4 the filter becomes long."""
+_STOP_BAND_ATTENUATION_DB: Final = 100.0
+"""Attenuation of the decimation filter in its stop band, in decibels."""
+
+_MIN_RATE_OVER_BAND: Final = 2.4
+"""Minimum decimated sampling rate relative to the highest frequency: at lower rates the decimation
+filter becomes long."""
 
 
 @dataclass(frozen=True, slots=True)
 class Decimation:
-    """Linear-phase low-pass filter, centred, followed by downsampling.
+    """Centred linear-phase low-pass filter, followed by downsampling.
 
     It does not use `scipy.signal` (`kaiserord`, `firwin` and `oaconvolve`), whose import takes 0.64
     s of processor time: a tenth of the analysis of a session of 76 s.
@@ -437,11 +471,12 @@ class Decimation:
     factor : int
         One sample in `factor` is retained.
     kernel : ndarray, shape (2 reach factor + 1,)
-        The filter: passes `highest_hz`, and 100 dB less from half the new rate on.
+        Impulse response of the filter: it passes `highest_hz`, and attenuates by 100 dB from half
+        the new rate on.
     reach : int
         Half length of the filter, in samples of the new rate.
     rate_hz : float
-        The new rate.
+        Sampling rate after decimation.
     """
 
     factor: int
@@ -451,57 +486,61 @@ class Decimation:
 
     @classmethod
     def to_band(cls, rate_hz: float, highest_hz: float) -> Decimation:
-        """Return the decimation to the lowest rate that holds the band from 0 to `highest_hz`.
+        """Return the decimation to the lowest rate that preserves the band from 0 to `highest_hz`.
 
         Parameters
         ----------
         rate_hz : float
             Rate of the record.
         highest_hz : float
-            Highest frequency that is retained, at most 0.4 `rate_hz`.
+            Highest frequency that is preserved, at most 0.4 `rate_hz`.
         """
-        factor = max(int(rate_hz / (_RATE_OVER_BAND * highest_hz)), 1)
+        factor = max(int(rate_hz / (_MIN_RATE_OVER_BAND * highest_hz)), 1)
         new_rate_hz = rate_hz / factor
         stop_hz = new_rate_hz / 2
         # Kaiser's formulas for the length of the filter and the shape of its window.
         width = 2 * np.pi * (stop_hz - highest_hz) / rate_hz
-        half = (_ATTENUATION_DB - 7.95) / (2 * 2.285 * width)
-        reach = int(np.ceil(half / factor))
+        half_length = (_STOP_BAND_ATTENUATION_DB - 7.95) / (2 * 2.285 * width)
+        reach = int(np.ceil(half_length / factor))
         ticks = np.arange(-reach * factor, reach * factor + 1)
         cutoff = (stop_hz + highest_hz) / rate_hz  # twice the middle of the transition
         kernel = cutoff * np.sinc(cutoff * ticks)
-        kernel *= np.kaiser(ticks.size, 0.1102 * (_ATTENUATION_DB - 8.7))
+        kernel *= np.kaiser(ticks.size, 0.1102 * (_STOP_BAND_ATTENUATION_DB - 8.7))
         return cls(factor, kernel / kernel.sum(), reach, new_rate_hz)
 
     def apply(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Filter and downsample.
+        """Low-pass filter a signal and downsample it.
 
         Parameters
         ----------
         values : ndarray, shape (n,)
-            Taken as 0 before and after.
+            Signal at the original rate, assumed to be 0 before and after.
 
         Returns
         -------
         ndarray, shape (m,)
-            Sample `reach` is the one at the first value; so many precede it.
+            Filtered samples. Sample `reach` has the time of the first value.
         """
         length = values.size + self.kernel.size - 1
         padded = fast_length(length)
         spectrum = np.fft.rfft(values, padded) * np.fft.rfft(self.kernel, padded)
         return np.fft.irfft(spectrum, padded)[: length : self.factor].copy()
 
-    def inside(self, ticks: int) -> slice:
-        """Return the slice of samples of `apply` that depend on the record's `ticks` only."""
+    def samples_inside_record(self, ticks: int) -> slice:
+        """Return the slice of decimated samples that depend on samples of the record only.
+
+        `ticks` is the number of ticks of the record. The filter window of other samples extends
+        beyond the record.
+        """
         return slice(2 * self.reach, (ticks - 1) // self.factor + 1)
 
 
 def fast_length(at_least: int) -> int:
     """Return the least number not below `at_least` (1 or more) with prime factors up to 11.
 
-    A transform of real values is a fifth faster with factors up to 5 (``real=True``), which makes
-    no fit faster. The grid of the Laplace variable depends on the length (`TorquePredictor`), and
-    with it the last digits of every estimate.
+    Fourier transforms of such a length are fast. Transforms of real values are a fifth faster with
+    factors up to 5 (``real=True``), which makes no fit faster. The grid of the Laplace variable
+    depends on the length (`TorquePredictor`), and with it the last digits of every estimate.
 
     Examples
     --------
@@ -515,7 +554,10 @@ def fast_length(at_least: int) -> int:
 
 
 def fast_length_below(at_most: int) -> int:
-    """Return the largest number not above `at_most` (1 or more) with prime factors up to 11."""
+    """Return the largest number not above `at_most` (1 or more) with prime factors up to 11.
+
+    Fourier transforms of such a length are fast.
+    """
     from scipy.fft import prev_fast_len
 
     return int(prev_fast_len(at_most))

@@ -1,7 +1,7 @@
-"""Diagnostics of a record: effects other than the beam of Eq. 25, by name and size.
+"""Diagnostics of a record: effects other than the linear uniform beam, with kind and size.
 
-Settings at the edge of the search range or different from the file, disturbances of the torque,
-nonlinear forces, drag, a free decay at the start, and the unexplained residual.
+They are parameters at the limit of the search range or different from the file, disturbances of the
+torque, nonlinear forces, drag, a free decay at the start, and the unexplained residual.
 """
 
 from __future__ import annotations
@@ -9,9 +9,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._channel_checks import clipping, drift_of_zero, stops
+from analysis.identify._channel_checks import (
+    clipping_findings,
+    standstill_findings,
+    torque_zero_drift_nm,
+)
 from analysis.identify._finding import Finding
-from analysis.identify._leakage import repeats_after_s
+from analysis.identify._leakage import repetition_period_s
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.statistics import NORMAL_95, chi_square_deviate
 from rigd.units import interval_text, to_uncertainty
@@ -31,45 +35,53 @@ if TYPE_CHECKING:
 def findings(
     candidate_set: CandidateSet,
     forces: tuple[NonlinearForce, ...],
-    multiples: tuple[Harmonic, ...],
+    harmonics: tuple[Harmonic, ...],
 ) -> tuple[Finding, ...]:
-    """Return the findings; for a record with a wrong sign or unit, only those without a model.
+    """Return the effects found in a record, in addition to the linear beam.
+
+    If a sign or unit of the record is wrong, only findings that need no model are returned.
 
     Parameters
     ----------
     candidate_set : CandidateSet
+        Candidates for the record.
     forces : tuple of NonlinearForce
-        Significant forces.
-    multiples : tuple of Harmonic
+        Significant nonlinear forces.
+    harmonics : tuple of Harmonic
         Residual at multiples of the sweep's frequency.
     """
     measurement = candidate_set.comparison.measurement
-    seen = (*candidate_set.misread, *clipping(measurement), *stops(measurement))
-    if candidate_set.misread:
-        return seen
-    found = (
-        *seen,
-        *_hum(candidate_set),
-        *_air(candidate_set),
-        *map(_force, forces),
-        *_harmonics(multiples),
+    model_independent = (
+        *candidate_set.misread,
+        *clipping_findings(measurement),
+        *standstill_findings(measurement),
     )
-    return (*found, *at_edges(candidate_set))
+    if candidate_set.misread:
+        return model_independent
+    all_findings = (
+        *model_independent,
+        *_hum_findings(candidate_set),
+        *_drag_findings(candidate_set),
+        *map(_force_finding, forces),
+        *_harmonic_findings(harmonics),
+    )
+    return (*all_findings, *search_limit_findings(candidate_set))
 
 
-# Settings at an edge, or not as the file states them
+# Settings at the limit of the search range, or different from the file
 
-_DELAY_OFF_S: Final = 1e-4
-"""Smallest reported delay: backlash of a few tenths of a milliradian passes for a shorter one."""
+_MIN_REPORTED_DELAY_S: Final = 1e-4
+"""Smallest deviation of the torque delay from the file that is reported, in seconds. Backlash of a
+few tenths of a milliradian resembles a shorter delay."""
 
-_BEAM_OFF: Final = 0.003
-"""Deviation of stiffness or density, relative to the file, that is reported."""
+_MIN_REPORTED_BEAM_DEVIATION: Final = 0.003
+"""Smallest relative deviation of stiffness or density from the file that is reported."""
 
 
-def at_edges(candidate_set: CandidateSet) -> Iterator[Finding]:
-    """Yield settings at the edge of the search range, which no real rig reaches."""
+def search_limit_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
+    """Yield a finding for each fitted parameter at the limit of its search range."""
     fit = candidate_set.best.fit
-    for name, words, factor, unit in (
+    for name, quantity, factor, unit in (
         ("delay_s", "The delay between the channels", 1e3, "ms"),
         ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)", 1, "s²/m⁴"),
         ("bending_stiffness_n_m2", "The bending stiffness (EI)", 1, "N·m²"),
@@ -79,7 +91,7 @@ def at_edges(candidate_set: CandidateSet) -> Iterator[Finding]:
             yield Finding(
                 kind="implausible",
                 sentence=(
-                    f"{words} would have to be {factor * value:.4g} {unit} or beyond, which is "
+                    f"{quantity} would have to be {factor * value:.4g} {unit} or beyond, which is "
                     "the limit of the search range: the record contradicts its file. "
                     "No number here is valid for the antenna."
                 ),
@@ -93,36 +105,36 @@ def at_edges(candidate_set: CandidateSet) -> Iterator[Finding]:
 
 
 def of_settings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Yield delay, inertia, beam data and initial ringing that differ from the file.
+    """Yield findings of delay, inertia, beam data and initial ringing that differ from the file.
 
-    Parameters with a flag in `headline` are no finding.
+    A parameter with a flag in `headline` yields no finding.
     """
-    yield from _of_instruments(candidate_set, headline)
-    yield from _of_beam(candidate_set, headline)
-    yield from _of_start(candidate_set, headline)
+    yield from _instrument_findings(candidate_set, headline)
+    yield from _beam_findings(candidate_set, headline)
+    yield from _initial_ringing_findings(candidate_set, headline)
 
 
-def _difference(
+def _significant_deviation(
     candidate_set: CandidateSet, headline: Headline, name: Setting
 ) -> tuple[float, float, float] | None:
-    """Return the difference of a setting from the file, with the ends of its interval.
+    """Return the deviation of a setting from the file, with its 95 % interval.
 
-    Return None if chance explains the difference, or if the value carries a flag.
+    Return None if the deviation is not significant, or if the value carries a flag.
     """
-    quantity, stated = headline.parameters.get(name), _stated(candidate_set, name)
+    quantity, stated_value = headline.parameters.get(name), _stated_value(candidate_set, name)
     if quantity is None or quantity.flag or not quantity.std or quantity.interval_95 is None:
         return None
-    if abs(quantity.value - stated) < SIGNIFICANT_STD * quantity.std:
+    if abs(quantity.value - stated_value) < SIGNIFICANT_STD * quantity.std:
         return None
     low, high = quantity.interval_95
-    return quantity.value - stated, low - stated, high - stated
+    return quantity.value - stated_value, low - stated_value, high - stated_value
 
 
-def _of_instruments(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Yield a delay and an inertia that the file does not state."""
-    off = _difference(candidate_set, headline, "delay_s")
-    if off is not None and abs(off[0]) > _DELAY_OFF_S:
-        value, *interval = off
+def _instrument_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
+    """Yield findings of a delay and a tool inertia that differ from the file."""
+    deviation = _significant_deviation(candidate_set, headline, "delay_s")
+    if deviation is not None and abs(deviation[0]) > _MIN_REPORTED_DELAY_S:
+        value, *interval = deviation
         low, high = interval
         (size,) = to_uncertainty((abs(value),), (high - low) / 2, 1e3)
         delay_s = headline.parameters["delay_s"].value
@@ -139,8 +151,8 @@ def _of_instruments(candidate_set: CandidateSet, headline: Headline) -> Iterator
             remedy=f"Declare the delay between the channels as {1e3 * delay_s:.3f} ms.",
             parameters=("delay_s",),
         )
-    if off := _difference(candidate_set, headline, "tool_inertia_kg_m2"):
-        value, *interval = off
+    if deviation := _significant_deviation(candidate_set, headline, "tool_inertia_kg_m2"):
+        value, *interval = deviation
         low, high = interval
         (size,) = to_uncertainty((value,), (high - low) / 2, 1e6)
         yield Finding(
@@ -157,24 +169,24 @@ def _of_instruments(candidate_set: CandidateSet, headline: Headline) -> Iterator
         )
 
 
-def _of_beam(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Yield density and stiffness that differ from the file."""
-    beam: tuple[tuple[Setting, str], ...] = (
+def _beam_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
+    """Yield findings of density and stiffness that differ from the file."""
+    beam_parameters: tuple[tuple[Setting, str], ...] = (
         ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)"),
         ("bending_stiffness_n_m2", "The bending stiffness (EI)"),
     )
-    for name, words in beam:
-        stated = _stated(candidate_set, name)
-        off = _difference(candidate_set, headline, name)
-        if off is None or abs(off[0]) < _BEAM_OFF * stated:
+    for name, description in beam_parameters:
+        stated_value = _stated_value(candidate_set, name)
+        deviation = _significant_deviation(candidate_set, headline, name)
+        if deviation is None or abs(deviation[0]) < _MIN_REPORTED_BEAM_DEVIATION * stated_value:
             continue
-        relative, *interval = (part / stated for part in off)
+        relative, *interval = (each / stated_value for each in deviation)
         low, high = interval
         (size,) = to_uncertainty((abs(relative),), (high - low) / 2, 100)
         yield Finding(
             kind="beam data",
             sentence=(
-                f"{words} is {size} % {'higher' if relative > 0 else 'lower'} than the "
+                f"{description} is {size} % {'higher' if relative > 0 else 'lower'} than the "
                 f"file states ({interval_text(interval, 100, '+')} %; 95 %)"
                 f"{_equivalent_causes(candidate_set, name)}."
             ),
@@ -186,48 +198,57 @@ def _of_beam(candidate_set: CandidateSet, headline: Headline) -> Iterator[Findin
 
 
 def _equivalent_causes(candidate_set: CandidateSet, name: Setting) -> str:
-    """Return the end of the sentence that names other causes with the same effect on the torque."""
+    """Return the end of a sentence that names other causes of a deviating density or stiffness.
+
+    Return an empty string if there are none.
+    """
     if name == "bending_stiffness_n_m2":
         return ", or the torque's gain is"
     fit, beam = candidate_set.best.fit, candidate_set.comparison.measurement.beam
-    relative = math.log(fit.plant.beam.density_over_stiffness / beam.density_over_stiffness) / 4
+    tip_mass_effect = (
+        math.log(fit.plant.beam.density_over_stiffness / beam.density_over_stiffness) / 4
+    )
     stiffness = fit.plant.beam.bending_stiffness_n_m2
     std = fit.std["bending_stiffness_n_m2"] or 0.0
-    # A small mass at the tip moves all modes alike, and the torque by a quarter of that.
-    missing = math.log(stiffness / beam.bending_stiffness_n_m2) + relative
-    if fit.plant.tip_mass_kg or relative <= 0 or abs(missing) > SIGNIFICANT_STD * std / stiffness:
+    # A small mass at the tip shifts all modes alike, and the torque by a quarter of that shift.
+    unexplained_change = math.log(stiffness / beam.bending_stiffness_n_m2) + tip_mass_effect
+    if (
+        fit.plant.tip_mass_kg
+        or tip_mass_effect <= 0
+        or abs(unexplained_change) > SIGNIFICANT_STD * std / stiffness
+    ):
         return ""
-    mass_g = 1e3 * relative * beam.density_kg_per_m * beam.length_m
+    mass_g = 1e3 * tip_mass_effect * beam.density_kg_per_m * beam.length_m
     return f", or the beam carries {mass_g:.2g} g at its tip"
 
 
-def _of_start(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Yield a finding if the modal model shows that the beam rang at the beginning."""
+def _initial_ringing_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
+    """Yield a finding if the modal model shows that the beam was ringing when the record began."""
     ringing = None if headline.modal is None else headline.modal.ringing
     if ringing is None or not ringing.degrees_of_freedom:
         return
-    loudest = max(ringing.amplitude_nm)
+    largest_nm = max(ringing.amplitude_nm)
     # A hum begins and ends with the record, and so resembles a decay.
-    hum = max((line.amplitude_nm for line in candidate_set.noise.lines), default=0.0)
+    hum_nm = max((line.amplitude_nm for line in candidate_set.noise.lines), default=0.0)
     if (
-        loudest <= hum
+        largest_nm <= hum_nm
         or chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) < SIGNIFICANT_STD
     ):
         return
     yield Finding(
         kind="ringing start",
         sentence=(
-            f"The beam was ringing when the record began ({1e3 * loudest:.3g} mN·m); its free "
+            f"The beam was ringing when the record began ({1e3 * largest_nm:.3g} mN·m); its free "
             "decay was fitted and biases nothing."
         ),
-        value=loudest,
+        value=largest_nm,
         unit="N·m",
         remedy="Wait longer at rest before the sweep.",
     )
 
 
-def _stated(candidate_set: CandidateSet, name: Setting) -> float:
-    """Return the value of a setting in the file."""
+def _stated_value(candidate_set: CandidateSet, name: Setting) -> float:
+    """Return the value that the file states for a setting."""
     measurement = candidate_set.comparison.measurement
     return {
         "density_over_stiffness": measurement.beam.density_over_stiffness,
@@ -239,39 +260,49 @@ def _stated(candidate_set: CandidateSet, name: Setting) -> float:
 
 # Disturbances, forces, and what remains
 
-_MAINS_WANDER: Final = 0.005
+_MAINS_FREQUENCY_TOLERANCE: Final = 0.005
+"""Largest relative difference between a multiple of the mains frequency and a hum that is
+attributed to the mains."""
 
-_SLOW_HZ: Final = 0.5
-_FEWEST_PERIODS: Final = 5.0
-"""In the record: what is slower is not a hum but a sensor that drifts."""
+_SENSOR_DRIFT_LIMIT_HZ: Final = 0.5
+"""Frequency below which a loud residual is attributed to a drift of the torque sensor."""
 
-_SAME_TURN: Final = 0.5
-"""Phase over the whole record, in turns, within which a line's frequency is a harmonic's."""
+_MIN_HUM_PERIODS: Final = 5.0
+"""Minimum number of periods of a hum within the record. A slower disturbance is attributed to a
+drift of the sensor."""
+
+_HARMONIC_PHASE_TOLERANCE_TURNS: Final = 0.5
+"""Largest phase difference over the whole record, in turns, between a line and a harmonic of the
+excitation."""
 
 
 def mains(frequency_hz: float) -> str:
-    """Return the name of the mains if it may be the source, else an empty string."""
-    for base in (50, 60):
+    """Return "the mains" or a multiple of the mains frequency if a frequency is near it, else "".
+
+    The text describes the possible source of a disturbance with this frequency.
+    """
+    for mains_hz in (50, 60):
         for n in range(1, 9):
-            if abs(frequency_hz - n * base) < _MAINS_WANDER * n * base:
+            if abs(frequency_hz - n * mains_hz) < _MAINS_FREQUENCY_TOLERANCE * n * mains_hz:
                 return "the mains" if n == 1 else f"{n} times the mains frequency"
     return ""
 
 
 def unexplained(
-    white: Whiteness,
-    related: InputRelation,
+    whiteness: Whiteness,
+    input_dependence: InputRelation,
     modes: tuple[ModeEstimate, ...],
     step: Step | None = None,
 ) -> Finding:
-    """Return the finding that describes the unexplained residual.
+    """Return the finding that describes the unexplained residual of a record.
 
-    `step` is the step of the stiffness that explains more of it than any effect of the amplitude.
+    `step` is a step of the stiffness during the record, if it explains more of the residual than
+    any effect of the amplitude.
     """
-    low, high = white.loudest_hz
+    low, high = whiteness.loudest_hz
     at_mode = [mode.number for mode in modes if low <= mode.frequency_hz <= high]
     if step is not None:
-        what = (
+        description = (
             f"The modes do not fit together. The likeliest cause is {step.words}, but one sweep "
             "does not tell a change in time from one with the frequency."
         )
@@ -279,36 +310,40 @@ def unexplained(
             "Fasten clamp and motor mount, and sweep again in both directions "
             "(rigd run chirp --there-and-back)."
         )
-    elif related.related:
-        where = f"near {related.at_hz:.1f} Hz" if related.local else "all through the band"
-        what = (
-            f"Unmodelled linear dynamics {where}: part of the torque is a linear response to "
+    elif input_dependence.related:
+        location = (
+            f"near {input_dependence.at_hz:.1f} Hz"
+            if input_dependence.local
+            else "all through the band"
+        )
+        description = (
+            f"Unmodelled linear dynamics {location}: part of the torque is a linear response to "
             "the motor angle that no nearly uniform beam has."
         )
         remedy = (
             "Fasten clamp, motor mount and sensor cable, and sweep again; then sweep without the "
             "beam: what remains belongs to the rig."
         )
-    elif white.loud and at_mode:
-        what = (
-            f"The residual is {white.loudest_ratio:.1f} times the noise at mode {at_mode[0]} "
+    elif whiteness.loud and at_mode:
+        description = (
+            f"The residual is {whiteness.loudest_ratio:.1f} times the noise at mode {at_mode[0]} "
             f"({low:.2f} to {high:.2f} Hz): encoder quantisation amplified by the resonance, or an "
             "unmodelled effect in that mode."
         )
         remedy = "Sweep again at twice the amplitude, which halves the effect of quantisation."
-    elif white.loud and high < _SLOW_HZ:
-        what = (
-            f"The residual below {high:.2f} Hz is {white.loudest_ratio:.1f} times the noise and "
-            "does not follow the motor: zero drift of the torque sensor."
+    elif whiteness.loud and high < _SENSOR_DRIFT_LIMIT_HZ:
+        description = (
+            f"The residual below {high:.2f} Hz is {whiteness.loudest_ratio:.1f} times the noise "
+            "and does not follow the motor: zero drift of the torque sensor."
         )
         remedy = ""
     else:
-        near = mains((low + high) / 2)
-        what = (
-            f"The residual is {white.loudest_ratio:.1f} times the noise from {low:.2f} to "
+        mains_words = mains((low + high) / 2)
+        description = (
+            f"The residual is {whiteness.loudest_ratio:.1f} times the noise from {low:.2f} to "
             f"{high:.2f} Hz and does not follow the motor: a disturbance"
-            f"{', such as intermittent mains interference' if near else ''}."
-            if white.loud
+            f"{', such as intermittent mains interference' if mains_words else ''}."
+            if whiteness.loud
             else "The residual is not white (most power from "
             f"{low:.2f} to {high:.2f} Hz) and does not follow the motor."
         )
@@ -318,26 +353,30 @@ def unexplained(
         )
     return Finding(
         kind="unexplained",
-        sentence=f"{what} Until this is explained, do not rely on intervals and orders.",
-        value=white.loudest_ratio,
+        sentence=f"{description} Until this is explained, do not rely on intervals and orders.",
+        value=whiteness.loudest_ratio,
         remedy=remedy,
     )
 
 
-def _hum(candidate_set: CandidateSet) -> Iterator[Finding]:
+def _hum_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
+    """Yield findings of torque-sensor drift and of narrow-band disturbances of the torque."""
     comparison = candidate_set.comparison
     duration_s = comparison.samples / comparison.decimation.rate_hz
-    drift_nm = drift_of_zero(candidate_set)
+    drift_nm = torque_zero_drift_nm(candidate_set)
     if drift_nm > 0:
-        yield _drift(drift_nm)
-    period_s = repeats_after_s(comparison)
+        yield _drift_finding(drift_nm)
+    period_s = repetition_period_s(comparison)
     for line in candidate_set.noise.lines:
-        if line.frequency_hz * duration_s < _FEWEST_PERIODS:
+        if line.frequency_hz * duration_s < _MIN_HUM_PERIODS:
             continue
-        near = mains(line.frequency_hz)
-        source = f", {near}" if near else ""
+        mains_words = mains(line.frequency_hz)
+        source = f", {mains_words}" if mains_words else ""
         turns = line.frequency_hz * period_s
-        with_drive = period_s > 0 and abs(turns - round(turns)) < _SAME_TURN * period_s / duration_s
+        is_harmonic = (
+            period_s > 0
+            and abs(turns - round(turns)) < _HARMONIC_PHASE_TOLERANCE_TURNS * period_s / duration_s
+        )
         yield Finding(
             kind="hum",
             sentence=(
@@ -346,7 +385,7 @@ def _hum(candidate_set: CandidateSet) -> Iterator[Finding]:
                 + (
                     f"The excitation repeats every {period_s:.4g} s, and so does this line: it may "
                     "be a harmonic due to a nonlinearity. It was left out of the fit."
-                    if with_drive
+                    if is_harmonic
                     else "The motor did not cause it; it was removed."
                 )
             ),
@@ -354,13 +393,14 @@ def _hum(candidate_set: CandidateSet) -> Iterator[Finding]:
             unit="N·m",
             remedy=(
                 "Repeat with half the amplitude: a line that shrinks is caused by the motor."
-                if with_drive
+                if is_harmonic
                 else "Check shield and earth of the torque sensor's cable."
             ),
         )
 
 
-def _drift(size_nm: float) -> Finding:
+def _drift_finding(size_nm: float) -> Finding:
+    """Return the finding of a zero drift of the torque sensor by `size_nm` newton metres."""
     return Finding(
         kind="sensor drift",
         sentence=(
@@ -372,7 +412,8 @@ def _drift(size_nm: float) -> Finding:
     )
 
 
-def _air(candidate_set: CandidateSet) -> Iterator[Finding]:
+def _drag_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
+    """Yield the finding of air drag, if the candidates include drag."""
     drag = candidate_set.drag
     if drag is None:
         return
@@ -394,7 +435,8 @@ def _air(candidate_set: CandidateSet) -> Iterator[Finding]:
     )
 
 
-def _force(force: NonlinearForce) -> Finding:
+def _force_finding(force: NonlinearForce) -> Finding:
+    """Return the finding of a nonlinear restoring force or of quadratic damping."""
     size, std, mode = force.size, force.std, force.term.mode
     percent = f"{100 * abs(size):.2g} % (± {100 * NORMAL_95 * std:.1g} %)"
     if force.term.kind == "quadratic drag":
@@ -423,8 +465,9 @@ def _force(force: NonlinearForce) -> Finding:
     )
 
 
-def _harmonics(multiples: tuple[Harmonic, ...]) -> Iterator[Finding]:
-    for harmonic in multiples:
+def _harmonic_findings(harmonics: tuple[Harmonic, ...]) -> Iterator[Finding]:
+    """Yield a finding for each multiple of the sweep frequency that is present in the residual."""
+    for harmonic in harmonics:
         if harmonic.present:
             parity = "odd" if harmonic.multiple % 2 else "even"
             yield Finding(

@@ -1,17 +1,17 @@
-"""Air drag on the beam: whether it is there, how large C_D d is, and the damping by amplitude.
+"""Air drag on the beam: whether it is significant, its size C_D d, and the damping by amplitude.
 
-Drag along the whole beam is one number, or two where the coefficient falls with the speed. Without
-it a fit finds a fractional order, a delay, deviating mode frequencies and another density
-instead: drag damps each mode in proportion to its speed.
+Drag along the whole beam is described by one number, or by two where the coefficient falls with the
+speed. A fit without drag yields a fractional order, a delay, deviating mode frequencies and a wrong
+density instead, because drag damps each mode in proportion to its speed.
 
-In free vibration of one mode, the tip moving by ``A sin(omega t)``, a force per metre
-``rho_air/2 C v^p`` takes from each cycle as much as linear damping of the ratio::
+In free vibration of one mode, with the tip moving by ``A sin(omega t)``, a force per metre
+``rho_air/2 C v^p`` dissipates in each cycle as much energy as linear damping of the ratio::
 
     rho_air/2 C (A omega)^(p - 1) m_p kappa_p / (2 rho omega)
 
-rho being the mass per length, ``m_p`` the mean of ``2 |sin|^(p + 1)`` and ``kappa_p`` that of
-``|psi|^(p + 1)`` over that of ``psi²`` along the beam, psi being the mode with 1 at the tip. This
-adds to the ratio of the beam without air.
+Here rho is the mass per length, ``m_p`` the mean of ``2 |sin|^(p + 1)``, ``kappa_p`` the mean of
+``|psi|^(p + 1)`` over that of ``psi²`` along the beam, and psi the mode shape with 1 at the tip.
+This ratio adds to the damping ratio of the beam without air.
 """
 
 from __future__ import annotations
@@ -42,79 +42,98 @@ if TYPE_CHECKING:
 
 # Search for drag
 
-_SCORED: Final = ("III", "VI", "VII")
-"""Structures with which drag is tested: those that have either damping."""
+_TESTED_STRUCTURES: Final = ("III", "VI", "VII")
+"""Names of the structures with which drag is tested: those with internal and external damping."""
 
-_EVIDENT: Final = 100.0
-_ALL_BUT_NOISE: Final = 0.8
-"""Squares, and fraction of the unexplained squares, by which a small drag reduces the cost where it
-is evident. In records with other defects of a rig (`benchmarks/wrong_models.py`) the column
-removes less than a third, or its size is negative. With drag it removes more than all, since a
-part of the residual by drag counts as noise."""
+_MIN_EVIDENT_COST_REDUCTION: Final = 100.0
+"""Minimum reduction of the cost by a small drag for which drag is evident."""
 
-_PROMISE: Final = 6.0
-"""Error of the deviance reduction that the first order predicts."""
+_MIN_EVIDENT_FRACTION: Final = 0.8
+"""Minimum fraction of the cost beyond noise that a small drag removes if drag is evident.
 
-_ROUNDS: Final = 15
-_FEW: Final = 12
-"""Evaluations of a descent before the drag is recomputed."""
+In records with other defects of a rig (`benchmarks/wrong_models.py`) a small drag removes less than
+a third, or its amplitude is negative. In records with drag it removes more than the whole cost
+beyond noise, since a part of the residual due to drag counts as noise."""
+
+_FIRST_ORDER_BIC_MARGIN: Final = 6.0
+"""Amount by which the predicted BIC with drag may exceed the lowest BIC for drag to be fitted. The
+prediction is of first order, and has an error."""
+
+_MAX_DRAG_COMPUTATIONS: Final = 15
+"""Maximum number of computations of the drag torque in a fit."""
+
+_SHORT_DESCENT_EVALUATIONS: Final = 12
+"""Maximum number of evaluations of a descent before the drag torque is recomputed."""
 
 _EARLY_EVALUATIONS: Final = 4
-"""Evaluations that show whether a structure is hopeless."""
+"""Number of evaluations after which the descent of a structure with drag ends if its cost is still
+far above that of the best structure."""
 
-_MANY: Final = 40
-_HOPELESS: Final = 50.0
-"""Deviance above the structure with drag from which the descent of another ends early."""
+_LONG_DESCENT_EVALUATIONS: Final = 40
+"""Maximum number of evaluations of a descent that continues a promising short descent."""
 
-_CONVERGED: Final = 2.0
-_ROUGHLY: Final = 500.0
-"""Predicted reduction of squares below which the drag is not recomputed: the step itself is taken,
-by all fits at this drag (`_fit_all`).
+_GIVE_UP_DEVIANCE: Final = 50.0
+"""Deviance, relative to that of the converged structure, above which the descent of another
+structure with drag ends early."""
 
-The two numbers of a law and external damping can compensate each other along a flat direction.
-There each recomputation predicted a step of half a standard deviation in the same direction, for
-ten rounds and more: away from the true value, at a second a round.
-"""
+_COST_TOLERANCE: Final = 2.0
+"""Predicted reduction of the cost below which the drag torque is not recomputed."""
 
-_IN_VAIN: Final = 20.0
-"""Reduction of squares with which a step may be the last, if the step before reduced them by no
-more than twice as much. Where external damping has vanished, or is an inertia, each step along its
-order predicts a reduction that the recomputed drag does not confirm.
-"""
+_ROUGH_COST_TOLERANCE: Final = 500.0
+"""Predicted reduction of the cost below which the drag torque is not recomputed in the first, rough
+fit.
 
-_LEAD: Final = "III"
-_FREEST: Final = "VI"
+The last step is still taken by all fits at this drag (`_fit_all_structures`). The two numbers of a
+law and external damping can compensate each other along a flat direction. There each recomputation
+predicted a step of half a standard deviation in the same direction, for ten rounds and more: away
+from the true value, at a second a round."""
 
-_ONE_NUMBER: Final = 0.1
-"""Relative deviation of the drag above which one number has to do.
+_STAGNATION_COST_REDUCTION: Final = 20.0
+"""Predicted reduction of the cost below which a fit with drag may end if it stagnates: if the step
+before reduced the cost by no more than twice as much.
 
-A cylinder's coefficient falls with the speed. Taken for constant it is up to 7 % off on rods and
-wires between 0.2 and 2 mm, and makes up for the rest with external damping: what is known better
-has two numbers, whether or not the second differs from nought, or its interval would be too narrow.
-"""
+Where external damping has vanished or acts as an inertia, each step along its order predicts a
+reduction that the recomputed drag does not confirm."""
 
-_SLOWEST: Final = 0.02
-"""Lowest speed with any information, relative to the highest."""
+_FIRST_STRUCTURE: Final = "III"
+"""Structure of the first fit with drag: both dampings with order 1."""
+
+_FREEST_STRUCTURE: Final = "VI"
+"""Structure with both dampings and free orders."""
+
+_ONE_NUMBER_LAW_STD: Final = 0.1
+"""Relative standard deviation of the drag coefficient above which the drag law has one number.
+
+The drag coefficient of a cylinder falls with the speed. A constant coefficient is wrong by up to 7
+% on rods and wires between 0.2 and 2 mm, and external damping compensates for the rest. A more
+certain coefficient gets a second number, whether or not that differs from 0, since its interval
+would be too narrow otherwise."""
+
+_LOWEST_RELATIVE_SPEED: Final = 0.02
+"""Lowest speed at which C_D d is reported, relative to the highest speed: below it the record
+contains no information."""
 
 
 @dataclass(frozen=True, slots=True)
 class DragEstimate:
-    """Estimate of the air drag.
+    """Estimate of the air drag on the beam.
 
     Attributes
     ----------
     value_m : float
-        C_D d at `speed_m_s`; the density of the air is assumed to be 1.2 kg/m³.
+        Drag coefficient times diameter, C_D d, at `speed_m_s`, for an assumed density of the air of
+        1.2 kg/m³.
     std_m : float
+        Standard deviation of `value_m`.
     interval_95_m : tuple of float
-        Not below 0.
+        95 % interval of `value_m`, not below 0.
     speed_m_s : float
-        The speed at which it is known best; if the record determines only a mean, the speed with
-        the largest weight.
+        Speed at which C_D d has the smallest uncertainty; if only a mean is determined, the speed
+        with the largest weight in it.
     law : DragLaw
-        For all speeds.
+        C_D d at all speeds.
     covariance : tuple of tuple of float
-        Covariance of the law's numbers that were free: of the first, or of both.
+        Covariance of the estimated numbers of the law: of the first, or of both.
     """
 
     value_m: float
@@ -125,182 +144,226 @@ class DragEstimate:
     covariance: tuple[tuple[float, ...], ...]
 
 
-def with_evident_drag(uniform: CandidateSet) -> CandidateSet:
-    """Refit with air drag if it is evident before any other explanation has been tested.
+def with_evident_drag(candidate_set: CandidateSet) -> CandidateSet:
+    """Refit with air drag if drag is evident before any other explanation has been tested.
 
-    To first order it explains the whole residual of a uniform beam, which no other defect of a rig
-    does. With drag only noise remains.
+    Drag is evident if, to first order, it explains the whole residual of a uniform beam, and only
+    noise remains after the refit. No other defect of a rig has this effect.
 
     Parameters
     ----------
-    uniform : CandidateSet
-        Without drag, on a uniform beam only.
+    candidate_set : CandidateSet
+        Candidates without drag, on a uniform beam.
 
     Returns
     -------
     CandidateSet
-        The one given, unless drag is evident; else with `drag` in all candidates.
+        `candidate_set` unless drag is evident; else the candidates with drag.
     """
-    if uniform.misread or not _is_evident(uniform):
-        return uniform
-    found = _with_drag(uniform)
-    return found if found.drag is not None and found.all_but_white(found.likeliest) else uniform
+    if candidate_set.misread or not _drag_is_evident(candidate_set):
+        return candidate_set
+    refitted = _refit_with_drag(candidate_set)
+    return (
+        refitted
+        if refitted.drag is not None and refitted.all_but_white(refitted.likeliest)
+        else candidate_set
+    )
 
 
-def _is_evident(uniform: CandidateSet) -> bool:
-    """Return whether a small drag with the freest structure would explain its residual."""
-    freest = next(c for c in uniform.candidates if c.structure.name == _FREEST)
-    refit = uniform.refit(freest, 1)
-    size, saved = _first_amplitude(refit)
-    return size > 0 and saved > max(_EVIDENT, _ALL_BUT_NOISE * (refit.cost - refit.expected_cost))
+def _drag_is_evident(candidate_set: CandidateSet) -> bool:
+    """Return whether a small drag would explain the residual of the freest structure."""
+    freest_candidate = next(
+        c for c in candidate_set.candidates if c.structure.name == _FREEST_STRUCTURE
+    )
+    refit = candidate_set.refit(freest_candidate, 1)
+    size, cost_reduction = _first_order_drag(refit)
+    return size > 0 and cost_reduction > max(
+        _MIN_EVIDENT_COST_REDUCTION, _MIN_EVIDENT_FRACTION * (refit.cost - refit.expected_cost)
+    )
 
 
 def with_air_drag(candidate_set: CandidateSet) -> CandidateSet:
     """Refit all candidates with air drag, if that explains the record better.
 
-    To first order a column of known shape predicts by how much drag reduces the cost of each of a
-    few structures. Drag is fitted only if one of them could then be the best of all.
+    To first order, the spectrum of a small drag predicts by how much drag reduces the cost of each
+    of a few structures. Drag is fitted only if one of them could then become the best candidate.
 
     Parameters
     ----------
     candidate_set : CandidateSet
-        Without drag.
+        Candidates without drag.
 
     Returns
     -------
     CandidateSet
-        The one given, if there is no drag; else with `drag`, the lowest BIC first.
+        `candidate_set` if drag does not improve it; else the candidates with drag, by rising BIC.
     """
-    return _with_drag(candidate_set) if _promising(candidate_set) else candidate_set
+    return (
+        _refit_with_drag(candidate_set) if _drag_may_improve_fit(candidate_set) else candidate_set
+    )
 
 
-def _with_drag(candidate_set: CandidateSet) -> CandidateSet:
-    """Fit all structures with drag; return the given set if that is no better."""
-    lead = next((c for c in candidate_set.candidates if c.structure.name == _LEAD), None)
-    start = None if lead is None else _start(candidate_set, lead)
-    if start is None:
+def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
+    """Fit all structures with drag; return the given candidate set unless drag lowers the BIC."""
+    lead_candidate = next(
+        (c for c in candidate_set.candidates if c.structure.name == _FIRST_STRUCTURE), None
+    )
+    first_start = (
+        None if lead_candidate is None else _first_order_start(candidate_set, lead_candidate)
+    )
+    if first_start is None:
         return candidate_set
-    converged = _converged(candidate_set, start, STRUCTURES[_LEAD], tolerance=_ROUGHLY)
-    if converged is None:
+    drag_fit = _converged_drag_fit(
+        candidate_set, first_start, STRUCTURES[_FIRST_STRUCTURE], tolerance=_ROUGH_COST_TOLERANCE
+    )
+    if drag_fit is None:
         return candidate_set
-    # Thence to the freest damping; without drag its fit may be that of no beam at all.
-    known, point = converged.objective.comparison, _DragPoint.of(converged)
-    for name in (_FREEST, _LEAD):
-        converged = _converged(candidate_set, point, STRUCTURES[name], known=known)
-        if converged is not None:
+    # The freest structure starts from this fit: its fit without drag may be far off.
+    start_comparison, next_start = drag_fit.objective.comparison, _DragFitStart.of(drag_fit)
+    for name in (_FREEST_STRUCTURE, _FIRST_STRUCTURE):
+        drag_fit = _converged_drag_fit(
+            candidate_set, next_start, STRUCTURES[name], start_comparison=start_comparison
+        )
+        if drag_fit is not None:
             break
     else:
         return candidate_set
-    found = _fit_all(candidate_set, converged)
-    assert found.drag is not None
-    return found if found.drag.value_m > 0 and found.bic < candidate_set.bic else candidate_set
+    refitted = _fit_all_structures(candidate_set, drag_fit)
+    assert refitted.drag is not None
+    return (
+        refitted
+        if refitted.drag.value_m > 0 and refitted.bic < candidate_set.bic
+        else candidate_set
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class _DragPoint:
-    """State of a search with drag."""
+class _DragFitStart:
+    """Start of a fit with drag: plant, damping structure, drag law and noise spectrum.
+
+    `two_numbers` states whether both numbers of the drag law are estimated.
+    """
 
     plant: Plant
     structure: Structure
     law: DragLaw
     noise: NoiseSpectrum
-    two: bool = False
+    two_numbers: bool = False
 
     @classmethod
-    def of(cls, refit: Refit) -> _DragPoint:
+    def of(cls, refit: Refit) -> _DragFitStart:
+        """Return the minimum of a refit as the start of the next fit with drag."""
         structure = refit.objective.unknowns.structure
-        two = len(refit.columns) > 1
-        return cls(refit.plant, structure, _law_at(refit), refit.noise, two)
+        two_numbers = len(refit.columns) > 1
+        return cls(refit.plant, structure, _law_at_minimum(refit), refit.noise, two_numbers)
 
 
-def _promising(candidate_set: CandidateSet) -> bool:
-    """Return whether some structure with drag could be better than the best without."""
+def _drag_may_improve_fit(candidate_set: CandidateSet) -> bool:
+    """Return whether drag could give some structure a lower BIC than the best candidate."""
     best = candidate_set.best
     for candidate in candidate_set.candidates:
-        if candidate is not best and candidate.structure.name not in _SCORED:
+        if candidate is not best and candidate.structure.name not in _TESTED_STRUCTURES:
             continue
         refit = candidate_set.refit(candidate, 1)
-        size, saved = _first_amplitude(refit)
-        before = refit.cost
-        cost = max(before - saved, 1e-3 * before)
-        gain = candidate.values * math.log(before / cost)
-        if size > 0 and candidate.bic - gain + math.log(candidate.values) < best.bic + _PROMISE:
+        size, cost_reduction = _first_order_drag(refit)
+        cost_without = refit.cost
+        cost_with = max(cost_without - cost_reduction, 1e-3 * cost_without)
+        deviance_reduction = candidate.values * math.log(cost_without / cost_with)
+        if (
+            size > 0
+            and candidate.bic - deviance_reduction + math.log(candidate.values)
+            < best.bic + _FIRST_ORDER_BIC_MARGIN
+        ):
             return True
     return False
 
 
 def small_drag(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Return the spectrum of the torque by a small drag over C_D d, shape (1, K)."""
-    moved_rad = comparison.angle_rad + comparison.incoherent_rad
-    response = DragResponse(moved_rad, comparison.decimation.rate_hz, plant)
+    """Return the torque spectrum of a small drag per metre of C_D d, shape (1, K), in N·m/m."""
+    whole_angle_rad = comparison.angle_rad + comparison.incoherent_rad
+    response = DragResponse(whole_angle_rad, comparison.decimation.rate_hz, plant)
     return comparison.spectrum(response.first_order()[None, comparison.retained])
 
 
-def _first_amplitude(refit: Refit) -> tuple[float, float]:
-    """Return the size of a small drag added to a fit, all else free, and the cost reduction."""
-    (column,), residual = refit.unexplained_columns(
+def _first_order_drag(refit: Refit) -> tuple[float, float]:
+    """Return C_D d in metres, to first order, and the cost reduction if drag is added to a fit.
+
+    All other parameters of the fit stay free.
+    """
+    (drag_spectrum,), residual = refit.unexplained_columns(
         small_drag(refit.objective.comparison, refit.plant)
     )
-    square = float(np.vdot(column, column).real)
+    square = float(np.vdot(drag_spectrum, drag_spectrum).real)
     if square <= 0:
         return 0.0, 0.0
-    along = float(np.vdot(column, residual).real)
-    return -along / square, along**2 / square
+    projection = float(np.vdot(drag_spectrum, residual).real)
+    return -projection / square, projection**2 / square
 
 
-def _start(candidate_set: CandidateSet, lead: Candidate) -> _DragPoint | None:
-    """Fit with the first order of the drag; return None if the drag would be negative."""
-    column = small_drag(candidate_set.comparison, lead.fit.plant)
-    refit = replace(candidate_set, columns=column).refit(lead, _FEW)
+def _first_order_start(candidate_set: CandidateSet, candidate: Candidate) -> _DragFitStart | None:
+    """Fit a candidate with drag to first order; return None if the drag would be negative."""
+    drag_spectrum = small_drag(candidate_set.comparison, candidate.fit.plant)
+    refit = replace(candidate_set, columns=drag_spectrum).refit(
+        candidate, _SHORT_DESCENT_EVALUATIONS
+    )
     size = float(refit.amplitudes()[0][0])
     return (
-        _DragPoint(refit.plant, lead.structure, DragLaw(size), candidate_set.noise)
+        _DragFitStart(refit.plant, candidate.structure, DragLaw(size), candidate_set.noise)
         if size > 0
         else None
     )
 
 
-def _converged(
+def _converged_drag_fit(
     candidate_set: CandidateSet,
-    point: _DragPoint,
+    fit_start: _DragFitStart,
     structure: Structure,
     *,
-    tolerance: float = _CONVERGED,
-    known: Comparison | None = None,
+    tolerance: float = _COST_TOLERANCE,
+    start_comparison: Comparison | None = None,
 ) -> Refit | None:
-    """Fit one structure with drag, from `point`; recompute the drag until the fit converges.
+    """Fit one structure with drag, starting from `fit_start`, until the drag torque has converged.
 
-    `tolerance` is the largest reduction of squares by a further step, `known` the comparison with
-    the drag of the start. Return None if the drag is negative, unstable or does not converge.
+    `tolerance` is the largest cost reduction by a further step. `start_comparison` is the
+    comparison with the drag of the start, if it has been computed. Return None if the drag is
+    negative, is unstable or does not converge.
     """
     unknowns = candidate_set.unknowns(structure)
-    x = unknowns.vector(point.plant)
-    law, noise, two = point.law, point.noise, point.two
-    comparison, roughly, saved = known, tolerance > _CONVERGED, math.inf
-    for _ in range(_ROUNDS):
+    x = unknowns.vector(fit_start.plant)
+    law, noise, two_numbers = fit_start.law, fit_start.noise, fit_start.two_numbers
+    comparison, is_rough, cost_reduction = start_comparison, tolerance > _COST_TOLERANCE, math.inf
+    for _ in range(_MAX_DRAG_COMPUTATIONS):
         if comparison is None:
             plant = unknowns.plant(x)
-            # Without drag the beam seemed to be another, and so what the rest of the angle did.
+            # With drag the plant is different, and so is the torque of the incoherent angle.
             try:
-                comparison = candidate_set.comparison.with_incoherent_part_of(plant).with_drag(
-                    plant, law
-                )
+                comparison = candidate_set.comparison.recompute_incoherent_torque(
+                    plant
+                ).remove_drag_torque(plant, law)
             except DragError:
                 return None
         drag = comparison.drag
         assert drag is not None
         descent = partial(Refit.descend, comparison, unknowns, noise=noise)
-        at_first = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=1)
-        here = at_first.further(_FEW)
-        if two or roughly or _relative_std(here) > _ONE_NUMBER:
-            before, saved = saved, at_first.cost - max(at_first.predicted_cost, here.cost)
-            if saved < tolerance or before / 2 < saved < _IN_VAIN:
-                return at_first
+        start_refit = descent(x, columns=drag.by_law[: 1 + two_numbers], max_evaluations=1)
+        refit = start_refit.further(_SHORT_DESCENT_EVALUATIONS)
+        if two_numbers or is_rough or _relative_std(refit) > _ONE_NUMBER_LAW_STD:
+            last_reduction, cost_reduction = (
+                cost_reduction,
+                start_refit.cost - max(start_refit.predicted_cost, refit.cost),
+            )
+            if (
+                cost_reduction < tolerance
+                or last_reduction / 2 < cost_reduction < _STAGNATION_COST_REDUCTION
+            ):
+                return start_refit
         else:
-            # With damping that is not the beam's, a second number would be its stopgap.
-            two = True
-            here = descent(here.x, columns=drag.by_law, max_evaluations=_FEW)
-        x, law, noise = here.x, _law_at(here), here.noise_here()
+            # Not before: a second number would compensate for wrong damping of the beam.
+            two_numbers = True
+            refit = descent(
+                refit.x, columns=drag.by_law, max_evaluations=_SHORT_DESCENT_EVALUATIONS
+            )
+        x, law, noise = refit.x, _law_at_minimum(refit), refit.noise_here()
         if law.at(drag.speed_m_s) <= 0:
             return None
         comparison = None
@@ -308,73 +371,85 @@ def _converged(
 
 
 def _relative_std(refit: Refit) -> float:
-    """Return the relative standard deviation of a drag law of one number."""
-    law, (_, std) = _law_at(refit), refit.amplitudes()
+    """Return the relative standard deviation of C_D d in a refit whose drag law has one number."""
+    law, (_, std) = _law_at_minimum(refit), refit.amplitudes()
     return float(std[0]) / max(float(law.constant_m), float(np.finfo(float).tiny))
 
 
-def _law_at(refit: Refit) -> DragLaw:
-    """Return the drag law at a minimum: the law of the last computation plus the step."""
+def _law_at_minimum(refit: Refit) -> DragLaw:
+    """Return the drag law at the minimum of a refit.
+
+    It is the law for which the drag torque was computed, plus the estimated change.
+    """
     expansion = refit.objective.comparison.drag
     assert expansion is not None
-    step = refit.amplitudes()[0].tolist()
-    slowing = expansion.law.slowing + (step[1] if len(step) > 1 else 0.0)
-    return DragLaw(expansion.law.constant_m + step[0], slowing)
+    law_change = refit.amplitudes()[0].tolist()
+    slowing = expansion.law.slowing + (law_change[1] if len(law_change) > 1 else 0.0)
+    return DragLaw(expansion.law.constant_m + law_change[0], slowing)
 
 
-def _fit_all(candidate_set: CandidateSet, converged: Refit) -> CandidateSet:
-    """Fit all structures with the drag of a converged fit, and estimate its size."""
-    other = replace(
+def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> CandidateSet:
+    """Fit all structures with the drag torque of a converged fit, and estimate the drag."""
+    set_with_drag = replace(
         candidate_set,
-        comparison=converged.objective.comparison,
-        columns=converged.columns,
-        noise=converged.noise_here(),
+        comparison=converged_fit.objective.comparison,
+        columns=converged_fit.columns,
+        noise=converged_fit.noise_here(),
     )
-    least = other.descent(converged.objective.unknowns, converged.x, 1).cost
-    most = least * math.exp(_HOPELESS / candidate_set.best.values)
-    begun = []
-    for each in candidate_set.candidates:
-        unknowns = other.unknowns(each.structure)
+    converged_cost = set_with_drag.descent(
+        converged_fit.objective.unknowns, converged_fit.x, 1
+    ).cost
+    cost_limit = converged_cost * math.exp(_GIVE_UP_DEVIANCE / candidate_set.best.values)
+    short_descents = []
+    for candidate_without in candidate_set.candidates:
+        unknowns = set_with_drag.unknowns(candidate_without.structure)
         refit = Refit.descend(
-            other.comparison,
+            set_with_drag.comparison,
             unknowns,
-            unknowns.vector(converged.plant),
-            other.noise,
-            other.columns,
-            max_evaluations=_FEW,
+            unknowns.vector(converged_fit.plant),
+            set_with_drag.noise,
+            set_with_drag.columns,
+            max_evaluations=_SHORT_DESCENT_EVALUATIONS,
             relative_tolerance=MISSED,
-            hopeless=(_EARLY_EVALUATIONS, most),
+            hopeless=(_EARLY_EVALUATIONS, cost_limit),
         )
-        begun.append((refit.candidate(), refit))
+        short_descents.append((refit.candidate(), refit))
     candidates = [
-        refit.further(_MANY).candidate() if refit.predicted_cost < most else candidate
-        for candidate, refit in begun
+        refit.further(_LONG_DESCENT_EVALUATIONS).candidate()
+        if refit.predicted_cost < cost_limit
+        else candidate
+        for candidate, refit in short_descents
     ]
-    found = other.ranked(candidates).cross_checked()
-    return replace(found, drag=_estimate(found))
+    refitted = set_with_drag.with_candidates(candidates).cross_check()
+    return replace(refitted, drag=_drag_estimate(refitted))
 
 
-def _estimate(candidate_set: CandidateSet) -> DragEstimate:
-    """Return the drag with its standard deviation, with all possible damping of the best beam."""
-    freest = max(candidate_set.candidates, key=lambda c: (len(c.structure.free), -c.bic))
-    refit = candidate_set.refit(freest)
-    law, covariance = _law_at(refit), refit.amplitude_covariance()[1]
-    covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom
+def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
+    """Return the air drag with its uncertainty, from a refit of the freest candidate.
+
+    All possible damping parameters are free in it.
+    """
+    freest_candidate = max(candidate_set.candidates, key=lambda c: (len(c.structure.free), -c.bic))
+    refit = candidate_set.refit(freest_candidate)
+    law, covariance = _law_at_minimum(refit), refit.amplitude_covariance()[1]
+    covariance = covariance * freest_candidate.fit.cost / freest_candidate.fit.degrees_of_freedom
     expansion = refit.objective.comparison.drag
     assert expansion is not None
-    speed = expansion.speed_m_s
-    slope = np.ones(1)
+    speed_m_s = expansion.speed_m_s
+    weights = np.ones(1)
     if len(covariance) > 1:
-        pivot = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
-        top = expansion.top_speed_m_s
-        speed = min(max(float(pivot**-1.5), _SLOWEST * top), top)
-        slope = np.array([1.0, speed ** (-2 / 3)])
-    value, std = law.at(speed), math.sqrt(float(slope @ covariance @ slope))
+        pivot_weight = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
+        top_speed_m_s = expansion.top_speed_m_s
+        speed_m_s = min(
+            max(float(pivot_weight**-1.5), _LOWEST_RELATIVE_SPEED * top_speed_m_s), top_speed_m_s
+        )
+        weights = np.array([1.0, speed_m_s ** (-2 / 3)])
+    value, std = law.at(speed_m_s), math.sqrt(float(weights @ covariance @ weights))
     return DragEstimate(
         value_m=value,
         std_m=std,
         interval_95_m=(max(value - NORMAL_95 * std, 0.0), value + NORMAL_95 * std),
-        speed_m_s=speed,
+        speed_m_s=speed_m_s,
         law=law,
         covariance=tuple(tuple(row) for row in covariance.tolist()),
     )
@@ -382,14 +457,18 @@ def _estimate(candidate_set: CandidateSet) -> DragEstimate:
 
 # Damping of a mode against its amplitude
 
-_MODES: Final = (1, 2)
-_DEFLECTIONS: Final = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
-"""Deflections of the tip relative to the length, as far as slopes are small."""
+_REPORTED_MODES: Final = (1, 2)
+"""Numbers of the modes whose damping ratio is reported at several amplitudes."""
 
-_POWERS: Final = (2.0, 4 / 3)
-"""Powers of the speed, for the two numbers of a `DragLaw`."""
+_RELATIVE_TIP_AMPLITUDES: Final = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
+"""Amplitudes of the tip, relative to the length of the beam, at which damping ratios are reported,
+up to the limit of small slopes."""
 
-_POINTS: Final = 64
+_SPEED_EXPONENTS: Final = (2.0, 4 / 3)
+"""Exponents of the speed in the drag force, for the two numbers of a `DragLaw`."""
+
+_QUADRATURE_POINTS: Final = 64
+"""Number of points of the Gauss quadrature along the beam."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,10 +478,12 @@ class DampingAt:
     Attributes
     ----------
     mode : int
+        Mode number, from 1.
     tip_amplitude_m : float
+        Amplitude of the tip.
     damping_ratio, std : float
-        Sum of the ratios of beam and air. Their uncertainties are added as if independent;
-        they are anticorrelated, so this is an upper limit.
+        Sum of the damping ratios by beam and air, and its standard deviation. The two uncertainties
+        are added as if independent. They are anticorrelated, so this is an upper limit.
     """
 
     mode: int
@@ -412,48 +493,54 @@ class DampingAt:
 
 
 def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAt, ...]:
-    """Return the damping of the first visible modes at several amplitudes; empty without drag."""
+    """Return the damping ratios of the first visible modes at several amplitudes of the tip.
+
+    The result is empty if the candidates include no drag.
+    """
     drag = candidate_set.drag
     if drag is None:
         return ()
     fit = candidate_set.best.fit
-    numbers = np.array([drag.law.constant_m, drag.law.slowing])[: len(drag.covariance)]
+    law_numbers = np.array([drag.law.constant_m, drag.law.slowing])[: len(drag.covariance)]
     covariance = np.array(drag.covariance)
-    found = []
+    estimates = []
     for mode in fit.modes:
-        if mode.number not in _MODES or mode.frequency_hz <= 0:
+        if mode.number not in _REPORTED_MODES or mode.frequency_hz <= 0:
             continue
-        for fraction in _DEFLECTIONS:
+        for fraction in _RELATIVE_TIP_AMPLITUDES:
             amplitude = fraction * fit.plant.beam.length_m
-            slopes = by_law(
+            ratio_by_law = damping_ratio_by_drag_law(
                 mode.number,
                 2 * math.pi * mode.frequency_hz,
                 amplitude,
                 fit.plant.beam.density_kg_per_m,
-            )[: numbers.size]
-            variance = mode.damping_ratio_std**2 + float(slopes @ covariance @ slopes)
-            found.append(
+            )[: law_numbers.size]
+            variance = mode.damping_ratio_std**2 + float(ratio_by_law @ covariance @ ratio_by_law)
+            estimates.append(
                 DampingAt(
                     mode=mode.number,
                     tip_amplitude_m=amplitude,
-                    damping_ratio=mode.damping_ratio + float(slopes @ numbers),
+                    damping_ratio=mode.damping_ratio + float(ratio_by_law @ law_numbers),
                     std=math.sqrt(variance),
                 )
             )
-    return tuple(found)
+    return tuple(estimates)
 
 
-def by_law(
+def damping_ratio_by_drag_law(
     mode: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
 ) -> NDArray[np.float64]:
-    """Return the damping ratio by the air per number of a `DragLaw`, shape (2,)."""
-    node, weight = np.polynomial.legendre.leggauss(_POINTS)
-    shape = np.abs(mode_shape(mode, 0.5 * (node + 1)) / mode_shape(mode, 1.0))
+    """Return the damping ratio by air drag per unit of each number of a `DragLaw`, shape (2,).
+
+    It is that of a mode in free vibration with a given amplitude of the tip.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
+    shape = np.abs(mode_shape(mode, 0.5 * (nodes + 1)) / mode_shape(mode, 1.0))
     speed = tip_amplitude_m * omega_rad_s
-    slopes = []
-    for power in _POWERS:
-        mean = 2 / math.sqrt(math.pi) * math.gamma(power / 2 + 1) / math.gamma(power / 2 + 1.5)
-        along = float(weight @ shape ** (power + 1)) / float(weight @ shape**2)
-        viscous = HALF_DENSITY * speed ** (power - 1) * mean * along
-        slopes.append(viscous / (2 * density_kg_per_m * omega_rad_s))
-    return np.array(slopes)
+    ratios = []
+    for power in _SPEED_EXPONENTS:
+        time_mean = 2 / math.sqrt(math.pi) * math.gamma(power / 2 + 1) / math.gamma(power / 2 + 1.5)
+        shape_mean = float(weights @ shape ** (power + 1)) / float(weights @ shape**2)
+        damping_per_length = HALF_DENSITY * speed ** (power - 1) * time_mean * shape_mean
+        ratios.append(damping_per_length / (2 * density_kg_per_m * omega_rad_s))
+    return np.array(ratios)

@@ -1,7 +1,8 @@
 """Simple causes of modes that deviate from a uniform beam; they are hypotheses, not facts.
 
-Each is fitted to the modal constants with the seven parameters of the beam, at exact geometry. A
-dozen constants admit several causes, so none of those that explain them is established.
+Each cause is fitted to the modal constants together with the seven parameters of the beam, at exact
+geometry. About twelve constants are compatible with several causes, so a cause that explains them
+is not established.
 """
 
 from __future__ import annotations
@@ -30,36 +31,50 @@ if TYPE_CHECKING:
     from analysis.identify._step_in_time import Step
     from analysis.identify.uniform_beam import UniformBeamTest
 
-_TOLERANCES: Final = (0.03, 1e-3, 0.0)
-"""Tolerances of all constants, one after the other.
+_CONSTANT_TOLERANCES: Final = (0.03, 1e-3, 0.0)
+"""Additional standard deviation of all modal constants in successive descents.
 
-Frequencies are known so well that without any the way to a minimum would be long and narrow."""
+Frequencies are known so precisely that a descent without tolerance would converge slowly along a
+long and narrow curve."""
 
-_HOPELESS: Final = 6.0
-"""Chi-square a degree of freedom, with a tolerance, from which a cause is given up."""
+_GIVE_UP_CHI_SQUARE: Final = 6.0
+"""Chi-square per degree of freedom, with a tolerance, above which a cause is given up."""
 
-_STEP: Final = 1e-6
-"""Steps of unknowns, for derivatives; those of a cause relative to their scale."""
+_DERIVATIVE_STEP: Final = 1e-6
+"""Step of an unknown for numerical derivatives. Steps of the unknowns of a cause are relative to
+their range."""
 
-_MANY: Final = 12
-_LONGEST: Final = 1.0
-"""Step in any unknown, relative to its scale."""
+_MAX_STEPS: Final = 12
+"""Maximum number of Gauss-Newton steps in the fit of a cause."""
 
-_RISE: Final = 10.0
-"""Factor by which chi-square may rise in a step."""
+_MAX_RELATIVE_STEP: Final = 1.0
+"""Largest Gauss-Newton step of any unknown, relative to the scale of the unknown."""
 
-_HALVINGS: Final = 3
-_CLOSE: Final = 0.02
-"""Least predicted reduction of chi-square in a step, relative to chi-square or 1."""
+_MAX_CHI_SQUARE_RISE: Final = 10.0
+"""Largest factor by which chi-square may rise in one Gauss-Newton step."""
 
-_RELUCTANCE: Final = 1e-3
-"""Regularization: an unknown without effect stays, a determined one moves all the same."""
+_MAX_HALVINGS: Final = 3
+"""Maximum number of times that a Gauss-Newton step is halved."""
 
-_NEAR: Final = 6.0
-"""Chi-square above the best from which a cause is not named unless its p-value is `_GOOD`."""
+_CONVERGED_REDUCTION: Final = 0.02
+"""Predicted reduction of chi-square below which the fit of a cause has converged, relative to
+chi-square or to 1 if that is larger."""
 
-_GOOD: Final = 0.05
-_MOST_NAMED: Final = 5
+_STEP_REGULARIZATION: Final = 1e-3
+"""Regularization of Gauss-Newton steps: an unknown without effect keeps its value, and a determined
+unknown moves almost freely."""
+
+_NAMED_CHI_SQUARE_MARGIN: Final = 6.0
+"""Excess of chi-square over the lowest of all causes, up to which a cause is named anyway.
+
+A general cause is considered only if its chi-square is lower than that of its special cases by more
+than this."""
+
+_NAMED_P_VALUE: Final = 0.05
+"""p-value above which a cause is named, however well another cause explains the modes."""
+
+_MAX_NAMED_CAUSES: Final = 5
+"""Maximum number of causes that the finding names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,16 +84,18 @@ class CauseFit:
     Attributes
     ----------
     name : str
-        Kind of cause.
+        Name of the cause.
     words : str
-        Cause and size in words, for sentences.
+        Cause and size as a phrase for sentences.
     size : float
-        In `unit`.
+        Size of the cause in `unit`.
     unit : str
+        Unit of `size`.
     chi_square, p_value : float
-        Misfit of the modal constants with it, and the probability of a larger one by chance.
+        Misfit of the modal constants with this cause, and the probability of a larger misfit by
+        chance.
     plant : Plant or None
-        Plant with this cause, if a `Plant` can represent it.
+        Plant with this cause; None if a `Plant` cannot represent it.
     """
 
     name: str
@@ -90,7 +107,7 @@ class CauseFit:
     plant: Plant | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fit as `json.dumps` takes it."""
+        """Return the fit of the cause as a dictionary for `json.dumps`."""
         return {
             "name": self.name,
             "size": self.size,
@@ -103,13 +120,14 @@ class CauseFit:
 def explanations(
     fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
 ) -> tuple[CauseFit, ...]:
-    """Return the causes that explain the modes, each alone; the best first.
+    """Return the causes of which each alone explains the modes, by falling p-value.
 
     Parameters
     ----------
     fit : ModalEstimate
+        Modal model of the record.
     nominal : Plant
-        Rig and specimen as the file states them; with a mass at the tip, if it states one.
+        Rig and specimen as the file states them, with the mass at the tip if it states one.
     tilt_deg : float, optional
         Inclination of the plane of motion along the beam at rest as the file states it.
     """
@@ -117,89 +135,105 @@ def explanations(
     if not modes:
         return ()
     problem = ConstantsProblem(fit, modes, nominal, tilt_deg=tilt_deg)
-    found = problem.minima()[0].x
-    straight = problem.starts()[len(problem.starts()) // 2]
-    without = np.where(np.arange(found.size) == 0, problem.lower, straight)
+    best_beam = problem.minima()[0].x
+    middle_start = problem.starts()[len(problem.starts()) // 2]
+    without_internal = np.where(np.arange(best_beam.size) == 0, problem.lower, middle_start)
     explained_by: dict[str, CauseFit] = {}
     for cause in CAUSES:
-        bases = (found, straight, without) if cause.name == RELAXATION else (found, straight)
-        explained = _explained(problem, cause, bases)
-        if explained is None:
+        start_beams = (
+            (best_beam, middle_start, without_internal)
+            if cause.name == RELAXATION
+            else (best_beam, middle_start)
+        )
+        cause_fit = _fit_cause(problem, cause, start_beams)
+        if cause_fit is None:
             continue
-        # One of each name, and no general cause where a special case of it suffices.
-        simpler = [explained_by[name].chi_square for name in cause.special if name in explained_by]
-        margin = _NEAR
+        # Of each name only the best fit, and no general cause if a special case suffices.
+        rival_chi_squares = [
+            explained_by[name].chi_square for name in cause.special_cases if name in explained_by
+        ]
+        required_reduction = _NAMED_CHI_SQUARE_MARGIN
         if cause.name in explained_by:
-            simpler, margin = [explained_by[cause.name].chi_square], 0.0
-        if not simpler or explained.chi_square < min(simpler) - margin:
-            explained_by[cause.name] = explained
-    least = min((each.chi_square for each in explained_by.values()), default=0.0)
-    named = [
+            rival_chi_squares, required_reduction = [explained_by[cause.name].chi_square], 0.0
+        if (
+            not rival_chi_squares
+            or cause_fit.chi_square < min(rival_chi_squares) - required_reduction
+        ):
+            explained_by[cause.name] = cause_fit
+    lowest_chi_square = min((each.chi_square for each in explained_by.values()), default=0.0)
+    named_causes = [
         each
         for each in explained_by.values()
-        if each.p_value >= _GOOD or each.chi_square <= least + _NEAR
+        if each.p_value >= _NAMED_P_VALUE
+        or each.chi_square <= lowest_chi_square + _NAMED_CHI_SQUARE_MARGIN
     ]
-    named.sort(key=lambda each: -each.p_value)
-    return tuple(named[:_MOST_NAMED])
+    named_causes.sort(key=lambda each: -each.p_value)
+    return tuple(named_causes[:_MAX_NAMED_CAUSES])
 
 
-def _explained(
-    problem: ConstantsProblem, cause: Cause, bases: Sequence[NDArray[np.float64]]
+def _fit_cause(
+    problem: ConstantsProblem, cause: Cause, start_beams: Sequence[NDArray[np.float64]]
 ) -> CauseFit | None:
-    """Fit one cause; return None if it is not tested, explains nothing or is not plausible."""
-    count = problem.lower.size
-    freedom = problem.compared - count - len(cause.lower)
-    if freedom <= 0:
+    """Fit one cause to the modes; return None if it cannot be tested or does not explain them.
+
+    `start_beams` are unknowns of the beam from which the search starts. A cause at the limit of its
+    plausible range does not count as an explanation.
+    """
+    beam_unknowns = problem.lower.size
+    degrees_of_freedom = problem.compared - beam_unknowns - len(cause.lower)
+    if degrees_of_freedom <= 0:
         return None
-    begun = [(*_CauseSearch(problem, cause, x).begun(), x) for x in bases]
-    for _, start, x in sorted(begun, key=lambda each: each[0]):
-        cost, y = _fitted(problem, cause, x, start, freedom)
-        p_value = float(chi_square_p_value(cost, freedom))
+    starts = [(*_CauseSearch(problem, cause, x).best_start(), x) for x in start_beams]
+    for _, start, x in sorted(starts, key=lambda each: each[0]):
+        cost, y = _descend_with_tolerances(problem, cause, x, start, degrees_of_freedom)
+        p_value = float(chi_square_p_value(cost, degrees_of_freedom))
         if p_value >= REFUSED_BELOW:
             break
     else:
         return None
-    own = y[count:]
-    rests = (own <= cause.lower) | (own >= cause.upper)
-    rests[1:] &= own[1:] != 0  # a loss may be none
-    if rests.any():
+    cause_unknowns = y[beam_unknowns:]
+    at_bound = (cause_unknowns <= cause.lower) | (cause_unknowns >= cause.upper)
+    at_bound[1:] &= cause_unknowns[1:] != 0  # a loss factor of 0 is allowed
+    if at_bound.any():
         return None
-    plant = problem.plant(y[:count])
-    size, unit, words = cause.described(own.tolist(), plant.beam)
+    plant = problem.plant(y[:beam_unknowns])
+    size, unit, phrase = cause.describe(cause_unknowns.tolist(), plant.beam)
     return CauseFit(
         name=cause.name,
-        words=words,
+        words=phrase,
         size=size,
         unit=unit,
         chi_square=cost,
         p_value=p_value,
-        plant=cause.plant(own.tolist(), plant) if cause.plant else None,
+        plant=cause.plant(cause_unknowns.tolist(), plant) if cause.plant else None,
     )
 
 
-def _fitted(
+def _descend_with_tolerances(
     problem: ConstantsProblem,
     cause: Cause,
     x: NDArray[np.float64],
     y: NDArray[np.float64],
-    freedom: int,
+    degrees_of_freedom: int,
 ) -> tuple[float, NDArray[np.float64]]:
-    """Descend from y, first with a tolerance; return chi-square and unknowns."""
+    """Descend from `y`, first with a tolerance; return chi-square and the unknowns."""
     cost = math.inf
-    for tolerance in _TOLERANCES:
-        cost, y = _CauseSearch(problem, cause, x, tolerance).descended(y)
-        if cost > _HOPELESS * freedom:
+    for tolerance in _CONSTANT_TOLERANCES:
+        cost, y = _CauseSearch(problem, cause, x, tolerance).descend(y)
+        if cost > _GIVE_UP_CHI_SQUARE * degrees_of_freedom:
             break
     return cost, y
 
 
 class _CauseSearch:
-    """Search for beam and cause, with one tolerance.
+    """Search for the parameters of beam and cause, with one tolerance of the modal constants.
 
     Parameters
     ----------
     problem : ConstantsProblem
+        Modal constants of the record and the beam to compare with them.
     cause : Cause
+        Cause that is added to the beam.
     x : ndarray, shape (7,)
         Unknowns of the beam without the cause. An absent damping stays absent.
     tolerance : float
@@ -211,159 +245,178 @@ class _CauseSearch:
         problem: ConstantsProblem,
         cause: Cause,
         x: NDArray[np.float64],
-        tolerance: float = _TOLERANCES[0],
+        tolerance: float = _CONSTANT_TOLERANCES[0],
     ) -> None:
-        self._problem, self._cause, self._x = problem, cause, x
-        self._plain = mode_terms(Alteration(), problem.nominal.beam, problem.modes)
+        self._problem, self._cause, self._beam_x = problem, cause, x
+        self._plain_terms = mode_terms(Alteration(), problem.nominal.beam, problem.modes)
         self._lower = np.concatenate([problem.lower, cause.lower])
         upper = np.where(x <= problem.lower, problem.lower, problem.upper)
         self._upper = np.concatenate([upper, cause.upper])
-        own = np.max(np.abs([cause.lower, cause.upper]), axis=0)
-        self._scale = np.concatenate([np.ones(x.size), own])
+        cause_scale = np.max(np.abs([cause.lower, cause.upper]), axis=0)
+        self._scale = np.concatenate([np.ones(x.size), cause_scale])
         covariance = problem.covariance + tolerance**2 * np.eye(problem.compared)
         self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
 
-    def begun(self) -> tuple[float, NDArray[np.float64]]:
-        """Return the best point one step of the beam's unknowns away from a start of the cause."""
-        x, rows = self._x, None
+    def best_start(self) -> tuple[float, NDArray[np.float64]]:
+        """Return the best point after one step of the beam's unknowns from each start of the cause.
+
+        The result is chi-square, and the unknowns of beam and cause.
+        """
+        x, derivatives = self._beam_x, None
         low, high = (ends[: x.size] - x for ends in (self._lower, self._upper))
-        found = []
+        steps = []
         for start in self._cause.starts:
             y = np.concatenate([x, start])
-            terms = self._terms(y)
-            if rows is None:
-                _, rows = self._slopes(y)
-            step = _step(self._whitened(x[None], terms)[0], rows, low, high)[0]
-            there = self._whitened((x + step)[None], terms)[0]
-            found.append((float(there @ there), np.concatenate([x + step, start])))
-        return min(found, key=lambda pair: pair[0])
+            terms = self._mode_terms(y)
+            if derivatives is None:
+                _, derivatives = self._deviations_by_beam(y)
+            step = _limited_step(
+                self._whitened_deviations(x[None], terms)[0], derivatives, low, high
+            )[0]
+            deviations = self._whitened_deviations((x + step)[None], terms)[0]
+            steps.append((float(deviations @ deviations), np.concatenate([x + step, start])))
+        return min(steps, key=lambda pair: pair[0])
 
-    def descended(self, y: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Take Gauss-Newton steps; return the least chi-square and its unknowns.
+    def descend(self, y: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Take Gauss-Newton steps from `y`; return the lowest chi-square and the unknowns there.
 
-        Steps are not shortened as a rule, also where chi-square rises a little: along a curved flat
+        Steps are not shortened as a rule, even where chi-square rises a little: along a curved flat
         direction it rises first and then falls further.
         """
-        scale, least, best = self._scale, math.inf, y
-        for _ in range(_MANY):
-            deviation, rows = self._jacobian(y)
+        scale, lowest, best_y = self._scale, math.inf, y
+        for _ in range(_MAX_STEPS):
+            deviation, derivatives = self._deviations_by_all(y)
             cost = float(deviation @ deviation)
-            if cost < least:
-                least, best = cost, y
-            step, predicted = _step(
+            if cost < lowest:
+                lowest, best_y = cost, y
+            step, predicted = _limited_step(
                 deviation,
-                rows * scale[:, None],
+                derivatives * scale[:, None],
                 (self._lower - y) / scale,
                 (self._upper - y) / scale,
             )
-            if cost - predicted < _CLOSE * max(cost, 1.0):
+            if cost - predicted < _CONVERGED_REDUCTION * max(cost, 1.0):
                 break
-            step = step * scale * min(1.0, _LONGEST / float(np.abs(step).max()))
-            for _ in range(_HALVINGS):
-                there = self._deviations(np.clip(y + step, self._lower, self._upper))
-                if there @ there < _RISE * cost:
+            step = step * scale * min(1.0, _MAX_RELATIVE_STEP / float(np.abs(step).max()))
+            for _ in range(_MAX_HALVINGS):
+                new_deviation = self._deviations(np.clip(y + step, self._lower, self._upper))
+                if new_deviation @ new_deviation < _MAX_CHI_SQUARE_RISE * cost:
                     break
                 step /= 2
             y = np.clip(y + step, self._lower, self._upper)
-        return least, best
+        return lowest, best_y
 
-    def _terms(self, y: NDArray[np.float64]) -> ModeTerms:
-        x, own = y[: self._x.size], y[self._x.size :].tolist()
+    def _mode_terms(self, y: NDArray[np.float64]) -> ModeTerms:
+        """Return the Galerkin coefficients of the modes for the unknowns of beam and cause."""
+        x, cause_unknowns = y[: self._beam_x.size], y[self._beam_x.size :].tolist()
         beam = self._problem.plant(x).beam
-        altered = self._cause.altered(self._problem.stated, own, beam)
-        if altered.same_shapes(Alteration()):
-            return replace(self._plain, alteration=altered)
-        terms = mode_terms(altered, beam, self._problem.modes)
-        # The mass of a cause is a fraction of the beam's: shapes stay the same while that varies.
+        alteration = self._cause.alter(self._problem.stated, cause_unknowns, beam)
+        if alteration.has_same_shapes(Alteration()):
+            return replace(self._plain_terms, alteration=alteration)
+        terms = mode_terms(alteration, beam, self._problem.modes)
+        # The mass of a cause is a fraction of the beam's: the mode shapes do not change with that.
         return terms if self._problem.stated.lumps else replace(terms, density_kg_per_m=None)
 
-    def _whitened(self, x: NDArray[np.float64], terms: ModeTerms) -> NDArray[np.float64]:
-        """Return the deviations of beams, (m, 7), with one cause: (m, 4 n)."""
-        off = self._problem.differences(x, terms)
-        found: NDArray[np.float64] = np.nan_to_num(off @ self._whitener.T, nan=1e6)
-        return found
+    def _whitened_deviations(self, x: NDArray[np.float64], terms: ModeTerms) -> NDArray[np.float64]:
+        """Return the whitened deviations of the modal constants for m beams, shape (m, 4 n).
+
+        `x` are the unknowns of the beams, shape (m, 7), and `terms` describe the beam with the
+        cause.
+        """
+        differences = self._problem.differences(x, terms)
+        whitened: NDArray[np.float64] = np.nan_to_num(differences @ self._whitener.T, nan=1e6)
+        return whitened
 
     def _deviations(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        found: NDArray[np.float64] = self._whitened(y[None, : self._x.size], self._terms(y))[0]
-        return found
+        """Return the whitened deviations of the modal constants at one point, shape (4 n,)."""
+        deviations: NDArray[np.float64] = self._whitened_deviations(
+            y[None, : self._beam_x.size], self._mode_terms(y)
+        )[0]
+        return deviations
 
-    def _slopes(self, y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the deviations and their derivatives by the beam's unknowns."""
-        count = self._x.size
-        steps = np.concatenate([np.zeros((1, count)), _STEP * np.eye(count)])
-        every = self._whitened(y[:count] + steps, self._terms(y))
-        return every[0], (every[1:] - every[0]) / _STEP
+    def _deviations_by_beam(
+        self, y: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the whitened deviations and their derivatives by the beam's unknowns."""
+        beam_unknowns = self._beam_x.size
+        steps = np.concatenate(
+            [np.zeros((1, beam_unknowns)), _DERIVATIVE_STEP * np.eye(beam_unknowns)]
+        )
+        deviations = self._whitened_deviations(y[:beam_unknowns] + steps, self._mode_terms(y))
+        return deviations[0], (deviations[1:] - deviations[0]) / _DERIVATIVE_STEP
 
-    def _jacobian(self, y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the deviations and their derivatives by all unknowns."""
-        deviation, rows = self._slopes(y)
-        steps = _STEP * np.diag(self._scale)[self._x.size :]
-        own_rows = [(self._deviations(y + step) - deviation) / step.sum() for step in steps]
-        return deviation, np.concatenate([rows, own_rows])
+    def _deviations_by_all(
+        self, y: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the whitened deviations and their derivatives by all unknowns."""
+        deviation, beam_rows = self._deviations_by_beam(y)
+        steps = _DERIVATIVE_STEP * np.diag(self._scale)[self._beam_x.size :]
+        cause_rows = [(self._deviations(y + step) - deviation) / step.sum() for step in steps]
+        return deviation, np.concatenate([beam_rows, cause_rows])
 
 
-def _step(
+def _limited_step(
     deviation: NDArray[np.float64],
     rows: NDArray[np.float64],
     low: NDArray[np.float64],
     high: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the Gauss-Newton step within limits, and the chi-square that it predicts.
+    """Return the Gauss-Newton step within limits, and the chi-square predicted after the step.
 
-    The deviations themselves are solved by least squares: frequencies are known a thousand times
-    better than residues, and normal equations would square that.
+    The deviations themselves are solved by least squares. Frequencies are known a thousand times
+    more precisely than residues, and normal equations would square that ratio.
     """
-    step, moving = np.zeros(len(rows)), np.arange(len(rows))
-    while moving.size:
-        step[moving] = 0.0
-        left = deviation + step @ rows
-        matrix = np.concatenate([rows[moving].T, _RELUCTANCE * np.eye(moving.size)])
-        target = np.concatenate([-left, np.zeros(moving.size)])
-        wanted, *_ = np.linalg.lstsq(matrix, target)
-        step[moving] = np.clip(wanted, low[moving], high[moving])
-        beyond = step[moving] != wanted
-        if not beyond.any():
+    step, free = np.zeros(len(rows)), np.arange(len(rows))
+    while free.size:
+        step[free] = 0.0
+        remaining = deviation + step @ rows
+        matrix = np.concatenate([rows[free].T, _STEP_REGULARIZATION * np.eye(free.size)])
+        target = np.concatenate([-remaining, np.zeros(free.size)])
+        unlimited, *_ = np.linalg.lstsq(matrix, target)
+        step[free] = np.clip(unlimited, low[free], high[free])
+        at_limit = step[free] != unlimited
+        if not at_limit.any():
             break
-        moving = moving[~beyond]
-    left = deviation + step @ rows
-    return step, float(left @ left)
+        free = free[~at_limit]
+    remaining = deviation + step @ rows
+    return step, float(remaining @ remaining)
 
 
 # Words
 
 
-def finding(test: UniformBeamTest, found: Sequence[CauseFit], step: Step | None = None) -> Finding:
-    """Return the finding that names the causes of the modes.
+def finding(test: UniformBeamTest, causes: Sequence[CauseFit], step: Step | None = None) -> Finding:
+    """Return the finding that names possible causes of deviating modes.
 
     Parameters
     ----------
     test : UniformBeamTest
         Test that refused the plain uniform beam.
     found : sequence of CauseFit
-        As `explanations` gives them.
+        Causes from `explanations`.
     step : Step, optional
-        Step of the stiffness, as `step_score` finds it.
+        Step of the stiffness during the record, from `step_score`.
     """
-    named = [each.words for each in found]
+    phrases = [each.words for each in causes]
     if step is not None and step.named:
-        named.append(step.words)
-    refused = f"A plain uniform beam does not predict the modes ({test.summary.chance})."
-    if not named:
+        phrases.append(step.words)
+    refusal = f"A plain uniform beam does not predict the modes ({test.summary.chance})."
+    if not phrases:
         return Finding(
             kind="rival explanations",
             sentence=(
-                f"{refused} None of the simple causes tried explains them alone: tilt, a mass at "
+                f"{refusal} None of the simple causes tried explains them alone: tilt, a mass at "
                 "the tip or elsewhere, an uneven or tapered beam, a soft or lossy clamp, a filter "
                 "or resonance of the sensor, a relaxation of the material."
             ),
             remedy="Check the beam and its clamp for several of these at once.",
         )
-    if len(named) == 1:
-        sentence = f"{refused} This would: {named[0]}. It is not established by this record."
+    if len(phrases) == 1:
+        sentence = f"{refusal} This would: {phrases[0]}. It is not established by this record."
     else:
         sentence = (
-            f"{refused} Each of these alone would: {'; '.join(named)}. None is established by this "
-            "record."
+            f"{refusal} Each of these alone would: {'; '.join(phrases)}. None is established by "
+            "this record."
         )
     return Finding(
         kind="rival explanations",

@@ -33,26 +33,30 @@ Kind = Literal[
     "implausible",
     "unexplained",
 ]
+"""Kind of an effect."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One effect found in a record.
+    """Effect found in a record in addition to the linear beam.
 
     Attributes
     ----------
     kind : str
+        Kind of the effect.
     sentence : str
         Sentence for the report.
     value : float or None
-        Its size, in `unit`.
+        Size of the effect in `unit`; None if it has no size.
     interval : tuple of float or None
-        95 %.
+        95 % interval of the size; None if it is not known.
     unit : str
+        Unit of the size.
     remedy : str
-        Action, or experiment that would clarify the cause; may be empty.
+        Action to avoid the effect, or experiment to clarify its cause; may be empty.
     parameters : tuple of str
-        Fitted parameters that it rests on: it is not established if one of them is flagged.
+        Fitted parameters on which the finding is based: it is not established if one of them is
+        flagged.
     """
 
     kind: Kind
@@ -64,7 +68,7 @@ class Finding:
     parameters: tuple[str, ...] = ()
 
 
-SEEN: Final[frozenset[Kind]] = frozenset(
+MODEL_INDEPENDENT_KINDS: Final[frozenset[Kind]] = frozenset(
     {
         "hum",
         "sensor drift",
@@ -77,24 +81,26 @@ SEEN: Final[frozenset[Kind]] = frozenset(
         "unexplained",
     }
 )
-"""What is seen in the record itself, whatever model is laid over it."""
+"""Kinds of effects that are visible in the record itself, whatever model is fitted to it."""
 
-_INTERVAL: Final = re.compile(r" \((?:[^()]*; 95 %|± [^()]*)\)")
+_INTERVAL_PATTERN: Final = re.compile(r" \((?:[^()]*; 95 %|± [^()]*)\)")
+"""Interval in parentheses in a sentence."""
 
 
-def doubted(finding: Finding, because: str) -> Finding:
-    """Return a finding as not established, for a reason.
+def doubted(finding: Finding, reason: str) -> Finding:
+    """Return a finding marked as not established, for a reason.
 
     Parameters
     ----------
     finding : Finding
-    because : str
+        Finding to be marked.
+    reason : str
         Reason why it is not established.
 
     Returns
     -------
     Finding
-        Finding without interval; unchanged if it does not rest on the model (`SEEN`).
+        Finding without interval; unchanged if its kind is one of `MODEL_INDEPENDENT_KINDS`.
 
     Examples
     --------
@@ -103,13 +109,13 @@ def doubted(finding: Finding, because: str) -> Finding:
     >>> doubted(delay, "part of the record is unexplained").sentence
     'Not established, because part of the record is unexplained: the torque comes 1 ms later.'
     """
-    if finding.kind in SEEN:
+    if finding.kind in MODEL_INDEPENDENT_KINDS:
         return finding
-    bare = _INTERVAL.sub("", finding.sentence)
-    if bare[1:2].islower() or bare[1:2] == " ":  # no abbreviation
-        bare = bare[0].lower() + bare[1:]
+    sentence = _INTERVAL_PATTERN.sub("", finding.sentence)
+    if sentence[1:2].islower() or sentence[1:2] == " ":  # no abbreviation
+        sentence = sentence[0].lower() + sentence[1:]
     return replace(
         finding,
-        sentence=f"Not established, because {because}: {bare}",
+        sentence=f"Not established, because {reason}: {sentence}",
         interval=None,
     )

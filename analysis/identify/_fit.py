@@ -1,4 +1,4 @@
-"""Output-error estimation on the whole record: measured torque against predicted torque."""
+"""Output-error estimation from a whole record: fit of the predicted to the measured torque."""
 
 from __future__ import annotations
 
@@ -37,21 +37,28 @@ if TYPE_CHECKING:
     from analysis.models import Structure
 
 BAND_HZ: Final[tuple[float, float]] = RECORD_BAND_HZ
-_TOLERANCE: Final = 1e-9
-"""Relative tolerance of the sum of squares: less than a hundredth of a standard deviation."""
+"""First and last frequency that are compared, unless another band is given."""
 
-_BEFORE_LINES: Final = 1e-4
-"""The same while noise and lines are still to be found: a standard deviation."""
+_COST_TOLERANCE: Final = 1e-9
+"""Relative tolerance of the cost in a descent: it moves the minimum by less than a hundredth of a
+standard deviation."""
 
-_PATIENCE: Final = 20
-"""Evaluations after which a structure far behind the closest one is left where it is: it
-converges slowly along a flat direction that damping of the wrong kind causes."""
+_ROUGH_COST_TOLERANCE: Final = 1e-4
+"""Relative tolerance of the cost in a descent before noise and lines have been estimated: it moves
+the minimum by about a standard deviation."""
+
+_FAR_BEHIND_EVALUATIONS: Final = 20
+"""Number of evaluations after which the descent of a structure ends if its cost is far above that
+of the closest structure. Such a descent converges slowly, along a flat direction that damping of
+the wrong kind causes."""
 
 _EARLY_EVALUATIONS: Final = 4
-"""The same for one that was far behind before."""
+"""Number of evaluations after which the descent of a structure ends if its cost was, and still is,
+far above that of the closest structure."""
 
-_REPEATS: Final = 3
-"""Each leaves a fifth of the bias that a narrow-band disturbance caused."""
+_MAX_REFERENCE_ESTIMATES: Final = 3
+"""Maximum number of estimates of the part of the angle that follows the reference. Each estimate
+leaves a fifth of the bias that a narrow-band disturbance caused."""
 
 
 def fit_record(
@@ -61,21 +68,22 @@ def fit_record(
     fixed: Iterable[Setting] = (),
     band_hz: tuple[float, float] = BAND_HZ,
 ) -> RecordAnalysis:
-    """Fit structures to a whole record in the band.
+    """Fit damping structures to a whole record in a band.
 
-    The torque is predicted from the measured angle (`TorquePredictor`); the squared residual,
+    The torque is predicted from the measured angle (`TorquePredictor`). The squared residual,
     whitened with the estimated noise spectrum, is minimised over the damping and over density over
-    stiffness, stiffness, delay and tool inertia. For noise in the torque alone that is the
-    maximum-likelihood estimate, whatever the excitation. Where a controller held the motor to a
-    reference, the part coherent with that is used as input (`analysis.identify._instrument`): the
-    noise then moves the motor as well.
+    stiffness, stiffness, delay and tool inertia. For noise in the torque alone this is the
+    maximum-likelihood estimate, whatever the excitation. If a controller made the motor follow a
+    reference, the noise moves the motor as well. The part of the angle coherent with the reference
+    is then used as input (`analysis.identify._instrument`).
 
     Parameters
     ----------
     measurement : Measurement
+        Record to which the structures are fitted.
     structures : iterable of Structure
-        All use one noise spectrum, that of the one closest to the coarse response, so that their
-        costs are comparable.
+        Structures to fit. All use one noise spectrum, so that their costs are comparable: that of
+        the structure closest to the coarse response.
     fixed : iterable of str
         Settings (`SETTINGS`) that stay at the values the file states.
     band_hz : tuple of float
@@ -86,52 +94,54 @@ def fit_record(
     MeasurementError
         The record cannot be used.
     ValueError
-        There is no such setting.
+        `fixed` contains a name that is no setting.
     """
     fixed = tuple(fixed)
-    unknown = sorted(set(fixed) - set(SETTINGS))
-    if unknown:
-        raise ValueError(f"{unknown} cannot be fixed: choose from {SETTINGS}.")
-    free = free_settings(fixed)
+    invalid_names = sorted(set(fixed) - set(SETTINGS))
+    if invalid_names:
+        raise ValueError(f"{invalid_names} cannot be fixed: choose from {SETTINGS}.")
+    free_names = free_settings(fixed)
     comparison = Comparison.of(measurement, band_hz)
     nominal = measurement.nominal
-    coarse = CoarseResponse(comparison)
+    coarse_response = CoarseResponse(comparison)
     searches = [
-        StructureSearch.of(Objective(comparison, unknowns), coarse)
-        for unknowns in (Unknowns.of(structure, nominal, free) for structure in structures)
+        StructureSearch.of(Objective(comparison, unknowns), coarse_response)
+        for unknowns in (Unknowns.of(structure, nominal, free_names) for structure in structures)
     ]
-    closest = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
-    reference = searches[closest].lowest()
-    reference = reference.to_minimum(reference.noise(), _BEFORE_LINES)
-    whole = reference.objective.comparison
-    comparison = whole.following_reference(reference.plant)
+    closest_index = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
+    reference_descent = searches[closest_index].lowest()
+    reference_descent = reference_descent.to_minimum(
+        reference_descent.noise(), _ROUGH_COST_TOLERANCE
+    )
+    whole_angle = reference_descent.objective.comparison
+    comparison = whole_angle.use_reference_coherent_angle(reference_descent.plant)
     searches = [search.on(comparison) for search in searches]
-    reference = Descent(searches[closest].objective, reference.x)
-    clean = reference.without_hum(_BEFORE_LINES)
-    if clean is not reference:
-        reference = _followed_again(clean, whole)
-        comparison = reference.objective.comparison
-        coarse = CoarseResponse(comparison)
+    reference_descent = Descent(searches[closest_index].objective, reference_descent.x)
+    without_hum = reference_descent.without_hum(_ROUGH_COST_TOLERANCE)
+    if without_hum is not reference_descent:
+        reference_descent = _update_reference_following(without_hum, whole_angle)
+        comparison = reference_descent.objective.comparison
+        coarse_response = CoarseResponse(comparison)
         searches = [
-            StructureSearch.of(Objective(comparison, search.unknowns), coarse)
+            StructureSearch.of(Objective(comparison, search.unknowns), coarse_response)
             for search in searches
         ]
-    # What was apart from the reference may hide the beam, or stand for noise. The closest structure
-    # shows that before all others are fitted, and the closest of all once they are.
-    renewed = reference.renewed(reference.noise(), _BEFORE_LINES)
+    # The incoherent part of the angle may contain the beam's motion, and not noise alone. It is
+    # re-estimated with the closest structure, before and after all others are fitted.
+    updated_descent = reference_descent.renewed(reference_descent.noise(), _ROUGH_COST_TOLERANCE)
     descents: list[Descent] = []
-    for _ in range(_REPEATS):
-        if renewed is not reference:
-            reference = renewed
-            comparison = reference.objective.comparison
+    for _ in range(_MAX_REFERENCE_ESTIMATES):
+        if updated_descent is not reference_descent:
+            reference_descent = updated_descent
+            comparison = reference_descent.objective.comparison
             searches = [search.on(comparison) for search in searches]
-        noise, descents = _descend_with_noise(searches, closest, reference, descents)
-        closest = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
-        reference = descents[closest]
-        if not _explains(reference, noise):
+        noise, descents = _descend_with_noise(searches, closest_index, reference_descent, descents)
+        closest_index = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
+        reference_descent = descents[closest_index]
+        if not _residual_is_noise(reference_descent, noise):
             break  # none of these explains it, so a further pass does not distinguish them better
-        renewed = reference.renewed(noise, _BEFORE_LINES)
-        if renewed is reference:
+        updated_descent = reference_descent.renewed(noise, _ROUGH_COST_TOLERANCE)
+        if updated_descent is reference_descent:
             break
     fits = (summary(descent.objective, descent.x, noise) for descent in descents)
     return RecordAnalysis.of(fits, noise, comparison)
@@ -144,149 +154,173 @@ def refit_record(
     *,
     band_hz: tuple[float, float] = BAND_HZ,
 ) -> RecordAnalysis | None:
-    """Fit one structure from a plant that explained an earlier part of the record.
+    """Fit one structure, starting from a plant that explained an earlier part of the record.
+
+    Return None if the residual is more than noise, or contains a hum: then a full search is needed.
 
     Parameters
     ----------
     measurement : Measurement
+        Longer record.
     unknowns : Unknowns
+        Unknowns of the structure.
     plant : Plant
+        Plant that explained the earlier part.
     band_hz : tuple of float
-
-    Returns
-    -------
-    RecordAnalysis or None
-        None if the residual is more than noise, or a hum: then a search is needed.
+        First and last frequency compared.
 
     Raises
     ------
     MeasurementError
         The record cannot be used.
     """
-    comparison = Comparison.of(measurement, band_hz).following_reference(plant)
-    here = Descent(Objective(comparison, unknowns), unknowns.vector(plant))
-    here = here.to_minimum(here.noise(), _BEFORE_LINES)
-    here = here.renewed(here.noise(), _BEFORE_LINES)
-    if here.hum():
+    comparison = Comparison.of(measurement, band_hz).use_reference_coherent_angle(plant)
+    descent = Descent(Objective(comparison, unknowns), unknowns.vector(plant))
+    descent = descent.to_minimum(descent.noise(), _ROUGH_COST_TOLERANCE)
+    descent = descent.renewed(descent.noise(), _ROUGH_COST_TOLERANCE)
+    if descent.hum():
         return None
-    noise = here.noise(with_lines=True)
-    here = here.to_minimum(noise, _TOLERANCE)
-    if not _explains(here, noise):
+    noise = descent.noise(with_lines=True)
+    descent = descent.to_minimum(noise, _COST_TOLERANCE)
+    if not _residual_is_noise(descent, noise):
         return None
-    comparison = here.objective.comparison
-    return RecordAnalysis.of([summary(here.objective, here.x, noise)], noise, comparison)
+    comparison = descent.objective.comparison
+    return RecordAnalysis.of([summary(descent.objective, descent.x, noise)], noise, comparison)
 
 
 def _descend_with_noise(
-    searches: list[StructureSearch], closest: int, reference: Descent, before: list[Descent]
+    searches: list[StructureSearch],
+    closest_index: int,
+    reference_descent: Descent,
+    earlier_descents: list[Descent],
 ) -> tuple[NoiseSpectrum, list[Descent]]:
-    """Descend with all structures under the noise of the closest one's residual.
+    """Fit all structures under the noise estimated from the residual of the closest structure.
 
-    `searches` holds one search for each structure; `closest` is the index of the closest one, and
-    `reference` its descent. `before` holds the descents before the part that follows the reference
-    was re-estimated, and is empty the first time: a structure far behind then is not searched for
-    again.
+    `searches` holds one search for each structure; `closest_index` is the index of the closest
+    structure, and `reference_descent` its descent. `earlier_descents` are the descents before the
+    part that follows the reference was re-estimated; it is empty the first time. A structure that
+    was far behind in them is not searched for again.
     """
     # Lines are searched for once, in the residual of a fit to every bin.
-    noise = reference.noise(with_lines=True)
-    hum = reference.objective.comparison.hum
+    noise = reference_descent.noise(with_lines=True)
+    hum = reference_descent.objective.comparison.hum
     noise = replace(noise, lines=(*noise.lines, *(each.line for each in hum)))
-    first = searches[closest].under(noise, reference).to_minimum(noise, _TOLERANCE)
-    behind = math.exp(FAR_BEHIND / (2 * np.count_nonzero(noise.counts)))
-    most = behind * first.cost(noise)
+    closest_descent = (
+        searches[closest_index].under(noise, reference_descent).to_minimum(noise, _COST_TOLERANCE)
+    )
+    far_behind_ratio = math.exp(FAR_BEHIND / (2 * np.count_nonzero(noise.counts)))
+    cost_limit = far_behind_ratio * closest_descent.cost(noise)
     descents = []
     for i, search in enumerate(searches):
-        found = first if i == closest else None
-        if found is None and before:
-            found = _still_worse(Descent(search.objective, before[i].x), noise, most)
-        if found is None:
-            found = search.under(noise).to_minimum(noise, _TOLERANCE, (_PATIENCE, most))
-        descents.append(found)
+        descent = closest_descent if i == closest_index else None
+        if descent is None and earlier_descents:
+            descent = _descent_if_still_worse(
+                Descent(search.objective, earlier_descents[i].x), noise, cost_limit
+            )
+        if descent is None:
+            descent = search.under(noise).to_minimum(
+                noise, _COST_TOLERANCE, (_FAR_BEHIND_EVALUATIONS, cost_limit)
+            )
+        descents.append(descent)
     return noise, descents
 
 
-def _explains(closest: Descent, noise: NoiseSpectrum) -> bool:
-    """Return whether chance explains the residual of a structure."""
-    objective, counts = closest.objective, noise.counts
-    residual = objective.project(objective.linearise(closest.x), noise.weight).residual
+def _residual_is_noise(descent: Descent, noise: NoiseSpectrum) -> bool:
+    """Return whether the residual of a descent passes the test of whiteness at the 1 % level."""
+    objective, is_used = descent.objective, noise.counts
+    residual = objective.project(objective.linearise(descent.x), noise.weight).residual
     hz = objective.comparison.frequency_hz
-    return whiteness(residual[counts], hz[counts]).all_but_white
+    return whiteness(residual[is_used], hz[is_used]).all_but_white
 
 
-def _still_worse(before: Descent, noise: NoiseSpectrum, most: float) -> Descent | None:
-    """Return the descent of a structure that stays above a cost; None if it does not."""
-    if before.cost(noise) <= most:
+def _descent_if_still_worse(
+    earlier: Descent, noise: NoiseSpectrum, cost_limit: float
+) -> Descent | None:
+    """Return a short descent of a structure if its cost stays above a limit, else None."""
+    if earlier.cost(noise) <= cost_limit:
         return None
-    found = before.to_minimum(noise, _TOLERANCE, (_EARLY_EVALUATIONS, most))
-    return found if found.cost(noise) > most else None
+    descent = earlier.to_minimum(noise, _COST_TOLERANCE, (_EARLY_EVALUATIONS, cost_limit))
+    return descent if descent.cost(noise) > cost_limit else None
 
 
-def _followed_again(clean: Descent, whole: Comparison) -> Descent:
-    """Recompute the incoherent part: the first estimate was biased by a disturbance."""
-    hum, unknowns = clean.objective.comparison.hum, clean.objective.unknowns
-    for _ in range(_REPEATS):
-        comparison = whole.following_reference(clean.plant).without_hum(hum)
-        clean = Descent(Objective(comparison, unknowns), clean.x)
-        clean = clean.to_minimum(clean.noise(), _TOLERANCE)
-        hum = clean.hum() or hum
-    return Descent(Objective(clean.objective.comparison.without_hum(hum), unknowns), clean.x)
+def _update_reference_following(descent: Descent, whole_angle: Comparison) -> Descent:
+    """Recompute the part of the angle that follows the reference, without the hum.
+
+    The first estimate was biased by the hum.
+    """
+    hum, unknowns = descent.objective.comparison.hum, descent.objective.unknowns
+    for _ in range(_MAX_REFERENCE_ESTIMATES):
+        comparison = whole_angle.use_reference_coherent_angle(descent.plant).without_hum(hum)
+        descent = Descent(Objective(comparison, unknowns), descent.x)
+        descent = descent.to_minimum(descent.noise(), _COST_TOLERANCE)
+        hum = descent.hum() or hum
+    return Descent(Objective(descent.objective.comparison.without_hum(hum), unknowns), descent.x)
 
 
 # Result at a minimum
 
 
 def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) -> RecordFit:
-    """Return parameters, uncertainty, modes and residual at a minimum.
+    """Return a fit with parameters, uncertainties, modes and residual at a minimum of the cost.
 
     Parameters
     ----------
     objective : Objective
+        Least-squares problem of the record.
     x : ndarray, shape (k,)
-        The minimum.
-    noise : Noise
-        Noise model when it was found.
+        Unknowns at the minimum.
+    noise : NoiseSpectrum
+        Noise spectrum under which the minimum was found.
     """
     unknowns, comparison = objective.unknowns, objective.comparison
-    at = objective.linearise(x)
-    projected = objective.project(at, noise.weight)
-    # Where a torque is unknown the residual is nought and adds nothing to the sum.
-    compared = round(2 * np.sum(noise.counts) * comparison.measurement.known_torque_fraction)
-    freedom = compared - x.size - projected.amplitudes.size
-    scatter = projected.cost / freedom
+    linearisation = objective.linearise(x)
+    projected = objective.project(linearisation, noise.weight)
+    # Where the torque is unknown the residual is 0 and adds nothing to the cost.
+    compared_values = round(2 * np.sum(noise.counts) * comparison.measurement.known_torque_fraction)
+    degrees_of_freedom = compared_values - x.size - projected.amplitudes.size
+    residual_variance = projected.cost / degrees_of_freedom
     lower, upper = unknowns.bounds
-    held = (x <= lower) | (x >= upper)
+    at_bound = (x <= lower) | (x >= upper)
     jacobian = _compared_jacobian(objective, x, projected, noise)
-    of_unknowns, known = covariance_of_unknowns(jacobian, scatter, held)
+    covariance, determined = covariance_of_unknowns(jacobian, residual_variance, at_bound)
     names, plant = unknowns.names, unknowns.plant(x)
     values = unknowns.parameters(x)
-    of = parameter_uncertainty(unknowns, x, held, of_unknowns, known)
-    std, intervals = dict(of.std), dict(of.interval)
-    tool = "tool_inertia_kg_m2"
-    if tool in names and held[names.index(tool)]:
-        index = names.index(tool)
-        free = held & (np.arange(held.size) != index)
-        every, _ = covariance_of_unknowns(jacobian, scatter, free)
-        chain = unknowns.estimates_by_unknowns(x)
-        std[tool] = float(chain[index, index] * every[index, index] ** 0.5)
-    spread = std.get(tool)
-    if tool in names and spread:
-        intervals[tool] = interval_from_zero(values[tool], spread)
-    hum = comparison.decays.hum([line.frequency_hz for line in noise.lines]) * noise.weight
+    uncertainty = parameter_uncertainty(unknowns, x, at_bound, covariance, determined)
+    std, intervals = dict(uncertainty.std), dict(uncertainty.interval)
+    tool_inertia = "tool_inertia_kg_m2"
+    if tool_inertia in names and at_bound[names.index(tool_inertia)]:
+        index = names.index(tool_inertia)
+        other_at_bound = at_bound & (np.arange(at_bound.size) != index)
+        free_covariance, _ = covariance_of_unknowns(jacobian, residual_variance, other_at_bound)
+        estimates_by_unknowns = unknowns.estimates_by_unknowns(x)
+        std[tool_inertia] = float(
+            estimates_by_unknowns[index, index] * free_covariance[index, index] ** 0.5
+        )
+    tool_inertia_std = std.get(tool_inertia)
+    if tool_inertia in names and tool_inertia_std:
+        intervals[tool_inertia] = interval_from_zero(values[tool_inertia], tool_inertia_std)
+    hum_spectra = comparison.decays.hum([line.frequency_hz for line in noise.lines]) * noise.weight
     return RecordFit(
         structure=unknowns.structure,
         plant=plant,
         parameters=values,
         std=std,
         interval=intervals,
-        determined=of.determined,
-        covariance=of.covariance,
-        at_bounds=of.at_bounds,
-        internal=of.internal,
-        external=of.external,
-        modes=mode_table(at.poles, of_unknowns),
-        ringing=ringing(at.poles, projected, scatter, at.columns * noise.weight, hum),
+        determined=uncertainty.determined,
+        covariance=uncertainty.covariance,
+        at_bounds=uncertainty.at_bounds,
+        internal=uncertainty.internal,
+        external=uncertainty.external,
+        modes=mode_table(linearisation.poles, covariance),
+        ringing=ringing(
+            linearisation.poles,
+            projected,
+            residual_variance,
+            linearisation.columns * noise.weight,
+            hum_spectra,
+        ),
         cost=projected.cost,
-        degrees_of_freedom=freedom,
+        degrees_of_freedom=degrees_of_freedom,
         residual=projected.residual,
     )
 
@@ -297,11 +331,14 @@ def _compared_jacobian(
     projected: Projected,
     noise: NoiseSpectrum,
 ) -> NDArray[np.complex128]:
-    """Return the Jacobian of the known torques, shape (k, K)."""
+    """Return the whitened Jacobian of the torques that were measured, shape (k, K).
+
+    Torques that are unknown, and filled by the prediction, contribute nothing.
+    """
     comparison, unknowns = objective.comparison, objective.unknowns
     if comparison.measurement.torque_known.all():
         return projected.jacobian
-    plant, chain = unknowns.plant_and_gradient(x)
-    lost = comparison.lost_gradient(plant, unknowns.gradient_names)
-    weighted = noise.weight * (chain.T @ lost)
-    return projected.jacobian - weighted
+    plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
+    unknown_gradient = comparison.gradient_at_unknown_torque(plant, unknowns.gradient_names)
+    unknown_jacobian = noise.weight * (parameters_by_unknowns.T @ unknown_gradient)
+    return projected.jacobian - unknown_jacobian

@@ -1,4 +1,4 @@
-"""Headline as the JSON document has it."""
+"""Headline numbers of a record or a campaign as the content of the JSON document."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 
 class OrderResult(Protocol):
-    """Result on one order, from one record or from a campaign."""
+    """Result for one damping order, from one record or from a campaign."""
 
     @property
     def order(self) -> str:
-        """Return "alpha" or "lambda"."""
+        """Return the name of the damping order: "alpha" or "lambda"."""
 
     @property
     def status(self) -> str:
-        """Return the status, as in `OrderVerdict`."""
+        """Return the status of the damping order, as in `OrderVerdict`."""
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """Return the 95 % interval."""
+        """Return the 95 % interval of the damping order; None if it is not determined."""
 
 
 def headline_json(
@@ -37,22 +37,25 @@ def headline_json(
     findings: Iterable[Finding],
     validity: Validity,
 ) -> dict[str, Any]:
-    """Return a headline as the content of the JSON document.
+    """Return the headline numbers as the content of the JSON document.
 
     Parameters
     ----------
     file : str or None
-        None for the estimate of a whole campaign.
+        Path of the session file; None for the estimate of a whole campaign.
     estimates : Estimates
-    orders : iterable of JudgedOrder
+        Headline numbers.
+    orders : iterable of OrderResult
+        Results for the damping orders.
     findings : iterable of Finding
+        Effects in addition to the linear beam.
     validity : Validity
         How exact the linear model is for the record.
 
     Returns
     -------
     dict
-        Numbers may be not finite.
+        Numbers may be infinite or NaN.
     """
     uniform_beam = None if estimates.uniform_beam is None else estimates.uniform_beam.as_json()
     return {
@@ -101,6 +104,7 @@ def headline_json(
 
 
 def _mode_json(mode: ReportedMode) -> dict[str, Any]:
+    """Return a mode as a dictionary for the JSON document."""
     participation = mode.participation
     return {
         "mode": mode.number,
@@ -113,7 +117,7 @@ def _mode_json(mode: ReportedMode) -> dict[str, Any]:
 
 
 def _exact_json(exact: Estimates) -> dict[str, Any]:
-    """Return the estimates that are valid if the beam is uniform to 1e-5."""
+    """Return the estimates for a beam that is uniform to 1e-5, for the JSON document."""
     return {
         "condition": EXACT_CONDITION,
         "parameters": {name: each.as_json() for name, each in exact.parameters.items()},

@@ -1,9 +1,9 @@
 """Narrow-band disturbance (hum) near a mode: a sinusoid that lasts while the beam does not respond.
 
 At a sharp resonance a fit attributes a hum to the beam, and the residual of a wrong model resembles
-a hum. Time separates them: a beam responds while the sweep passes, and rings down; a hum lasts. So
-the residual's spectrum is taken over the times at which the model predicts next to nothing there,
-and a hum must be the same in all of them.
+a hum. Time separates them: a beam responds while the sweep passes, and rings down, but a hum lasts.
+So the spectrum of the residual is computed over the times at which the model predicts almost no
+response near the mode, and a hum must be the same in all of them.
 """
 
 from __future__ import annotations
@@ -25,51 +25,62 @@ if TYPE_CHECKING:
     from analysis.identify.free_decay import Pole
     from analysis.identify.noise import NoiseSpectrum
 
-_RESONANCE: Final = 3.0
-"""Half-widths of a resonance (damping ratio times frequency) that count as the resonance."""
+_RESONANCE_HALF_WIDTHS: Final = 3.0
+"""Half width of the frequency range that counts as a resonance, in multiples of damping ratio times
+frequency."""
 
-_RESONANCE_BINS: Final = 20
-"""The same for the sharpest of them, in bins."""
+_MIN_RESONANCE_BINS: Final = 20
+"""Minimum half width, in bins, of the frequency range that counts as a resonance."""
 
-_CLEARANCE: Final = 3.0
-"""Range of the search for hum, in these units: farther off its skirts do not affect the mode."""
+_SEARCH_HALF_WIDTHS: Final = 3.0
+"""Half width of the frequency range in which a hum is searched for, in half widths of the
+resonance. A hum outside this range does not affect the mode."""
 
 _BLOCK_S: Final = 4.0
-_WRONG: Final = 0.3
-"""Assumed relative error of the model's prediction in the test."""
+"""Duration in seconds of the overlapping blocks of the record in which a hum is searched for."""
 
-_LEVEL: Final = 25.0
-"""Power over that of the noise: chance exceeds it at one frequency in 7e10; hundreds are tested."""
+_ASSUMED_MODEL_ERROR: Final = 0.3
+"""Relative error of the predicted torque that the test for hum assumes."""
 
-_VARIES: Final = 0.3
-"""Largest power of the unsteady part, beyond chance, relative to the hum's."""
+_MIN_HUM_POWER_RATIO: Final = 25.0
+"""Minimum power of a hum relative to the noise. Chance exceeds this power at one frequency in 7e10,
+and hundreds are tested."""
 
-_SILENT: Final = 0.2
-"""Fraction of the record in which the beam has to be silent: at other times the signal may be its
-own response to a steady excitation."""
+_MAX_UNSTEADY_POWER_RATIO: Final = 0.3
+"""Largest power of the difference between the blocks of a record and a steady hum, beyond noise,
+relative to the power of the hum."""
 
-_GROWS: Final = 0.3
-"""Largest change of the amplitude from end to end, relative to its mean: what rings down slowly,
-where a wrong model does not, loses more."""
+_MIN_SILENT_FRACTION: Final = 0.2
+"""Minimum fraction of the record in which the beam has to be silent. At other times a sinusoid may
+be the response of the beam to a steady excitation."""
 
-_STEADILY: Final = 3.0
-"""Amplitude of a hum over what is predicted of that frequency in those times: a beam that is driven
-there all the time, by a multisine, leaves something steady wherever the model is wrong."""
+_MAX_RELATIVE_GROWTH: Final = 0.3
+"""Largest change of the amplitude of a hum over the record, relative to its mean. The slow decay of
+a mode, which a wrong model does not predict, changes more."""
 
-_OVERSAMPLED: Final = 4
-_STEPS: Final = 4
+_MIN_HUM_OVER_PREDICTION: Final = 3.0
+"""Minimum amplitude of a hum relative to the predicted torque of that frequency in the silent
+times. A steadily driven beam, as by a multisine, leaves a steady residual wherever the model is
+wrong."""
+
+_FREQUENCY_OVERSAMPLING: Final = 4
+"""Number of frequency points per bin in the search for a hum."""
+
+_FREQUENCY_STEPS: Final = 4
+"""Number of Gauss-Newton steps for the frequency of a hum."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hum:
-    """A narrow-band disturbance: a sinusoid in the torque.
+    """Narrow-band disturbance: a sinusoid in the torque.
 
     Attributes
     ----------
     frequency_hz : float
+        Frequency of the sinusoid.
     phasor_nm : complex
-        The torque is the real part of ``phasor_nm exp(2j pi frequency_hz t)``, t being the time
-        since the first sample compared.
+        The torque is the real part of ``phasor_nm exp(2j pi frequency_hz t)``, with the time t
+        since the first compared sample.
     """
 
     frequency_hz: float
@@ -77,19 +88,22 @@ class Hum:
 
     @property
     def line(self) -> NoiseLine:
-        """Return frequency and amplitude."""
+        """Return frequency and amplitude of the hum as a noise line."""
         return NoiseLine(self.frequency_hz, float(abs(self.phasor_nm)))
 
     def torque(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the torque in N·m at some times, of their shape."""
-        turning = np.exp(2j * np.pi * self.frequency_hz * time_s)
-        torque: NDArray[np.float64] = (self.phasor_nm * turning).real
+        """Return the torque of the hum in N·m at times since the first compared sample."""
+        rotation = np.exp(2j * np.pi * self.frequency_hz * time_s)
+        torque: NDArray[np.float64] = (self.phasor_nm * rotation).real
         return torque
 
 
 def resonance_reach_hz(pole: Pole, spacing_hz: float) -> float:
-    """Return the half width of a resonance, for bins that are `spacing_hz` apart."""
-    return max(_RESONANCE * abs(pole.at_rad_s.real) / (2 * np.pi), _RESONANCE_BINS * spacing_hz)
+    """Return the half width of a resonance in hertz, for bins that are `spacing_hz` apart."""
+    return max(
+        _RESONANCE_HALF_WIDTHS * abs(pole.at_rad_s.real) / (2 * np.pi),
+        _MIN_RESONANCE_BINS * spacing_hz,
+    )
 
 
 def hum_near_modes(
@@ -99,139 +113,165 @@ def hum_near_modes(
     noise: NoiseSpectrum,
     decaying_nm: NDArray[np.float64],
 ) -> tuple[Hum, ...]:
-    """Search for hum near each mode, including the hum that has been removed already.
+    """Search for hum near each mode, including the hum that has already been removed.
 
     Parameters
     ----------
     comparison : Comparison
+        Record, reduced to the band.
     plant : Plant
         Current estimate.
     poles : tuple of Pole
         Poles of the plant.
-    noise : Noise
+    noise : NoiseSpectrum
+        Noise spectrum of the record.
     decaying_nm : ndarray, shape (samples,)
         Torque of the estimated free decay. Part of it may be the hum, so it is not subtracted.
 
     Returns
     -------
     tuple of Hum
-        At most one per mode.
+        At most one hum per mode.
     """
     predicted, _ = comparison.prediction.torque(plant)
     measured = comparison.torque_nm[comparison.retained] + comparison.hum_nm
     hz = comparison.frequency_hz
     blocks = _Blocks(comparison.samples, comparison.decimation.rate_hz)
-    found: list[Hum] = []
+    hums: list[Hum] = []
     for pole in poles:
         if not pole.oscillates:
             continue
-        at_hz = pole.at_rad_s.imag / (2 * np.pi)
-        reach_hz = _CLEARANCE * resonance_reach_hz(pole, float(hz[1] - hz[0]))
-        near = (max(at_hz - reach_hz, hz[0]), min(at_hz + reach_hz, hz[-1]))
-        if near[1] - near[0] < reach_hz / 2:
-            continue  # a wrong model may have its modes anywhere
-        variance = float(np.interp(at_hz, hz, noise.power)) / comparison.samples
-        hum = blocks.steady(measured - predicted, predicted, decaying_nm, near, variance)
+        mode_hz = pole.at_rad_s.imag / (2 * np.pi)
+        reach_hz = _SEARCH_HALF_WIDTHS * resonance_reach_hz(pole, float(hz[1] - hz[0]))
+        search_range_hz = (max(mode_hz - reach_hz, hz[0]), min(mode_hz + reach_hz, hz[-1]))
+        if search_range_hz[1] - search_range_hz[0] < reach_hz / 2:
+            continue  # a wrong model may have modes outside the band
+        variance = float(np.interp(mode_hz, hz, noise.power)) / comparison.samples
+        hum = blocks.find_steady_hum(
+            measured - predicted, predicted, decaying_nm, search_range_hz, variance
+        )
         if hum is not None and all(
-            abs(hum.frequency_hz - other.frequency_hz) > hz[1] - hz[0] for other in found
+            abs(hum.frequency_hz - other_hum.frequency_hz) > hz[1] - hz[0] for other_hum in hums
         ):
-            found.append(hum)
-    return tuple(found)
+            hums.append(hum)
+    return tuple(hums)
 
 
 class _Blocks:
-    """Overlapping windows over a record, with weights."""
+    """Overlapping windowed blocks of a record, in which a steady sinusoid is searched for."""
 
     def __init__(self, samples: int, rate_hz: float) -> None:
         self.rate_hz = rate_hz
         self.time_s = np.arange(samples) / rate_hz
-        half = round(_BLOCK_S * rate_hz / 2)
-        self.window = np.hanning(2 * half + 1)[:-1]
-        self.parts = np.arange(0, samples - 2 * half + 1, half)[:, None] + np.arange(2 * half)
+        half_block = round(_BLOCK_S * rate_hz / 2)
+        self.window = np.hanning(2 * half_block + 1)[:-1]
+        self.block_indices = np.arange(0, samples - 2 * half_block + 1, half_block)[
+            :, None
+        ] + np.arange(2 * half_block)
 
-    def steady(
+    def find_steady_hum(
         self,
         residual: NDArray[np.float64],
         predicted: NDArray[np.float64],
-        decaying: NDArray[np.float64],
-        near_hz: tuple[float, float],
+        free_decay: NDArray[np.float64],
+        range_hz: tuple[float, float],
         variance: float,
     ) -> Hum | None:
-        """Find a steady sinusoid in the residual.
+        """Return a sinusoid in the residual that is steady over the record, or None.
 
         Parameters
         ----------
-        residual, predicted, decaying : ndarray, shape (samples,)
-            Torque in N·m.
+        residual, predicted, free_decay : ndarray, shape (samples,)
+            Torque in N·m: residual, prediction, and estimated free decay.
         near_hz : tuple of float
-            Range of frequencies.
+            Lowest and highest frequency of the search.
         variance : float
-            Variance of one sample of noise as strong as that at these frequencies, in N²·m².
+            Variance of one sample of noise that is as strong as the noise near these frequencies,
+            in N²·m².
         """
-        if not len(self.parts):
+        if not len(self.block_indices):
             return None
-        chance = variance * float(self.window @ self.window)
-        # Power of noise, of what a wrong model may leave, and of what it does not predict.
-        power = chance + (_WRONG * self._largest(predicted, *near_hz)) ** 2
-        power += self._largest(decaying, *near_hz) ** 2
-        weight = np.zeros(residual.size)
-        for part, ratio in zip(self.parts, chance / power, strict=True):
-            weight[part] += ratio * self.window
-        if weight.mean() < _SILENT:
+        noise_power = variance * float(self.window @ self.window)
+        # Power of the noise, of the possible error of the model, and of the free decay.
+        block_power = (
+            noise_power
+            + (_ASSUMED_MODEL_ERROR * self._largest_block_magnitudes(predicted, *range_hz)) ** 2
+        )
+        block_power += self._largest_block_magnitudes(free_decay, *range_hz) ** 2
+        time_weight = np.zeros(residual.size)
+        for indices, block_weight in zip(
+            self.block_indices, noise_power / block_power, strict=True
+        ):
+            time_weight[indices] += block_weight * self.window
+        if time_weight.mean() < _MIN_SILENT_FRACTION:
             return None
-        hum, growth_per_s = self._strongest(residual, weight, near_hz)
-        if abs(growth_per_s) * residual.size > _GROWS * self.rate_hz:
+        hum, growth_per_s = self._fit_strongest_sinusoid(residual, time_weight, range_hz)
+        if abs(growth_per_s) * residual.size > _MAX_RELATIVE_GROWTH * self.rate_hz:
             return None
-        if abs(hum.phasor_nm) ** 2 * weight.sum() < 4 * variance * _LEVEL:
+        if abs(hum.phasor_nm) ** 2 * time_weight.sum() < 4 * variance * _MIN_HUM_POWER_RATIO:
             return None
-        if abs(hum.phasor_nm) < _STEADILY * self._amplitude(predicted, weight, hum.frequency_hz):
+        if abs(hum.phasor_nm) < _MIN_HUM_OVER_PREDICTION * self._largest_amplitude(
+            predicted, time_weight, hum.frequency_hz
+        ):
             return None
-        steady = hum.phasor_nm / 2 * self.window.sum()
-        turned = residual * np.exp(-2j * np.pi * hum.frequency_hz * self.time_s)
-        varies = np.abs(turned[self.parts] @ self.window - steady) ** 2 / power
-        if np.sum(varies - 1) > _VARIES * np.sum(abs(steady) ** 2 / power):
+        block_phasor = hum.phasor_nm / 2 * self.window.sum()
+        demodulated = residual * np.exp(-2j * np.pi * hum.frequency_hz * self.time_s)
+        relative_variation = (
+            np.abs(demodulated[self.block_indices] @ self.window - block_phasor) ** 2 / block_power
+        )
+        if np.sum(relative_variation - 1) > _MAX_UNSTEADY_POWER_RATIO * np.sum(
+            abs(block_phasor) ** 2 / block_power
+        ):
             return None
         return hum
 
-    def _largest(
+    def _largest_block_magnitudes(
         self, values: NDArray[np.float64], first_hz: float, last_hz: float
     ) -> NDArray[np.float64]:
-        """Return the largest value of each block's spectrum between two frequencies, (blocks,)."""
+        """Return the largest magnitude of each block's spectrum in a frequency range, (blocks,)."""
         count = math.ceil((last_hz - first_hz) * _BLOCK_S * 2) + 1
         hz = np.linspace(first_hz, last_hz, count)
-        turn = np.exp(-2j * np.pi * np.outer(np.arange(self.window.size) / self.rate_hz, hz))
-        spectra = values[self.parts] @ (self.window[:, None] * turn)
-        largest: NDArray[np.float64] = np.abs(spectra).max(axis=1)
-        return largest
+        rotation = np.exp(-2j * np.pi * np.outer(np.arange(self.window.size) / self.rate_hz, hz))
+        spectra = values[self.block_indices] @ (self.window[:, None] * rotation)
+        magnitudes: NDArray[np.float64] = np.abs(spectra).max(axis=1)
+        return magnitudes
 
-    def _amplitude(
+    def _largest_amplitude(
         self, values: NDArray[np.float64], weight: NDArray[np.float64], at_hz: float
     ) -> float:
-        """Return the largest amplitude of a sinusoid within a bin of a frequency."""
-        steps = np.linspace(-1, 1, 2 * _OVERSAMPLED + 1) / values.size
-        turn = np.exp(-2j * np.pi * np.outer(at_hz / self.rate_hz + steps, np.arange(values.size)))
-        return 2 * float(np.abs(turn @ (weight * values)).max() / weight.sum())
+        """Return the largest amplitude of a sinusoid near a frequency in a weighted torque.
 
-    def _strongest(
+        Frequencies within one bin of `at_hz` are considered.
+        """
+        frequency_steps = np.linspace(-1, 1, 2 * _FREQUENCY_OVERSAMPLING + 1) / values.size
+        rotation = np.exp(
+            -2j * np.pi * np.outer(at_hz / self.rate_hz + frequency_steps, np.arange(values.size))
+        )
+        return 2 * float(np.abs(rotation @ (weight * values)).max() / weight.sum())
+
+    def _fit_strongest_sinusoid(
         self,
         residual: NDArray[np.float64],
         weight: NDArray[np.float64],
-        near_hz: tuple[float, float],
+        range_hz: tuple[float, float],
     ) -> tuple[Hum, float]:
-        """Fit the sinusoid that explains most of a residual; return its growth per s as well."""
-        length = _OVERSAMPLED * residual.size
+        """Fit the sinusoid that explains most of a residual.
+
+        Return it as a hum, with the relative growth of its amplitude per second.
+        """
+        length = _FREQUENCY_OVERSAMPLING * residual.size
         hz = np.fft.rfftfreq(length, 1 / self.rate_hz)
-        near = slice(*np.searchsorted(hz, near_hz))
-        spectrum = np.fft.rfft(weight * residual, length)[near]
-        frequency_hz = float(hz[near][np.argmax(np.abs(spectrum))])
-        middle_s = float(weight @ self.time_s / weight.sum())
-        time_s = self.time_s - middle_s
-        spread = float(weight @ time_s**2)
-        for _ in range(_STEPS):
-            turned = 2 * weight * residual * np.exp(-2j * np.pi * frequency_hz * time_s)
-            phasor = complex(turned.sum()) / float(weight.sum())
-            # What grows at a right angle to it is a frequency somewhat off (Gauss-Newton).
-            growth = complex(turned @ time_s) / spread / phasor
+        bins_in_range = slice(*np.searchsorted(hz, range_hz))
+        spectrum = np.fft.rfft(weight * residual, length)[bins_in_range]
+        frequency_hz = float(hz[bins_in_range][np.argmax(np.abs(spectrum))])
+        mean_time_s = float(weight @ self.time_s / weight.sum())
+        time_s = self.time_s - mean_time_s
+        time_variance = float(weight @ time_s**2)
+        for _ in range(_FREQUENCY_STEPS):
+            demodulated = 2 * weight * residual * np.exp(-2j * np.pi * frequency_hz * time_s)
+            phasor = complex(demodulated.sum()) / float(weight.sum())
+            # Growth in quadrature means that the frequency is slightly wrong (Gauss-Newton).
+            growth = complex(demodulated @ time_s) / time_variance / phasor
             frequency_hz += growth.imag / (2 * math.pi)
-        at_start = phasor * cmath.exp(-2j * math.pi * frequency_hz * middle_s)
+        at_start = phasor * cmath.exp(-2j * math.pi * frequency_hz * mean_time_s)
         return Hum(frequency_hz, at_start), growth.real

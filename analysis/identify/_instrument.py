@@ -1,18 +1,19 @@
-"""Instrument: the part of the motor's angle that is coherent with the reference.
+"""Instrumental variable: the part of the motor's angle that is coherent with the reference.
 
-The controller feeds the measured torque forward and the measured angle back, so the motor moves
-with the noise of the sensor. A fit of the torque to all of the angle takes part of that noise for
-response: in a closed loop noise and input are correlated, and a fit that leaves out all beyond its
-band is biased by it [1]_: a chirp's tool inertia by 1.4 and its stiffness by 0.24 standard
-deviations at 1e-2 N·m. The reference was known beforehand and does not depend on the noise, so the
-part of the angle that is coherent with the reference is used as input (`following`). The torque by
-the remaining angle is computed with the current estimate of the beam, and removed. Fitting what
-remains is the instrumental-variable estimate with the reference as instrument. Where the remaining
-angle is noise it is unbiased for any beam. But a beam that rings for long moves the motor in bands
-narrower than the smoothing of the response, and then the remaining angle is not noise: in a record
-of narrow sweeps with 0.2 g at the tip the first beam would bias the result by up to 45 standard
-deviations. So if a better beam predicts another torque, the part of the angle that follows the
-reference is re-estimated, with the torque on the motor as a second input (`Comparison.renewed`).
+The controller uses the measured torque as feedforward and the measured angle as feedback, so the
+motor moves with the noise of the sensor. A fit of the torque to the whole angle takes part of that
+noise for response: in a closed loop noise and input are correlated, and a fit that omits everything
+beyond its band is biased by the noise [1]_: a chirp's tool inertia by 1.4 and its stiffness by 0.24
+standard deviations at 1e-2 N·m. The reference was known beforehand and does not depend on the
+noise, so the part of the angle that is coherent with the reference is used as input
+(`reference_coherent_part`). The torque caused by the remaining angle is computed with the current
+estimate of the beam, and removed. The fit to the remaining torque is the instrumental-variable
+estimate with the reference as instrument. Where the remaining angle is noise, the estimate is
+unbiased for any beam. But a beam that rings for long moves the motor in bands narrower than the
+smoothing of the response, and then the remaining angle is not noise: in a record of narrow sweeps
+with 0.2 g at the tip the first beam would bias the result by up to 45 standard deviations. So if a
+better beam predicts another torque, the part of the angle that follows the reference is
+re-estimated, with the torque on the motor as a second input (`Comparison.renewed`).
 
 References
 ----------
@@ -31,21 +32,23 @@ from analysis.identify._data import fast_length
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_MEMORY_S: Final = 0.4
-"""Standard deviation of the window over the lags of the correlations, that is how long the loop may
-remember its reference: 0.4 Hz in frequency. A longer one lets noise pass for response. A shorter
-one misses sharp features of the loop, and those of a beam that rings for long; its torque, given as
-a second input, provides the latter."""
+_LAG_WINDOW_S: Final = 0.4
+"""Standard deviation in seconds of the window over the lags of the correlations: the time for which
+the loop may depend on its past reference (0.4 Hz in frequency).
 
-_RETURN_S: Final = 4.0
-"""For which both are taken to return to 0 after the record. A reference that ended elsewhere and
-fell to 0 at once would do so without the lag of the loop."""
+A longer window takes noise for response. A shorter window misses sharp features of the loop, and
+those of a beam that rings for long. The torque, given as a second input, provides the features of
+the beam."""
 
-_FLOOR: Final = 1e-12
-"""Least power of the reference at a frequency, relative to its largest."""
+_RETURN_TO_ZERO_S: Final = 4.0
+"""Duration in seconds after the record in which angle and reference are assumed to return to 0. A
+reference that fell to 0 at once would do so without the lag of the loop."""
+
+_RELATIVE_POWER_FLOOR: Final = 1e-12
+"""Minimum assumed power of the reference at a frequency, relative to its largest power."""
 
 
-def following(
+def reference_coherent_part(
     angle_rad: NDArray[np.float64],
     reference_rad: NDArray[np.float64],
     rate_hz: float,
@@ -59,37 +62,51 @@ def following(
     Parameters
     ----------
     angle_rad, reference_rad : ndarray, shape (n,)
-        Both taken as 0 before.
+        Measured angle and reference of the motor, both assumed to be 0 before the record.
     rate_hz : float
+        Sampling rate.
     torque_nm : ndarray, shape (n,), optional
-        Torque on the motor without noise: it may ring in bands narrower than the smoothing of the
-        response.
+        Torque on the motor without noise. It is a second input, since it may ring in bands narrower
+        than the smoothing of the response.
     """
-    way_back = 0.5 * (1 + np.cos(np.linspace(0, np.pi, round(_RETURN_S * rate_hz) + 1)[1:]))
-    length = fast_length(2 * (angle_rad.size + way_back.size))
+    return_to_zero = 0.5 * (
+        1 + np.cos(np.linspace(0, np.pi, round(_RETURN_TO_ZERO_S * rate_hz) + 1)[1:])
+    )
+    length = fast_length(2 * (angle_rad.size + return_to_zero.size))
 
-    def transformed(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        return np.fft.rfft(np.concatenate([values, values[-1] * way_back]), length)
+    def spectrum_of(values: NDArray[np.float64]) -> NDArray[np.complex128]:
+        return np.fft.rfft(np.concatenate([values, values[-1] * return_to_zero]), length)
 
     lag_s = np.fft.fftfreq(length) * (length / rate_hz)
-    window = np.exp(-0.5 * (lag_s / _MEMORY_S) ** 2)
+    window = np.exp(-0.5 * (lag_s / _LAG_WINDOW_S) ** 2)
 
-    def smoothed(power: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def smooth_over_frequency(power: NDArray[np.complex128]) -> NDArray[np.complex128]:
         return np.fft.rfft(window * np.fft.irfft(power, length))
 
-    angle, reference = transformed(angle_rad), transformed(reference_rad)
-    across, own = smoothed(angle * reference.conj()), smoothed(np.abs(reference) ** 2).real
-    if not own.max() > 0:
+    angle, reference = spectrum_of(angle_rad), spectrum_of(reference_rad)
+    cross_spectrum, reference_power = (
+        smooth_over_frequency(angle * reference.conj()),
+        smooth_over_frequency(np.abs(reference) ** 2).real,
+    )
+    if not reference_power.max() > 0:
         return np.zeros(angle_rad.size)
-    own = np.maximum(own, _FLOOR * own.max())
-    spectrum = across / own * reference
+    reference_power = np.maximum(reference_power, _RELATIVE_POWER_FLOOR * reference_power.max())
+    spectrum = cross_spectrum / reference_power * reference
     if torque_nm is not None:
-        # What of the torque is no smooth response to the reference itself.
-        torque = transformed(torque_nm)
-        shared = smoothed(torque * reference.conj()) / own
-        apart = smoothed(np.abs(torque) ** 2).real - np.abs(shared) ** 2 * own
-        apart = np.maximum(apart, _FLOOR * apart.max())
-        felt = (smoothed(angle * torque.conj()) - across * shared.conj()) / apart
-        spectrum += felt * (torque - shared * reference)
-    followed: NDArray[np.float64] = np.fft.irfft(spectrum, length)[: angle_rad.size]
-    return followed
+        # Use the part of the torque that is no smooth response to the reference.
+        torque = spectrum_of(torque_nm)
+        torque_by_reference = smooth_over_frequency(torque * reference.conj()) / reference_power
+        independent_torque_power = (
+            smooth_over_frequency(np.abs(torque) ** 2).real
+            - np.abs(torque_by_reference) ** 2 * reference_power
+        )
+        independent_torque_power = np.maximum(
+            independent_torque_power, _RELATIVE_POWER_FLOOR * independent_torque_power.max()
+        )
+        response_to_torque = (
+            smooth_over_frequency(angle * torque.conj())
+            - cross_spectrum * torque_by_reference.conj()
+        ) / independent_torque_power
+        spectrum += response_to_torque * (torque - torque_by_reference * reference)
+    coherent_rad: NDArray[np.float64] = np.fft.irfft(spectrum, length)[: angle_rad.size]
+    return coherent_rad

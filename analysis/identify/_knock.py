@@ -1,10 +1,10 @@
-"""Impacts (knocks): the beam was struck or touched once during the record, and rang freely.
+"""Impacts (knocks): the beam was struck or touched during the record, and rang freely afterwards.
 
-During the contact the torque is unknown; afterwards it is the free decay of the beam's modes. So an
-impact adds to the torque one unknown value at each sample of the contact, and a decay of unknown
-amplitude and phase of each mode. Each decay may have a pole slightly off the model's, to first
-order (a column that grows with the time in front of the decay): so a larger deflection than that of
-the excitation, or inaccurate poles, cause no bias.
+During the contact the torque is unknown. Afterwards it contains the free decay of the beam's modes.
+So an impact adds to the torque one unknown value at each sample of the contact, and a decay of
+unknown amplitude and phase for each mode. Each decay may have a pole slightly different from that
+of the model: to first order, this adds the decay times the time since the impact. So neither a
+larger deflection than that of the excitation nor inaccurate poles cause a bias.
 """
 
 from __future__ import annotations
@@ -34,178 +34,209 @@ if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
     from analysis.identify._data import Measurement
 
-_FREEST: Final = STRUCTURES["VI"]
+_FREEST_STRUCTURE: Final = STRUCTURES["VI"]
+"""Structure with both dampings and free orders."""
 
 MAX_KNOCKS: Final = 3
-"""Limit of impacts in one record."""
+"""Maximum number of impacts in one record."""
 
-_WINDOWS_S: Final = (0.08, 0.5)
-"""Windows to either side of the instant from the scan: for a blow, and for a touch."""
+_WINDOW_HALF_WIDTHS_S: Final = (0.08, 0.5)
+"""Half widths of the search windows about the sample that the scan finds: the first for a blow, the
+second for a touch."""
 
-_APART_S: Final = 0.1
-_AT_ONCE_S: Final = 0.4
-_RISES: Final = 0.5
-"""Largest power of the residual before an impact, in that time and at that distance, relative to
-the power after it."""
+_GAP_BEFORE_IMPACT_S: Final = 0.1
+"""Duration in seconds between an impact and the samples before it that are tested for noise."""
 
-_ROUNDS: Final = 2
-"""Rounds of estimates of poles and noise, each without the impact."""
+_COMPARED_DURATION_S: Final = 0.4
+"""Duration in seconds, before and after an impact, over which the powers of the residual are
+compared."""
 
-_MOST: Final = 0.8
-"""Least fraction of the unexplained squares that an impact has to explain."""
+_MAX_POWER_BEFORE_OVER_AFTER: Final = 0.5
+"""Largest power of the residual before an impact, relative to the power after the impact."""
 
-_WORTH: Final = 0.5
-"""Least fraction that justifies a fit with the impact removed."""
+_IMPACT_FIT_ROUNDS: Final = 2
+"""Number of rounds that estimate poles and noise with the impact as part of the fit."""
 
-_ALL: Final = 0.95
-"""Fraction with which the impact is accepted before any other explanation is tested."""
+_EVIDENT_FRACTION: Final = 0.8
+"""Minimum fraction of the unexplained cost that an evident impact explains."""
 
-_RINGS: Final = 0.5
-"""Least fraction of the reduction by the decays after the impact, not during it."""
+_WORTHWHILE_FRACTION: Final = 0.5
+"""Minimum fraction of the unexplained cost that an impact explains for a fit with the impact
+removed."""
 
-_OVERWHELMING: Final = 10.0
-"""Squares over those of the noise above which the part that impact and beam could both explain is
-attributed to the impact. Below it is attributed to the beam: the residual of a wrong model is at
-most 3 times the noise, and decays would explain all of it."""
+_OBVIOUS_FRACTION: Final = 0.95
+"""Minimum fraction of the unexplained cost for which an impact is accepted before any other effect
+is tested."""
 
-_QUIET_S: Final = 2.0
-_LOUDER: Final = 1.5
-"""Largest power of the residual in that time before an impact, relative to the noise."""
+_MIN_DECAY_FRACTION: Final = 0.5
+"""Minimum fraction of the cost reduction by an impact that is due to the free decays after the
+contact."""
+
+_OVERWHELMING_COST_RATIO: Final = 10.0
+"""Ratio of the cost to the cost of noise above which a torque that both impact and beam could
+explain is attributed to the impact. Below this ratio it is attributed to the beam: the residual
+of a wrong model is at most 3 times the noise, and decays would explain all of that residual."""
+
+_QUIET_DURATION_S: Final = 2.0
+"""Duration in seconds before an impact in which the residual should be noise."""
+
+_MAX_QUIET_POWER_RATIO: Final = 1.5
+"""Largest power of the residual before an impact, relative to the noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectedImpact:
-    """Impact, with the fraction of the record's residual that it explains.
+    """Impact found in a record, with the fraction of the residual that it explains.
 
     Attributes
     ----------
     knock : RecordedImpact
+        Time, poles and amplitudes of the impact.
     explained_fraction : float
-        Fraction of the unexplained squares that it explains.
+        Fraction of the unexplained cost that the impact explains.
     before : float
-        Power of the residual in the two seconds before it, relative to the noise.
+        Power of the residual in the two seconds before the impact, relative to its mean power in
+        the record once the impact is removed.
     """
 
     knock: RecordedImpact
     explained_fraction: float
-    before: float
+    power_ratio_before: float
 
     @property
     def evident(self) -> bool:
-        """Return whether it explains most of the residual and began abruptly."""
-        return self.explained_fraction > _MOST and self.before < _LOUDER
+        """Return whether the impact explains most of the residual and begins abruptly."""
+        return (
+            self.explained_fraction > _EVIDENT_FRACTION
+            and self.power_ratio_before < _MAX_QUIET_POWER_RATIO
+        )
 
     @property
     def obvious(self) -> bool:
-        """Return whether no other effect needs to be tested first."""
-        return self.explained_fraction > _ALL and self.before < _LOUDER
+        """Return whether the impact explains so much that no other effect is tested first."""
+        return (
+            self.explained_fraction > _OBVIOUS_FRACTION
+            and self.power_ratio_before < _MAX_QUIET_POWER_RATIO
+        )
 
 
 def knocks_in(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator[DetectedImpact]:
-    """Search for one more impact; yield alternatives, the likeliest first.
+    """Search a record for one more impact; yield alternative impacts, the likeliest first.
 
     An impact may be larger than the response to the motor, so that a fit to the whole record fails.
-    One half of the record then holds no impact, or only its free decay at the start. So the search
+    One half of the record then contains no impact, or only a free decay at its start. So the search
     also uses the residual of fits to either half. With `obvious` it is limited to obvious impacts.
     """
     if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_KNOCKS:
         return
-    first = knock_in(candidate_set)
-    if first is not None and first.obvious:
-        yield first
-        first = None
+    found_in_whole = find_impact(candidate_set)
+    if found_in_whole is not None and found_in_whole.obvious:
+        yield found_in_whole
+        found_in_whole = None
     if obvious:
         return
-    for start in _from_halves(candidate_set):
-        found = _knock_in(start)
-        if found is not None:
-            yield found
-    if first is not None:
-        yield first
+    for start in _fits_to_halves(candidate_set):
+        impact = _find_impact_in_residual(start)
+        if impact is not None:
+            yield impact
+    if found_in_whole is not None:
+        yield found_in_whole
 
 
-def knock_in(candidate_set: CandidateSet) -> DetectedImpact | None:
-    """Search for an impact in the residual of the likeliest candidate."""
+def find_impact(candidate_set: CandidateSet) -> DetectedImpact | None:
+    """Search for an impact in the residual of the candidate with the lowest cost."""
     likeliest = min(candidate_set.candidates, key=lambda each: each.fit.cost)
-    return _knock_in(candidate_set.refit(likeliest, 1))
+    return _find_impact_in_residual(candidate_set.refit(likeliest, 1))
 
 
-def _knock_in(refit: Refit) -> DetectedImpact | None:
-    """Search for an impact in the residual of a refit."""
-    sample = _scan(refit)
-    if sample is None:
+def _find_impact_in_residual(refit: Refit) -> DetectedImpact | None:
+    """Search for an impact in the residual of a refit; return None if there is none."""
+    start_sample = _likeliest_start(refit)
+    if start_sample is None:
         return None
     comparison = refit.objective.comparison
-    for width_s in _WINDOWS_S:
-        half = math.ceil(width_s * comparison.decimation.rate_hz)
-        first, last = max(sample - half, 0), min(sample + half, comparison.samples)
-        cleaned = _cleaned(refit, first, last)
-        extent = _extent(cleaned, first, last)
+    for width_s in _WINDOW_HALF_WIDTHS_S:
+        half_width = math.ceil(width_s * comparison.decimation.rate_hz)
+        window_start, window_end = (
+            max(start_sample - half_width, 0),
+            min(start_sample + half_width, comparison.samples),
+        )
+        refit_around_impact = _fit_around_impact(refit, window_start, window_end)
+        extent = _impact_extent(refit_around_impact, window_start, window_end)
         if extent is None:
             return None
-        found = _sized(cleaned, *extent)
-        if found.explained_fraction < _WORTH:
+        impact = _with_amplitudes(refit_around_impact, *extent)
+        if impact.explained_fraction < _WORTHWHILE_FRACTION:
             return None
-        if extent[0] > first:
-            return found
-        if found.explained_fraction < _MOST:
+        if extent[0] > window_start:
+            return impact
+        if impact.explained_fraction < _EVIDENT_FRACTION:
             return None
-        # A touch that began before this window.
+        # A touch may have begun before this window: try the wider one.
     return None
 
 
-def _from_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
-    """Fit the freest structure to either half alone; return it for the record if it fits."""
+def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
+    """Fit the freest structure to each half of the record, and apply the plant to the whole one.
+
+    A half is skipped if its residual is not white.
+    """
     comparison = candidate_set.comparison
     measurement, hz = comparison.measurement, comparison.frequency_hz
     band_hz = (0.0 if comparison.bins.start == 1 else float(hz[0]), float(hz[-1]))
-    middle = measurement.angle_rad.size // 2
-    for half in (slice(0, middle), slice(middle, None)):
-        part = replace(
+    middle_tick = measurement.angle_rad.size // 2
+    for half in (slice(0, middle_tick), slice(middle_tick, None)):
+        half_measurement = replace(
             measurement,
             angle_rad=measurement.angle_rad[half],
             torque_nm=measurement.torque_nm[half],
             angle_known=measurement.angle_known[half],
             torque_known=measurement.torque_known[half],
-            # What rings since the knock may be far louder than what the reference asks for: from
-            # that alone, no beam is found.
+            # The ringing after the impact may be far louder than the response to the reference,
+            # and the part that follows the reference then identifies no beam.
             reference_rad=None,
             knocks=(),
         )
         try:
-            analysis = fit_record(part, (_FREEST,), band_hz=band_hz)
+            analysis = fit_record(half_measurement, (_FREEST_STRUCTURE,), band_hz=band_hz)
         except MeasurementError:
             continue
-        fit, counts = analysis.fits[0], analysis.noise.counts
-        if not whiteness(fit.residual[counts], analysis.comparison.frequency_hz[counts]).white:
+        fit, is_used = analysis.fits[0], analysis.noise.counts
+        if not whiteness(fit.residual[is_used], analysis.comparison.frequency_hz[is_used]).white:
             continue
-        plain = comparison.without_hum(()).with_incoherent_part_of(fit.plant)
-        unknowns = Unknowns.of(_FREEST, measurement.nominal, candidate_set.free)
-        there = partial(
-            Refit.descend, plain, unknowns, unknowns.vector(fit.plant), max_evaluations=1
+        comparison_with_hum = comparison.without_hum(()).recompute_incoherent_torque(fit.plant)
+        unknowns = Unknowns.of(_FREEST_STRUCTURE, measurement.nominal, candidate_set.free)
+        refit_at_start = partial(
+            Refit.descend,
+            comparison_with_hum,
+            unknowns,
+            unknowns.vector(fit.plant),
+            max_evaluations=1,
         )
-        loud = there(noise=candidate_set.noise)
-        every = replace(loud.noise_here(), counts=np.ones(hz.size, dtype=bool), lines=())
-        yield there(noise=every)
+        first_refit = refit_at_start(noise=candidate_set.noise)
+        noise_of_all_bins = replace(
+            first_refit.noise_here(), counts=np.ones(hz.size, dtype=bool), lines=()
+        )
+        yield refit_at_start(noise=noise_of_all_bins)
 
 
-def with_knock(measurement: Measurement, found: DetectedImpact) -> Measurement:
-    """Return the measurement with a known impact."""
-    return replace(measurement, knocks=(*measurement.knocks, found.knock))
+def with_knock(measurement: Measurement, impact: DetectedImpact) -> Measurement:
+    """Return the measurement with a detected impact added to its known impacts."""
+    return replace(measurement, knocks=(*measurement.knocks, impact.knock))
 
 
-def of_knocks(knocks: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
-    """Yield the findings of the impacts of a record.
+def of_knocks(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
+    """Yield a finding for each known impact of a record.
 
-    `explained` states whether the remaining record is explained.
+    `explained` states whether the model with the impacts explains the record.
     """
-    for knock in knocks:
-        within_s = knock.resolution_s
+    for impact in impacts:
+        tolerance_s = impact.start_uncertainty_s
         yield Finding(
             kind="knock",
             sentence=(
-                f"The beam was struck at {knock.first_s:.2f} s (to within {within_s:.2g} s): "
-                f"{1e3 * knock.largest_nm:.3g} mN·m in the torque, and from then on the free "
+                f"The beam was struck at {impact.first_s:.2f} s (to within {tolerance_s:.2g} s): "
+                f"{1e3 * impact.largest_nm:.3g} mN·m in the torque, and from then on the free "
                 "decay of its modes. "
                 + (
                     "It was fitted too, and biases nothing."
@@ -213,8 +244,8 @@ def of_knocks(knocks: tuple[RecordedImpact, ...], *, explained: bool) -> Iterato
                     else "It was fitted too, but is not all that is in the record."
                 )
             ),
-            value=knock.first_s,
-            interval=(knock.first_s - within_s, knock.first_s + within_s),
+            value=impact.first_s,
+            interval=(impact.first_s - tolerance_s, impact.first_s + tolerance_s),
             unit="s",
             remedy="Keep clear of the beam while it is recorded.",
         )
@@ -223,11 +254,12 @@ def of_knocks(knocks: tuple[RecordedImpact, ...], *, explained: bool) -> Iterato
 # Search
 
 
-def _scan(refit: Refit) -> int | None:
-    """Return the sample at which decays of all modes explain most; None if chance may do so.
+def _likeliest_start(refit: Refit) -> int | None:
+    """Return the sample from which free decays of all modes explain most of the residual.
 
-    This takes one correlation per column: the sums for a decay from the first sample on, reversed
-    in time, give those for all samples at once.
+    Return None if chance may explain as much, or if the residual does not rise abruptly. The search
+    takes one correlation per decay: the sums for a decay from the first sample on, reversed in
+    time, give those for all samples at once.
     """
     comparison, weight = refit.objective.comparison, refit.noise.weight
     poles = comparison.poles(refit.plant)
@@ -235,137 +267,176 @@ def _scan(refit: Refit) -> int | None:
         return None
     residual = refit.objective.project(refit.objective.linearise(refit.x), weight).residual
     decays = comparison.decays.columns(poles) * weight
-    along = np.array([comparison.in_time(decay.conj() * residual) for decay in decays])
-    along *= comparison.samples / 2
-    scale = np.sqrt(np.sum(np.abs(decays) ** 2, axis=1))
-    if not scale.all():
+    projections = np.array([comparison.in_time(decay.conj() * residual) for decay in decays])
+    projections *= comparison.samples / 2
+    lengths = np.sqrt(np.sum(np.abs(decays) ** 2, axis=1))
+    if not lengths.all():
         return None
-    gram = (decays.conj() @ decays.T).real / np.outer(scale, scale)
-    along /= scale[:, None]
-    saved = np.sum(along * np.linalg.solve(gram + 1e-9 * np.eye(scale.size), along), axis=0)
-    sample = int(np.argmax(saved))
-    deviate = chi_square_deviate(float(saved[sample]), scale.size)
+    gram = (decays.conj() @ decays.T).real / np.outer(lengths, lengths)
+    projections /= lengths[:, None]
+    cost_reductions = np.sum(
+        projections * np.linalg.solve(gram + 1e-9 * np.eye(lengths.size), projections), axis=0
+    )
+    start_sample = int(np.argmax(cost_reductions))
+    deviate = chi_square_deviate(float(cost_reductions[start_sample]), lengths.size)
     if deviate < math.sqrt(2 * largest_of(comparison.samples)):
         return None
-    # What a wrong model leaves at a resonance rises and falls with the sweep; a knock does not.
+    # The residual of a wrong model rises and falls with the sweep; an impact begins abruptly.
     power = comparison.in_time(residual) ** 2
     rate_hz = comparison.decimation.rate_hz
-    apart, until = (math.ceil(each * rate_hz) for each in (_APART_S, _APART_S + _AT_ONCE_S))
-    earlier = power[max(sample - until, 0) : max(sample - apart, 0)]
-    later = power[sample : sample + until]
-    at_once = earlier.size == 0 or earlier.mean() < _RISES * later.mean()
-    return sample if at_once else None
+    gap_samples, window_end = (
+        math.ceil(each * rate_hz)
+        for each in (_GAP_BEFORE_IMPACT_S, _GAP_BEFORE_IMPACT_S + _COMPARED_DURATION_S)
+    )
+    power_before = power[max(start_sample - window_end, 0) : max(start_sample - gap_samples, 0)]
+    power_after = power[start_sample : start_sample + window_end]
+    is_abrupt = (
+        power_before.size == 0
+        or power_before.mean() < _MAX_POWER_BEFORE_OVER_AFTER * power_after.mean()
+    )
+    return start_sample if is_abrupt else None
 
 
-def _cleaned(refit: Refit, first: int, last: int) -> Refit:
-    """Fit with an impact between two samples, under the noise of the new residual."""
-    comparison, before = refit.objective.comparison, refit.columns
-    for _ in range(_ROUNDS):
-        knock = _knock(refit, first, last)
-        columns = np.concatenate([before, comparison.spectrum(_in_time(comparison, knock))])
+def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refit:
+    """Estimate plant and noise with an impact between two samples as part of the model.
+
+    Return the refit without the impact, under the new noise.
+    """
+    comparison, columns_before = refit.objective.comparison, refit.columns
+    for _ in range(_IMPACT_FIT_ROUNDS):
+        impact = _impact_between(refit, first_sample, end_sample)
+        columns = np.concatenate(
+            [columns_before, comparison.spectrum(_impact_torques(comparison, impact))]
+        )
         refit = Refit.descend(
             comparison, refit.objective.unknowns, refit.x, refit.noise, columns,
             max_evaluations=FEW,
         )  # fmt: skip
         refit = replace(refit, noise=refit.noise_here())
     return Refit.descend(
-        comparison, refit.objective.unknowns, refit.x, refit.noise, before, max_evaluations=1
+        comparison,
+        refit.objective.unknowns,
+        refit.x,
+        refit.noise,
+        columns_before,
+        max_evaluations=1,
     )
 
 
-def _knock(refit: Refit, first: int, last: int) -> RecordedImpact:
-    """Return an impact of no size between two samples, with the poles of the fit."""
+def _impact_between(refit: Refit, first_sample: int, end_sample: int) -> RecordedImpact:
+    """Return an impact between two samples, with the poles of a refit and no amplitudes yet."""
     comparison = refit.objective.comparison
     rate_hz = comparison.decimation.rate_hz
     poles = comparison.poles(refit.plant)
     return RecordedImpact(
-        first_s=comparison.first_s + first / rate_hz,
-        last_s=comparison.first_s + last / rate_hz,
-        # A touch that begins softly is seen when it has grown.
-        resolution_s=max(2, last - first) / rate_hz,
+        first_s=comparison.first_s + first_sample / rate_hz,
+        last_s=comparison.first_s + end_sample / rate_hz,
+        # The soft beginning of a touch is not visible before the torque has grown.
+        start_uncertainty_s=max(2, end_sample - first_sample) / rate_hz,
         poles_rad_s=tuple(pole.at_rad_s for pole in poles),
     )
 
 
-def _in_time(comparison: Comparison, knock: RecordedImpact) -> NDArray[np.float64]:
-    """Return the columns of an impact at the compared samples, shape (c, samples)."""
-    return knock.columns(comparison.times_s(), comparison.decimation.rate_hz)
+def _impact_torques(comparison: Comparison, impact: RecordedImpact) -> NDArray[np.float64]:
+    """Return the torques of an impact per unit amplitude at the compared samples, (c, samples)."""
+    return impact.columns(comparison.times_s(), comparison.decimation.rate_hz)
 
 
-def _sums(refit: Refit, columns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cost reduction by each column in addition to those before it, shape (c,).
+def _successive_cost_reductions(refit: Refit, columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the cost reduction by each torque in addition to the torques before it, shape (c,).
 
-    All free parameters stay free, to first order. The columns are torques at the compared samples.
+    `columns` are torques of unit amplitude at the compared samples, shape (c, samples). All free
+    parameters of the fit stay free, to first order.
     """
-    free, residual = refit.unexplained_columns(refit.objective.comparison.spectrum(columns))
-    free /= np.maximum(np.linalg.norm(free, axis=1), np.finfo(float).tiny)[:, None]
-    # One after the other (Gram and Schmidt's method): each of what the former have left.
-    basis, upper = np.linalg.qr(np.ascontiguousarray(free).view(np.float64).T)
-    along = basis.T @ residual.view(np.float64)
-    along[np.abs(np.diag(upper)) < _DEPENDENT] = 0.0
-    saved: NDArray[np.float64] = along**2
-    return saved
+    unexplained, residual = refit.unexplained_columns(refit.objective.comparison.spectrum(columns))
+    unexplained /= np.maximum(np.linalg.norm(unexplained, axis=1), np.finfo(float).tiny)[:, None]
+    # Gram-Schmidt orthogonalisation: each torque without its projection on the earlier ones.
+    basis, triangular = np.linalg.qr(np.ascontiguousarray(unexplained).view(np.float64).T)
+    projections = basis.T @ residual.view(np.float64)
+    projections[np.abs(np.diag(triangular)) < _DEPENDENT_LENGTH] = 0.0
+    cost_reductions: NDArray[np.float64] = projections**2
+    return cost_reductions
 
 
-_DEPENDENT: Final = 1e-6
-"""Length, relative to its own, of what of a column the former ones leave, if it is one of them."""
+_DEPENDENT_LENGTH: Final = 1e-6
+"""Length of a torque of length 1, after its projection on earlier torques is removed, below which
+it is a linear combination of these."""
 
 
-def _extent(refit: Refit, first: int, last: int) -> tuple[int, int] | None:
-    """Return first sample and end of an impact within a window; None if there is none.
+def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[int, int] | None:
+    """Return first sample and end of an impact within a window; None if there is no impact.
 
-    Each sample of unknown torque has to save the BIC penalty of a parameter. There is no impact if
-    the samples suffice without the decays: then the sensor was disturbed.
+    Each sample of unknown torque has to reduce the cost by the BIC penalty of a parameter. If the
+    samples suffice without the decays there is no impact: the sensor was disturbed.
     """
-    price = math.log(2 * np.count_nonzero(refit.noise.counts))
+    penalty = math.log(2 * np.count_nonzero(refit.noise.counts))
     comparison = refit.objective.comparison
-    # From behind: decays from the window's end on, then one sample after the other before it.
-    knock = _knock(refit, last, last)
-    decays = _in_time(comparison, knock)
-    single = np.zeros((last - first, comparison.samples))
-    single[np.arange(last - first), np.arange(first, last)] = 1.0
-    saved = _sums(refit, np.concatenate([decays, single[::-1]]))[len(decays) :]
-    gained = np.concatenate([[0.0], np.cumsum(saved - price)])
-    begins = last - max(int(np.argmax(gained)), 1)
-    # From its beginning on: how long it lasts.
-    knock = _knock(refit, begins, begins)
-    decays = _in_time(comparison, knock)
-    saved = _sums(refit, np.concatenate([decays, single[begins - first :]]))[len(decays) :]
-    gained = np.concatenate([[0.0], np.cumsum(saved - price)])
-    ends = begins + int(np.argmax(gained))
-    alone = _sums(refit, np.concatenate([single[begins - first : ends - first], decays]))
-    rings = float(alone[ends - begins :].sum())
-    deviate = chi_square_deviate(rings, len(decays))
-    sure = deviate > math.sqrt(2 * largest_of(comparison.samples))
-    return (begins, ends) if sure and rings > _RINGS * float(alone.sum()) else None
+    # Beginning: decays from the window's end on, then single samples backwards from there.
+    impact = _impact_between(refit, window_end, window_end)
+    decays = _impact_torques(comparison, impact)
+    single_samples = np.zeros((window_end - window_start, comparison.samples))
+    single_samples[np.arange(window_end - window_start), np.arange(window_start, window_end)] = 1.0
+    cost_reductions = _successive_cost_reductions(
+        refit, np.concatenate([decays, single_samples[::-1]])
+    )[len(decays) :]
+    net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - penalty)])
+    begin = window_end - max(int(np.argmax(net_reduction)), 1)
+    # End: decays from the beginning on, then single samples forwards.
+    impact = _impact_between(refit, begin, begin)
+    decays = _impact_torques(comparison, impact)
+    cost_reductions = _successive_cost_reductions(
+        refit, np.concatenate([decays, single_samples[begin - window_start :]])
+    )[len(decays) :]
+    net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - penalty)])
+    end = begin + int(np.argmax(net_reduction))
+    reductions_samples_first = _successive_cost_reductions(
+        refit, np.concatenate([single_samples[begin - window_start : end - window_start], decays])
+    )
+    reduction_by_decays = float(reductions_samples_first[end - begin :].sum())
+    normal_deviate = chi_square_deviate(reduction_by_decays, len(decays))
+    is_significant = normal_deviate > math.sqrt(2 * largest_of(comparison.samples))
+    return (
+        (begin, end)
+        if is_significant
+        and reduction_by_decays > _MIN_DECAY_FRACTION * float(reductions_samples_first.sum())
+        else None
+    )
 
 
-def _sized(refit: Refit, first: int, last: int) -> DetectedImpact:
-    """Return an impact with its size and the fraction that it explains."""
+def _with_amplitudes(refit: Refit, first_sample: int, end_sample: int) -> DetectedImpact:
+    """Return an impact with its amplitudes and the fraction of the cost that it explains."""
     comparison = refit.objective.comparison
-    knock = _knock(refit, first, last)
-    in_time = _in_time(comparison, knock)
-    cost, expected = refit.cost, refit.expected_cost
-    shared = bool(cost < _OVERWHELMING * expected)
-    whitened, residual = refit.unexplained_columns(comparison.spectrum(in_time), beam_free=shared)
-    free = whitened.view(np.float64)
-    scale = np.linalg.norm(free, axis=1)
-    scale[scale == 0] = 1.0
-    free /= scale[:, None]
-    sizes = -np.linalg.lstsq(free.T, residual.view(np.float64), rcond=1e-10)[0]
-    left = (residual.view(np.float64) + sizes @ free).view(np.complex128)
-    explained = float(np.vdot(left, left).real)
-    sizes /= scale
+    impact = _impact_between(refit, first_sample, end_sample)
+    in_time = _impact_torques(comparison, impact)
+    cost, expected_cost = refit.cost, refit.expected_cost
+    beam_free = bool(cost < _OVERWHELMING_COST_RATIO * expected_cost)
+    whitened, residual = refit.unexplained_columns(
+        comparison.spectrum(in_time), beam_free=beam_free
+    )
+    unexplained_parts = whitened.view(np.float64)
+    lengths = np.linalg.norm(unexplained_parts, axis=1)
+    lengths[lengths == 0] = 1.0
+    unexplained_parts /= lengths[:, None]
+    sizes = -np.linalg.lstsq(unexplained_parts.T, residual.view(np.float64), rcond=1e-10)[0]
+    remaining = (residual.view(np.float64) + sizes @ unexplained_parts).view(np.complex128)
+    remaining_cost = float(np.vdot(remaining, remaining).real)
+    sizes /= lengths
     torque_nm = sizes @ in_time
-    after = slice(first, first + math.ceil(comparison.decimation.rate_hz))
-    before = comparison.in_time(left)
-    quiet = before[max(first - math.ceil(_QUIET_S * comparison.decimation.rate_hz), 0) : first]
+    first_second = slice(first_sample, first_sample + math.ceil(comparison.decimation.rate_hz))
+    remaining_in_time = comparison.in_time(remaining)
+    before_impact = remaining_in_time[
+        max(
+            first_sample - math.ceil(_QUIET_DURATION_S * comparison.decimation.rate_hz), 0
+        ) : first_sample
+    ]
     return DetectedImpact(
         knock=replace(
-            knock,
+            impact,
             sizes=tuple(sizes.tolist()),
-            largest_nm=float(np.abs(torque_nm[after]).max()),
+            largest_nm=float(np.abs(torque_nm[first_second]).max()),
         ),
-        explained_fraction=float((cost - explained) / max(cost - expected, 1.0)),
-        before=float(np.mean(quiet**2) / np.mean(before**2)) if quiet.size else 0.0,
+        explained_fraction=float((cost - remaining_cost) / max(cost - expected_cost, 1.0)),
+        power_ratio_before=float(np.mean(before_impact**2) / np.mean(remaining_in_time**2))
+        if before_impact.size
+        else 0.0,
     )

@@ -1,13 +1,13 @@
-"""Fit of the modal model to a record, by output error as that of the beam.
+"""Fit of the modal model to a record by output error, like the fit of the beam.
 
-The linear parameters (residues and background) are eliminated at each point, so that the search is
-over frequency and damping of each mode alone (variable projection). With numerators of one size
-within the band::
+The linear parameters (residues and background) are eliminated at each point, so that the search
+varies only frequency and damping of each mode (variable projection). The fitted form has numerators
+that are of similar size within the band::
 
     G(s) = sum_k (A_k + B_k q) q² / (1 + eta_k q + q²) + b0 + … + b4 s⁴,    q = s / omega_k
 
-is the pole-residue form (`ModalModel`) with another background. The spectrum of the noise is
-estimated from the residual, in turns with the fit; it may have any smooth shape.
+It is the pole-residue form (`ModalModel`) with a different background. Estimates of the noise
+spectrum from the residual alternate with the fit. The spectrum may have any smooth form.
 
 References
 ----------
@@ -40,57 +40,72 @@ if TYPE_CHECKING:
     from analysis.identify.noise import NoiseSpectrum
     from analysis.identify.residual_tests import InputRelation, Whiteness
 
-_TOLERANCE: Final = 1e-8
-_NARROWEST: Final = 1e-5
-_WIDEST: Final = 1.0
-"""Least and largest eta, twice the damping ratio."""
+_RELATIVE_TOLERANCE: Final = 1e-8
+"""Relative tolerance of the sum of squares at which a descent has converged."""
 
-_NEAR: Final = 0.15
-"""How far a mode may be from where the search begins, relatively."""
+_LEAST_ETA: Final = 1e-5
+"""Lower bound of eta, which is twice the damping ratio of a mode."""
 
-_LOWEST: Final = 0.12
-"""Lowest frequency compared, relative to the first mode: below are drift and 1/f noise, and nothing
-that determines a mode."""
+_LARGEST_ETA: Final = 1.0
+"""Upper bound of eta, which is twice the damping ratio of a mode."""
 
-_HALF_WIDTHS: Final = 3.0
-_NEAREST: Final = 0.02
-_NEAREST_BINS: Final = 24
-"""Range about a mode in which the noise has no narrow peak: in half-widths, at least relative to
-the frequency, and bins beyond."""
+_MAX_LOG_FREQUENCY_CHANGE: Final = 0.15
+"""Largest change of the logarithm of a mode frequency in the search."""
 
-_NOISE_PASSES: Final = 3
-_CONVERGED: Final = 0.02
-"""Change of the noise's mean logarithm below which it is not estimated again."""
+_LOWEST_RELATIVE_FREQUENCY: Final = 0.12
+"""Lowest frequency compared, relative to that of the first mode. At lower frequencies the record
+contains sensor drift and 1/f noise, but nothing that determines a mode."""
 
-_MOST_FURTHER: Final = 2
-"""Limit of resonances in addition to those of the beam: of the sensor or the mount."""
+_MODE_REACH_HALF_WIDTHS: Final = 3.0
+"""Distance from a mode, in half-widths of its resonance, within which the noise has no narrow peak.
+"""
 
-_EVIDENCE: Final = 60.0
-"""Deviance that a further resonance must save."""
+_LEAST_RELATIVE_MODE_REACH: Final = 0.02
+"""Minimum distance from a mode, relative to its frequency, within which the noise has no narrow
+peak."""
 
-_VISIBLE: Final = 400.0
-"""Deviance by which a mode must improve the fit: its damping ratio is then known to a tenth."""
+_MODE_REACH_MARGIN_BINS: Final = 24
+"""Number of frequency bins added to the distance from a mode within which the noise has no narrow
+peak."""
+
+_MAX_NOISE_ESTIMATES: Final = 3
+"""Maximum number of estimates of the noise spectrum, each followed by a descent."""
+
+_NOISE_LOG_TOLERANCE: Final = 0.02
+"""Mean change of the logarithm of the noise power below which the noise spectrum has converged."""
+
+_MAX_ADDITIONAL_RESONANCES: Final = 2
+"""Maximum number of resonances, of the sensor or the mount, that are added to those of the beam."""
+
+_MIN_DEVIANCE_REDUCTION: Final = 60.0
+"""Minimum reduction of the deviance by a mode or an additional resonance that is retained."""
+
+_MIN_VISIBLE_DEVIANCE_REDUCTION: Final = 400.0
+"""Minimum reduction of the deviance by a mode that counts as visible: its damping ratio is then
+known to a tenth."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModalFit(ModalEstimate):
-    """Modal model fitted to a record.
+    """Modal model fitted to one record.
 
     Attributes
     ----------
     evidence : tuple of float
-        Deviance reduction by each mode.
+        Reduction of the deviance by each mode.
     residual : ndarray of complex, shape (K,)
-        Whitened; parts of variance 1 where chance is all that remains.
-    noise : Noise
-        As estimated from this residual; bins below the first mode do not count.
+        Whitened residual; its real and imaginary parts have variance 1 if only noise remains.
+    noise : NoiseSpectrum
+        Noise spectrum estimated from this residual; bins below the first mode are excluded.
     whiteness : Whiteness
+        Test of whether the residual is white.
     input_relation : InputRelation
+        Test of whether the residual depends linearly on the motor angle.
     ringing : Ringing
-        Free decay with which the record begins.
+        Free decay at the beginning of the record.
     span : ndarray, shape (r, 2 K)
-        Orthonormal rows that all derivatives of the whitened residual span, its real and imaginary
-        parts side by side.
+        Orthonormal rows that span all derivatives of the whitened residual, with real and imaginary
+        parts interleaved.
     """
 
     evidence: tuple[float, ...]
@@ -102,49 +117,64 @@ class ModalFit(ModalEstimate):
     span: NDArray[np.float64]
 
     def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the squares that each of some further columns would save, shape (c,).
+        """Return by how much each additional torque spectrum would reduce the cost, shape (c,).
+
+        Each spectrum is added to the fit alone, with a free amplitude; the cost is the sum of
+        whitened squares.
 
         Parameters
         ----------
         columns : ndarray of complex, shape (c, K)
-            Spectra in N·m, not whitened.
+            Torque spectra in N·m, not whitened.
         """
-        white = np.ascontiguousarray(columns * self.noise.weight).view(np.float64)
-        white -= (white @ self.span.T) @ self.span
-        along = white @ self.residual.view(np.float64)
-        squares = np.maximum(np.einsum("ij,ij->i", white, white), np.finfo(float).tiny)
-        saved: NDArray[np.float64] = along**2 / squares
-        return saved
+        whitened = np.ascontiguousarray(columns * self.noise.weight).view(np.float64)
+        whitened -= (whitened @ self.span.T) @ self.span
+        projections = whitened @ self.residual.view(np.float64)
+        squares = np.maximum(np.einsum("ij,ij->i", whitened, whitened), np.finfo(float).tiny)
+        cost_reductions: NDArray[np.float64] = projections**2 / squares
+        return cost_reductions
 
     @property
     def explained(self) -> bool:
-        """Return whether only noise remains."""
+        """Return whether only noise remains in the residual of the modal model."""
         return self.whiteness.white and not self.input_relation.related
 
     @property
     def visible(self) -> tuple[int, ...]:
-        """Return the numbers of the beam's modes that the record shows."""
-        shown = zip(self.numbers, self.evidence, strict=True)
-        return tuple(sorted(number for number, saved in shown if number and saved > _VISIBLE))
+        """Return the sorted numbers of the beam modes that are visible in the record."""
+        modes = zip(self.numbers, self.evidence, strict=True)
+        return tuple(
+            sorted(
+                number
+                for number, reduction in modes
+                if number and reduction > _MIN_VISIBLE_DEVIANCE_REDUCTION
+            )
+        )
 
     def plant_like(self, plant: Plant) -> Plant:
-        """Return a plant with the frequencies of the visible modes, each by its own stiffness.
+        """Return the plant with each visible mode's stiffness adjusted to its fitted frequency.
+
+        The given plant is returned unchanged if there is no such plant, if the visible modes are
+        not modes 1 to n without a gap, or if the plant has a tip mass, a compliant clamp or a
+        filter.
 
         Parameters
         ----------
         plant : Plant
-            Without anything at its ends.
+            Plant with a bare beam.
         """
         visible = self.visible
-        if not visible or any(plant.extras.values()) or len(visible) != visible[-1]:
+        if not visible or any(plant.optional_parameters.values()) or len(visible) != visible[-1]:
             return plant
         poles = dict(zip(self.numbers, self.model.poles_rad_s, strict=True))
         frequency_hz = [poles[number].imag / (2 * math.pi) for number in visible]
         try:
-            like = LoadedBeam(plant.beam, plant.damping).with_frequencies(frequency_hz)
+            loaded_beam = LoadedBeam(plant.beam, plant.damping).with_frequencies(frequency_hz)
         except ValueError:
             return plant
-        return replace(plant, beam=like.beam, stiffness_offsets=like.stiffness_offsets)
+        return replace(
+            plant, beam=loaded_beam.beam, stiffness_offsets=loaded_beam.stiffness_offsets
+        )
 
 
 def fit_modes(
@@ -153,215 +183,249 @@ def fit_modes(
     starts: Sequence[tuple[int, float, float]],
     columns: NDArray[np.complex128] | None = None,
 ) -> ModalFit | None:
-    """Fit the modal model to a record.
+    """Fit the modal model to a record; return None if no mode is within the band or significant.
 
     Parameters
     ----------
     comparison : Comparison
-    noise : Noise
-        First estimate; its lines stay excluded.
+        Record, reduced to the band.
+    noise : NoiseSpectrum
+        First estimate; bins that it excludes stay excluded.
     starts : sequence of (int, float, float)
-        Number, frequency (Hz) and damping ratio of each mode, roughly.
+        Mode number, approximate frequency (Hz) and approximate damping ratio of each mode.
     columns : ndarray of complex, shape (c, K), optional
-        Spectra of known shape and unknown size, as for `Objective`.
-
-    Returns
-    -------
-    ModalFit or None
-        None if no mode is within the band.
+        Torque spectra of known form and unknown amplitude, as for `Objective`.
     """
-    inside = [each for each in starts if each[1] <= comparison.frequency_hz[-1]]
-    if not inside:
+    starts_in_band = [each for each in starts if each[1] <= comparison.frequency_hz[-1]]
+    if not starts_in_band:
         return None
-    further = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
-    further = further if columns is None else columns
-    lowest_hz = _LOWEST * min(hz for _, hz, _ in inside)
+    effect_spectra = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
+    effect_spectra = effect_spectra if columns is None else columns
+    lowest_hz = _LOWEST_RELATIVE_FREQUENCY * min(hz for _, hz, _ in starts_in_band)
     counts = noise.counts & (comparison.frequency_hz >= lowest_hz)
     search = _ModalSearch(
         comparison,
         replace(noise, counts=counts),
-        further,
-        tuple(number for number, _, _ in inside),
-        np.array([[math.log(2 * math.pi * hz), 2 * ratio] for _, hz, ratio in inside]).ravel(),
+        effect_spectra,
+        tuple(number for number, _, _ in starts_in_band),
+        np.array(
+            [[math.log(2 * math.pi * hz), 2 * ratio] for _, hz, ratio in starts_in_band]
+        ).ravel(),
     )
-    return search.without_unexcited_modes().converged().with_further_resonances().fit()
+    return search.remove_unexcited_modes().converge_with_noise().add_resonances().fit()
 
 
 @dataclass(frozen=True, slots=True)
 class _ModalSearch:
-    """Modes at one point of the search, under one noise estimate."""
+    """Search for mode frequencies and damping under one noise estimate.
+
+    `x` is the current point ``(ln omega_1, eta_1, ln omega_2, …)``, with omega in rad/s.
+    """
 
     comparison: Comparison
     noise: NoiseSpectrum
-    further: NDArray[np.complex128]
+    effect_spectra: NDArray[np.complex128]
     numbers: tuple[int, ...]
     x: NDArray[np.float64]
 
     def problem(self) -> _ModalProblem:
-        """Return the residual of these modes under this noise."""
-        return _ModalProblem(self.comparison, self.noise.weight, self.further, self.numbers)
+        """Return the least-squares problem of these modes under this noise estimate."""
+        return _ModalProblem(self.comparison, self.noise.weight, self.effect_spectra, self.numbers)
 
-    def descended(self) -> _ModalSearch:
-        """Descend under this noise."""
-        low = np.column_stack([self.x[::2] - _NEAR, np.full(len(self.numbers), _NARROWEST)])
-        high = np.column_stack([self.x[::2] + _NEAR, np.full(len(self.numbers), _WIDEST)])
-        found = descend(
+    def descend_to_minimum(self) -> _ModalSearch:
+        """Return the search at the minimum of the cost under the current noise estimate."""
+        low = np.column_stack(
+            [self.x[::2] - _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _LEAST_ETA)]
+        )
+        high = np.column_stack(
+            [self.x[::2] + _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _LARGEST_ETA)]
+        )
+        minimum = descend(
             self.problem().normal_equations,
             self.x,
             Box(low.ravel(), high.ravel()),
-            relative_tolerance=_TOLERANCE,
+            relative_tolerance=_RELATIVE_TOLERANCE,
             max_evaluations=60,
         )
-        return replace(self, x=found.x)
+        return replace(self, x=minimum.x)
 
-    def converged(self) -> _ModalSearch:
+    def converge_with_noise(self) -> _ModalSearch:
         """Alternate descents with estimates of noise and unknown torque until they converge."""
         search = self
-        for _ in range(_NOISE_PASSES):
-            search = search.descended()
+        for _ in range(_MAX_NOISE_ESTIMATES):
+            search = search.descend_to_minimum()
             problem = search.problem()
             model = problem.model(search.x)
             residual = problem.residual(search.x, model)
-            comparison = search.comparison.renewed(model, search.noise).filled(model)
+            comparison = search.comparison.renewed(model, search.noise).fill_unknown_torque(model)
             power = smooth_power(residual, finely=True)
-            power = with_peaks(residual, power, ~search.near_modes())
+            power = with_peaks(residual, power, ~search.is_near_mode())
             power /= comparison.measurement.known_torque_fraction
             counts = search.noise.counts
             change = np.abs(np.log(power / search.noise.power)[counts]).mean()
             search = replace(
                 search, comparison=comparison, noise=replace(search.noise, power=power)
             )
-            if change < _CONVERGED and comparison.measurement.torque_known.all():
+            if change < _NOISE_LOG_TOLERANCE and comparison.measurement.torque_known.all():
                 break
-        return search.descended()
+        return search.descend_to_minimum()
 
-    def near_modes(self) -> NDArray[np.bool_]:
-        """Return the bins in which the residual may belong to a mode, shape (K,)."""
+    def is_near_mode(self) -> NDArray[np.bool_]:
+        """Return a mask of the bins in which the residual may belong to a mode, shape (K,)."""
         hz = self.comparison.frequency_hz[:, None]
         frequencies, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
-        bins_hz = _NEAREST_BINS * float(hz[1, 0] - hz[0, 0])
-        reach = np.maximum(_HALF_WIDTHS * eta / 2, _NEAREST) * frequencies + bins_hz
-        near: NDArray[np.bool_] = np.any(np.abs(hz - frequencies) < reach, axis=1)
-        return near
+        bins_hz = _MODE_REACH_MARGIN_BINS * float(hz[1, 0] - hz[0, 0])
+        reach_hz = (
+            np.maximum(_MODE_REACH_HALF_WIDTHS * eta / 2, _LEAST_RELATIVE_MODE_REACH) * frequencies
+            + bins_hz
+        )
+        is_near: NDArray[np.bool_] = np.any(np.abs(hz - frequencies) < reach_hz, axis=1)
+        return is_near
 
     def cost(self) -> float:
-        """Return the sum of whitened squares at this point."""
-        residual = self.problem().at(self.x).residual
+        """Return the sum of the squared whitened residual at the current point."""
+        residual = self.problem().solution_at(self.x).residual
         return float(residual @ residual)
 
-    def with_further_resonances(self) -> _ModalSearch:
-        """Add a resonance where the residual still follows the angle, if it explains that."""
+    def add_resonances(self) -> _ModalSearch:
+        """Add a resonance at the frequency where the residual depends on the motor angle.
+
+        A resonance is added only while it reduces the cost enough and overlaps with no mode.
+        """
         search = self
-        for _ in range(_MOST_FURTHER):
-            related = search.relation(search.problem().at(search.x))
-            if not related.related:
+        for _ in range(_MAX_ADDITIONAL_RESONANCES):
+            input_dependence = search.residual_dependence_on_angle(
+                search.problem().solution_at(search.x)
+            )
+            if not input_dependence.related:
                 break
-            start = [math.log(2 * math.pi * related.at_hz), 0.02]
-            more = replace(
+            start = [math.log(2 * math.pi * input_dependence.at_hz), 0.02]
+            with_resonance = replace(
                 search, numbers=(*search.numbers, 0), x=np.concatenate([search.x, start])
-            ).converged()
-            at = replace(search, noise=more.noise, comparison=more.comparison).descended()
-            if at.cost() - more.cost() < _EVIDENCE or more.last_overlaps():
+            ).converge_with_noise()
+            without_resonance = replace(
+                search, noise=with_resonance.noise, comparison=with_resonance.comparison
+            ).descend_to_minimum()
+            if (
+                without_resonance.cost() - with_resonance.cost() < _MIN_DEVIANCE_REDUCTION
+                or with_resonance.last_mode_overlaps()
+            ):
                 break
-            search = more
+            search = with_resonance
         return search
 
-    def last_overlaps(self) -> bool:
-        """Return whether the last resonance lies within the width of another."""
+    def last_mode_overlaps(self) -> bool:
+        """Return whether the last mode lies within the width of another mode."""
         frequencies = np.exp(self.x[::2])
         half_widths = frequencies * self.x[1::2] / 2
-        reach = _HALF_WIDTHS * (half_widths[:-1] + half_widths[-1])
-        return bool(np.any(np.abs(frequencies[:-1] - frequencies[-1]) < reach))
+        least_distances = _MODE_REACH_HALF_WIDTHS * (half_widths[:-1] + half_widths[-1])
+        return bool(np.any(np.abs(frequencies[:-1] - frequencies[-1]) < least_distances))
 
-    def without_unexcited_modes(self) -> _ModalSearch:
-        """Remove modes that save nothing at first and then follow a line of the noise."""
-        saved = self.evidence()
-        if saved.min() >= _EVIDENCE:
+    def remove_unexcited_modes(self) -> _ModalSearch:
+        """Remove modes that hardly reduce the cost at first and lose their damping in a descent.
+
+        Such a mode would fit a narrow line of the noise.
+        """
+        cost_increases = self.evidence()
+        if cost_increases.min() >= _MIN_DEVIANCE_REDUCTION:
             return self
-        undamped = self.descended().x[1::2] < 2 * _NARROWEST
+        is_undamped = self.descend_to_minimum().x[1::2] < 2 * _LEAST_ETA
         search = self
-        for index in np.flatnonzero((saved < _EVIDENCE) & undamped)[::-1].tolist():
-            search = search._without(index)
+        for index in np.flatnonzero((cost_increases < _MIN_DEVIANCE_REDUCTION) & is_undamped)[
+            ::-1
+        ].tolist():
+            search = search._remove_mode(index)
         return search
 
-    def _without(self, index: int) -> _ModalSearch:
+    def _remove_mode(self, index: int) -> _ModalSearch:
+        """Return the search without the mode at an index."""
         numbers = self.numbers[:index] + self.numbers[index + 1 :]
         return replace(self, numbers=numbers, x=np.delete(self.x, [2 * index, 2 * index + 1]))
 
     def evidence(self) -> NDArray[np.float64]:
-        """Return the cost reduction by each mode with the others unchanged, shape (n,)."""
-        own = self.cost()
-        return np.array([self._without(i).cost() - own for i in range(len(self.numbers))])
+        """Return the cost increase if each mode alone is removed, with no new descent, (n,)."""
+        cost = self.cost()
+        return np.array([self._remove_mode(i).cost() - cost for i in range(len(self.numbers))])
 
-    def relation(self, point: _ModalPoint) -> InputRelation:
-        """Return the relation of the residual at this point to the angle."""
+    def residual_dependence_on_angle(self, point: _LinearSolution) -> InputRelation:
+        """Test whether the residual at a point depends linearly on the motor angle."""
         residual = point.residual.view(np.complex128)
         angle = self.comparison.spectrum(self.comparison.angle_rad[self.comparison.retained])
-        counts = self.noise.counts
-        first = int(np.argmax(counts))
-        return input_relation(residual[first:], angle[first:], self.comparison.frequency_hz[first:])
+        is_used = self.noise.counts
+        first_used = int(np.argmax(is_used))
+        return input_relation(
+            residual[first_used:], angle[first_used:], self.comparison.frequency_hz[first_used:]
+        )
 
     def fit(self) -> ModalFit | None:
-        """Return the fit without modes that save nothing: they are undetermined."""
+        """Return the fit after the removal of modes that do not reduce the cost enough.
+
+        Return None if no mode remains. The removed modes are undetermined.
+        """
         order = np.argsort(self.x[::2])
         search = replace(
             self,
             x=self.x.reshape(-1, 2)[order].ravel(),
             numbers=tuple(self.numbers[i] for i in order),
         )
-        saved = search.evidence()
-        while saved.size and saved.min() < _EVIDENCE:
-            search = search._without(int(np.argmin(saved))).descended()
-            saved = search.evidence()
-        if not saved.size:
+        cost_increases = search.evidence()
+        while cost_increases.size and cost_increases.min() < _MIN_DEVIANCE_REDUCTION:
+            search = search._remove_mode(int(np.argmin(cost_increases))).descend_to_minimum()
+            cost_increases = search.evidence()
+        if not cost_increases.size:
             return None
         x, numbers = search.x, search.numbers
         problem = search.problem()
-        point = problem.at(x)
-        every = problem.covariance(point)
-        constants, covariance = problem.constants(point, x, every)
+        point = problem.solution_at(x)
+        joint_covariance = problem.covariance(point)
+        constants, covariance = problem.constants(point, x, joint_covariance)
         residual = point.residual.view(np.complex128)
-        counts = search.noise.counts
+        is_used = search.noise.counts
         return ModalFit(
             model=problem.model(x),
             numbers=numbers,
             constants=constants,
             joint_covariance=covariance,
-            evidence=tuple(saved.tolist()),
+            evidence=tuple(cost_increases.tolist()),
             residual=residual,
             noise=search.noise,
-            whiteness=whiteness(residual[counts], search.comparison.frequency_hz[counts]),
-            input_relation=search.relation(point),
-            ringing=problem.ringing(point, every),
-            span=np.concatenate([point.span, _orthonormal(point.jacobian)[0]]),
+            whiteness=whiteness(residual[is_used], search.comparison.frequency_hz[is_used]),
+            input_relation=search.residual_dependence_on_angle(point),
+            ringing=problem.ringing(point, joint_covariance),
+            span=np.concatenate([point.span, _orthonormal_rows(point.jacobian)[0]]),
         )
 
 
-def _gram(
+def _scaled_gram(
     rows: NDArray[np.float64], regularization: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return rows of length 1, their regularized Gram matrix, and their original lengths."""
-    scale = np.sqrt(np.einsum("ij,ij->i", rows, rows))
-    scale[scale == 0] = 1.0  # a decay that is over at once
-    scaled = rows / scale[:, None]
+    """Return rows scaled to length 1, their regularized Gram matrix and their former lengths."""
+    lengths = np.sqrt(np.einsum("ij,ij->i", rows, rows))
+    lengths[lengths == 0] = 1.0  # the spectrum of a decay that ends at once
+    scaled = rows / lengths[:, None]
     gram = scaled @ scaled.T
     gram[np.diag_indices_from(gram)] += regularization
-    return scaled, gram, scale
+    return scaled, gram, lengths
 
 
-def _orthonormal(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return orthonormal rows with the same span, and the factor that restores the rows."""
-    scaled, gram, scale = _gram(rows, 1e-13)
+def _orthonormal_rows(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return orthonormal rows of the same span, and the matrix that restores the given rows."""
+    scaled, gram, lengths = _scaled_gram(rows, 1e-13)
     factor = np.linalg.cholesky(gram)
-    return np.linalg.solve(factor, scaled), factor * scale[:, None]
+    return np.linalg.solve(factor, scaled), factor * lengths[:, None]
 
 
 @dataclass(frozen=True, slots=True)
-class _ModalPoint:
-    """Whitened residual of the best linear parameters at one point, and its derivatives."""
+class _LinearSolution:
+    """Solution for the linear parameters at one point, with its whitened residual and derivatives.
+
+    `columns` are the whitened spectra that the linear parameters multiply, `span` is an orthonormal
+    basis of these, and `jacobian` the part of `full_jacobian` outside that span. Real and imaginary
+    parts are interleaved, so that rows have 2 K values.
+    """
 
     residual: NDArray[np.float64]
-    linear: NDArray[np.float64]
+    linear_parameters: NDArray[np.float64]
     columns: NDArray[np.float64]
     span: NDArray[np.float64]
     full_jacobian: NDArray[np.float64]
@@ -369,204 +433,245 @@ class _ModalPoint:
 
 
 def _unit_pole(eta: float) -> complex:
-    """Return the upper root of ``1 + eta q + q²``."""
+    """Return the root of ``1 + eta q + q²`` with positive imaginary part."""
     return complex(-eta / 2, math.sqrt(1 - eta * eta / 4))
 
 
-def _unit_pole_slope(eta: float) -> complex:
-    """Differentiate `_unit_pole` by eta."""
+def _unit_pole_derivative(eta: float) -> complex:
+    """Return the derivative, with respect to eta, of the upper root of ``1 + eta q + q²``."""
     return complex(-0.5, -eta / (4 * math.sqrt(1 - eta * eta / 4)))
 
 
 class _ModalProblem:
-    """Whitened residual of some modes as a function of frequencies and damping."""
+    """Least-squares problem of the modal model: its unknowns are mode frequencies and damping."""
 
     def __init__(
         self,
         comparison: Comparison,
         weight: NDArray[np.float64],
-        further: NDArray[np.complex128],
+        effect_spectra: NDArray[np.complex128],
         numbers: tuple[int, ...],
     ) -> None:
-        self._recent: Recent[_ModalPoint] = Recent()
+        self._recent: Recent[_LinearSolution] = Recent()
         self._numbers = numbers
         self._comparison = comparison
         self._weight = weight
-        self._further = further
+        self._effect_spectra = effect_spectra
         self._s = comparison.prediction.s
         self.scale_rad_s = 2 * math.pi * float(comparison.frequency_hz[-1])
-        self._measured = self._white(comparison.spectrum(comparison.torque_nm[comparison.retained]))
+        self._measured_torque = self._whiten(
+            comparison.spectrum(comparison.torque_nm[comparison.retained])
+        )
         background = np.array([(self._s / self.scale_rad_s) ** n for n in range(BACKGROUND)])
-        self._background = self._spectra(background)
+        self._background = self._predicted_spectra(background)
 
-    def _white(self, spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def _whiten(self, spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
         return np.ascontiguousarray(spectra * self._weight).view(np.float64)
 
-    def _spectra(self, responses: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def _predicted_spectra(self, responses: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Return the whitened torque spectra of transfer functions from the angle, (n, 2 K)."""
         comparison = self._comparison
-        return self._white(comparison.spectrum(comparison.prediction.in_time(responses)))
+        return self._whiten(comparison.spectrum(comparison.prediction.in_time(responses)))
 
     def _poles(self, x: NDArray[np.float64]) -> list[Pole]:
-        """Return the poles at a point, with derivatives by it."""
+        """Return the poles of the modes at a point, with their derivatives by the point."""
         poles = []
         for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
             omega, q = math.exp(log_omega), _unit_pole(eta)
             derivative = np.zeros(x.size, dtype=np.complex128)
             derivative[2 * k] = omega * q
-            derivative[2 * k + 1] = omega * _unit_pole_slope(eta)
+            derivative[2 * k + 1] = omega * _unit_pole_derivative(eta)
             poles.append(Pole(self._numbers[k], omega * q, derivative))
         return poles
 
-    def _nuisance(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        return np.concatenate([self._comparison.nuisance(poles), self._further])
+    def _nuisance_spectra(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Return the spectra of all effects of unknown amplitude, not whitened, shape (m, K)."""
+        return np.concatenate([self._comparison.nuisance_spectra(poles), self._effect_spectra])
 
-    def _drag(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Return the change of the torque by drag with the poles, and derivatives, (1 + k, K)."""
+    def _drag_change(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Return how the drag torque changes with the poles, and its derivatives, shape (1 + k, K).
+
+        Row 0 is the change of the spectrum relative to the plant for which the drag was computed.
+        """
         total = np.zeros((1 + 2 * len(poles), self._weight.size), dtype=np.complex128)
         drag = self._comparison.drag
         if drag is None:
             return total
-        own = {pole.mode: pole.at_rad_s for pole in mode_poles(drag.plant, len(drag.by_pole), ())}
+        reference_poles = {
+            pole.mode: pole.at_rad_s for pole in mode_poles(drag.plant, len(drag.by_pole), ())
+        }
         for pole in poles:
-            if pole.mode in drag.by_pole and pole.mode in own:
+            if pole.mode in drag.by_pole and pole.mode in reference_poles:
                 by_real, by_imaginary = drag.by_pole[pole.mode]
-                apart = pole.at_rad_s - own[pole.mode]
-                total[0] += apart.real * by_real + apart.imag * by_imaginary
+                difference = pole.at_rad_s - reference_poles[pole.mode]
+                total[0] += difference.real * by_real + difference.imag * by_imaginary
                 total[1:] += np.outer(pole.derivative.real, by_real)
                 total[1:] += np.outer(pole.derivative.imag, by_imaginary)
         return total
 
-    def at(self, x: NDArray[np.float64]) -> _ModalPoint:
-        """Eliminate the linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
+    def solution_at(self, x: NDArray[np.float64]) -> _LinearSolution:
+        """Solve for the linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
 
-        The last two points are cached.
+        The solutions at the last two points are cached.
         """
-        return self._recent.at(x, self._at)
+        return self._recent.at(x, self._solve_at)
 
-    def _at(self, x: NDArray[np.float64]) -> _ModalPoint:
+    def _solve_at(self, x: NDArray[np.float64]) -> _LinearSolution:
+        """Solve for the linear parameters at a point, without the cache."""
         modes = x.reshape(-1, 2)
         rows: list[NDArray[np.complex128]] = []
-        slopes: list[NDArray[np.complex128]] = []
+        derivative_rows: list[NDArray[np.complex128]] = []
         for log_omega, eta in modes:
             omega = math.exp(log_omega)
             q = self._s / omega
-            over = 1 / (1 + eta * q + q * q)
-            numerators = (q * q * over, q**3 * over)
+            inverse_denominator = 1 / (1 + eta * q + q * q)
+            numerators = (q * q * inverse_denominator, q**3 * inverse_denominator)
             rows += numerators
-            # d/d eta and d/d ln omega of either numerator over the denominator
+            # Derivatives by ln omega and eta of either numerator over the denominator
             for power, row in zip((2, 3), numerators, strict=True):
-                slopes.append(row * ((eta * q + 2 * q * q) * over - power))
-                slopes.append(-row * q * over)
-        count = len(rows)
-        spectra = self._spectra(np.array(rows + slopes).reshape(-1, self._s.size))
+                derivative_rows.append(row * ((eta * q + 2 * q * q) * inverse_denominator - power))
+                derivative_rows.append(-row * q * inverse_denominator)
+        numerator_count = len(rows)
+        spectra = self._predicted_spectra(
+            np.array(rows + derivative_rows).reshape(-1, self._s.size)
+        )
         poles = self._poles(x)
-        nuisance = self._white(self._nuisance(poles))
-        drag, *by_drag = self._white(self._drag(poles))
-        columns = np.concatenate([spectra[:count], self._background, nuisance])
-        span, factor = _orthonormal(columns)
-        measured = self._measured - drag
-        along = span @ measured
-        residual = along @ span - measured
-        linear = np.linalg.solve(factor.T, along)
-        decays = linear[count + BACKGROUND :]
-        jacobian = np.array(by_drag).reshape(x.size, residual.size)
+        nuisance_spectra = self._whiten(self._nuisance_spectra(poles))
+        drag, *drag_jacobian = self._whiten(self._drag_change(poles))
+        columns = np.concatenate([spectra[:numerator_count], self._background, nuisance_spectra])
+        span, factor = _orthonormal_rows(columns)
+        measured_torque = self._measured_torque - drag
+        projections = span @ measured_torque
+        residual = projections @ span - measured_torque
+        linear_parameters = np.linalg.solve(factor.T, projections)
+        nuisance_amplitudes = linear_parameters[numerator_count + BACKGROUND :]
+        jacobian = np.array(drag_jacobian).reshape(x.size, residual.size)
         if poles:
-            jacobian += self._white(self._comparison.decay_gradient(poles, decays))
+            jacobian += self._whiten(self._comparison.decay_gradient(poles, nuisance_amplitudes))
         for k in range(len(modes)):
-            a, b = linear[2 * k : 2 * k + 2]
-            four = spectra[count + 4 * k : count + 4 * k + 4]
-            jacobian[2 * k] += a * four[0] + b * four[2]
-            jacobian[2 * k + 1] += a * four[1] + b * four[3]
-        projected = jacobian - (jacobian @ span.T) @ span
-        return _ModalPoint(residual, linear, columns, span, jacobian, projected)
+            a, b = linear_parameters[2 * k : 2 * k + 2]
+            mode_derivatives = spectra[numerator_count + 4 * k : numerator_count + 4 * k + 4]
+            jacobian[2 * k] += a * mode_derivatives[0] + b * mode_derivatives[2]
+            jacobian[2 * k + 1] += a * mode_derivatives[1] + b * mode_derivatives[3]
+        projected_jacobian = jacobian - (jacobian @ span.T) @ span
+        return _LinearSolution(
+            residual, linear_parameters, columns, span, jacobian, projected_jacobian
+        )
 
     def model(self, x: NDArray[np.float64]) -> ModalModel:
-        """Return the modal model at a point."""
-        linear = self.at(x).linear
+        """Return the modal model at a point, with the best linear parameters."""
+        linear_parameters = self.solution_at(x).linear_parameters
         modes = x.reshape(-1, 2)
         poles, residues = [], []
-        first = 2 * len(modes)
-        background = linear[first : first + BACKGROUND] / self.scale_rad_s ** np.arange(BACKGROUND)
+        first_background = 2 * len(modes)
+        background = linear_parameters[
+            first_background : first_background + BACKGROUND
+        ] / self.scale_rad_s ** np.arange(BACKGROUND)
         for k, (log_omega, eta) in enumerate(modes):
-            omega, (a, b) = math.exp(log_omega), linear[2 * k : 2 * k + 2]
+            omega, (a, b) = math.exp(log_omega), linear_parameters[2 * k : 2 * k + 2]
             q = _unit_pole(eta)
             poles.append(omega * q)
             residues.append(omega * (a + b * q) * q * q / (2j * q.imag))
-            # (a + b q) q² over the denominator, less its remainder
+            # Add the polynomial part of (a + b q) q² over the denominator.
             background[0] += a - b * eta
             background[1] += b / omega
         return ModalModel(tuple(poles), tuple(residues), tuple(background.tolist()))
 
     def residual(self, x: NDArray[np.float64], model: ModalModel) -> NDArray[np.complex128]:
-        """Return the residual of the model at a point in N·m, not whitened."""
-        first = 2 * len(self._numbers) + BACKGROUND
-        amplitudes = self.at(x).linear[first:]
-        here = self._poles(x)
+        """Return the residual spectrum of a model at a point in N·m, not whitened, shape (K,)."""
+        first_nuisance = 2 * len(self._numbers) + BACKGROUND
+        amplitudes = self.solution_at(x).linear_parameters[first_nuisance:]
+        poles = self._poles(x)
         comparison = self._comparison
         torque = comparison.prediction.torque(model)[0]
-        bare = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
-        drag: NDArray[np.complex128] = self._drag(here)[0]
-        return drag + bare + amplitudes @ self._nuisance(here)
+        modal_residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
+        drag_change: NDArray[np.complex128] = self._drag_change(poles)[0]
+        return drag_change + modal_residual + amplitudes @ self._nuisance_spectra(poles)
 
-    def covariance(self, point: _ModalPoint) -> NDArray[np.float64]:
-        """Return the covariance of the unknowns and the linear parameters."""
-        _, gram, scale = _gram(np.concatenate([point.full_jacobian, point.columns]), 1e-14)
-        covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(scale, scale)
+    def covariance(self, point: _LinearSolution) -> NDArray[np.float64]:
+        """Return the joint covariance of the point and the linear parameters."""
+        _, gram, lengths = _scaled_gram(np.concatenate([point.full_jacobian, point.columns]), 1e-14)
+        covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(lengths, lengths)
         return covariance
 
-    def ringing(self, point: _ModalPoint, covariance: NDArray[np.float64]) -> Ringing:
-        """Return the free decay at the beginning, two amplitudes a mode, and its chi-square."""
-        count = len(self._numbers)
-        first = 2 * count + BACKGROUND
-        decays = point.linear[first : first + 2 * count]
-        rows = slice(2 * count + first, 2 * count + first + 2 * count)
+    def ringing(self, point: _LinearSolution, covariance: NDArray[np.float64]) -> Ringing:
+        """Return the free decay at the beginning of the record, with its chi-square.
+
+        The decay of each mode has two amplitudes, which are free linear parameters of the fit.
+        """
+        mode_count = len(self._numbers)
+        first_decay = 2 * mode_count + BACKGROUND
+        amplitudes = point.linear_parameters[first_decay : first_decay + 2 * mode_count]
+        rows = slice(2 * mode_count + first_decay, 2 * mode_count + first_decay + 2 * mode_count)
         return Ringing(
-            amplitude_nm=tuple(np.hypot(decays[::2], decays[1::2]).tolist()),
-            chi_square=float(decays @ np.linalg.solve(covariance[rows, rows], decays)),
-            degrees_of_freedom=decays.size,
+            amplitude_nm=tuple(np.hypot(amplitudes[::2], amplitudes[1::2]).tolist()),
+            chi_square=float(amplitudes @ np.linalg.solve(covariance[rows, rows], amplitudes)),
+            degrees_of_freedom=amplitudes.size,
         )
 
     def constants(
-        self, point: _ModalPoint, x: NDArray[np.float64], covariance: NDArray[np.float64]
+        self, point: _LinearSolution, x: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return `CONSTANTS` of all modes, and their covariance with that of the background."""
-        count = x.size // 2
-        constants = np.empty(4 * count)
-        linear = x.size + 2 * count  # index of the first coefficient of the background
-        chain = np.zeros((4 * count + BACKGROUND, linear + BACKGROUND))
-        background = chain[4 * count :]
-        background[:, linear:] = np.diag(self.scale_rad_s ** -np.arange(float(BACKGROUND)))
-        for k in range(count):
+        """Return the `CONSTANTS` of all modes, and their joint covariance with the background.
+
+        Their shapes are (4 n,) and (4 n + 5, 4 n + 5).
+        """
+        mode_count = x.size // 2
+        constants = np.empty(4 * mode_count)
+        first_background = x.size + 2 * mode_count
+        derivatives = np.zeros((4 * mode_count + BACKGROUND, first_background + BACKGROUND))
+        background_rows = derivatives[4 * mode_count :]
+        background_rows[:, first_background:] = np.diag(
+            self.scale_rad_s ** -np.arange(float(BACKGROUND))
+        )
+        for k in range(mode_count):
             log_omega, eta = x[2 * k : 2 * k + 2]
-            a, b = point.linear[2 * k : 2 * k + 2]
+            a, b = point.linear_parameters[2 * k : 2 * k + 2]
             q = _unit_pole(eta)
-            over = a + b * q
+            numerator = a + b * q
             # ln of the residue over j: ln omega + ln (a + b q) + 2 ln q - ln(2 Im q) + j pi
-            log_residue = np.log(-over * q * q / (2 * q.imag)) + log_omega
-            by_eta_q = _unit_pole_slope(eta)
-            by_eta = (b / over + 2 / q) * by_eta_q - by_eta_q.imag / q.imag
-            by_a, by_b = 1 / over, q / over
+            log_residue = np.log(-numerator * q * q / (2 * q.imag)) + log_omega
+            pole_derivative = _unit_pole_derivative(eta)
+            residue_by_eta = (
+                b / numerator + 2 / q
+            ) * pole_derivative - pole_derivative.imag / q.imag
+            residue_by_a, residue_by_b = 1 / numerator, q / numerator
             constants[4 * k : 4 * k + 4] = (
                 log_omega + math.log(q.imag / (2 * math.pi)),
                 math.log(eta / 2),
                 log_residue.real,
                 log_residue.imag,
             )
-            rows = chain[4 * k : 4 * k + 4]
-            omega_at, eta_at, a_at, b_at = 2 * k, 2 * k + 1, x.size + 2 * k, x.size + 2 * k + 1
-            rows[0, [omega_at, eta_at]] = 1.0, by_eta_q.imag / q.imag
-            rows[1, eta_at] = 1 / eta
-            rows[2, [omega_at, eta_at, a_at, b_at]] = 1.0, by_eta.real, by_a.real, by_b.real
-            rows[3, [eta_at, a_at, b_at]] = by_eta.imag, by_a.imag, by_b.imag
-            # What the numerator leaves beyond the poles, as in `model`.
-            background[0, [a_at, b_at, eta_at]] = 1.0, -eta, -b
-            background[1, [b_at, omega_at]] = np.array([1.0, -b]) / math.exp(log_omega)
-        own = covariance[: chain.shape[1], : chain.shape[1]]
-        return constants, chain @ own @ chain.T
+            rows = derivatives[4 * k : 4 * k + 4]
+            omega_index, eta_index, a_index, b_index = (
+                2 * k,
+                2 * k + 1,
+                x.size + 2 * k,
+                x.size + 2 * k + 1,
+            )
+            rows[0, [omega_index, eta_index]] = 1.0, pole_derivative.imag / q.imag
+            rows[1, eta_index] = 1 / eta
+            rows[2, [omega_index, eta_index, a_index, b_index]] = (
+                1.0,
+                residue_by_eta.real,
+                residue_by_a.real,
+                residue_by_b.real,
+            )
+            rows[3, [eta_index, a_index, b_index]] = (
+                residue_by_eta.imag,
+                residue_by_a.imag,
+                residue_by_b.imag,
+            )
+            # The remainder of the division of the numerator by the denominator, as in `model`.
+            background_rows[0, [a_index, b_index, eta_index]] = 1.0, -eta, -b
+            background_rows[1, [b_index, omega_index]] = np.array([1.0, -b]) / math.exp(log_omega)
+        used_covariance = covariance[: derivatives.shape[1], : derivatives.shape[1]]
+        return constants, derivatives @ used_covariance @ derivatives.T
 
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
-        """Return the normal equations for the descent (Kaufman's Jacobian)."""
-        point = self.at(x)
+        """Return the normal equations at a point for the descent, with Kaufman's Jacobian."""
+        point = self.solution_at(x)
         return NormalEquations(
             cost=float(point.residual @ point.residual),
             gradient=point.jacobian @ point.residual,

@@ -1,9 +1,9 @@
-"""Headline of a record from its modal model, and from a beam with a tolerance of the geometry.
+"""Headline numbers from the modal model, and from a beam with a tolerance of the geometry.
 
-Modes are those of the modal model, which holds for every antenna. Damping and stiffness are those
-of a beam whose mode frequencies may differ from those of a uniform one by a stated tolerance: an
-unevenness of a thousandth changes a frequency as much as an order of the damping does. The
-estimates for a beam that is uniform to 1e-5 are reported as conditional estimates.
+The modes are those of the modal model, which is valid for every antenna. Damping and stiffness are
+those of a beam whose mode frequencies may differ from those of a uniform beam by a stated
+tolerance: an unevenness of a thousandth changes a frequency as much as an order of the damping
+does. The estimates for a beam that is uniform to 1e-5 are reported as conditional estimates.
 """
 
 from __future__ import annotations
@@ -36,25 +36,29 @@ if TYPE_CHECKING:
 NOT_UNIFORM: Final = (
     "the modes are not those of a uniform beam, and what makes them differ may change this value"
 )
-NO_ORDER: Final = "no beam with one internal and one external order explains the losses"
+"""Reason for a flag on parameters that a deviation from a uniform beam may change."""
 
-_EFFECTIVE: Final = (*OF_BEAM, "delay_s", "gamma", "lambda")
-"""Parameters that an uneven beam may change by more than the tolerance. External damping is among
-them: it is relative to the inertia of each mode."""
+NO_ORDER: Final = "no beam with one internal and one external order explains the losses"
+"""Reason for a flag on damping parameters: no beam with fractional orders explains the losses."""
+
+_EFFECTIVE_PARAMETERS: Final = (*OF_BEAM, "delay_s", "gamma", "lambda")
+"""Parameters that a deviation from a uniform beam may change by more than the tolerance of the
+geometry. External damping is among them: it is relative to the inertia of each mode."""
 
 
 def refused_reason(test: UniformBeamTest) -> str | None:
-    """Return why values of a uniform beam are not valid; None if they may be."""
+    """Return the reason why values of a uniform beam are invalid; None if they may be valid."""
     if test.status != "refused":
         return None
     return f"a uniform beam does not predict the modal constants ({test.summary.chance})"
 
 
-_N = TypeVar("_N", bound=Estimates)
+_EstimatesT = TypeVar("_EstimatesT", bound=Estimates)
+"""Type variable for `Estimates` or a subclass, which `with_modal_model` takes and returns."""
 
 
 def with_modal_model(
-    exact: _N,
+    exact: _EstimatesT,
     modal: ModalEstimate,
     test: UniformBeamTest,
     tolerant: TolerantEstimate | None,
@@ -62,87 +66,100 @@ def with_modal_model(
     mode_doubt: str | None,
     *,
     half_width: float = NORMAL_95,
-) -> _N:
-    """Replace modes and parameters of an exactly uniform beam by the tolerant estimates.
+) -> _EstimatesT:
+    """Replace the estimates for an exactly uniform beam by those of more general models.
+
+    Modes come from the modal model. Parameters come from the beam with a tolerance of the geometry.
 
     Parameters
     ----------
     exact : Estimates
         Estimates for an exactly uniform beam.
     modal : ModalEstimate
+        Modal model.
     test : UniformBeamTest
+        Test of a uniform beam against the modal model.
     tolerant : TolerantEstimate or None
-        None retains the parameters: the beam is stated to be uniform, or too few modes show.
+        Parameters of a beam with a tolerance of the geometry. With None the parameters of `exact`
+        are retained: the beam is stated to be uniform, or too few modes are visible.
     doubt, mode_doubt : str or None
-        Reason against every number of the record, or against every mode.
+        Reason against every number of the record, and against every mode.
     half_width : float
         Half width of the modes' 95 % intervals, in standard deviations.
     """
-    refused = refused_reason(test)
-    condition = exact if refused is None else exact.doubted(refused)
-    # What drag does depends on how a mode decays, which the beam takes into account.
-    of_beam = test.status == "passed" and (tolerant is None or "drag" in exact.parameters)
-    modes = _modes(condition, modal, mode_doubt, half_width, own=of_beam)
-    numbers = replace(condition, modes=modes, uniform_beam=test, modal=modal)
+    refusal = refused_reason(test)
+    exact_estimates = exact if refusal is None else exact.doubted(refusal)
+    # The effect of drag depends on how a mode decays, which the beam model includes.
+    modes_of_beam = test.status == "passed" and (tolerant is None or "drag" in exact.parameters)
+    modes = _reported_modes(exact_estimates, modal, mode_doubt, half_width, from_beam=modes_of_beam)
+    estimates = replace(exact_estimates, modes=modes, uniform_beam=test, modal=modal)
     if tolerant is None:
-        return numbers
+        return estimates
     return replace(
-        numbers,
+        estimates,
         parameters={
             **{
                 name: quantity
-                for name, quantity in condition.parameters.items()
+                for name, quantity in exact_estimates.parameters.items()
                 if name not in PARAMETERS
             },
-            **_parameters(tolerant, doubt, refused=refused is not None),
+            **_reported_parameters(tolerant, doubt, refused=refusal is not None),
         },
         sizes=tuple(each.flagged(doubt) for each in tolerant_sizes(test, tolerant)),
-        structures=_structures(condition, tolerant),
+        structures=_structure_status(exact_estimates, tolerant),
         simpler=None,
         exact=Estimates(
-            name=condition.name,
-            parameters=condition.parameters,
-            sizes=condition.sizes,
-            modes=condition.modes,
-            structures=condition.structures,
-            simpler=condition.simpler,
-            drag_speed_m_s=condition.drag_speed_m_s,
+            name=exact_estimates.name,
+            parameters=exact_estimates.parameters,
+            sizes=exact_estimates.sizes,
+            modes=exact_estimates.modes,
+            structures=exact_estimates.structures,
+            simpler=exact_estimates.simpler,
+            drag_speed_m_s=exact_estimates.drag_speed_m_s,
         ),
         tolerant=tolerant,
     )
 
 
-def _modes(
-    numbers: Estimates, modal: ModalEstimate, doubt: str | None, half_width: float, *, own: bool
+def _reported_modes(
+    estimates: Estimates,
+    modal: ModalEstimate,
+    doubt: str | None,
+    half_width: float,
+    *,
+    from_beam: bool,
 ) -> tuple[ReportedMode, ...]:
-    """Return the visible modes from the modal model, and the others from the beam."""
+    """Return the visible modes from the modal model, and the other modes from the beam.
+
+    With `from_beam`, frequency and damping ratio of visible modes are also those of the beam.
+    """
     visible = modal.visible
-    found: dict[int, ReportedMode] = {mode.number: mode for mode in numbers.modes}
+    modes: dict[int, ReportedMode] = {mode.number: mode for mode in estimates.modes}
     for number in visible:
-        its = modal.mode(number)
-        inertia, spread = modal.inertia(number)
+        modal_mode = modal.mode(number)
+        inertia, relative_std = modal.inertia(number)
         mode = ReportedMode(
             number,
-            symmetric(its.frequency_hz, its.frequency_std_hz, doubt, half_width),
-            symmetric(its.damping_ratio, its.damping_ratio_std, doubt, half_width),
+            symmetric(modal_mode.frequency_hz, modal_mode.frequency_std_hz, doubt, half_width),
+            symmetric(modal_mode.damping_ratio, modal_mode.damping_ratio_std, doubt, half_width),
             shown=True,
             source="modal",
-            participation=symmetric(inertia, inertia * spread, doubt, half_width),
+            participation=symmetric(inertia, inertia * relative_std, doubt, half_width),
         )
-        if own and number in found:
-            before = found[number]
-            mode = replace(before, shown=True, participation=mode.participation)
-        found[number] = mode
+        if from_beam and number in modes:
+            beam_mode = modes[number]
+            mode = replace(beam_mode, shown=True, participation=mode.participation)
+        modes[number] = mode
     return tuple(
         each if each.number in visible else replace(each, shown=False)
-        for _, each in sorted(found.items())
+        for _, each in sorted(modes.items())
     )
 
 
-def _parameters(
+def _reported_parameters(
     estimate: TolerantEstimate, doubt: str | None, *, refused: bool
 ) -> dict[str, ReportedValue]:
-    """Return the parameters of the nearly uniform beam, with flags on undetermined ones.
+    """Return the parameters of the beam with a tolerance of the geometry, flagged if undetermined.
 
     `doubt` is the reason against every number. With `refused`, stiffness, density, delay and
     external damping are effective values: a tip mass or a compliant clamp changes all modes alike,
@@ -153,14 +170,16 @@ def _parameters(
             estimate.values[name],
             estimate.std[name],
             estimate.interval[name],
-            doubt or effective_reason(name, refused=refused) or _reason(estimate, name),
+            doubt
+            or effective_reason(name, refused=refused)
+            or _reason_undetermined(estimate, name),
         )
         for name in PARAMETERS
     }
 
 
-def _reason(estimate: TolerantEstimate, name: str) -> str | None:
-    """Return the reason against a parameter; None if it is valid."""
+def _reason_undetermined(estimate: TolerantEstimate, name: str) -> str | None:
+    """Return the reason why the modes do not determine a parameter; None if they do."""
     if estimate.basis == "none":
         return NO_ORDER
     for order, coefficient in COEFFICIENT_OF.items():
@@ -170,40 +189,46 @@ def _reason(estimate: TolerantEstimate, name: str) -> str | None:
 
 
 def identifiable(estimate: TolerantEstimate, order: str) -> bool:
-    """Return whether the modes bound an order within less than half of its range."""
+    """Return whether the modes determine a damping order.
+
+    Its 95 % interval must be narrower than a quarter of its range, and its damping significant.
+    """
     low, high = estimate.interval[order]
-    wide = WIDEST_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
-    shows = estimate.deviance_without[COEFFICIENT_OF[order]] > NORMAL_95**2
-    return high - low <= wide and shows
+    widest = WIDEST_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
+    is_significant = estimate.deviance_without[COEFFICIENT_OF[order]] > NORMAL_95**2
+    return high - low <= widest and is_significant
 
 
-def _structures(
+def _structure_status(
     exact: Estimates, estimate: TolerantEstimate
 ) -> tuple[tuple[str, StructureStatus], ...]:
-    """Return the status of the structures by their losses; mode frequencies are no proof."""
+    """Return the name and status of each damping structure, assessed by the losses of the modes.
 
-    def status(name: str, before: StructureStatus) -> StructureStatus:
-        if before == "selected":
-            return before
+    Mode frequencies do not distinguish structures if the beam may deviate from a uniform one.
+    """
+
+    def status_of(name: str, exact_status: StructureStatus) -> StructureStatus:
+        if exact_status == "selected":
+            return exact_status
         structure = STRUCTURES[name.partition(",")[0]]
         for order, coefficient in COEFFICIENT_OF.items():
             if not structure.has(coefficient):
-                rise = estimate.deviance_without[coefficient]
+                deviance_rise = estimate.deviance_without[coefficient]
             elif structure.fixed.get(order) == 1.0:  # type: ignore[call-overload]
-                rise = estimate.deviance_of_one[order]
+                deviance_rise = estimate.deviance_of_one[order]
             else:
                 continue
-            if rise > EXCLUDED[0]:
+            if deviance_rise > EXCLUDED[0]:
                 return "excluded"
         return "compatible"
 
-    return tuple((name, status(name, before)) for name, before in exact.structures)
+    return tuple((name, status_of(name, exact_status)) for name, exact_status in exact.structures)
 
 
 def tolerant_sizes(
     test: UniformBeamTest, estimate: TolerantEstimate
 ) -> tuple[ReportedLossFactor, ...]:
-    """Return the loss factors where they depend least on their orders.
+    """Return the loss factors at the frequencies where they depend least on their orders.
 
     The loss factor of external damping is relative to the inertia, which is an effective value if
     the test refuses a uniform beam.
@@ -211,33 +236,36 @@ def tolerant_sizes(
     Parameters
     ----------
     test : UniformBeamTest
+        Test of a uniform beam against the modal model.
     estimate : TolerantEstimate
+        Parameters of a beam with a tolerance of the geometry.
     """
     values = dict(estimate.values)
-    found = []
+    reported = []
     for damping, (coefficient, order) in NAMES.items():
-        size = damping_size(
+        loss_factor = damping_size(
             coefficient, order, values, PARAMETERS, estimate.covariance, estimate.first_rad_s
         )
-        if size is None:
+        if loss_factor is None:
             continue
         flag = NO_ORDER if estimate.basis == "none" else None
         if damping == "external" and test.status == "refused":
             flag = flag or NOT_UNIFORM
-        found.append(size_of(damping, size, flag))
-    return tuple(found)
+        reported.append(size_of(damping, loss_factor, flag))
+    return tuple(reported)
 
 
 def effective_reason(name: str, *, refused: bool) -> str | None:
-    """Return why a parameter is an effective value; None if it is a property of the beam.
+    """Return why a parameter is only an effective value; None if it is a property of the beam.
 
     Parameters
     ----------
     name : str
+        Name of the parameter.
     refused : bool
         Whether the test refused a uniform beam.
     """
-    return NOT_UNIFORM if refused and name in _EFFECTIVE else None
+    return NOT_UNIFORM if refused and name in _EFFECTIVE_PARAMETERS else None
 
 
 def tolerant_order(
@@ -248,31 +276,33 @@ def tolerant_order(
     *,
     refused: bool,
 ) -> OrderVerdict:
-    """Assess one order with a tolerance of the geometry.
+    """Return the verdict on one damping order, with a tolerance of the geometry.
 
-    `profile` is the profile of the order on an exactly uniform beam, `doubt` the reason against
-    every number of the record. With `refused`, a uniform beam does not predict the modes: the cause
-    of their difference may have a loss of its own, so no order is excluded.
+    `profile` is the likelihood profile of the order on an exactly uniform beam, `doubt` the reason
+    against every number of the record. With `refused`, a uniform beam does not predict the modes:
+    the cause may have a loss of its own, so no order is excluded.
     """
     status, reason = tolerant_status(order, estimate, refused=refused)
     if reason is not None:
         return OrderVerdict(order, status, None, None, reason, profile)
-    value, ends = estimate.values[order], estimate.interval[order]
+    value, interval = estimate.values[order], estimate.interval[order]
     doubt = doubt or effective_reason(order, refused=refused)
     if doubt is not None:
-        return OrderVerdict(order, "open", value, ends, doubt, profile)
-    return OrderVerdict(order, status, value, ends, None, profile)
+        return OrderVerdict(order, "open", value, interval, doubt, profile)
+    return OrderVerdict(order, status, value, interval, None, profile)
 
 
 def tolerant_status(
     order: Order, estimate: TolerantEstimate, *, refused: bool
 ) -> tuple[Status, str | None]:
-    """Assess one order by an estimate, with the reason where it is not identifiable.
+    """Return the status of one damping order, and the reason if it is not identifiable.
 
     Parameters
     ----------
     order : str
+        "alpha" or "lambda".
     estimate : TolerantEstimate
+        Parameters of a beam with a tolerance of the geometry.
     refused : bool
         Whether the test refused a uniform beam.
     """
@@ -283,5 +313,5 @@ def tolerant_status(
     low, high = estimate.interval[order]
     if low <= 1 <= high:
         return "compatible", None
-    fractional = estimate.deviance_of_one[order] > EXCLUDED[0] and not refused
-    return ("fractional" if fractional else "open"), None
+    is_fractional = estimate.deviance_of_one[order] > EXCLUDED[0] and not refused
+    return ("fractional" if is_fractional else "open"), None

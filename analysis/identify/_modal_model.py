@@ -1,12 +1,13 @@
 """Modal model: poles and complex residues of the visible modes, and a smooth background.
 
-With angle in and coupling torque out, of any linear constant antenna on any mount::
+It describes the coupling torque as a function of the angle for any linear time-invariant antenna on
+any mount::
 
     G(s) = sum_k ( R_k / (s - p_k) + R_k* / (s - p_k*) ) + b0 + b1 s + b2 s² + b3 s³ + b4 s⁴
 
-Residues are complex: external damping, a lossy clamp, a delay and the sensor's lag all turn their
-phase. The background represents the modes beyond the band, the tool's inertia and the delay. No law
-of the damping is assumed, nor that the beam is uniform.
+The residues are complex, since external damping, a lossy clamp, a delay and the sensor's lag all
+change their phase. The background represents the modes beyond the band, the tool's inertia and the
+delay. The model assumes neither a law of the damping nor a uniform beam.
 
 References
 ----------
@@ -31,24 +32,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 BACKGROUND: Final = 5
-"""Coefficients of the background, b0 to b4."""
+"""Number of coefficients of the background polynomial, b0 to b4."""
 
 CONSTANTS: Final = ("ln_frequency", "ln_damping_ratio", "ln_residue", "residue_phase_rad")
-"""Real constants of a mode, in the order of the covariance of a fit."""
+"""Names of the four real constants of a mode, in the order of the covariance of a fit."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModalModel:
-    """Transfer function from motor angle to coupling torque by poles and residues.
+    """Transfer function from motor angle to coupling torque, by poles and residues.
 
     Attributes
     ----------
     poles_rad_s : tuple of complex
         Upper pole of each conjugate pair, by rising frequency.
     residues : tuple of complex
-        Residue at each, in N·m/s.
+        Residue at each of these poles, in N·m/s.
     background : tuple of float
-        b0 to b4, in N·m s^n/rad.
+        Coefficients b0 to b4 of the background polynomial, in N·m s^n/rad.
     """
 
     poles_rad_s: tuple[complex, ...]
@@ -56,12 +57,12 @@ class ModalModel:
     background: tuple[float, ...]
 
     def response(self, s: NDArray[np.complexfloating[Any, Any]]) -> NDArray[np.complex128]:
-        """Return G in N·m/rad, of the shape of `s`.
+        """Return the transfer function G in N·m/rad, of the shape of `s`.
 
         Parameters
         ----------
         s : ndarray of complex
-            In rad/s.
+            Laplace variable in rad/s.
         """
         total: NDArray[np.complex128] = np.polynomial.polynomial.polyval(
             s, np.array(self.background, dtype=np.complex128)
@@ -73,19 +74,19 @@ class ModalModel:
 
     @property
     def frequencies_hz(self) -> tuple[float, ...]:
-        """Return the frequencies of the free decay."""
+        """Return the damped natural frequencies of the modes, in Hz."""
         return tuple(pole.imag / (2 * math.pi) for pole in self.poles_rad_s)
 
     @property
     def damping_ratios(self) -> tuple[float, ...]:
-        """Return the damping ratios (fractions of the critical damping)."""
+        """Return the damping ratios of the modes (fractions of the critical damping)."""
         return tuple(-pole.real / abs(pole) for pole in self.poles_rad_s)
 
     @property
     def effective_inertias_kg_m2(self) -> tuple[float, ...]:
         """Return the effective inertia of each mode about the motor axis.
 
-        The inertias of an undamped beam add up to its moment of inertia.
+        The inertias of all modes of an undamped beam add up to its moment of inertia.
         """
         return tuple(
             2 * abs(residue) / abs(pole) ** 3
@@ -93,7 +94,7 @@ class ModalModel:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the model as `json.dumps` takes it."""
+        """Return poles, residues and background as a dictionary for `json.dumps`."""
         return {
             "poles_rad_s": [[pole.real, pole.imag] for pole in self.poles_rad_s],
             "residues": [[residue.real, residue.imag] for residue in self.residues],
@@ -104,13 +105,14 @@ class ModalModel:
     def of_constants(
         cls, constants: NDArray[np.float64], background: Sequence[float]
     ) -> ModalModel:
-        """Return the model with given constants.
+        """Return the modal model with given constants.
 
         Parameters
         ----------
         constants : ndarray, shape (4 n,)
             `CONSTANTS` of each mode in turn, by rising frequency.
         background : sequence of float
+            Coefficients b0 to b4 of the background.
         """
         rows = constants.reshape(-1, len(CONSTANTS)).tolist()
         poles, residues = [], []
@@ -123,11 +125,12 @@ class ModalModel:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> ModalModel:
-        """Read the result of `as_json`.
+        """Return the modal model from the content of a JSON document.
 
         Parameters
         ----------
         content : mapping
+            Result of `as_json`.
         """
         return cls(
             tuple(complex(*pair) for pair in content["poles_rad_s"]),
@@ -143,11 +146,12 @@ class ModalEstimate:
     Attributes
     ----------
     model : ModalModel
+        Poles, residues and background.
     numbers : tuple of int
-        Number of each mode of the model among those of the beam, from 1; 0 for a resonance of
-        something else.
+        Number of each mode of the model among those of the beam, from 1; 0 for a resonance that
+        does not belong to the beam.
     constants : ndarray, shape (4 n,)
-        `CONSTANTS` of each mode in turn; the phase is that of the residue over j.
+        `CONSTANTS` of each mode in turn; the phase is that of the residue divided by j.
     joint_covariance : ndarray, shape (4 n + 5, 4 n + 5)
         Covariance of the constants and the coefficients of the background.
     """
@@ -159,58 +163,69 @@ class ModalEstimate:
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """Return the covariance of the constants, shape (4 n, 4 n)."""
+        """Return the covariance of the constants of all modes, shape (4 n, 4 n)."""
         return self.joint_covariance[: self.constants.size, : self.constants.size]
 
     @property
     def visible(self) -> tuple[int, ...]:
-        """Return the numbers of the beam's modes that the data show."""
+        """Return the numbers of the beam modes that are visible in the data, in ascending order."""
         return tuple(sorted(number for number in self.numbers if number))
 
     def rows(self, numbers: Sequence[int]) -> NDArray[np.intp]:
-        """Return the indices of the constants of some modes, shape (4 m,).
+        """Return the indices of the constants of some modes in `constants`, shape (4 m,).
 
         Parameters
         ----------
         numbers : sequence of int
+            Numbers of m modes.
         """
-        each = np.arange(len(CONSTANTS))
-        indices = [each + each.size * self.numbers.index(number) for number in numbers]
+        mode_indices = np.arange(len(CONSTANTS))
+        indices = [
+            mode_indices + mode_indices.size * self.numbers.index(number) for number in numbers
+        ]
         return np.concatenate(indices) if indices else np.zeros(0, dtype=np.intp)
 
     def mode(self, number: int) -> ModeEstimate:
-        """Return a mode with its standard deviations.
+        """Return frequency and damping ratio of a mode, with their standard deviations.
 
         Parameters
         ----------
         number : int
+            Number of the mode.
         """
         rows = self.rows([number])[:2]
         frequency_hz, ratio = np.exp(self.constants[rows]).tolist()
-        of_frequency, of_ratio = np.sqrt(np.diag(self.covariance)[rows]).tolist()
+        relative_frequency_std, relative_ratio_std = np.sqrt(
+            np.diag(self.covariance)[rows]
+        ).tolist()
         return ModeEstimate(
-            number, frequency_hz, frequency_hz * of_frequency, ratio, ratio * of_ratio
+            number,
+            frequency_hz,
+            frequency_hz * relative_frequency_std,
+            ratio,
+            ratio * relative_ratio_std,
         )
 
     def inertia(self, number: int) -> tuple[float, float]:
-        """Return the effective inertia of a mode in kg m², and its relative standard deviation.
+        """Return the effective inertia of a mode in kg·m², and its relative standard deviation.
 
         Parameters
         ----------
         number : int
+            Number of the mode.
         """
         rows = self.rows([number])
-        # ln of the inertia: ln of the residue less three times ln of the frequency
-        slope = np.zeros(len(CONSTANTS))
-        slope[CONSTANTS.index("ln_frequency")] = -3.0
-        slope[CONSTANTS.index("ln_residue")] = 1.0
-        spread = math.sqrt(float(slope @ self.covariance[np.ix_(rows, rows)] @ slope))
-        return self.model.effective_inertias_kg_m2[self.numbers.index(number)], spread
+        # The logarithm of the inertia is ln_residue - 3 ln_frequency, plus a constant.
+        weights = np.zeros(len(CONSTANTS))
+        weights[CONSTANTS.index("ln_frequency")] = -3.0
+        weights[CONSTANTS.index("ln_residue")] = 1.0
+        relative_std = math.sqrt(float(weights @ self.covariance[np.ix_(rows, rows)] @ weights))
+        return self.model.effective_inertias_kg_m2[self.numbers.index(number)], relative_std
 
     def of_visible(self) -> ModalEstimate:
-        """Return the estimate of the visible modes alone, with the same background."""
+        """Return the modal model restricted to the visible modes, with the same background."""
         rows, indices = self.rows(self.visible), [self.numbers.index(n) for n in self.visible]
-        joint = np.concatenate([rows, self.constants.size + np.arange(BACKGROUND)])
+        joint_rows = np.concatenate([rows, self.constants.size + np.arange(BACKGROUND)])
         return ModalEstimate(
             ModalModel(
                 tuple(self.model.poles_rad_s[index] for index in indices),
@@ -219,11 +234,11 @@ class ModalEstimate:
             ),
             self.visible,
             self.constants[rows],
-            self.joint_covariance[np.ix_(joint, joint)],
+            self.joint_covariance[np.ix_(joint_rows, joint_rows)],
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the estimate as `json.dumps` takes it."""
+        """Return model, mode numbers and covariance as a dictionary for `json.dumps`."""
         names = [f"{name}_{k}" for k in range(1, len(self.numbers) + 1) for name in CONSTANTS]
         names += [f"background_{power}" for power in range(BACKGROUND)]
         return {

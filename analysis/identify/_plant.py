@@ -1,4 +1,4 @@
-"""Parameters of the predicted torque: beam, damping, settings and stated values."""
+"""Parameters that determine the predicted torque: beam, damping, settings and stated values."""
 
 from __future__ import annotations
 
@@ -13,63 +13,71 @@ if TYPE_CHECKING:
 Setting = Literal[
     "density_over_stiffness", "bending_stiffness_n_m2", "delay_s", "tool_inertia_kg_m2"
 ]
+"""Name of a parameter other than the damping that a fit estimates."""
+
 SETTINGS: Final[tuple[Setting, ...]] = (
     "density_over_stiffness",
     "bending_stiffness_n_m2",
     "delay_s",
     "tool_inertia_kg_m2",
 )
-"""Free parameters in addition to the damping, unless fixed: rho/EI in s²/m⁴, EI in N·m², the age of
-the torque relative to the angle, and the inertia between torque sensor and beam."""
+"""Parameters other than the damping that are estimated unless fixed: rho/EI in s²/m⁴, EI in N·m²,
+the age of the torque relative to the angle, and the inertia between torque sensor and beam."""
 
 
 def free_settings(fixed: Collection[Setting]) -> tuple[Setting, ...]:
-    """Return all `SETTINGS` except some, in their order.
+    """Return the `SETTINGS` that are not fixed, in their order.
 
     Parameters
     ----------
     fixed : collection of str
+        Names of the fixed settings.
     """
     return tuple(name for name in SETTINGS if name not in fixed)
 
 
-EXTRAS: Final = (
+OPTIONAL_PARAMETERS: Final = (
     "root_compliance_rad_per_nm",
     "tip_mass_kg",
     "filter_time_constant_s",
     "second_order_filter_time_constant_s",
 )
-"""What a rig may have besides a rigid clamp, a bare beam and ideal channels; 0 if it has not."""
+"""Parameters of a rig with a compliant clamp, a mass at the tip or filters in the torque channel; 0
+if it has none."""
 
 OF_BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
-"""Parameters of the beam without its damping."""
+"""Parameters of the beam other than its damping."""
 
 LOGARITHMIC: Final = frozenset({"zeta", "gamma", *OF_BEAM})
-"""Parameters that are positive and uncertain by a factor: their logarithm is what is estimated."""
+"""Parameters that are positive and uncertain by a factor, so their logarithm is estimated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plant:
-    """One point of the search: all parameters of the predicted torque.
+    """All parameters that determine the torque predicted from the angle; one point of a search.
 
     Attributes
     ----------
     beam : Beam
+        Geometry and material of the beam.
     damping : Damping
+        Coefficients and orders of internal and external damping.
     delay_s : float
         Age of the torque relative to the angle.
     tool_inertia_kg_m2 : float
+        Inertia between torque sensor and beam.
     stiffness_offsets : tuple of float
         Relative deviation of the stiffness of modes 2, 3, … from the uniform beam.
     root_compliance_rad_per_nm : float
         Rotation of the clamp per torque on the beam's root. The tool inertia is on the motor's side
-        of it: the bolted parts are stiff, and the grip on the beam yields.
+        of this compliance: the bolted parts are stiff, and the grip on the beam yields.
     tip_mass_kg : float
         Point mass at the beam's tip.
     filter_time_constant_s : float
-        Time constant of a low-pass filter of first order in the torque's channel.
+        Time constant of a first-order low-pass filter in the torque channel.
     second_order_filter_time_constant_s : float
-        Reciprocal corner frequency (rad/s) of a Butterworth low-pass filter of second order there.
+        Reciprocal corner frequency (rad/s) of a second-order Butterworth filter in the torque
+        channel.
     """
 
     beam: Beam
@@ -83,15 +91,16 @@ class Plant:
     second_order_filter_time_constant_s: float = 0.0
 
     @property
-    def extras(self) -> dict[str, float]:
-        """Return the values of all `EXTRAS`."""
-        return {name: getattr(self, name) for name in EXTRAS}
+    def optional_parameters(self) -> dict[str, float]:
+        """Return the values of all `OPTIONAL_PARAMETERS` by name."""
+        return {name: getattr(self, name) for name in OPTIONAL_PARAMETERS}
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Return values by name: zeta, alpha, gamma, lambda, the `SETTINGS`, stiffness_offset_2, ….
+        """Return the parameters by name.
 
-        Only those of the `EXTRAS` that are not 0 are included.
+        The names are zeta, alpha, gamma, lambda, the `SETTINGS`, stiffness_offset_2, …, and those
+        of the `OPTIONAL_PARAMETERS` that are not 0.
         """
         return {
             "zeta": self.damping.zeta,
@@ -106,5 +115,5 @@ class Plant:
                 f"stiffness_offset_{mode}": offset
                 for mode, offset in enumerate(self.stiffness_offsets, start=2)
             },
-            **{name: value for name, value in self.extras.items() if value},
+            **{name: value for name, value in self.optional_parameters.items() if value},
         }

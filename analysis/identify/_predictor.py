@@ -6,9 +6,9 @@ The response from measured angle to measured torque is::
 
 G is the exact fractional-order beam (Eq. 25 of the reference paper). With a tip mass, or with
 deviating stiffness of single modes, G is that of `rigd.beam._tip_mass`. kappa is the clamp's
-compliance, between tool and beam. Q holds the low-pass filters of the torque's channel, ``1 / (1 +
-tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)`` (Butterworth), and tau is the delay of the
-torque's channel relative to the angle's.
+compliance, between tool and beam. Q is the response of the low-pass filters of the torque channel,
+``1 / (1 + tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)`` (Butterworth), and tau is the
+delay of the torque channel relative to the angle channel.
 
 The angle is convolved with H causally, over the whole record, on ``s = sigma + j omega``: see
 `TorquePredictor`.
@@ -38,45 +38,54 @@ if TYPE_CHECKING:
 
 @lru_cache(maxsize=16)
 def eigenvalues(count: int) -> NDArray[np.float64]:
-    """Return the first roots of ``1 + cos z cosh z = 0``, shape (count,); cached and read-only."""
+    """Return the first roots of ``1 + cos z cosh z = 0``: clamped-free eigenvalues, shape (count,).
+
+    The array is cached and read-only.
+    """
     z = clamped_free_eigenvalues(count)
     z.flags.writeable = False
     return z
 
 
-_FILTERS: Final = ("filter_time_constant_s", "second_order_filter_time_constant_s")
-_BUTTERWORTH: Final = 2**0.5
+_FILTER_TIME_CONSTANTS: Final = ("filter_time_constant_s", "second_order_filter_time_constant_s")
+"""Parameters of `Plant` that are time constants of filters of the torque channel."""
+
+_BUTTERWORTH_LOSS: Final = 2**0.5
+"""Reciprocal quality factor of a second-order Butterworth filter."""
 
 
 def torque_channel(
     plant: Plant, s: NDArray[np.complexfloating[Any, Any]]
 ) -> NDArray[np.complex128]:
-    """Return the factor of delay and filters of the torque channel, of the shape of `s`.
+    """Return the transfer function of delay and filters of the torque channel, of the shape of `s`.
 
     Parameters
     ----------
     plant : Plant
+        Plant with the delay and the filters.
     s : ndarray of complex
-        In rad/s.
+        Laplace variable in rad/s.
     """
     at = s.astype(np.complex128, copy=False)
-    through: NDArray[np.complex128] = np.exp(-plant.delay_s * at)
-    for name in _FILTERS:
-        constant_s = plant.extras[name]
+    response: NDArray[np.complex128] = np.exp(-plant.delay_s * at)
+    for name in _FILTER_TIME_CONSTANTS:
+        constant_s = plant.optional_parameters[name]
         if constant_s:
-            through /= _divisor(name, constant_s, at)
-    return through
+            response /= _filter_denominator(name, constant_s, at)
+    return response
 
 
-def _divisor(name: str, constant_s: float, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return the denominator of a filter."""
+def _filter_denominator(
+    name: str, constant_s: float, s: NDArray[np.complex128]
+) -> NDArray[np.complex128]:
+    """Return the denominator of the transfer function of a filter at `s` in rad/s."""
     if name == "filter_time_constant_s":
         return 1 + constant_s * s
-    return 1 + constant_s * (_BUTTERWORTH * s + constant_s * s * s)
+    return 1 + constant_s * (_BUTTERWORTH_LOSS * s + constant_s * s * s)
 
 
 class ResponseGrid:
-    """H and its derivatives on one grid of s.
+    """Evaluates the transfer function from angle to torque, and its derivatives, on one grid of s.
 
     Parameters
     ----------
@@ -94,7 +103,7 @@ class ResponseGrid:
 
     @property
     def s(self) -> NDArray[np.complex128]:
-        """Return the grid, shape (n,)."""
+        """Return the grid of the Laplace variable in rad/s, shape (n,)."""
         return self._s
 
     def evaluate(
@@ -103,46 +112,51 @@ class ResponseGrid:
         wrt: Sequence[str] = (),
         angle: NDArray[np.complex128] | float = 1.0,
     ) -> NDArray[np.complex128]:
-        """Return the torque for an angle, and its derivatives.
+        """Return the transform of the torque of a plant for an angle, and its derivatives.
+
+        With the angle 1 this is the transfer function in N·m/rad.
 
         Parameters
         ----------
         plant : Plant
-            Where to evaluate.
+            Plant whose torque is computed.
         wrt : sequence of str
-            Names from `rigd.beam.PARAMETERS`, "delay_s" and "tool_inertia_kg_m2"; for each
-            derivative all others are constant.
+            Names of k parameters from `rigd.beam.PARAMETERS`, "delay_s" and "tool_inertia_kg_m2".
+            The torque is differentiated with respect to each while all others are constant.
         angle : ndarray of complex, shape (n,), or float
             Transform of the angle.
 
         Returns
         -------
         ndarray of complex, shape (1 + k, n)
-            The torque's transform, then the derivatives in the order of `wrt`.
+            Transform of the torque, then the derivatives in the order of `wrt`.
         """
-        response, rows = self._of_beam(plant, wrt)
+        response, derivatives = self._beam_response(plant, wrt)
         if plant.root_compliance_rad_per_nm:
-            softened = 1 / (1 + plant.root_compliance_rad_per_nm * response)
-            for name in rows:
-                rows[name] = rows[name] * softened**2
-            response = response * softened
+            clamp_factor = 1 / (1 + plant.root_compliance_rad_per_nm * response)
+            for name in derivatives:
+                derivatives[name] = derivatives[name] * clamp_factor**2
+            response = response * clamp_factor
         response += plant.tool_inertia_kg_m2 * self._s_squared
-        rows["tool_inertia_kg_m2"] = self._s_squared
-        late = torque_channel(plant, self._s) * angle
+        derivatives["tool_inertia_kg_m2"] = self._s_squared
+        channel_times_angle = torque_channel(plant, self._s) * angle
         if "delay_s" in wrt:
-            rows["delay_s"] = -self._s * response
-        found = np.empty((1 + len(wrt), late.size), dtype=np.complex128)
-        for out, row in zip(found, [response, *(rows[name] for name in wrt)], strict=True):
-            np.multiply(row, late, out=out)
-        return found
+            derivatives["delay_s"] = -self._s * response
+        spectra = np.empty((1 + len(wrt), channel_times_angle.size), dtype=np.complex128)
+        for out, row in zip(spectra, [response, *(derivatives[name] for name in wrt)], strict=True):
+            np.multiply(row, channel_times_angle, out=out)
+        return spectra
 
-    def _of_beam(
+    def _beam_response(
         self, plant: Plant, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
-        """Return G on a rigid clamp, and its derivatives by the names in `wrt` that affect it."""
-        of_beam = [name for name in wrt if name in PARAMETERS]
+        """Return the response G of the beam on a rigid clamp, and its derivatives by name.
+
+        Only the names in `wrt` on which G depends are included.
+        """
+        beam_names = [name for name in wrt if name in PARAMETERS]
         if plant.tip_mass_kg or plant.stiffness_offsets:
-            found, slopes = differentiated_response(
+            loaded_response, derivatives = differentiated_response(
                 self._log_s,
                 self._s_squared,
                 plant.beam,
@@ -150,19 +164,25 @@ class ResponseGrid:
                 plant.tip_mass_kg,
                 plant.stiffness_offsets,
             )
-            return found.response, {name: slopes[name]() for name in of_beam}
-        if not of_beam:
+            return loaded_response.response, {name: derivatives[name]() for name in beam_names}
+        if not beam_names:
             return self._beam.evaluate(plant.beam, plant.damping), {}
-        response, gradient = self._beam.evaluate_with_gradient(plant.beam, plant.damping, of_beam)
-        return response, dict(zip(of_beam, gradient, strict=True))
+        response, gradient = self._beam.evaluate_with_gradient(
+            plant.beam, plant.damping, beam_names
+        )
+        return response, dict(zip(beam_names, gradient, strict=True))
 
 
 # Prediction
 
-_PADDED: Final = 1.1
-_DECAY: Final = 6.6
-"""sigma times the padded duration. What wraps round shrinks by exp(-6.6), to 1e-3 of what a beam
-still does after a whole record, and is a free decay, of which no fit takes notice; rounding and
+_PADDED_LENGTH_RATIO: Final = 1.1
+"""Length of the padded Fourier transforms relative to the record."""
+
+_WRAPPED_DECAY_EXPONENT: Final = 6.6
+"""Product of the damping rate sigma and the padded duration.
+
+The part that wraps around shrinks by exp(-6.6), to 1e-3 of the response of a beam after a whole
+record. It has the form of a free decay, which no fit mistakes for the response. Rounding errors and
 what the decimation left beyond the band grow by exp(6.6 / 1.1) = 400."""
 
 
@@ -171,17 +191,18 @@ class TorquePredictor:
 
     A finite convolution by discrete transforms wraps around, and a lightly damped beam rings longer
     than any padding. So the angle is multiplied with exp(-sigma t) before the transform, which
-    gives its Laplace transform on s = sigma + j omega. It is multiplied with the response there,
+    gives its Laplace transform on s = sigma + j omega. There it is multiplied with the response,
     and after the inverse transform the exponential is removed: the part that wrapped around has
     decayed.
 
     Parameters
     ----------
     angle_rad : ndarray, shape (n,)
-        From rest, band-limited: nothing left at half the rate.
+        Angle from rest, band-limited: it has no power at half the rate.
     rate_hz : float
+        Sampling rate of the angle.
     retained : slice
-        Retained samples of the prediction.
+        Samples at which the torque is returned.
     """
 
     __slots__ = (
@@ -198,8 +219,8 @@ class TorquePredictor:
     def __init__(self, angle_rad: NDArray[np.float64], rate_hz: float, retained: slice) -> None:
         self.rate_hz = rate_hz
         self._retained = retained
-        self._length = fast_length(int(np.ceil(_PADDED * angle_rad.size)))
-        self._sigma = sigma = _DECAY * rate_hz / self._length
+        self._length = fast_length(int(np.ceil(_PADDED_LENGTH_RATIO * angle_rad.size)))
+        self._sigma = sigma = _WRAPPED_DECAY_EXPONENT * rate_hz / self._length
         time_s = np.arange(angle_rad.size) / rate_hz
         bins = np.arange(self._length // 2 + 1)
         self._response = ResponseGrid(sigma + 2j * np.pi * rate_hz / self._length * bins)
@@ -208,10 +229,10 @@ class TorquePredictor:
         self._growth = np.exp(sigma * time_s[retained])
 
     def of_other(self, angle_rad: NDArray[np.float64]) -> TorquePredictor:
-        """Return the prediction from another angle of the same length, shape (n,)."""
-        other = copy(self)
-        other._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
-        return other
+        """Return the predictor for another angle of the same length, shape (n,)."""
+        predictor = copy(self)
+        predictor._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
+        return predictor
 
     @property
     def s(self) -> NDArray[np.complex128]:
@@ -219,12 +240,12 @@ class TorquePredictor:
         return self._response.s
 
     def in_time(self, responses: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the torque of any responses to the angle at the retained samples, (..., m).
+        """Return the torque that transfer functions predict from the angle, shape (..., m).
 
         Parameters
         ----------
         responses : ndarray of complex, shape (..., n)
-            On `s`.
+            Transfer functions on the grid `s`.
         """
         spectra = responses * self._spectrum
         torque: NDArray[np.float64] = np.fft.irfft(spectra, self._length)[..., self._retained]
@@ -233,49 +254,51 @@ class TorquePredictor:
     def torque(
         self, plant: Plant | ModalModel, wrt: Sequence[str] = ()
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the torque in N·m at the retained samples, and its derivatives.
+        """Return the predicted torque in N·m at the retained samples, and its derivatives.
 
         Parameters
         ----------
         plant : Plant or ModalModel
-            Where to evaluate.
+            Plant or model whose torque is computed.
         wrt : sequence of str
-            Names as for `ResponseGrid.evaluate`; none for a modal model.
+            Names of k parameters as for `ResponseGrid.evaluate`; none for a modal model.
 
         Returns
         -------
         torque : ndarray, shape (m,)
         gradient : ndarray, shape (k, m)
         """
-        spectra = self._spectra(plant, wrt)
+        spectra = self._torque_spectra(plant, wrt)
         in_time = np.fft.irfft(spectra, self._length)[:, self._retained] * self._growth
         return in_time[0], in_time[1:]
 
-    def _spectra(self, plant: Plant | ModalModel, wrt: Sequence[str]) -> NDArray[np.complex128]:
-        """Return the transform of the torque and its derivatives, shape (1 + k, n)."""
+    def _torque_spectra(
+        self, plant: Plant | ModalModel, wrt: Sequence[str]
+    ) -> NDArray[np.complex128]:
+        """Return the transforms of the torque and of its derivatives, shape (1 + k, n)."""
         if isinstance(plant, ModalModel):
             return (plant.response(self.s) * self._spectrum)[None]
         return self._response.evaluate(plant, wrt, self._spectrum)
 
-    def torque_between(
+    def torque_at_fine_samples(
         self,
         plant: Plant | ModalModel,
         factor: int,
         indices: NDArray[np.intp],
         wrt: Sequence[str] = (),
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the torque at single indices of a multiple of the rate, and its derivatives.
+        """Return the predicted torque at single samples of a higher rate, and its derivatives.
 
         Parameters
         ----------
         plant : Plant or ModalModel
-            Beam and rig.
-        wrt : sequence of str
-            Names of the derivatives, k of them.
+            Plant or model whose torque is computed.
         factor : int
-            Rate, in multiples of `rate_hz`.
+            Higher rate, in multiples of `rate_hz`.
         indices : ndarray of int, shape (p,)
-            Samples of that rate, from the angle's first sample on.
+            Samples at the higher rate, counted from the angle's first sample.
+        wrt : sequence of str
+            Names of the k parameters with respect to which the torque is differentiated.
 
         Returns
         -------
@@ -283,16 +306,19 @@ class TorquePredictor:
         gradient : ndarray, shape (k, p)
         """
         growth = np.exp(self._sigma * indices / (factor * self.rate_hz))
-        spectra = self._spectra(plant, wrt)
-        # As many short transforms, each of them shifted by a tick, as the factor says: they stay
-        # in the cache, and take less than half the time of a long one.
-        shifts = np.ones((factor, spectra.shape[1]), dtype=np.complex128)
-        shifts[1:] = np.exp(2j * np.pi / (factor * self._length) * np.arange(spectra.shape[1]))
-        np.cumprod(shifts, axis=0, out=shifts)
+        spectra = self._torque_spectra(plant, wrt)
+        # One short transform for each sample of the higher rate within a sample of the lower one:
+        # they fit into the cache, and take less than half the time of one long transform.
+        shift_factors = np.ones((factor, spectra.shape[1]), dtype=np.complex128)
+        shift_factors[1:] = np.exp(
+            2j * np.pi / (factor * self._length) * np.arange(spectra.shape[1])
+        )
+        np.cumprod(shift_factors, axis=0, out=shift_factors)
         if self._length % 2 == 0:
-            shifts[:, -1] *= 2  # at the longer length this bin and its mirror image are two
-        at = np.empty((len(spectra), indices.size))
-        for row, spectrum in zip(at, spectra, strict=True):
-            row[:] = np.fft.irfft(shifts * spectrum, self._length).T.ravel()[indices]
-        at *= growth
-        return at[0], at[1:]
+            # At the higher rate this bin and its mirror image are distinct.
+            shift_factors[:, -1] *= 2
+        values = np.empty((len(spectra), indices.size))
+        for row, spectrum in zip(values, spectra, strict=True):
+            row[:] = np.fft.irfft(shift_factors * spectrum, self._length).T.ravel()[indices]
+        values *= growth
+        return values[0], values[1:]

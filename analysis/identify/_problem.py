@@ -1,4 +1,4 @@
-"""Least-squares problem of a record: the whitened residual of a structure, and its minimum."""
+"""Least-squares problem of a record: whitened residual of a damping structure, and its minimum."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Linearisation:
-    """Residual (prediction minus measurement) and its derivatives at one point.
+    """Residual spectrum (prediction minus measurement) and its derivatives at one point.
 
     Attributes
     ----------
     residual : ndarray of complex, shape (K,)
-        Not whitened.
+        Residual in N·m, not whitened.
     jacobian : ndarray of complex, shape (k, K)
-        By the unknowns.
+        Derivatives of the residual by the unknowns.
     poles : tuple of Pole
-        Differentiated by the unknowns.
+        Poles of the beam, differentiated by the unknowns.
     columns : ndarray of complex, shape (m, K)
-        Spectra of their free decays.
+        Spectra of torques with unknown amplitude: free decays, other disturbances and effects.
     """
 
     residual: NDArray[np.complex128]
@@ -43,15 +43,17 @@ class Linearisation:
 
 @dataclass(frozen=True, slots=True)
 class Projected:
-    """Whitened linearisation with the free decay projected out.
+    """Whitened residual and derivatives with the torques of unknown amplitude projected out.
 
     Attributes
     ----------
     residual : ndarray of complex, shape (K,)
-        Real and imaginary parts of variance 1 where the noise is as assumed.
+        Whitened residual. Its real and imaginary parts have variance 1 if the noise is as assumed.
     jacobian : ndarray of complex, shape (k, K)
+        Derivatives of the residual by the unknowns.
     amplitudes : ndarray, shape (m,)
-        Amplitudes of the free decays, in N·m, at the first sample compared.
+        Best amplitudes of `Linearisation.columns`; those of free decays are in N·m at the first
+        compared sample.
     amplitude_gram : ndarray, shape (m, m)
         Inverse covariance of the amplitudes.
     """
@@ -63,36 +65,40 @@ class Projected:
 
     @property
     def cost(self) -> float:
-        """Return the sum of squares."""
+        """Return the cost: the sum of the squared whitened residual."""
         return float(np.vdot(self.residual, self.residual).real)
 
     def normal_equations(self) -> NormalEquations:
-        """Return the normal equations for the descent."""
-        jacobian = _parts(self.jacobian)
+        """Return the normal equations of a Gauss-Newton step."""
+        jacobian = _as_real_rows(self.jacobian)
         return NormalEquations(
             cost=self.cost,
-            gradient=jacobian @ _parts(self.residual),
+            gradient=jacobian @ _as_real_rows(self.residual),
             hessian=jacobian @ jacobian.T,
         )
 
 
-_FILLINGS: Final = 8
-"""As often unknown torques are put as predicted, at most."""
+_MAX_FILLINGS: Final = 8
+"""Maximum number of times that a descent is repeated with unknown torques filled again."""
 
-_CONVERGED: Final = 1e-6
-"""Change of the unknowns below which the fill of unknown torques is final."""
+_UNKNOWNS_TOLERANCE: Final = 1e-6
+"""Change of the unknowns below which the filling of unknown torques has converged."""
 
 
 class Objective:
-    """Sum of squares of one structure on one record, as a function of the unknowns.
+    """Cost of one damping structure on one record, as a function of the unknowns.
+
+    The cost is the sum of the squared whitened residual.
 
     Parameters
     ----------
     comparison : Comparison
+        Record, reduced to the band.
     unknowns : Unknowns
+        Free parameters of the structure.
     columns : ndarray of complex, shape (c, K), optional
-        Spectra of known shape and unknown size, in N·m per unit of amplitude: their amplitudes are
-        free as those of the free decay are.
+        Torque spectra of known form, in N·m per unit of amplitude. Their amplitudes are free, like
+        those of the free decay.
     """
 
     __slots__ = ("_recent", "columns", "comparison", "unknowns")
@@ -103,79 +109,85 @@ class Objective:
         unknowns: Unknowns,
         columns: NDArray[np.complex128] | None = None,
     ) -> None:
-        none = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
+        no_columns = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
         self.comparison = comparison
         self.unknowns = unknowns
-        self.columns = none if columns is None else columns
+        self.columns = no_columns if columns is None else columns
         self._recent: Recent[Linearisation] = Recent()
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
-        """Return residual and derivatives at `x`; the last two points are cached."""
+        """Return residual and derivatives at `x`; the results at the last two points are cached."""
         return self._recent.at(x, self._linearise)
 
     def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
+        """Return residual and derivatives at `x`, without the cache."""
         comparison, unknowns = self.comparison, self.unknowns
         names = unknowns.gradient_names
-        plant, chain = unknowns.plant_and_gradient(x)
+        plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
         torque, gradient = comparison.prediction.torque(plant, names)
         poles = tuple(
-            Pole(pole.mode, pole.at_rad_s, pole.derivative @ chain)
+            Pole(pole.mode, pole.at_rad_s, pole.derivative @ parameters_by_unknowns)
             for pole in comparison.poles(plant, names)
         )
         residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
-        jacobian = (chain.T @ _parts(comparison.spectrum(gradient))).view(np.complex128)
+        jacobian = (parameters_by_unknowns.T @ _as_real_rows(comparison.spectrum(gradient))).view(
+            np.complex128
+        )
         if comparison.drag is not None:
-            change, slopes = comparison.drag.change_to(plant, poles, unknowns.names, chain)
-            residual += change
-            jacobian += slopes
+            drag_change, drag_derivatives = comparison.drag.change_to(
+                plant, poles, unknowns.names, parameters_by_unknowns
+            )
+            residual += drag_change
+            jacobian += drag_derivatives
         return Linearisation(
             residual=residual,
             jacobian=jacobian,
             poles=poles,
-            columns=np.concatenate([comparison.nuisance(poles), self.columns]),
+            columns=np.concatenate([comparison.nuisance_spectra(poles), self.columns]),
         )
 
     def project(self, at: Linearisation, weight: NDArray[np.float64] | float) -> Projected:
-        """Whiten, and project out the free decay (variable projection).
+        """Whiten residual and derivatives, and project out the torques of unknown amplitude.
 
-        The best amplitudes at each point are linear in the residual; the Jacobian is Kaufman's (BIT
-        15 (1975) 49-57), with the motion of the poles.
+        This is variable projection: the best amplitudes at each point are linear in the residual.
+        The Jacobian is Kaufman's (BIT 15 (1975) 49-57), with the motion of the poles.
 
         Parameters
         ----------
         at : Linearisation
+            Residual and derivatives at one point.
         weight : ndarray, shape (K,), or float
-            Weight of `NoiseSpectrum`, or 1 not to whiten.
+            Weight of `NoiseSpectrum`; with 1 nothing is whitened.
         """
         residual, jacobian = at.residual * weight, at.jacobian * weight
-        columns = _parts(at.columns * weight)
-        scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))
-        scale[scale == 0] = 1.0  # a decay that is over at once
-        columns /= scale[:, None]
+        columns = _as_real_rows(at.columns * weight)
+        lengths = np.sqrt(np.einsum("ij,ij->i", columns, columns))
+        lengths[lengths == 0] = 1.0  # the spectrum of a decay that ends at once
+        columns /= lengths[:, None]
         gram = columns @ columns.T
-        inverse = np.linalg.inv(gram + 1e-12 * np.eye(scale.size))
-        amplitudes = -inverse @ (columns @ _parts(residual))
-        jacobian += weight * self.comparison.decay_gradient(at.poles, amplitudes / scale)
-        parts = _parts(jacobian)
-        parts -= ((parts @ columns.T) @ inverse) @ columns
+        inverse_gram = np.linalg.inv(gram + 1e-12 * np.eye(lengths.size))
+        amplitudes = -inverse_gram @ (columns @ _as_real_rows(residual))
+        jacobian += weight * self.comparison.decay_gradient(at.poles, amplitudes / lengths)
+        real_jacobian = _as_real_rows(jacobian)
+        real_jacobian -= ((real_jacobian @ columns.T) @ inverse_gram) @ columns
         return Projected(
             residual=residual + (amplitudes @ columns).view(np.complex128),
             jacobian=jacobian,
-            amplitudes=amplitudes / scale,
-            amplitude_gram=gram * np.outer(scale, scale),
+            amplitudes=amplitudes / lengths,
+            amplitude_gram=gram * np.outer(lengths, lengths),
         )
 
     def normal_equations(
         self, x: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> NormalEquations:
-        """Return the sum of squares at `x`, with gradient and Hessian of a Gauss-Newton step.
+        """Return the cost at `x`, with gradient and Hessian of a Gauss-Newton step.
 
         Parameters
         ----------
         x : ndarray, shape (k,)
             Unknowns.
         weight : ndarray, shape (K,)
-            Inverse standard deviation of the noise, bin by bin.
+            Inverse standard deviation of the noise in each bin.
         """
         return self.project(self.linearise(x), weight).normal_equations()
 
@@ -189,27 +201,28 @@ class Objective:
         max_evaluations: int = 200,
         hopeless: tuple[int, float] | None = None,
     ) -> tuple[Objective, Minimum]:
-        """Descend; repeat while the fill of unknown torques moves the minimum.
+        """Descend to a minimum of the cost; repeat while filling unknown torques moves the minimum.
 
         Parameters
         ----------
         start : ndarray, shape (k,)
+            Unknowns at which the descent starts.
         weight : ndarray, shape (K,)
-            That of `NoiseSpectrum`.
+            Weight of `NoiseSpectrum`.
         region, relative_tolerance, max_evaluations, hopeless
             Arguments of `descend`.
 
         Returns
         -------
         objective : Objective
-            Objective with the last fill of unknown torques; `self` if all are known.
+            Objective with the unknown torques filled for the last time; `self` if all are known.
         minimum : Minimum
             Minimum of that objective.
         """
         x = start
-        for _ in range(_FILLINGS):
-            objective = self._filled(x)
-            found = descend(
+        for _ in range(_MAX_FILLINGS):
+            objective = self._fill_unknown_torque(x)
+            minimum = descend(
                 partial(objective.normal_equations, weight=weight),
                 x,
                 region,
@@ -217,26 +230,26 @@ class Objective:
                 max_evaluations=max_evaluations,
                 hopeless=hopeless,
             )
-            converged = objective is self or np.abs(found.x - x).max() < _CONVERGED
-            x = found.x
+            converged = objective is self or np.abs(minimum.x - x).max() < _UNKNOWNS_TOLERANCE
+            x = minimum.x
             # A descent that did not converge does not converge with new fills either.
-            given_up = hopeless is not None and found.equations.cost > hopeless[1]
-            if converged or given_up or found.evaluations >= max_evaluations:
+            given_up = hopeless is not None and minimum.equations.cost > hopeless[1]
+            if converged or given_up or minimum.evaluations >= max_evaluations:
                 break
-        return objective, found
+        return objective, minimum
 
-    def _filled(self, x: NDArray[np.float64]) -> Objective:
+    def _fill_unknown_torque(self, x: NDArray[np.float64]) -> Objective:
         """Fill unknown torques with the prediction at `x`; return `self` if all are known."""
-        comparison = self.comparison.filled(self.unknowns.plant(x))
+        comparison = self.comparison.fill_unknown_torque(self.unknowns.plant(x))
         if comparison is self.comparison:
             return self
         return Objective(comparison, self.unknowns, self.columns)
 
 
-def _parts(values: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return real and imaginary parts side by side, shape (..., 2 K), as a view.
+def _as_real_rows(values: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Return a view with real and imaginary parts interleaved, shape (..., 2 K).
 
-    Products of these are the real parts of complex products, at half the cost.
+    Products of such rows are the real parts of complex products, at half the cost.
     """
-    parts: NDArray[np.float64] = np.ascontiguousarray(values).view(np.float64)
-    return parts
+    real_rows: NDArray[np.float64] = np.ascontiguousarray(values).view(np.float64)
+    return real_rows

@@ -7,7 +7,7 @@ import pytest
 from wrong_models import RIGS, Drag, drags
 
 from analysis.identify import select
-from analysis.identify._drag import by_law, with_air_drag, with_evident_drag
+from analysis.identify._drag import damping_ratio_by_drag_law, with_air_drag, with_evident_drag
 from analysis.identify.drag_torque import HALF_DENSITY
 from analysis.models import STRUCTURES
 from rigd.beam import mode_shape
@@ -117,10 +117,10 @@ def test_the_air_takes_as_much_as_linear_damping_of_that_ratio(mode, number, pow
     shape = mode_shape(mode, x) / mode_shape(mode, 1.0)
     speed = omega * amplitude * np.outer(shape, np.sin(turn))
     taken = np.mean(HALF_DENSITY * np.abs(speed) ** (power + 1))
-    ratio = by_law(mode, omega, amplitude, density)[number]
+    ratio = damping_ratio_by_drag_law(mode, omega, amplitude, density)[number]
     linear = np.mean(2 * ratio * omega * density * speed**2)
     assert taken == pytest.approx(linear, rel=1e-3)
 
 
 def test_at_rest_the_air_takes_nothing():
-    assert by_law(1, 16.0, 0.0, 4.7e-3) == pytest.approx([0.0, 0.0])
+    assert damping_ratio_by_drag_law(1, 16.0, 0.0, 4.7e-3) == pytest.approx([0.0, 0.0])

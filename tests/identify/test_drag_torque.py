@@ -139,7 +139,7 @@ def test_the_torque_that_was_taken_out_comes_back_beside_the_beam(short, here, t
     """A fit's residual with another beam than that of the drag, against recomputed drag."""
     torque_nm = short.prediction.torque(there)[0]
     torque_nm = torque_nm + response(short, there).torque(LAW).torque_nm[short.retained]
-    with_drag = short.with_drag(here, LAW)
+    with_drag = short.remove_drag_torque(here, LAW)
     assert with_drag.drag is not None
     names = ("gamma",)
     poles = mode_poles(there, 3, names)

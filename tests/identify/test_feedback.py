@@ -8,7 +8,7 @@ import pytest
 from cases import further
 
 from analysis.identify import Comparison, Measurement, Plant, fit_record, select
-from analysis.identify._instrument import following
+from analysis.identify._instrument import reference_coherent_part
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues, transfer
 
@@ -67,17 +67,17 @@ def test_what_follows_is_found_through_a_lag_and_noise():
     lag = np.exp(-np.arange(200) / 10.0)
     follows = np.convolve(reference, lag)[:n]
     noise = rng.normal(size=n) * 0.3 * follows.std()
-    found = following(follows + noise, reference, 125.0)
+    found = reference_coherent_part(follows + noise, reference, 125.0)
     assert np.std(found - follows) < 0.2 * noise.std()
 
 
 def test_an_angle_that_is_its_own_reference_follows_it_all():
     angle = np.random.default_rng(2).normal(size=5000)
-    assert following(angle, angle, 125.0) == pytest.approx(angle, abs=1e-6)
+    assert reference_coherent_part(angle, angle, 125.0) == pytest.approx(angle, abs=1e-6)
 
 
 def test_nothing_follows_a_reference_that_stands_still():
-    assert not following(np.ones(500), np.zeros(500), 125.0).any()
+    assert not reference_coherent_part(np.ones(500), np.zeros(500), 125.0).any()
 
 
 @pytest.mark.fit
@@ -102,7 +102,7 @@ def test_a_reference_may_end_anywhere():
     reference = 0.1 * rng.normal(size=n) * np.hanning(n) + np.where(np.arange(n) < 15_000, 0.0, 3.0)
     lag = np.exp(-np.arange(200) / 10.0) / 10.0
     follows = np.convolve(reference, lag)[:n]
-    found = following(follows, reference, 125.0)
+    found = reference_coherent_part(follows, reference, 125.0)
     assert np.abs(found - follows)[-125:].max() < 0.01 * follows[-1]
 
 
@@ -130,10 +130,10 @@ def test_a_reference_that_does_not_explain_the_angle_is_not_believed(sessions, r
     other = np.random.default_rng(0).normal(size=measured.angle_rad.size)
     comparison = Comparison.of(replace(measured, reference_rad=other), (0.0, 50.0))
     plant = fit(measured, "III").plant
-    assert comparison.following_reference(plant) is comparison
+    assert comparison.use_reference_coherent_angle(plant) is comparison
     explained = replace(measured, reference_rad=references(measured.angle_rad.size))
     comparison = Comparison.of(explained, (0.0, 50.0))
-    assert comparison.following_reference(plant) is not comparison
+    assert comparison.use_reference_coherent_angle(plant) is not comparison
 
 
 @pytest.mark.fit
@@ -209,7 +209,7 @@ def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
     comparison = Comparison.of(measured, (0.0, 50.0))
     found = fit_record(measured, [STRUCTURES["III"]])
     plant = found.fits[0].plant
-    first = comparison.following_reference(plant)
+    first = comparison.use_reference_coherent_angle(plant)
     assert first.renewed(plant, found.noise) is first
     other = first.renewed(
         replace(plant, beam=replace(LINK, density_kg_per_m=5.2e-3)), found.noise
@@ -228,7 +228,7 @@ def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
 def test_what_rings_in_narrow_bands_is_followed_with_the_torque_it_makes(in_narrow_bands):
     loaded = LoadedBeam(LINK, DAMPED, tip_mass_kg=1.8e-4)
     plant = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4)
-    first = Comparison.of(in_narrow_bands, (0.0, 50.0)).following_reference(plant)
+    first = Comparison.of(in_narrow_bands, (0.0, 50.0)).use_reference_coherent_angle(plant)
     noise = fit_record(in_narrow_bands, [STRUCTURES["III"]]).noise
     wrong = first.renewed(Plant(LINK, DAMPED), noise)
     told = wrong.renewed(plant, noise)

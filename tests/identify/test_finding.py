@@ -2,7 +2,7 @@
 
 import pytest
 
-from analysis.identify._finding import SEEN, Finding, doubted
+from analysis.identify._finding import MODEL_INDEPENDENT_KINDS, Finding, doubted
 from analysis.identify._select import _with_doubts
 
 
@@ -29,7 +29,7 @@ def test_a_doubted_finding_is_no_fact_and_has_no_interval(sentence, bare):
     assert (found.value, found.interval, found.remedy) == (1.0, None, "Look.")
 
 
-@pytest.mark.parametrize("kind", sorted(SEEN))
+@pytest.mark.parametrize("kind", sorted(MODEL_INDEPENDENT_KINDS))
 def test_what_is_seen_in_the_record_stays_a_fact(kind):
     found = Finding(kind, "It is there (1 to 2; 95 %).", 1.0, (1.0, 2.0), "1", "")
     assert doubted(found, "it rains") is found

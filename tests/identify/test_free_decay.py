@@ -80,7 +80,7 @@ def assert_gradient(spectra, some):
 @pytest.mark.fit
 def test_spectra_of_decays_that_begin_within_a_filtered_record(decimation):
     rate_hz, begin = 1000.0, 2345
-    inside = decimation.inside(7000)
+    inside = decimation.samples_inside_record(7000)
     samples = inside.stop - inside.start
     hz = np.fft.rfftfreq(samples, 1 / decimation.rate_hz)
     bins = slice(1, int(np.searchsorted(hz, 50.0)))

@@ -7,7 +7,7 @@ import pytest
 from cases import further
 
 from analysis.identify import freest_alone, select
-from analysis.identify._knock import knock_in
+from analysis.identify._knock import find_impact
 from rigd.beam import PointForceGrid, modes
 
 RATE_HZ = 1000.0
@@ -95,7 +95,7 @@ def test_the_whole_judgement_says_so(knocked):
 @pytest.mark.fit
 def test_noise_and_a_disturbed_sensor_are_no_knock(plain, freest_of):
     for seed in range(3):
-        assert knock_in(freest_of(plain.measured(NOISE_NM, seed))) is None
+        assert find_impact(freest_of(plain.measured(NOISE_NM, seed))) is None
     measurement = plain.measured(NOISE_NM, 1)
     measurement.torque_nm[30_000:30_020] += 5.0
     _, found, _ = freest_alone(measurement, BAND_HZ)

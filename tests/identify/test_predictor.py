@@ -70,7 +70,7 @@ def test_between_the_samples_it_is_the_same(plant, decimation):
     angle = decimation.apply(noise)
     prediction = TorquePredictor(angle, 125.0, slice(0, 400))
     torque, gradient = prediction.torque(plant, WRT)
-    at, gradient_at = prediction.torque_between(plant, 8, np.arange(0, 3200, 8), WRT)
+    at, gradient_at = prediction.torque_at_fine_samples(plant, 8, np.arange(0, 3200, 8), WRT)
     assert np.abs(at - torque).max() < 1e-3 * torque.std()
     assert (np.abs(gradient_at - gradient).max(axis=1) < 1e-3 * gradient.std(axis=1)).all()
 
@@ -86,7 +86,7 @@ def test_between_the_samples_it_is_that_of_more_samples(plant, factor):
     torque, gradient = fine.torque(plant, WRT)
     places = np.arange(1, torque.size, 5)
     coarse = TorquePredictor(angle(125.0), 125.0, slice(0, 400))
-    at, gradient_at = coarse.torque_between(plant, factor, places, WRT)
+    at, gradient_at = coarse.torque_at_fine_samples(plant, factor, places, WRT)
     assert np.abs(at - torque[places]).max() < 1e-6 * torque.std()
     apart = np.abs(gradient_at - gradient[:, places]).max(axis=1)
     assert (apart < 1e-6 * gradient.std(axis=1)).all()

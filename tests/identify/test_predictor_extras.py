@@ -70,7 +70,7 @@ def test_between_the_samples_it_is_the_same():
     angle = np.random.default_rng(1).normal(size=400)
     prediction = TorquePredictor(np.convolve(angle, np.hanning(9), "same"), 125.0, slice(0, 400))
     torque, gradient = prediction.torque(ALL, WRT)
-    at, gradient_at = prediction.torque_between(ALL, 4, np.arange(0, 1600, 4), WRT)
+    at, gradient_at = prediction.torque_at_fine_samples(ALL, 4, np.arange(0, 1600, 4), WRT)
     assert at == pytest.approx(torque, abs=1e-9 * torque.std())
     assert gradient_at == pytest.approx(gradient, rel=1e-6, abs=1e-6 * np.abs(gradient).max())
 

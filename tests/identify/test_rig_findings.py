@@ -8,9 +8,9 @@ import pytest
 from cases import further
 
 from analysis.identify import Comparison, Measurement, select
-from analysis.identify._channel_checks import clipping, stops, wrong_scale
+from analysis.identify._channel_checks import clipping_findings, standstill_findings, wrong_scale
 from analysis.identify._drag import with_evident_drag
-from analysis.identify._leakage import repeats_after_s
+from analysis.identify._leakage import repetition_period_s
 from analysis.identify._time_varying import along_time
 from analysis.identify.headline import MISREAD
 from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues
@@ -186,11 +186,11 @@ def test_a_clipped_torque_leaves_no_number_without_a_flag():
 def test_a_torque_flat_at_its_extremes_is_clipped():
     made = record()
     most = 0.7 * np.abs(made.torque_nm).max()
-    (finding,) = clipping(replace(made, torque_nm=np.clip(made.torque_nm, -most, most)))
+    (finding,) = clipping_findings(replace(made, torque_nm=np.clip(made.torque_nm, -most, most)))
     assert finding.value == pytest.approx(most)
-    assert not any(clipping(made))
+    assert not any(clipping_findings(made))
     coarse = np.round(made.torque_nm / 1e-3) * 1e-3
-    assert not any(clipping(replace(made, torque_nm=coarse)))
+    assert not any(clipping_findings(replace(made, torque_nm=coarse)))
 
 
 def test_a_motor_that_stands_still_when_asked_to_move():
@@ -198,9 +198,9 @@ def test_a_motor_that_stands_still_when_asked_to_move():
     stopped = made.angle_rad.copy()
     stopped[20_000:22_000] = stopped[20_000]
     asked = replace(made, reference_rad=made.angle_rad)
-    (finding,) = stops(replace(asked, angle_rad=stopped))
+    (finding,) = standstill_findings(replace(asked, angle_rad=stopped))
     assert finding.value == pytest.approx(4.0, abs=1.0)
-    assert not any(stops(asked))
+    assert not any(standstill_findings(asked))
 
 
 @pytest.mark.further  # as other residuals
@@ -330,5 +330,5 @@ def test_a_drive_that_repeats_has_a_period():
     t = np.arange(TICKS) / RATE_HZ
     lines = sum(np.cos(2 * np.pi * k * t / 7.2 + k * k) for k in range(1, 200, 3))
     repeating = Comparison.of(replace(made, angle_rad=1e-3 * lines), (0.0, 50.0))
-    assert repeats_after_s(repeating) == pytest.approx(7.2, abs=0.01)
-    assert repeats_after_s(Comparison.of(made, (0.0, 50.0))) == 0.0
+    assert repetition_period_s(repeating) == pytest.approx(7.2, abs=0.01)
+    assert repetition_period_s(Comparison.of(made, (0.0, 50.0))) == 0.0

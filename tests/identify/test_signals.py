@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.identify._data import Decimation, bridged, fast_length, fast_length_below
+from analysis.identify._data import Decimation, fast_length, fast_length_below, interpolate_gaps
 from analysis.identify.noise import noise_of, smooth_power
 
 
@@ -15,7 +15,7 @@ def test_gaps_of_a_band_limited_signal_are_closed():
     known[900:905] = False
     known[-1] = False
     spoilt = np.where(known, signal, np.nan)
-    closed = bridged(spoilt, known, 0.05)
+    closed = interpolate_gaps(spoilt, known, 0.05)
     assert (closed[known] == signal[known]).all()
     assert np.abs(closed - signal)[:-1].max() < 2e-3 * 2e-3
     line = np.interp(t, t[known], signal[known])
@@ -25,7 +25,7 @@ def test_gaps_of_a_band_limited_signal_are_closed():
 
 def test_without_a_gap_nothing_changes():
     values = np.random.default_rng(2).normal(size=50)
-    assert (bridged(values, np.ones(50, dtype=bool), 0.05) == values).all()
+    assert (interpolate_gaps(values, np.ones(50, dtype=bool), 0.05) == values).all()
 
 
 @pytest.mark.parametrize(
@@ -38,21 +38,21 @@ def test_decimation_keeps_the_band_and_nothing_else(rate_hz, highest_hz, factor)
     t = np.arange(n) / rate_hz
     for hz in (0.0, 0.3 * highest_hz, highest_hz):
         kept = decimation.apply(np.cos(2 * np.pi * hz * t + 0.4))
-        inside = decimation.inside(n)
+        inside = decimation.samples_inside_record(n)
         at = (np.arange(kept.size) - decimation.reach) / decimation.rate_hz
         expected = np.cos(2 * np.pi * hz * at + 0.4)
         assert np.abs(kept - expected)[inside].max() < 2e-5
     beyond_hz = 1.01 * decimation.rate_hz / 2
     if beyond_hz < rate_hz / 2:
         kept = decimation.apply(np.cos(2 * np.pi * beyond_hz * t))
-        assert np.abs(kept[decimation.inside(n)]).max() < 2e-5
+        assert np.abs(kept[decimation.samples_inside_record(n)]).max() < 2e-5
 
 
 def test_inside_is_where_the_edges_do_not_reach():
     decimation = Decimation.to_band(1000.0, 50.0)
     n = 5001
     kept = decimation.apply(np.ones(n))
-    inside = decimation.inside(n)
+    inside = decimation.samples_inside_record(n)
     assert kept[inside] == pytest.approx(1.0, abs=1e-12)
     assert kept[inside.start - 1] != pytest.approx(1.0, abs=1e-12)
     assert kept[inside.stop] != pytest.approx(1.0, abs=1e-12)
