@@ -45,16 +45,6 @@ if TYPE_CHECKING:
 _TESTED_STRUCTURES: Final = ("III", "VI", "VII")
 """Names of the structures with which drag is tested: those with internal and external damping."""
 
-_MIN_EVIDENT_COST_REDUCTION: Final = 100.0
-"""Minimum reduction of the cost by a small drag for which drag is evident."""
-
-_MIN_EVIDENT_FRACTION: Final = 0.8
-"""Minimum fraction of the cost beyond noise that a small drag removes if drag is evident.
-
-In records with other defects of a rig (`benchmarks/wrong_models.py`) a small drag removes less than
-a third, or its amplitude is negative. In records with drag it removes more than the whole cost
-beyond noise, since a part of the residual due to drag counts as noise."""
-
 _FIRST_ORDER_BIC_MARGIN: Final = 6.0
 """Amount by which the predicted BIC with drag may exceed the lowest BIC for drag to be fitted. The
 prediction is of first order, and has an error."""
@@ -142,44 +132,6 @@ class DragEstimate:
     speed_m_s: float
     law: DragLaw
     covariance: tuple[tuple[float, ...], ...]
-
-
-def with_evident_drag(candidate_set: CandidateSet) -> CandidateSet:
-    """Refit with air drag if drag is evident before any other explanation has been tested.
-
-    Drag is evident if, to first order, it explains the whole residual of a uniform beam, and only
-    noise remains after the refit. No other defect of a rig has this effect.
-
-    Parameters
-    ----------
-    candidate_set : CandidateSet
-        Candidates without drag, on a uniform beam.
-
-    Returns
-    -------
-    CandidateSet
-        `candidate_set` unless drag is evident; else the candidates with drag.
-    """
-    if candidate_set.misread or not _drag_is_evident(candidate_set):
-        return candidate_set
-    refitted = _refit_with_drag(candidate_set)
-    return (
-        refitted
-        if refitted.drag is not None and refitted.all_but_white(refitted.likeliest)
-        else candidate_set
-    )
-
-
-def _drag_is_evident(candidate_set: CandidateSet) -> bool:
-    """Return whether a small drag would explain the residual of the freest structure."""
-    freest_candidate = next(
-        c for c in candidate_set.candidates if c.structure.name == _FREEST_STRUCTURE
-    )
-    refit = candidate_set.refit(freest_candidate, 1)
-    size, cost_reduction = _first_order_drag(refit)
-    return size > 0 and cost_reduction > max(
-        _MIN_EVIDENT_COST_REDUCTION, _MIN_EVIDENT_FRACTION * (refit.cost - refit.expected_cost)
-    )
 
 
 def with_air_drag(candidate_set: CandidateSet) -> CandidateSet:

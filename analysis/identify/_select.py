@@ -18,7 +18,6 @@ from analysis.identify._diagnostics import findings, of_settings, unexplained
 from analysis.identify._drag import (
     damping_with_amplitude,
     with_air_drag,
-    with_evident_drag,
 )
 from analysis.identify._explanations import explanations
 from analysis.identify._explanations import finding as explanation_finding
@@ -242,9 +241,7 @@ def _selected(
         if step is not None:
             small, alone, suffices = None, modal, plain
     if not (plain or suffices) or (small is not None and small.large):
-        candidate_set, forces, changes = _with_effects(
-            linear, again=again is not None, of_amplitude=step is None
-        )
+        candidate_set, forces, changes = _with_effects(linear, of_amplitude=step is None)
         modal = _modal(candidate_set)
         if suffices and not (
             modal is not None and _linear_and_constant(candidate_set, modal, band_hz)
@@ -444,7 +441,7 @@ def _linear_and_constant(
 
 
 def _with_effects(
-    linear: CandidateSet, *, again: bool, of_amplitude: bool
+    linear: CandidateSet, *, of_amplitude: bool
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[TemporalChange, ...]]:
     """Test for nonlinear and time-varying effects, or for the latter alone.
 
@@ -454,9 +451,7 @@ def _with_effects(
     if not of_amplitude:
         candidate_set, changes = along_time(linear.with_orders_free())
         return candidate_set, (), changes
-    candidate_set = linear if again else with_evident_drag(linear)
-    if candidate_set is linear:
-        candidate_set = linear if linear.misread else with_air_drag(linear)
+    candidate_set = linear if linear.misread else with_air_drag(linear)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     candidate_set, forces = (
         (candidate_set, ()) if candidate_set.misread else nonlinear_forces(candidate_set, visible)

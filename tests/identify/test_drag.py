@@ -7,7 +7,7 @@ import pytest
 from wrong_models import RIGS, Drag, drags
 
 from analysis.identify import select
-from analysis.identify._drag import damping_ratio_by_drag_law, with_air_drag, with_evident_drag
+from analysis.identify._drag import damping_ratio_by_drag_law, with_air_drag
 from analysis.identify.drag_torque import HALF_DENSITY
 from analysis.models import STRUCTURES
 from rigd.beam import mode_shape
@@ -62,11 +62,11 @@ def test_the_beam_beside_the_drag_is_that_without_air(selection, plants, link):
         assert abs(value - middle) < 3 / 1.96 * half, name
 
 
-def test_evident_drag_needs_nothing_else_to_be_tried(braked, candidates_of):
+def test_drag_leaves_noise_only(braked, candidates_of):
     measured = braked.measured(noise_nm=NOISE_NM, seed=61)
     uniform = candidates_of(measured)
     assert not uniform.all_but_white(uniform.likeliest)
-    found = with_evident_drag(uniform)
+    found = with_air_drag(uniform)
     assert abs(found.drag.value_m - DRAG_M) < 3 * found.drag.std_m
     assert found.all_but_white(found.likeliest)
     names = [candidate.name for candidate in found.candidates]

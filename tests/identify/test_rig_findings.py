@@ -9,7 +9,6 @@ from cases import further
 
 from analysis.identify import Comparison, Measurement, select
 from analysis.identify._channel_checks import clipping_findings, standstill_findings, wrong_scale
-from analysis.identify._drag import with_evident_drag
 from analysis.identify._leakage import repetition_period_s
 from analysis.identify._time_varying import along_time
 from analysis.identify.headline import MISREAD
@@ -94,22 +93,6 @@ def test_a_rig_that_is_otherwise_has_its_cause_named_and_no_fact(more, ends, wor
     assert selection.verdict.adequate
     assert selection.headline.uniform_beam.status == "refused"
     assert_modes(selection.headline, **ends)
-
-
-@pytest.mark.parametrize(
-    ("more", "hidden"),
-    [
-        ({"tip_mass_kg": 1.5e-4}, True),
-        ({"filter_hz": 120.0}, True),
-        further({"clock": 1e-5}, True),
-        further({"clamp_nm_per_rad": 30.0}, False),
-        ({}, False),
-    ],
-)
-def test_nothing_else_is_evident_drag(candidates_of, more, hidden):
-    uniform = candidates_of(record(**more))
-    assert uniform.all_but_white(uniform.likeliest) != hidden
-    assert with_evident_drag(uniform) is uniform
 
 
 @pytest.mark.parametrize("clock", [1e-5, further(-1e-5), further(1e-4)])
@@ -276,7 +259,6 @@ def changing(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, back=False):
 
 def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted(candidates_of):
     uniform = candidates_of(changing(damping=0.2))
-    assert with_evident_drag(uniform) is uniform
     with_change, (change,) = along_time(uniform)
     assert change.what == "damping"
     saved = uniform.bic - with_change.bic
