@@ -34,7 +34,7 @@ from analysis.identify._step_in_time import step_score
 from analysis.identify._time_varying import along_time, changing, established
 from analysis.identify._visible_modes import visible_modes
 from analysis.identify.headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
-from analysis.identify.profile_likelihood import WIDEST_FRACTION, profiled
+from analysis.identify.profile_likelihood import WIDEST_FRACTION, profile_both_orders
 from analysis.identify.residual_tests import (
     InputRelation,
     Whiteness,
@@ -251,7 +251,7 @@ def _selected(
     # The whole record excludes every local minimum that a part of it excludes.
     determined = earlier.determined if earlier and again else ()
     walk = not_reported_reason(candidate_set, visible) is None and not refused
-    candidate_set, *profiles = profiled(candidate_set, determined, walk=walk)
+    candidate_set, *profiles = profile_both_orders(candidate_set, determined, compute=walk)
     leading = candidate_set.led_by(candidate_set.freest)
     white, related, multiples = _tests(leading, modal, band_hz)
     explained = white.white and not related.related

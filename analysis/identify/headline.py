@@ -313,7 +313,7 @@ def headline(
     intervals: dict[str, tuple[float, float]] = {
         each.order: each.profile.interval
         for each in orders
-        if each.profile.walked and each.order in freest.structure.free
+        if each.profile.is_computed and each.order in freest.structure.free
     }
     result = of_fit(
         freest.name, freest.fit, visible, reasons, intervals, unexplained,

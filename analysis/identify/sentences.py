@@ -259,7 +259,7 @@ def _with_interval(quantity: ReportedValue) -> str:
 def _why_not(verdict: OrderVerdict) -> str:
     profile = verdict.profile
     low, high = profile.interval
-    if verdict.reason is not None and (profile.identifiable or not profile.walked):
+    if verdict.reason is not None and (profile.identifiable or not profile.is_computed):
         return verdict.reason
     if len(profile.local_minima) > 1:
         equal = " and ".join(f"{value:.3f}" for value in sorted(profile.local_minima))
