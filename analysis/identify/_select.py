@@ -33,7 +33,7 @@ from analysis.identify._small_effects import LARGE, small_effect
 from analysis.identify._step_in_time import step_score
 from analysis.identify._time_varying import along_time, changing, established
 from analysis.identify._visible_modes import visible_modes
-from analysis.identify.headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
+from analysis.identify.headline import MISREAD, UNEXPLAINED_REASON, Headline, headline, of_fit
 from analysis.identify.profile_likelihood import WIDEST_FRACTION, profile_both_orders
 from analysis.identify.residual_tests import (
     InputRelation,
@@ -42,7 +42,7 @@ from analysis.identify.residual_tests import (
     input_relation,
     whiteness,
 )
-from analysis.identify.sentences import experiments, of_headline
+from analysis.identify.sentences import experiments, headline_sentences
 from analysis.identify.uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify.verdict import (
     BIC_TIE,
@@ -318,7 +318,7 @@ def _select_with_known_impacts(
         )
         orders = alpha, lambda_
     if "nonlinear stiffness" in kinds:
-        reported = reported.with_law_assumed()
+        reported = reported.with_stiffness_law_flag()
     sentences, advice = [], []
     if model_reason == MISREAD:
         all_findings = tuple(each for each in all_findings if each.kind in _CHANNEL_KINDS)
@@ -339,7 +339,7 @@ def _select_with_known_impacts(
         all_findings = _add_impacts_and_unexplained(
             leading, all_findings, whiteness_test, input_test
         )
-        sentences = of_headline(reported, orders, alone=doubt is None)
+        sentences = headline_sentences(reported, orders, without_rival=doubt is None)
         advice = experiments(candidate_set, orders, visible_numbers, all_findings, close_rivals)
     advice += [each.remedy for each in all_findings if each.remedy]
     best = candidate_set.best
@@ -607,7 +607,7 @@ def _wrong_model_reason(kinds: Collection[str], *, explained: bool) -> str | Non
     """Return the reason why findings or residual refute the model, or None if they do not."""
     if not _CONTRADICTING_KINDS.isdisjoint(kinds):
         return MISREAD
-    return UNEXPLAINED if "harmonics" in kinds or not explained else None
+    return UNEXPLAINED_REASON if "harmonics" in kinds or not explained else None
 
 
 def _doubt_reason(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> str | None:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 EXACT_CONDITION: Final = "if the beam is uniform to 1e-5"
 """Condition of the estimates on an exactly uniform beam."""
 
-UNEXPLAINED: Final = "part of the record is unexplained"
+UNEXPLAINED_REASON: Final = "part of the record is unexplained"
 """Reason against all numbers if the residual is more than noise."""
 
 MISREAD: Final = "the record contradicts its file"
@@ -55,7 +55,7 @@ _NOT_SEPARABLE_FLAG: Final = "not separable from a damping of unknown order"
 """Flag of the beam parameters if a damping is not separable from them: damping of a low order acts
 as stiffness, damping of an order near 2 as inertia."""
 
-ONE_MODE: Final = "one mode alone does not separate internal from external damping"
+ONE_MODE_REASON: Final = "one mode alone does not separate internal from external damping"
 """Flag of both loss factors if the record shows a single mode."""
 
 _STIFFNESS_LAW_FLAG: Final = (
@@ -288,7 +288,7 @@ class Headline(Estimates):
         """Return the numbers of the modes that the record shows."""
         return tuple(mode.number for mode in self.modes if mode.shown)
 
-    def with_law_assumed(self) -> Headline:
+    def with_stiffness_law_flag(self) -> Headline:
         """Return the headline with a flag on numbers that depend on the assumed stiffness law."""
         return replace(
             self,
@@ -304,7 +304,7 @@ class Headline(Estimates):
             ),
         )
 
-    def with_status(self, status: StructureStatus) -> tuple[str, ...]:
+    def structures_with_status(self, status: StructureStatus) -> tuple[str, ...]:
         """Return the names of the structures with a given status.
 
         Parameters
@@ -398,7 +398,7 @@ def of_fit(
         Result of `CandidateSet.with_both_dampings`: the fit with both dampings, for the modes.
     """
     with_both, uses_both = both or (fit, False)
-    damping_reason = ONE_MODE if len(visible) < _MODES_TO_SEPARATE_DAMPINGS else None
+    damping_reason = ONE_MODE_REASON if len(visible) < _MODES_TO_SEPARATE_DAMPINGS else None
     if ANOTHER_DAMPING in reasons.values():
         damping_reason = ANOTHER_DAMPING
     flags: dict[str, str] = {

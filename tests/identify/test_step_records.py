@@ -4,7 +4,7 @@ import pytest
 
 from analysis.identify import select
 from analysis.identify.profile_likelihood import LikelihoodProfile, profile_both_orders
-from analysis.identify.sentences import order as order_sentence
+from analysis.identify.sentences import order_sentence
 from analysis.identify.verdict import order_verdict
 
 
