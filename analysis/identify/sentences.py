@@ -215,10 +215,14 @@ def order_sentence(verdict: OrderVerdict) -> str:
     if verdict.status == "absent":
         return f"No {damping_name} was found, so its order {name} has no meaning."
     if verdict.status == "not identifiable":
-        return f"The order {name} of the {damping_name} is not identifiable: {_unidentifiable_reason(verdict)}."
+        return (
+            f"The order {name} of the {damping_name} is not identifiable: "
+            f"{_unidentifiable_reason(verdict)}."
+        )
     if verdict.reason is not None:
         return (
-            f"The order {name} of the {damping_name} is not established: {value} fits, but {verdict.reason}. "
+            f"The order {name} of the {damping_name} is not established: {value} fits, but "
+            f"{verdict.reason}. "
             "Do not interpret it."
         )
     if verdict.status == "compatible":
@@ -245,7 +249,8 @@ def _conditional_sentence(simpler: ConditionalEstimate) -> str:
         if name in simpler.parameters
     ]
     return (
-        f"{assumption[0].upper()}{assumption[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} not excluded; "
+        f"{assumption[0].upper()}{assumption[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} "
+        "not excluded; "
         f"if true (type {simpler.name}): {', '.join(numbers)}."
     )
 
@@ -274,7 +279,8 @@ def _unidentifiable_reason(verdict: OrderVerdict) -> str:
     if len(profile.local_minima) > 1:
         minima_text = " and ".join(f"{value:.3f}" for value in sorted(profile.local_minima))
         return (
-            f"{minima_text} fit the record equally well, each with a different damping (95 %: {low:.3f} "
+            f"{minima_text} fit the record equally well, each with a different damping (95 %: "
+            f"{low:.3f} "
             f"to {high:.3f}, with all that lies between)"
         )
     return (
@@ -332,7 +338,8 @@ def experiments(
             )
         else:
             advice.append(
-                f"To determine {order_names}, run narrow, slow sweeps around the modes, or a wider sweep "
+                f"To determine {order_names}, run narrow, slow sweeps around the modes, or a "
+                "wider sweep "
                 "that reaches one more mode."
             )
     unexplained = any(finding.kind == "unexplained" for finding in found)
@@ -353,7 +360,8 @@ def _advice_for_two_modes(candidate_set: CandidateSet, visible: tuple[int, ...])
     last_hz = float(candidate_set.comparison.frequency_hz[-1])
     if at_hz[missing_mode] > last_hz:
         return (
-            f"analyse and excite the {_MODE_ORDINALS[missing_mode]} mode as well: band and sweep up to at "
+            f"analyse and excite the {_MODE_ORDINALS[missing_mode]} mode as well: band and sweep "
+            "up to at "
             f"least {1.3 * at_hz[missing_mode]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
         )
     if not driven(candidate_set.comparison, at_hz[missing_mode], relative_to_hz=at_hz[other_mode]):
@@ -364,6 +372,7 @@ def _advice_for_two_modes(candidate_set: CandidateSet, visible: tuple[int, ...])
         )
     return (
         f"raise the {_MODE_ORDINALS[missing_mode]} mode above the noise: it was driven at its "
-        f"{at_hz[missing_mode]:.1f} Hz, so increase the amplitude (twice), sweep slower or repeat; a "
+        f"{at_hz[missing_mode]:.1f} Hz, so increase the amplitude (twice), sweep slower or "
+        "repeat; a "
         "wider band does not help."
     )
