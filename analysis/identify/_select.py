@@ -29,7 +29,7 @@ from analysis.identify._modal_fit import fit_modes
 from analysis.identify._modal_headline import tolerant_order, with_modal_model
 from analysis.identify._nonlinear import nonlinear_forces
 from analysis.identify._result import RecordAnalysis
-from analysis.identify._small_effects import LARGE, small_effect
+from analysis.identify._small_effects import LARGE_DEVIANCE_REDUCTION, small_effect
 from analysis.identify._step_in_time import step_score
 from analysis.identify._time_varying import along_time, changing, established
 from analysis.identify._visible_modes import visible_modes
@@ -274,7 +274,7 @@ def _select_with_known_impacts(
             candidate_set, forces, changes, modal = linear, (), (), modal_with_effect
         else:
             small_linear_effect = None
-    elif small_linear_effect is not None and small_linear_effect.saved > LARGE:
+    elif small_linear_effect is not None and small_linear_effect.saved > LARGE_DEVIANCE_REDUCTION:
         candidate_set = linear.with_effect(small_linear_effect.column[None])
         modal = _fit_modal_model(candidate_set)
     else:
