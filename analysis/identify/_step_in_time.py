@@ -132,7 +132,7 @@ class _StiffnessStepTorque:
             fit.numbers, fit.model.poles_rad_s, fit.model.residues, strict=True
         ):
             if number:
-                # The mode adds inertia s⁴ / (s² + 2 xi omega s + omega²) to G, apart from constants.
+                # The mode adds inertia s⁴ / (s² + 2 xi omega s + omega²) to G, without constants.
                 omega_squared, inertia = abs(pole) ** 2, 2 * abs(residue) / abs(pole) ** 3
                 mode_response = s * s / (s * s - 2 * pole.real * s + omega_squared)
                 vibrations.append(np.fft.irfft(angle * mode_response, self._length)[:count])

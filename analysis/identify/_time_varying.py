@@ -443,8 +443,8 @@ def changing(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> Iterato
             yield replace(
                 finding,
                 sentence=(
-                    f"{_EFFECT_NAMES[change.what]} ({_size_text(change)}) would explain the record as well as "
-                    f"{others}: in one sweep, time and frequency vary together."
+                    f"{_EFFECT_NAMES[change.what]} ({_size_text(change)}) would explain the record "
+                    f"as well as {others}: in one sweep, time and frequency vary together."
                 ),
                 value=None,
                 interval=None,
@@ -483,7 +483,8 @@ def _established_finding(change: TemporalChange) -> Finding:
         kind=_FINDING_KINDS[change.what],
         sentence=(
             f"{_EFFECT_NAMES[change.what]}: {_size_text(change)} "
-            f"(± {_DISPLAY_FACTORS.get(change.what, 100.0) * half_width:.1g}; 95 %). It was fitted too"
+            f"(± {_DISPLAY_FACTORS.get(change.what, 100.0) * half_width:.1g}; 95 %). "
+            "It was fitted too"
             + (
                 ", to first order in its size."
                 if of_play
