@@ -249,7 +249,7 @@ class LaterDecaySpectra(DecaySpectra):
         Time between ticks.
     """
 
-    __slots__ = ("_first_tick_factor", "_tick_s", "_tick_rotation")
+    __slots__ = ("_first_tick_factor", "_tick_rotation", "_tick_s")
 
     def __init__(
         self,

@@ -6,10 +6,10 @@ parameters compensate it exactly. With z = beta L the response (Eq. 25) is::
     G = -(EI/L) (1 + zeta s^alpha) F(z),    z^4 = -(rho/EI L^4 s² + gamma L^4 s^lambda) / (1 + ...)
 
 so that a session determines only EI/L, rho/EI L^4, gamma L^4, zeta and both orders. A torque that
-is read too large by a factor enlarges EI and the tool inertia by this factor. The drag of the air
-is proportional to the torque and to the square of the speed, which is proportional to the length,
-times the square of the length that it acts over. So every parameter is proportional to a power of
-each scale (`SCALE_EXPONENTS`), and the relative variances add (JCGM 100:2008, GUM, 5.1.6).
+is read too large by a factor enlarges EI and the tool inertia by this factor. The torque by air
+drag is proportional to the drag parameter, to the square of the speed, which is proportional to the
+length, and to the square of the length that it acts over. So every parameter is proportional to a
+power of each scale (`SCALE_EXPONENTS`), and the relative variances add (JCGM 100:2008, GUM, 5.1.6).
 """
 
 from __future__ import annotations
