@@ -92,7 +92,7 @@ class Refit:
         for name in hold:
             index = unknowns.names.index(name)
             region.lower[index] = region.upper[index] = x[index]
-        objective, found = Objective(comparison, unknowns, columns).minimum(
+        objective, minimum = Objective(comparison, unknowns, columns).minimum(
             x,
             noise.weight,
             region,
@@ -100,21 +100,21 @@ class Refit:
             max_evaluations=max_evaluations,
             hopeless=hopeless,
         )
-        return cls(objective, found.x, found.equations, noise)
+        return cls(objective, minimum.x, minimum.equations, noise)
 
     def further(self, max_evaluations: int) -> Refit:
         """Continue the descent with no unknown fixed, as `descend` from the same point would.
 
         The evaluation at this point counts, but is not repeated unless torques are unknown.
         """
-        objective, found = self.objective.minimum(
+        objective, minimum = self.objective.minimum(
             self.x,
             self.noise.weight,
             Steps.of(self.objective.unknowns, NEXT_TO_NOTHING),
             relative_tolerance=_COST_TOLERANCE,
             max_evaluations=max_evaluations,
         )
-        return Refit(objective, found.x, found.equations, self.noise)
+        return Refit(objective, minimum.x, minimum.equations, self.noise)
 
     @property
     def columns(self) -> NDArray[np.complex128]:
@@ -141,13 +141,15 @@ class Refit:
     def predicted_step(self) -> NDArray[np.float64]:
         """Return the Gauss-Newton step of the unknowns to the true minimum, shape (k,)."""
         equations = self.equations
-        held = equations.held(self.x, *self.objective.unknowns.bounds)
-        free = ~held & (np.diag(equations.hessian) > 0)
-        scaled, scale = equations.scaled_hessian()
-        slope = equations.gradient[free] / scale[free]
+        at_bound = equations.held(self.x, *self.objective.unknowns.bounds)
+        is_free = ~at_bound & (np.diag(equations.hessian) > 0)
+        scaled_hessian, scale = equations.scaled_hessian()
+        slope = equations.gradient[is_free] / scale[is_free]
         step = np.zeros(self.x.size)
-        solved = np.linalg.solve(scaled[np.ix_(free, free)] + 1e-12 * np.eye(slope.size), slope)
-        step[free] = -solved / scale[free]
+        solved = np.linalg.solve(
+            scaled_hessian[np.ix_(is_free, is_free)] + 1e-12 * np.eye(slope.size), slope
+        )
+        step[is_free] = -solved / scale[is_free]
         return step
 
     @property
@@ -193,10 +195,10 @@ class Refit:
         """
         weight, linearisation = self.noise.weight, self.objective.linearise(self.x)
         projected = self.objective.project(linearisation, weight)
-        known = linearisation.columns * weight
+        explaining_spectra = linearisation.columns * weight
         if beam_free:
-            known = np.concatenate([projected.jacobian, known])
-        return unexplained_part(columns * weight, known), projected.residual
+            explaining_spectra = np.concatenate([projected.jacobian, explaining_spectra])
+        return unexplained_part(columns * weight, explaining_spectra), projected.residual
 
     def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Return the first-order cost reduction by each added torque spectrum alone, shape (c,).
@@ -249,15 +251,16 @@ class Refit:
 
 
 def unexplained_part(
-    columns: NDArray[np.complex128], known: NDArray[np.complex128]
+    columns: NDArray[np.complex128], explaining_spectra: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
     """Return the part of whitened spectra that other free terms do not explain, shape (c, K).
 
-    `known`, shape (k, K), are the whitened derivatives by all free parameters and amplitudes.
+    `explaining_spectra`, shape (k, K), are the whitened derivatives by all free parameters and
+    amplitudes.
     """
-    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
-    basis = known[scale > 0] / scale[scale > 0, None]
+    scale = np.sqrt(np.sum(np.abs(explaining_spectra) ** 2, axis=1))
+    basis = explaining_spectra[scale > 0] / scale[scale > 0, None]
     gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
     coefficients = np.linalg.solve(gram, (basis.conj() @ columns.T).real)
-    part: NDArray[np.complex128] = columns - coefficients.T @ basis
-    return part
+    remainder: NDArray[np.complex128] = columns - coefficients.T @ basis
+    return remainder

@@ -101,8 +101,8 @@ class CoarseResponse:
     def __init__(self, comparison: Comparison) -> None:
         length = comparison.angle_rad.size
         hz = np.fft.rfftfreq(length, 1 / comparison.decimation.rate_hz)
-        first, last = comparison.frequency_hz[[0, -1]]
-        band = np.flatnonzero((hz >= first) & (hz <= last))
+        first_hz, last_hz = comparison.frequency_hz[[0, -1]]
+        band = np.flatnonzero((hz >= first_hz) & (hz <= last_hz))
         angle = np.fft.rfft(comparison.angle_rad)[band]
         torque = np.fft.rfft(comparison.torque_nm)[band]
         # Without excitation the motor moved with the noise: such bins show no response.
@@ -110,9 +110,9 @@ class CoarseResponse:
         power = coherent_angle.real**2 + coherent_angle.imag**2
         excited = power > 1e-12 * power.max()
         response, weights = torque[excited] / angle[excited], power[excited]
-        index, self._weights = thinned(response, weights / weights.sum(), _COARSE_POINTS)
-        self._measured = response[index]
-        self._frequency_hz = hz[band][excited][index]
+        selected, self._weights = thinned(response, weights / weights.sum(), _COARSE_POINTS)
+        self._measured = response[selected]
+        self._frequency_hz = hz[band][excited][selected]
         self._response = ResponseGrid(2j * np.pi * self._frequency_hz)
         self._costs: dict[Plant, float] = {}
 
@@ -140,16 +140,16 @@ class CoarseResponse:
             self._costs[plant] = self._mean_square(deviation)
         return self._costs[plant]
 
-    def distance(self, one: Plant, other: Plant) -> float:
+    def distance(self, first_plant: Plant, second_plant: Plant) -> float:
         """Return the weighted mean square of the difference between two plants' responses."""
         return self._mean_square(
-            self._response.evaluate(one)[0] - self._response.evaluate(other)[0]
+            self._response.evaluate(first_plant)[0] - self._response.evaluate(second_plant)[0]
         )
 
-    def alike(self, one: Plant, other: Plant) -> bool:
+    def alike(self, first_plant: Plant, second_plant: Plant) -> bool:
         """Return whether two plants are so similar that they belong to the same minimum."""
-        return self.distance(one, other) <= _SAME_MINIMUM_FRACTION * min(
-            self.cost(one), self.cost(other)
+        return self.distance(first_plant, second_plant) <= _SAME_MINIMUM_FRACTION * min(
+            self.cost(first_plant), self.cost(second_plant)
         )
 
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
@@ -207,7 +207,9 @@ def coarse_minima(
     distinct: list[Minimum] = []
     for minimum in sorted(minima, key=lambda m: m.cost):
         plant = unknowns.plant(minimum.x)
-        if not any(coarse.alike(plant, unknowns.plant(other.x)) for other in distinct):
+        if not any(
+            coarse.alike(plant, unknowns.plant(known_minimum.x)) for known_minimum in distinct
+        ):
             distinct.append(minimum)
     return distinct
 
@@ -387,11 +389,11 @@ class StructureSearch:
         """
         coarse = self.coarse.whitened(noise, self.objective.comparison.frequency_hz)
         points = [minimum.x for minimum in self.minima[:_MAX_STORED_MINIMA]]
-        found = coarse_minima(coarse, self.unknowns, [*points, self.first])
+        minima_under_noise = coarse_minima(coarse, self.unknowns, [*points, self.first])
         rivals = [
             Descent(self.objective, minimum.x)
-            for minimum in found[:_MAX_RIVALS]
-            if minimum.cost < _RIVAL_COST_RATIO * found[0].cost
+            for minimum in minima_under_noise[:_MAX_RIVALS]
+            if minimum.cost < _RIVAL_COST_RATIO * minima_under_noise[0].cost
         ]
         if near is not None:
             plant = self.unknowns.plant(near.x)
@@ -404,5 +406,5 @@ class StructureSearch:
             ]
         if len(rivals) == 1:
             return rivals[0]
-        ends = [rival.to_minimum(noise, _RIVAL_TOLERANCE) for rival in rivals]
-        return min(ends, key=lambda end: end.cost(noise))
+        final_descents = [rival.to_minimum(noise, _RIVAL_TOLERANCE) for rival in rivals]
+        return min(final_descents, key=lambda end: end.cost(noise))

@@ -74,7 +74,9 @@ if TYPE_CHECKING:
     from analysis.identify.uniform_beam import UniformBeamTest
 
 
-_MODES_TO_TEST: Final = 2
+_MODES_WITHOUT_REDUNDANCY: Final = 2
+"""Number of visible modes up to which deviations from a uniform beam leave no degree of freedom."""
+
 _TILTED_AXIS_REASON: Final = (
     "the axis is tilted, and fits to the whole record are of one that is plumb"
 )
@@ -120,7 +122,7 @@ class Selection:
 
     @property
     def fit(self) -> RecordFit:
-        """Return the fit that the headline reports."""
+        """Return the fit whose numbers are reported."""
         return self.headline.fit
 
     @property
@@ -266,7 +268,9 @@ def _select_with_known_impacts(
     if not (is_linear or effect_suffices) or (
         small_linear_effect is not None and small_linear_effect.large
     ):
-        candidate_set, forces, changes = _fit_further_effects(linear, again=refitted is not None)
+        candidate_set, forces, changes = _fit_further_effects(
+            linear, from_earlier=refitted is not None
+        )
         modal = _fit_modal_model(candidate_set)
         if effect_suffices and not (
             modal is not None and _is_linear_and_constant(candidate_set, modal, band_hz)
@@ -342,7 +346,7 @@ def _select_with_known_impacts(
         sentences = headline_sentences(reported, orders, without_rival=doubt is None)
         advice = experiments(candidate_set, orders, visible_numbers, all_findings, close_rivals)
     advice += [each.remedy for each in all_findings if each.remedy]
-    best = candidate_set.best
+    best_candidate = candidate_set.best
     selection = Selection(
         candidates=candidate_set.candidates,
         headline=reported,
@@ -351,7 +355,7 @@ def _select_with_known_impacts(
         ),
         verdict=Verdict(
             name=measurement.name,
-            structure=best.structure.name,
+            structure=best_candidate.structure.name,
             rivals=tuple(c.name for c in close_rivals),
             parameters={k: q.value for k, q in reported.parameters.items() if q.flag is None},
             adequate=model_reason is None,
@@ -372,11 +376,11 @@ def _select_with_known_impacts(
 
 
 def _fit_modal_model(
-    candidate_set: CandidateSet, further: NDArray[np.complex128] | None = None
+    candidate_set: CandidateSet, added_spectra: NDArray[np.complex128] | None = None
 ) -> ModalFit | None:
     """Fit the modal model to the record of a candidate set, or return None if no mode is visible.
 
-    `further`, shape (c, K), are torque spectra of unknown size in addition to those of the
+    `added_spectra`, shape (c, K), are torque spectra of unknown size in addition to those of the
     candidates.
     """
     if candidate_set.misread:
@@ -387,8 +391,8 @@ def _fit_modal_model(
         if mode.frequency_hz > 0
     ]
     columns, drag = candidate_set.columns, candidate_set.comparison.drag
-    if further is not None:
-        columns = np.concatenate([columns, further])
+    if added_spectra is not None:
+        columns = np.concatenate([columns, added_spectra])
     if drag is not None:  # the size of the drag is not known exactly
         columns = np.concatenate([columns, drag.by_law])
     return fit_modes(candidate_set.comparison, candidate_set.noise, starts, columns)
@@ -402,7 +406,7 @@ def _visible_mode_numbers(candidate_set: CandidateSet, modal: ModalFit | None) -
 
 
 def _add_modal_model(
-    exact: Headline,
+    exact_headline: Headline,
     measurement: Measurement,
     modal: ModalFit | None,
     test: UniformBeamTest | None,
@@ -411,19 +415,19 @@ def _add_modal_model(
 ) -> Headline:
     """Add the modal model and the estimates with tolerance to the headline of a uniform beam.
 
-    Return `exact` if there is no modal model. `doubt` is the reason against every number, and
-    `mode_doubt` the reason against every mode. They are None if there is no such reason.
+    Return `exact_headline` if there is no modal model. `doubt` is the reason against every number,
+    and `mode_doubt` the reason against every mode. They are None if there is no such reason.
     """
     if modal is None or test is None:
-        return exact
+        return exact_headline
     tolerant = None
     if measurement.axis_tilt_deg:
-        exact = exact.doubted(_TILTED_AXIS_REASON)
+        exact_headline = exact_headline.doubted(_TILTED_AXIS_REASON)
     if measurement.uniformity or test.status == "refused" or measurement.axis_tilt_deg:
         tolerant = tolerant_estimate(
             modal, measurement.nominal, measurement.uniformity, measurement.axis_tilt_deg
         )
-    return with_modal_model(exact, modal, test, tolerant, doubt, mode_doubt)
+    return with_modal_model(exact_headline, modal, test, tolerant, doubt, mode_doubt)
 
 
 def _uniform_beam_test(measurement: Measurement, modal: ModalFit | None) -> UniformBeamTest | None:
@@ -440,7 +444,7 @@ def _explain_deviations(
 
     Return no finding with only two modes, which leave no degree of freedom for this test.
     """
-    if len(modal.visible) <= _MODES_TO_TEST:
+    if len(modal.visible) <= _MODES_WITHOUT_REDUNDANCY:
         return ()
     causes = explanations(modal, measurement.nominal, measurement.axis_tilt_deg)
     stiffness_step = step_score(candidate_set.comparison, modal) if measurement.one_sweep else None
@@ -451,7 +455,7 @@ def _setting_findings(
     candidate_set: CandidateSet, result: Headline, kinds: Collection[str]
 ) -> tuple[Finding, ...]:
     """Return findings on settings that differ from the file, if the record can show them."""
-    if "implausible" in kinds or len(result.visible_modes) < _MODES_TO_TEST:
+    if "implausible" in kinds or len(result.visible_modes) < _MODES_WITHOUT_REDUNDANCY:
         return ()
     return tuple(of_settings(candidate_set, result))
 
@@ -465,14 +469,15 @@ def _is_linear_and_constant(
 
 
 def _fit_further_effects(
-    linear: CandidateSet, *, again: bool
+    linear: CandidateSet, *, from_earlier: bool
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[TemporalChange, ...]]:
     """Test a record for nonlinear and time-varying effects.
 
     Return the candidate set with the best explanation, its nonlinear forces, and its changes along
-    the record. `again` states that the candidates were refitted from an earlier part of the record.
+    the record. `from_earlier` states that the candidates were refitted from an earlier part of the
+    record.
     """
-    candidate_set = linear if again else with_evident_drag(linear)
+    candidate_set = linear if from_earlier else with_evident_drag(linear)
     if candidate_set is linear:
         candidate_set = linear if linear.misread else with_air_drag(linear)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
@@ -581,7 +586,7 @@ def _fit_freest_with_known_impacts(
 
 def _unidentifiable_orders(candidate_set: CandidateSet, visible: tuple[int, ...]) -> dict[str, str]:
     """Return the orders that the fit of the freest structure does not determine, with reasons."""
-    freest, *others = candidate_set.candidates
+    freest, *other_candidates = candidate_set.candidates
     reason = not_reported_reason(candidate_set, visible)
     reasons = {}
     for name in COEFFICIENT_OF.keys() & set(freest.structure.free):
@@ -591,7 +596,7 @@ def _unidentifiable_orders(candidate_set: CandidateSet, visible: tuple[int, ...]
         at_local_minimum = not low <= 1 <= high and any(
             each.structure.fixed.get(name) == 1.0  # type: ignore[call-overload]
             and each.deviance - freest.deviance < NORMAL_95**2
-            for each in others
+            for each in other_candidates
         )
         if (
             reason

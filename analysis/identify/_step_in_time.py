@@ -86,23 +86,23 @@ class Step:
 def step_score(comparison: Comparison, fit: ModalFit) -> Step:
     """Return the stiffness step that best explains the residual of the modal model."""
     residual = fit.residual.view(np.float64)
-    stiffened = _StiffnessStepTorque(comparison, fit)
-    best, instants = (
+    step_torque = _StiffnessStepTorque(comparison, fit)
+    best_step, instants = (
         Step(0.0, 0.0, 0.0),
         np.linspace(0, comparison.samples, _COARSE_INSTANTS + 2)[1:-1],
     )
     spacing = float(instants[1] - instants[0])
     for _ in range(2):
-        spectra = np.array([stiffened.spectrum(int(instant)) for instant in instants])
-        rows = np.ascontiguousarray(spectra * fit.noise.weight).view(np.float64)
-        rows = rows - (rows @ fit.span.T) @ fit.span
-        squares = np.einsum("ij,ij->i", rows, rows)
+        spectra = np.array([step_torque.spectrum(int(instant)) for instant in instants])
+        whitened_spectra = np.ascontiguousarray(spectra * fit.noise.weight).view(np.float64)
+        whitened_spectra = whitened_spectra - (whitened_spectra @ fit.span.T) @ fit.span
+        squares = np.einsum("ij,ij->i", whitened_spectra, whitened_spectra)
         squares[squares == 0] = np.inf
-        correlation = -(rows @ residual)  # the residual is model less measurement
+        correlation = -(whitened_spectra @ residual)  # the residual is model less measurement
         scores = correlation**2 / squares
         best_index = int(np.argmax(scores))
-        if scores[best_index] > best.score:
-            best = Step(
+        if scores[best_index] > best_step.score:
+            best_step = Step(
                 score=float(scores[best_index]),
                 instant_s=comparison.first_s
                 + float(instants[best_index]) / comparison.decimation.rate_hz,
@@ -113,7 +113,7 @@ def step_score(comparison: Comparison, fit: ModalFit) -> Step:
             + spacing * np.linspace(-1, 1, 2 * _FINE_INSTANTS_PER_SIDE + 3)[1:-1]
         )
         instants = instants[(instants > 0) & (instants < comparison.samples)]
-    return best
+    return best_step
 
 
 class _StiffnessStepTorque:

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 # Search for changes along the record
 
 Effect = Literal["damping", "stiffness", "gain", "clock", "play"]
+"""Property that changes along the record, or "play" for backlash."""
 
 _SIMPLE_STRUCTURES: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
 """Simple structures that may explain the record if one property changes along it."""
@@ -60,11 +61,11 @@ _GRADIENT_PARAMETERS: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over
 """Parameters by which the predicted torque is differentiated."""
 
 _MIN_DEVIANCE_REDUCTION: Final = SIGNIFICANT_STD**2 + 2 * math.log(20)
-"""Deviance by which a column must reduce the residual: five of them are tried on four
+"""Deviance by which an effect must reduce the residual: five effects are tried on four
 candidates."""
 
 _RIVAL_BIC_FRACTION: Final = 0.75
-"""Fraction of the BIC advantage of another explanation that a column must be predicted to reach.
+"""Fraction of the BIC advantage of another explanation that an effect must be predicted to reach.
 The first order predicts this advantage to a tenth."""
 
 UNIT_PLAY_RAD: Final = 1e-4
@@ -80,7 +81,7 @@ _TAYLOR_TERMS: Final = 16
 """Number of terms of the Taylor series in time: enough for three radians."""
 
 _MAX_SIZE_FITS: Final = 8
-"""Largest number of fits after which the column is recomputed for the fitted size."""
+"""Largest number of fits. After each, the torque spectrum is recomputed for the fitted size."""
 
 _SIZE_TOLERANCE: Final = 0.01
 """Relative change of the fitted size at which these fits end."""
@@ -141,10 +142,10 @@ def along_time(
                     fitted_changes[what] = (bic, refit)
     possible_changes = []
     for what, (bic, refit) in fitted_changes.items():
-        sizes, std = refit.amplitudes()
+        amplitudes, std = refit.amplitudes()
         unit = _SIZE_UNITS.get(what, 1.0)
         change = TemporalChange(
-            what, unit * float(sizes[-1]), unit * float(std[-1]), bic - candidate_set.best.bic
+            what, unit * float(amplitudes[-1]), unit * float(std[-1]), bic - candidate_set.best.bic
         )
         if change.behind < BIC_DECISIVE and _has_possible_size(change):
             possible_changes.append((change, refit))
@@ -175,11 +176,11 @@ def _candidates_to_test(candidate_set: CandidateSet) -> Iterator[Candidate]:
 
 
 def _promising_changes(
-    candidate_set: CandidateSet, candidate: Candidate, lag: NDArray[np.float64], most_bic: float
+    candidate_set: CandidateSet, candidate: Candidate, lag: NDArray[np.float64], highest_bic: float
 ) -> Iterator[tuple[Effect, float]]:
     """Yield the changes that would make a candidate the best one, with their predicted BIC.
 
-    A change must reduce the deviance significantly, and its BIC must be below `most_bic`.
+    A change must reduce the deviance significantly, and its BIC must be below `highest_bic`.
     """
     refit = candidate_set.refit(candidate, 1)
     columns = _torque_spectra(candidate_set.comparison, candidate.fit.plant, lag)
@@ -188,7 +189,7 @@ def _promising_changes(
         remaining_cost = max(refit.cost - reduction, 1e-3 * refit.cost)
         deviance_reduction = candidate.values * math.log(refit.cost / remaining_cost)
         bic = candidate.bic - deviance_reduction + math.log(candidate.values)
-        if deviance_reduction > _MIN_DEVIANCE_REDUCTION and bic < most_bic:
+        if deviance_reduction > _MIN_DEVIANCE_REDUCTION and bic < highest_bic:
             yield what, bic
 
 
@@ -231,11 +232,13 @@ def _torque_spectra(
 
 def _torque_slopes(comparison: Comparison, plant: Plant) -> dict[Effect, NDArray[np.float64]]:
     """Return the torque per relative change of damping, stiffness and gain, each (samples,)."""
-    _, (zeta, gamma, gain, ratio) = comparison.prediction.torque(plant, _GRADIENT_PARAMETERS)
+    _, (by_zeta, by_gamma, by_gain, by_density_over_stiffness) = comparison.prediction.torque(
+        plant, _GRADIENT_PARAMETERS
+    )
     return {
-        "damping": plant.damping.zeta * zeta + plant.damping.gamma * gamma,
-        "stiffness": gain - ratio,  # EI rises, rho stays
-        "gain": gain,
+        "damping": plant.damping.zeta * by_zeta + plant.damping.gamma * by_gamma,
+        "stiffness": by_gain - by_density_over_stiffness,  # EI rises, rho stays
+        "gain": by_gain,
     }
 
 
@@ -272,12 +275,12 @@ def _clock_torque(comparison: Comparison, plant: Plant, size: float) -> NDArray[
     offset_s = _CLOCK_UNIT * (time_s - time_s.mean())
     grid = ResponseGrid(prediction.s)
     derivative = grid.evaluate(plant)[0]
-    factor = offset_s
+    taylor_factor = offset_s
     torque_change = np.zeros(offset_s.size)
     for number in range(1, _TAYLOR_TERMS + 1 if size else 2):
         derivative = derivative * grid.s
-        torque_change += factor * prediction.in_time(derivative)
-        factor = factor * size * offset_s / (number + 1)
+        torque_change += taylor_factor * prediction.in_time(derivative)
+        taylor_factor = taylor_factor * size * offset_s / (number + 1)
     return torque_change
 
 
@@ -353,8 +356,8 @@ def memory_torque(
 
     def weighted(spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the spectrum of w times the values of a spectrum over time."""
-        found: NDArray[np.complex128] = np.fft.rfft(w * in_time(spectrum) / growth, length)
-        return found
+        transform: NDArray[np.complex128] = np.fft.rfft(w * in_time(spectrum) / growth, length)
+        return transform
 
     k4_of_modes = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
     stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * k4_of_modes)

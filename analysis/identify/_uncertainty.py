@@ -68,12 +68,12 @@ def covariance_of_unknowns(
     covariance = np.zeros_like(hessian)
     if not determined.any():
         return covariance, determined
-    block = np.ix_(determined, determined)
-    unit = np.outer(scale[determined], scale[determined])
-    scaled = hessian[block] / unit
-    if np.linalg.cond(scaled) > _MAX_CONDITION_NUMBER:
+    determined_block = np.ix_(determined, determined)
+    scale_products = np.outer(scale[determined], scale[determined])
+    scaled_hessian = hessian[determined_block] / scale_products
+    if np.linalg.cond(scaled_hessian) > _MAX_CONDITION_NUMBER:
         return covariance, np.zeros_like(determined)
-    covariance[block] = scatter * np.linalg.inv(scaled) / unit
+    covariance[determined_block] = scatter * np.linalg.inv(scaled_hessian) / scale_products
     return covariance, determined
 
 
@@ -124,15 +124,15 @@ def parameter_uncertainty(
     for name, spread in zip(determined, np.sqrt(np.diag(covariance)).tolist(), strict=True):
         std[name] = values[name] * spread if name in LOGARITHMIC else spread
         intervals[name] = interval(name, values[name], spread)
-    first, _second = unknowns.omega_rad_s
+    first_omega_rad_s, _second = unknowns.omega_rad_s
     return ParameterUncertainty(
         std=std,
         interval=intervals,
         determined=determined,
         covariance=covariance,
         at_bounds=tuple(name for name, is_held in zip(names, held, strict=True) if is_held),
-        internal=damping_size("zeta", "alpha", values, determined, covariance, first),
-        external=damping_size("gamma", "lambda", values, determined, covariance, first),
+        internal=damping_size("zeta", "alpha", values, determined, covariance, first_omega_rad_s),
+        external=damping_size("gamma", "lambda", values, determined, covariance, first_omega_rad_s),
     )
 
 
@@ -240,24 +240,24 @@ def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[
     """
     table = []
     for number in dict.fromkeys(pole.mode for pole in poles):
-        first, *other_poles = (pole for pole in poles if pole.mode == number)
-        p, dp = first.at_rad_s, first.derivative
+        first_pole, *other_poles = (pole for pole in poles if pole.mode == number)
+        p, dp = first_pole.at_rad_s, first_pole.derivative
         q, dq = (
             (other_poles[0].at_rad_s, other_poles[0].derivative)
             if other_poles
             else (p.conjugate(), dp.conj())
         )
         natural = math.sqrt((p * q).real)
-        ratio = -(p + q).real / (2 * natural)
+        damping_ratio = -(p + q).real / (2 * natural)
         natural_slope = (q * dp + p * dq).real / (2 * natural)
-        ratio_slope = -(dp + dq).real / (2 * natural) - ratio * natural_slope / natural
+        ratio_slope = -(dp + dq).real / (2 * natural) - damping_ratio * natural_slope / natural
         frequency_slope = np.zeros(dp.size) if other_poles else dp.imag / (2 * np.pi)
         table.append(
             ModeEstimate(
                 number=number,
                 frequency_hz=abs(p.imag) / (2 * np.pi),
                 frequency_std_hz=_propagated_std(frequency_slope, covariance),
-                damping_ratio=ratio,
+                damping_ratio=damping_ratio,
                 damping_ratio_std=_propagated_std(ratio_slope, covariance),
             )
         )
@@ -313,10 +313,10 @@ def _best_combination(
     values: NDArray[np.complex128], columns: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], float]:
     """Return the best real combination of spectra, (m,), and its remaining sum of squares."""
-    parts = np.ascontiguousarray(columns).view(np.float64)
-    norms = np.sqrt(np.einsum("ij,ij->i", parts, parts))
+    real_columns = np.ascontiguousarray(columns).view(np.float64)
+    norms = np.sqrt(np.einsum("ij,ij->i", real_columns, real_columns))
     norms[norms == 0] = 1.0
-    scaled, target = (parts / norms[:, None]).T, values.view(np.float64)
-    factors = np.linalg.lstsq(scaled, target)[0]
-    remainder = target - scaled @ factors
+    scaled_columns, target = (real_columns / norms[:, None]).T, values.view(np.float64)
+    factors = np.linalg.lstsq(scaled_columns, target)[0]
+    remainder = target - scaled_columns @ factors
     return factors / norms, float(remainder @ remainder)

@@ -54,17 +54,17 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
     """
     torque = comparison.spectrum(comparison.torque_nm[comparison.retained])
     angle = comparison.spectrum(comparison.angle_rad[comparison.retained])
-    found = []
+    visible = []
     for mode in fit.modes:
         offset = comparison.frequency_hz - mode.frequency_hz
         reach_hz = _window_half_width_hz(comparison, mode.frequency_hz, mode.damping_ratio)
-        near = (np.abs(offset) < reach_hz) & noise.counts
-        degrees_of_freedom = 2 * (int(np.count_nonzero(near)) - _SMOOTH_DEGREE - 1)
+        in_window = (np.abs(offset) < reach_hz) & noise.counts
+        degrees_of_freedom = 2 * (int(np.count_nonzero(in_window)) - _SMOOTH_DEGREE - 1)
         if degrees_of_freedom < _MIN_BINS_PER_SIDE:
             continue
-        weight = noise.weight[near]
+        weight = noise.weight[in_window]
         smooth_chi_square = _smooth_response_chi_square(
-            torque[near] * weight, angle[near] * weight, offset[near] / reach_hz
+            torque[in_window] * weight, angle[in_window] * weight, offset[in_window] / reach_hz
         )
         # Chance does neither: together they are nearly eight standard deviations, or more.
         significant = (
@@ -72,10 +72,10 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
             and smooth_chi_square > _MIN_RESIDUAL_OVER_NOISE * degrees_of_freedom
         )
         # With many bins a resonance may be below the noise of each and still be significant.
-        fit_chi_square = float(np.vdot(fit.residual[near], fit.residual[near]).real)
+        fit_chi_square = float(np.vdot(fit.residual[in_window], fit.residual[in_window]).real)
         if significant or smooth_chi_square - fit_chi_square > _MIN_EVIDENCE:
-            found.append(mode.number)
-    return tuple(found)
+            visible.append(mode.number)
+    return tuple(visible)
 
 
 def driven(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
@@ -90,8 +90,10 @@ def driven(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -
 
     def amplitude(at_hz: float) -> float:
         """Return the root-mean-square amplitude of the excitation near a frequency."""
-        near = np.abs(hz - at_hz) <= max(_MIN_RELATIVE_REACH * at_hz, _MIN_BINS_PER_SIDE * hz[1])
-        return math.sqrt(float(np.mean(power[near]))) if near.any() else 0.0
+        in_window = np.abs(hz - at_hz) <= max(
+            _MIN_RELATIVE_REACH * at_hz, _MIN_BINS_PER_SIDE * hz[1]
+        )
+        return math.sqrt(float(np.mean(power[in_window]))) if in_window.any() else 0.0
 
     return amplitude(frequency_hz) > _MIN_EXCITATION_RATIO * amplitude(relative_to_hz) > 0
 

@@ -257,22 +257,22 @@ class DragResponse:
         modal_torques = self._leverage[:, None] * self._inertial_response * spectra[:-1]
         for mode in modes:
             pole = self._pole_pairs[mode - 1][0]
-            term, mirror = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
-            for change in (term + mirror, 1j * (term - mirror)):
+            pole_term, conjugate_term = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
+            for pole_factor in (pole_term + conjugate_term, 1j * (pole_term - conjugate_term)):
                 sources.append(
-                    (mode - 1, self._oversampled_values(modal_speeds[mode - 1] * change))
+                    (mode - 1, self._oversampled_values(modal_speeds[mode - 1] * pole_factor))
                 )
-                direct_torques.append(self.in_time(modal_torques[mode - 1] * change))
+                direct_torques.append(self.in_time(modal_torques[mode - 1] * pole_factor))
         for mode in _LOWEST_MODE_INDICES:
-            for change in (1 / self._inertia_term, self.s / self._inertia_term):
+            for pole_factor in (1 / self._inertia_term, self.s / self._inertia_term):
                 sources.append(
-                    (mode, self._oversampled_values(self._modal_speed_by_angle[mode] * change))
+                    (mode, self._oversampled_values(self._modal_speed_by_angle[mode] * pole_factor))
                 )
-                direct_torques.append(self.in_time(modal_torques[mode] * change))
+                direct_torques.append(self.in_time(modal_torques[mode] * pole_factor))
         force_changes = self._modal_force_changes(speed, law, sources)
-        by = [self._torque_over_time(change) for change in force_changes]
+        by = [self._torque_over_time(pole_factor) for pole_factor in force_changes]
         by[: len(direct_torques)] = [
-            row + more for row, more in zip(by, direct_torques, strict=False)
+            sampled + direct for sampled, direct in zip(by, direct_torques, strict=False)
         ]
         of_external, of_law = by[2 * len(modes) : len(direct_torques)], by[len(direct_torques) :]
         torque = self._torque_transform(spectra)
@@ -359,16 +359,16 @@ class DragResponse:
         state, out = np.zeros((len(by_state), run_count)), np.zeros((len(step), run_count))
         modal_speed, free_state = out[:MODES], out[MODES:]
         force, dot, add = np.empty(force_changes.shape[1:]), np.dot, np.add
-        for first in range(0, len(speed), _STEPS_PER_CHUNK):
-            chunk = slice(first, first + _STEPS_PER_CHUNK)
+        for first_step in range(0, len(speed), _STEPS_PER_CHUNK):
+            chunk = slice(first_step, first_step + _STEPS_PER_CHUNK)
             now, magnitude = force_changes[chunk], np.abs(speed[chunk])
             cube_root = np.cbrt(magnitude)
             slope = -2 * HALF_DENSITY * law.constant_m * magnitude
             if law.slowing:
                 slope -= (1 + _SLOWING_EXPONENT) * HALF_DENSITY * law.slowing * cube_root
             by_speed = (slope @ coupling).reshape(-1, len(force_weights), MODES)
-            for run, (mode, faster) in enumerate(sources):
-                np.multiply(by_speed[:, :, mode], faster[chunk, None], out=now[:, :, run])
+            for run, (mode, added_speed) in enumerate(sources):
+                np.multiply(by_speed[:, :, mode], added_speed[chunk, None], out=now[:, :, run])
             for run, power in (-2, magnitude), (-1, cube_root):
                 now[:, :, run] = (-HALF_DENSITY * power * speed[chunk]) @ force_weights.T
             for at, matrix in zip(now, by_speed, strict=True):
@@ -394,7 +394,7 @@ class DragResponse:
         for i, (pair, slope) in enumerate(zip(self._pole_pairs, z_prime, strict=True)):
             rows = slice(2 * i, 2 * i + 2)
             decay = np.exp(pair * step_s)
-            force_weights = _polynomial_inputs(pair, step_s)  # (2, 1 + _PAST), the newest first
+            force_weights = _force_weights_of_step(pair, step_s)  # (2, 1 + _PAST), the newest first
             gain = pair / slope / self.plant.beam.bending_stiffness_n_m2
             if pair[0].imag > 0:
                 a, b = decay[0].real, decay[0].imag
@@ -414,8 +414,8 @@ class DragResponse:
         by_state[3 * n :, 2 * n : -n] = np.eye((_PAST_FORCES - 1) * n)
         # The new force is not known yet: it is extrapolated from the last three for the speed.
         with_extrapolated_force = by_state[: 2 * n].copy()
-        for back, factor in enumerate((3.0, -3.0, 1.0)):
-            columns = slice((2 + back) * n, (3 + back) * n)
+        for steps_back, factor in enumerate((3.0, -3.0, 1.0)):
+            columns = slice((2 + steps_back) * n, (3 + steps_back) * n)
             with_extrapolated_force[:, columns] += factor * by_force[: 2 * n]
         return output[:, : 2 * n] @ with_extrapolated_force, by_state, by_force
 
@@ -475,8 +475,10 @@ class DragResponse:
         Modes are numbered from 1. This part of the linear torque contains its whole dependence on
         the poles of the mode.
         """
-        term = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode - 1]
-        torque: Complex = term * self._inertia_term * self._modal_speed_by_angle[mode - 1] / self.s
+        torque_factor = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode - 1]
+        torque: Complex = (
+            torque_factor * self._inertia_term * self._modal_speed_by_angle[mode - 1] / self.s
+        )
         return torque
 
     def _oversampled_values(self, spectrum: Complex) -> Real:
@@ -502,11 +504,11 @@ def _pole_pairs(k_of_length: Real, plant: Plant) -> Complex:
     return pairs.astype(np.complex128)
 
 
-def _polynomial_inputs(pole: Complex, step_s: float) -> Complex:
+def _force_weights_of_step(pole: Complex, step_s: float) -> Complex:
     """Return the weights of the last forces in one time step of ``z' = p z + F``.
 
-    They have the shape (poles, 1 + _PAST), with the newest force first. Between the instants the
-    force is the polynomial through all of these forces.
+    They have the shape (poles, 1 + `_PAST_FORCES`), with the newest force first. Between the
+    instants the force is the polynomial through all of these forces.
     """
     node, weight = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     fraction = 0.5 * (node + 1)
@@ -575,7 +577,7 @@ class DragExpansion:
     top_speed_m_s: float
 
     def change_to(
-        self, plant: Plant, poles: Sequence[Pole], names: Sequence[str], chain: Real
+        self, plant: Plant, poles: Sequence[Pole], names: Sequence[str], parameter_slopes: Real
     ) -> tuple[Complex, Complex]:
         """Return how the drag torque changes for another beam, and the derivatives of this change.
 
@@ -587,7 +589,7 @@ class DragExpansion:
             Poles of the other beam, differentiated by the unknowns.
         names : sequence of str
             Names of the parameters, as in `Unknowns`.
-        chain : ndarray, shape (len(names), k)
+        parameter_slopes : ndarray, shape (len(names), k)
             Derivatives of the parameters by the unknowns, with density over stiffness and stiffness
             as logarithms.
 
@@ -613,21 +615,27 @@ class DragExpansion:
                 rows += [*by_pole, *remainder_slopes, remainder]
                 steps += [pole_step.real, pole_step.imag, 0.0, 0.0, -1.0]
                 pole_slopes = [pole.derivative.real, pole.derivative.imag]
-                slopes += [*pole_slopes, *(-part for part in pole_slopes), np.zeros(chain.shape[1])]
+                slopes += [
+                    *pole_slopes,
+                    *(-pole_slope for pole_slope in pole_slopes),
+                    np.zeros(parameter_slopes.shape[1]),
+                ]
         rows.append(self.by_ln_density)
         own_density, other_density = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
         steps.append(np.log(other_density / own_density))
         # ln(mass per length) is the sum of ln(rho/EI) and ln(EI).
-        slopes.append(_parameter_rows(chain, names, OF_BEAM).sum(axis=0))
+        slopes.append(_parameter_rows(parameter_slopes, names, OF_BEAM).sum(axis=0))
         for by_external, values in zip(
             self.by_external, self._external_damping_change(plant), strict=True
         ):
             rows += list(by_external)
             steps += values[:, 0].tolist()
-            slopes += list(values[:, 1:] @ _parameter_rows(chain, names, _EXTERNAL_PARAMETERS))
+            slopes += list(
+                values[:, 1:] @ _parameter_rows(parameter_slopes, names, _EXTERNAL_PARAMETERS)
+            )
         rows.append(self.by_delay)
         steps.append(plant.delay_s - self.plant.delay_s)
-        slopes += list(_parameter_rows(chain, names, ("delay_s",)))
+        slopes += list(_parameter_rows(parameter_slopes, names, ("delay_s",)))
         # A real view suffices, since the spectra are multiplied by real numbers only.
         real_rows = np.array(rows).view(np.float64)
         change: Complex = (np.array(steps) @ real_rows).view(np.complex128)
@@ -647,15 +655,17 @@ class DragExpansion:
             For each mode c_0 and c_1 of ``c_0 + c_1 s``, each with its derivatives by gamma and
             lambda.
         """
-        before, after = self.plant.damping, plant.damping
+        own_damping, other_damping = self.plant.damping, plant.damping
         differences = []
         for s in self.response.poles[_LOWEST_MODE_INDICES].tolist():
             if not s.imag > 0:  # no such oscillation
                 differences.append(np.zeros((2, 3)))
                 continue
-            log_s, per_gamma = np.log(s), s**after.lambda_
-            change = after.gamma * per_gamma - before.gamma * s**before.lambda_
-            values = np.array([change, per_gamma, after.gamma * log_s * per_gamma])
+            log_s, per_gamma = np.log(s), s**other_damping.lambda_
+            difference = (
+                other_damping.gamma * per_gamma - own_damping.gamma * s**own_damping.lambda_
+            )
+            values = np.array([difference, per_gamma, other_damping.gamma * log_s * per_gamma])
             linear_term = values.imag / s.imag
             differences.append(np.array([values.real - linear_term * s.real, linear_term]))
         return differences
@@ -670,18 +680,22 @@ class DragExpansion:
         """
         s, torque = self.response.s, self.response.modal_torque(mode)
         pole_step = other_pole - own_pole
-        before, mirror = 1 / (s - own_pole), 1 / (s - own_pole.conjugate())
-        after, after_mirror = 1 / (s - other_pole), 1 / (s - other_pole.conjugate())
-        ratio = after * after_mirror / (before * mirror)
-        first = pole_step * before + pole_step.conjugate() * mirror
-        real = ratio * (after + after_mirror) - (before + mirror)
-        imaginary = 1j * (ratio * (after - after_mirror) - (before - mirror))
-        spectra = torque * np.array([ratio - 1 - first, real, imaginary])
+        own_term, own_conjugate_term = 1 / (s - own_pole), 1 / (s - own_pole.conjugate())
+        other_term, other_conjugate_term = 1 / (s - other_pole), 1 / (s - other_pole.conjugate())
+        ratio = other_term * other_conjugate_term / (own_term * own_conjugate_term)
+        first_order = pole_step * own_term + pole_step.conjugate() * own_conjugate_term
+        by_real_part = ratio * (other_term + other_conjugate_term) - (own_term + own_conjugate_term)
+        by_imaginary_part = 1j * (
+            ratio * (other_term - other_conjugate_term) - (own_term - own_conjugate_term)
+        )
+        spectra = torque * np.array([ratio - 1 - first_order, by_real_part, by_imaginary_part])
         remainder, *remainder_slopes = self.band(self.response.in_time(spectra))
         return remainder, np.array(remainder_slopes)
 
 
-def _parameter_rows(chain: Real, names: Sequence[str], wanted: Sequence[str]) -> Real:
+def _parameter_rows(derivatives: Real, names: Sequence[str], parameters: Sequence[str]) -> Real:
     """Return the rows of a derivative matrix for some parameters, zero for missing ones, (n, k)."""
-    none = np.zeros(chain.shape[1])
-    return np.array([chain[names.index(name)] if name in names else none for name in wanted])
+    zero_row = np.zeros(derivatives.shape[1])
+    return np.array(
+        [derivatives[names.index(name)] if name in names else zero_row for name in parameters]
+    )

@@ -76,14 +76,14 @@ def mode_poles(
     near_rad_s : sequence of complex, optional
         Approximate poles in the order of the modes, if all are known.
     """
-    near = np.array(near_rad_s) if len(near_rad_s) == count > 0 else None
+    near_poles = np.array(near_rad_s) if len(near_rad_s) == count > 0 else None
     if plant.tip_mass_kg or plant.root_compliance_rad_per_nm:
-        return _loaded_poles(plant, count, wrt, near)
+        return _loaded_poles(plant, count, wrt, near_poles)
     z = eigenvalues(count).copy()
     for index, offset in enumerate(plant.stiffness_offsets[: count - 1], start=1):
         z[index] *= (1 + offset) ** 0.25
     poles = []
-    for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, near)):
+    for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, near_poles)):
         if np.isnan(pair[0]):
             continue
         k4_per_m4 = float((z[i] / plant.beam.length_m) ** 4)
@@ -169,11 +169,11 @@ class DecaySpectra:
             else:
                 weighted_derivatives.append(amplitudes[index] * pole.derivative.real)
                 index += 1
-        parts: NDArray[np.float64] = np.array(weighted_derivatives).T @ self.growing(poles).view(
-            np.float64
-        )
-        total: NDArray[np.complex128] = parts.view(np.complex128)
-        return total
+        real_parts: NDArray[np.float64] = np.array(weighted_derivatives).T @ self.growing(
+            poles
+        ).view(np.float64)
+        gradient: NDArray[np.complex128] = real_parts.view(np.complex128)
+        return gradient
 
     def growing(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
         """Return the spectra of the decays times the time since the first sample, shape (m, K)."""
@@ -186,10 +186,12 @@ class DecaySpectra:
         Together they describe any amplitude and phase at the beginning and any other at the end,
         which leaks into distant bins.
         """
-        none = np.zeros(0, dtype=np.complex128)
+        no_derivatives = np.zeros(0, dtype=np.complex128)
         # A steady oscillation at the frequency of a bin would give 0 / 0, so it decays a little.
         decay_rate = _HUM_DECAY_EXPONENT / self._duration_s
-        poles = [Pole(0, complex(-decay_rate, 2 * np.pi * hz), none) for hz in frequency_hz]
+        poles = [
+            Pole(0, complex(-decay_rate, 2 * np.pi * hz), no_derivatives) for hz in frequency_hz
+        ]
         return np.concatenate([self.columns(poles), self.growing(poles)])
 
     def _spectra(
@@ -199,33 +201,33 @@ class DecaySpectra:
         rows = np.empty((decay_columns(poles), self._sample_rotation.size), complex)
         index = 0
         for pole in poles:
-            of_pole = spectrum_of_pole(pole.at_rad_s)
+            pole_spectrum = spectrum_of_pole(pole.at_rad_s)
             if pole.oscillates:
-                of_conjugate = spectrum_of_pole(pole.at_rad_s.conjugate())
-                np.multiply(of_pole + of_conjugate, 0.5, out=rows[index])
-                np.multiply(of_pole - of_conjugate, -0.5j, out=rows[index + 1])
+                conjugate_spectrum = spectrum_of_pole(pole.at_rad_s.conjugate())
+                np.multiply(pole_spectrum + conjugate_spectrum, 0.5, out=rows[index])
+                np.multiply(pole_spectrum - conjugate_spectrum, -0.5j, out=rows[index + 1])
                 index += 2
             else:
-                rows[index] = of_pole
+                rows[index] = pole_spectrum
                 index += 1
         return rows
 
     def _sum(self, pole: complex) -> NDArray[np.complex128]:
         """Return the sum of ``exp(p t)`` over the samples, rotated to each bin, shape (K,)."""
-        ratio = np.exp(pole * self._period_s) * self._sample_rotation
-        total: NDArray[np.complex128] = (1 - np.exp(pole * self._duration_s)) / (1 - ratio)
-        return total
+        step_factor = np.exp(pole * self._period_s) * self._sample_rotation
+        spectrum: NDArray[np.complex128] = (1 - np.exp(pole * self._duration_s)) / (1 - step_factor)
+        return spectrum
 
     def _sum_of_time(self, pole: complex) -> NDArray[np.complex128]:
         """Return the sum of ``t exp(p t)``, the derivative of `_sum` by the pole, shape (K,)."""
-        ratio = np.exp(pole * self._period_s) * self._sample_rotation
+        step_factor = np.exp(pole * self._period_s) * self._sample_rotation
         end_value = np.exp(pole * self._duration_s)
-        reciprocal = np.reciprocal(1 - ratio)
-        total: NDArray[np.complex128] = ratio * reciprocal
-        total *= (1 - end_value) * self._period_s
-        total -= self._duration_s * end_value
-        total *= reciprocal
-        return total
+        reciprocal = np.reciprocal(1 - step_factor)
+        spectrum: NDArray[np.complex128] = step_factor * reciprocal
+        spectrum *= (1 - end_value) * self._period_s
+        spectrum -= self._duration_s * end_value
+        spectrum *= reciprocal
+        return spectrum
 
 
 class LaterDecaySpectra(DecaySpectra):
@@ -269,19 +271,23 @@ class LaterDecaySpectra(DecaySpectra):
         """Return the sum of ``exp(p t)`` from the first tick, rotated to each bin, shape (K,)."""
         begin_denominator = 1 - np.exp(pole * self._tick_s) * self._tick_rotation
         end_denominator = 1 - np.exp(pole * self._period_s) * self._sample_rotation
-        total: NDArray[np.complex128] = (
+        spectrum: NDArray[np.complex128] = (
             self._first_tick_factor / begin_denominator
             - np.exp(pole * self._duration_s) / end_denominator
         )
-        return total
+        return spectrum
 
     def _sum_of_time(self, pole: complex) -> NDArray[np.complex128]:
         """Return the sum of ``t exp(p t)`` from the first tick, rotated to each bin, shape (K,)."""
-        tick = np.exp(pole * self._tick_s) * self._tick_rotation
-        ratio = np.exp(pole * self._period_s) * self._sample_rotation
+        tick_factor = np.exp(pole * self._tick_s) * self._tick_rotation
+        step_factor = np.exp(pole * self._period_s) * self._sample_rotation
         end_value = np.exp(pole * self._duration_s)
-        total: NDArray[np.complex128] = (
-            self._first_tick_factor * self._tick_s * tick / (1 - tick) ** 2
+        spectrum: NDArray[np.complex128] = (
+            self._first_tick_factor * self._tick_s * tick_factor / (1 - tick_factor) ** 2
         )
-        total -= end_value * (self._duration_s + self._period_s * ratio / (1 - ratio)) / (1 - ratio)
-        return total
+        spectrum -= (
+            end_value
+            * (self._duration_s + self._period_s * step_factor / (1 - step_factor))
+            / (1 - step_factor)
+        )
+        return spectrum

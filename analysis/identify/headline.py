@@ -64,7 +64,11 @@ _STIFFNESS_LAW_FLAG: Final = (
 """Flag of the parameters that depend on the assumed law of the nonlinear stiffness."""
 
 StructureStatus = Literal["selected", "compatible", "excluded"]
+"""Relation of a structure to the record."""
+
 Damping = Literal["internal", "external"]
+"""Kind of damping: of the material, or of the surroundings."""
+
 NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
     "internal": ("zeta", "alpha"),
     "external": ("gamma", "lambda"),
@@ -108,11 +112,11 @@ class ReportedValue:
 
     def as_json(self) -> dict[str, Any]:
         """Return value, standard deviation, 95 % interval and flag as a JSON-ready dict."""
-        ends = None if self.interval_95 is None else list(self.interval_95)
+        interval_95 = None if self.interval_95 is None else list(self.interval_95)
         return {
             "value": self.value,
             "std": self.std,
-            "interval_95": ends,
+            "interval_95": interval_95,
             "flag": self.flag,
         }
 
@@ -280,7 +284,7 @@ class Headline(Estimates):
 
     @property
     def flags(self) -> dict[str, str]:
-        """Return the reasons against single parameters, by parameter name."""
+        """Return, for each parameter that is not valid, the reason why."""
         return {name: each.flag for name, each in self.parameters.items() if each.flag}
 
     @property
@@ -352,13 +356,13 @@ def headline(
     if candidate_set.drag is not None:
         drag = candidate_set.drag
         reported_drag = ReportedValue(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
-        sizes = (
+        loss_factors = (
             each.flagged(WITH_DRAG) if each.damping == "external" else each for each in result.sizes
         )
         result = replace(
             result,
             parameters={**result.parameters, "drag": reported_drag},
-            sizes=tuple(sizes),
+            sizes=tuple(loss_factors),
             drag_speed_m_s=drag.speed_m_s,
         )
     conditional_estimate = (
@@ -500,19 +504,19 @@ def _conditional_estimate(
     ]
     if not compatible_candidates:
         return None
-    best = min(compatible_candidates, key=lambda each: each.bic)
+    simplest = min(compatible_candidates, key=lambda each: each.bic)
     fixed = {
-        order: best.structure.fixed[order]  # type: ignore[index]
+        order: simplest.structure.fixed[order]  # type: ignore[index]
         for order, coefficient in COEFFICIENT_OF.items()
-        if order in best.structure.fixed and coefficient in best.structure.free
+        if order in simplest.structure.fixed and coefficient in simplest.structure.free
     }
     return ConditionalEstimate(
-        name=best.name,
+        name=simplest.name,
         fixed=fixed,
         parameters={
-            name: _reported_parameter(best.fit, name, None, None)
-            for name in best.fit.parameters
-            if best.structure.has(name) and name not in fixed
+            name: _reported_parameter(simplest.fit, name, None, None)
+            for name in simplest.fit.parameters
+            if simplest.structure.has(name) and name not in fixed
         },
     )
 
@@ -570,14 +574,14 @@ def _reported_mode(
     mode: ModeEstimate, visible: Collection[int], reason: str | None
 ) -> ReportedMode:
     """Return the reported frequency and damping ratio of a mode, flagged if it is not visible."""
-    shown = mode.number in visible
-    if reason is None and not shown:
+    is_visible = mode.number in visible
+    if reason is None and not is_visible:
         reason = "computed from the model: the record does not show this mode"
     return ReportedMode(
         mode.number,
         symmetric(mode.frequency_hz, mode.frequency_std_hz, reason),
         symmetric(mode.damping_ratio, mode.damping_ratio_std, reason),
-        shown,
+        is_visible,
     )
 
 

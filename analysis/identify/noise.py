@@ -177,8 +177,8 @@ def with_peaks(
     where : ndarray of bool, shape (K,)
         True for bins at which a peak is possible.
     """
-    ratio = (residual.real**2 + residual.imag**2) / power
-    local_ratio = np.convolve(ratio, np.full(_PEAK_BINS, 1 / _PEAK_BINS), mode="same")
+    power_ratio = (residual.real**2 + residual.imag**2) / power
+    local_ratio = np.convolve(power_ratio, np.full(_PEAK_BINS, 1 / _PEAK_BINS), mode="same")
     # Include all bins within the averaging width around each significant one.
     is_peak = (
         np.convolve(local_ratio > _PEAK_POWER_RATIO, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
@@ -216,9 +216,9 @@ def _find_line_groups(residual: NDArray[np.complex128], power: NDArray[np.float6
     groups = np.split(bins, np.flatnonzero(np.diff(bins) > _DURATION_BINS // 2) + 1)
     groups_with_skirts = []
     for group in groups:
-        first, last = int(group[0]), int(group[-1])
-        skirt = max(last - first, 2)
-        groups_with_skirts.append(slice(max(first - skirt, 0), last + skirt + 1))
+        first_bin, last_bin = int(group[0]), int(group[-1])
+        skirt = max(last_bin - first_bin, 2)
+        groups_with_skirts.append(slice(max(first_bin - skirt, 0), last_bin + skirt + 1))
     return groups_with_skirts
 
 

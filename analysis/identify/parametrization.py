@@ -103,9 +103,9 @@ class Unknowns:
         free : tuple of str
             Names of the settings that are estimated.
         """
-        first, second = map(float, undamped_frequencies_rad_s(nominal.beam, 2))
+        first_omega, second_omega = map(float, undamped_frequencies_rad_s(nominal.beam, 2))
         ordered = tuple(name for name in SETTINGS if name in free)
-        return cls(structure, nominal, ordered, (first, second))
+        return cls(structure, nominal, ordered, (first_omega, second_omega))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -120,16 +120,16 @@ class Unknowns:
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lower and the upper bounds of the unknowns, each of shape (k,)."""
-        size = (math.log(SIZE_RANGE[0]), math.log(SIZE_RANGE[1]))
-        delay = _DELAY_RANGE_S / _DELAY_UNIT_S
+        ln_size_range = (math.log(SIZE_RANGE[0]), math.log(SIZE_RANGE[1]))
+        largest_delay = _DELAY_RANGE_S / _DELAY_UNIT_S
         ranges = {
-            "zeta": size,
+            "zeta": ln_size_range,
             "alpha": ORDER_RANGE,
-            "gamma": size,
+            "gamma": ln_size_range,
             "lambda": ORDER_RANGE,
             "density_over_stiffness": (-_LN_BEAM_HALF_RANGE, _LN_BEAM_HALF_RANGE),
             "bending_stiffness_n_m2": (-_LN_BEAM_HALF_RANGE, _LN_BEAM_HALF_RANGE),
-            "delay_s": (-delay, delay),
+            "delay_s": (-largest_delay, largest_delay),
             "tool_inertia_kg_m2": (0.0, 1.0),
         }
         low, high = zip(*(ranges[name] for name in self.names), strict=True)
@@ -166,9 +166,9 @@ class Unknowns:
             1.
         """
         damping, nominal = plant.damping, self.nominal.beam
-        first, second = self.omega_rad_s
-        ratio = plant.beam.density_over_stiffness
-        ln_ratio = math.log(ratio / nominal.density_over_stiffness)
+        first_omega, second_omega = self.omega_rad_s
+        density_over_stiffness = plant.beam.density_over_stiffness
+        ln_ratio = math.log(density_over_stiffness / nominal.density_over_stiffness)
         ln_stiffness = math.log(plant.beam.bending_stiffness_n_m2 / nominal.bending_stiffness_n_m2)
         at = {
             "zeta": math.log(_LOSS_OF_NEW_DAMPING),
@@ -179,7 +179,7 @@ class Unknowns:
         at |= self._linear_unknowns(plant)
         if damping.zeta > 0:
             damping_size, phase = (
-                damping.zeta * second**damping.alpha,
+                damping.zeta * second_omega**damping.alpha,
                 _QUARTER_TURN_RAD * damping.alpha,
             )
             at["zeta"], at["alpha"] = math.log(damping_size * math.sin(phase)), damping.alpha
@@ -187,7 +187,9 @@ class Unknowns:
             ln_ratio -= stiffening
             ln_stiffness += stiffening
         if damping.gamma > 0:
-            damping_size = damping.gamma / ratio * first ** (damping.lambda_ - 2)
+            damping_size = (
+                damping.gamma / density_over_stiffness * first_omega ** (damping.lambda_ - 2)
+            )
             phase = _QUARTER_TURN_RAD * damping.lambda_
             at["gamma"], at["lambda"] = math.log(damping_size * math.sin(phase)), damping.lambda_
             ln_ratio += math.log(abs(1 - damping_size * complex(math.cos(phase), math.sin(phase))))
@@ -212,10 +214,13 @@ class Unknowns:
 
     def _plant_of(self, values: Mapping[str, float]) -> Plant:
         """Return the plant with given values of all parameters."""
-        ratio, stiffness = values["density_over_stiffness"], values["bending_stiffness_n_m2"]
+        density_over_stiffness, stiffness = (
+            values["density_over_stiffness"],
+            values["bending_stiffness_n_m2"],
+        )
         return replace(
             self.nominal,
-            beam=Beam(self.nominal.beam.length_m, ratio * stiffness, stiffness),
+            beam=Beam(self.nominal.beam.length_m, density_over_stiffness * stiffness, stiffness),
             damping=self.structure.damping({name: values[name] for name in self.structure.free}),
             delay_s=values["delay_s"],
             tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
@@ -265,30 +270,32 @@ class Unknowns:
         unknown_values: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))
         values: dict[str, float] = dict(self._fixed_values)
         derivative = np.eye(x.size)
-        first, second = self.omega_rad_s
+        first_omega, second_omega = self.omega_rad_s
         # ln of the factor by which damping changes stiffness and inertia, with its derivatives.
         stiffness_change, inertia_change = np.zeros((2, x.size + 1))
         if self.structure.internal:
             values["alpha"] = order = unknown_values.get("alpha", values["alpha"])
             ln_z, slope = _ln_damping_size(unknown_values["zeta"], order)
-            values["zeta"] = math.exp(ln_z - order * math.log(second))
+            values["zeta"] = math.exp(ln_z - order * math.log(second_omega))
             stiffness_change = self._ln_factor_of_damping(ln_z, order, 1.0, "zeta", "alpha", slope)
             if "alpha" in indices:
-                derivative[indices["zeta"], indices["alpha"]] = slope - math.log(second)
+                derivative[indices["zeta"], indices["alpha"]] = slope - math.log(second_omega)
         if self.structure.external:
             values["lambda"] = order = unknown_values.get("lambda", values["lambda"])
             ln_g, slope = _ln_damping_size(unknown_values["gamma"], order)
             inertia_change = self._ln_factor_of_damping(ln_g, order, -1.0, "gamma", "lambda", slope)
             if "lambda" in indices:
-                derivative[indices["gamma"], indices["lambda"]] = slope - math.log(first)
+                derivative[indices["gamma"], indices["lambda"]] = slope - math.log(first_omega)
         for name, sign in (("density_over_stiffness", 1.0), ("bending_stiffness_n_m2", -1.0)):
             if name in indices:
                 ln_factor = sign * stiffness_change - (inertia_change if sign > 0 else 0.0)
                 values[name] *= math.exp(unknown_values[name] + ln_factor[-1])
                 derivative[indices[name]] += ln_factor[:-1]
         if self.structure.external:
-            ratio = values["density_over_stiffness"]
-            values["gamma"] = ratio * math.exp(ln_g + (2 - values["lambda"]) * math.log(first))
+            density_over_stiffness = values["density_over_stiffness"]
+            values["gamma"] = density_over_stiffness * math.exp(
+                ln_g + (2 - values["lambda"]) * math.log(first_omega)
+            )
             if "density_over_stiffness" in indices:
                 derivative[indices["gamma"]] += derivative[indices["density_over_stiffness"]]
         units = self.units

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 # Profile
 
 Order = Literal["alpha", "lambda"]
+"""Name of a damping order: alpha of internal, lambda of external damping."""
 
 WIDEST_FRACTION: Final = 0.25
 """Largest 95 % interval of an identifiable order, as a fraction of the range 0 to 2: an order with
@@ -104,8 +105,10 @@ class LikelihoodProfile:
     @property
     def identifiable(self) -> bool:
         """Return whether the record determines this order to a useful precision."""
-        narrow = self.relative_width <= WIDEST_FRACTION and not (self.open_below or self.open_above)
-        return narrow and len(self.local_minima) < 2
+        is_narrow = self.relative_width <= WIDEST_FRACTION and not (
+            self.open_below or self.open_above
+        )
+        return is_narrow and len(self.local_minima) < 2
 
     @property
     def admits_one(self) -> bool:
@@ -229,30 +232,30 @@ def profile_both_orders(
         costs_before = [candidate.fit.cost for candidate in candidate_set.candidates]
         if round_ == _MAX_ROUNDS:
             break
-        for found in profiles.values():
-            if _may_improve(candidate_set, found):
-                for plant in found.plants:
+        for profile_fit in profiles.values():
+            if _may_improve(candidate_set, profile_fit):
+                for plant in profile_fit.plants:
                     candidate_set = candidate_set.restarted_from(plant)
         if [candidate.fit.cost for candidate in candidate_set.candidates] == costs_before:
             break
-    of_alpha, of_lambda = (
+    alpha_profile, lambda_profile = (
         profiles[order].profile
         if order in profiles
         else LikelihoodProfile.undetermined(freest, order)
         for order in _BOTH_ORDERS
     )
-    return candidate_set, of_alpha, of_lambda
+    return candidate_set, alpha_profile, lambda_profile
 
 
 def _may_improve(candidate_set: CandidateSet, profile_fit: ProfileWithPlants) -> bool:
     """Return whether a refit from the minima of a profile may lower the cost of a candidate."""
     if len(profile_fit.plants) > 1:
         return True
-    free = set(profile_fit.structure.free)
+    free_parameters = set(profile_fit.structure.free)
     costs = [
         candidate.fit.cost
         for candidate in candidate_set.candidates
-        if free <= set(candidate.structure.free)
+        if free_parameters <= set(candidate.structure.free)
     ]
     return bool(costs) and profile_fit.cost < min(costs) * (1 - MISSED)
 
@@ -311,8 +314,8 @@ def with_free_order(structure: Structure, order: Order) -> Structure:
     """
     coefficient = COEFFICIENT_OF[order]
     fixed = {name: at for name, at in structure.fixed.items() if name not in (coefficient, order)}
-    free = tuple(name for name in PARAMETERS if name not in fixed)
-    return Structure(structure.name, free, MappingProxyType(fixed))
+    free_parameters = tuple(name for name in PARAMETERS if name not in fixed)
+    return Structure(structure.name, free_parameters, MappingProxyType(fixed))
 
 
 class OrderProfiler:
@@ -334,12 +337,12 @@ class OrderProfiler:
         self._candidate_set, self._value_count = candidate_set, candidate.values
         self._unknowns = unknowns = candidate_set.unknowns(self.structure)
         self._order_index = unknowns.names.index(order)
-        first = candidate_set.descent(
+        first_minimum = candidate_set.descent(
             unknowns, unknowns.vector(candidate.fit.plant), _MAX_EVALUATIONS
         )
         self.costs: dict[float, float] = {}
         self._refits: dict[float, Refit] = {}
-        self._start_at(first)
+        self._start_at(first_minimum)
 
     def _start_at(self, bottom: Refit) -> None:
         """Store a minimum with free order, and continue the profile from it."""
@@ -367,9 +370,9 @@ class OrderProfiler:
 
         Most of them fix the order at 1. A barrier may separate them from the minimum.
         """
-        coefficient, free = COEFFICIENT_OF[self.order], set(self.structure.free)
+        coefficient, free_parameters = COEFFICIENT_OF[self.order], set(self.structure.free)
         for candidate in self._candidate_set.candidates:
-            is_special_case = candidate.structure.has(coefficient) and free > set(
+            is_special_case = candidate.structure.has(coefficient) and free_parameters > set(
                 candidate.structure.free
             )
             if not is_special_case:
@@ -410,10 +413,10 @@ class OrderProfiler:
                 self._start_at(minimum)
                 self.extend_both_ways()
 
-    def _store_lower(self, value: float, found: Refit) -> None:
+    def _store_lower(self, value: float, refit: Refit) -> None:
         """Store a refit at one value of the order, unless a stored one has a lower cost."""
-        if found.cost < self.costs.get(value, math.inf):
-            self.costs[value], self._refits[value] = found.cost, found
+        if refit.cost < self.costs.get(value, math.inf):
+            self.costs[value], self._refits[value] = refit.cost, refit
 
     def _extend(self, sign: float) -> None:
         """Extend the profile in one direction until the record excludes the values beyond.
@@ -422,34 +425,42 @@ class OrderProfiler:
         """
         low, high = ORDER_RANGE
         value, distance, root = self._bottom_order, self._order_std(), 0.0
-        inside, outside = value, None
+        inside_value, outside_value = value, None
         while low < value < high and root**2 < _LAST_DEVIANCE:
             nearest_refit = self._refits[value]
             value = min(max(self._bottom_order + sign * distance, low), high)
             root = self._refit_at(value, nearest_refit)
             if root**2 < CHI_SQUARE_95:
-                inside, level = value, CHI_SQUARE_95
+                inside_value, target_deviance = value, CHI_SQUARE_95
             else:
-                outside, level = outside if outside is not None else value, _LAST_DEVIANCE
-            growth = _OVERSHOOT_FACTOR * math.sqrt(level) / max(root, 1e-3)
+                outside_value, target_deviance = (
+                    outside_value if outside_value is not None else value,
+                    _LAST_DEVIANCE,
+                )
+            growth = _OVERSHOOT_FACTOR * math.sqrt(target_deviance) / max(root, 1e-3)
             distance *= min(max(growth, _MIN_DISTANCE_GROWTH), _MAX_DISTANCE_GROWTH)
-        for _ in range(_MAX_LIMIT_REFITS if outside is not None else 0):
-            assert outside is not None
-            if abs(inside - self._bottom_order) >= abs(outside - self._bottom_order):
+        for _ in range(_MAX_LIMIT_REFITS if outside_value is not None else 0):
+            assert outside_value is not None
+            if abs(inside_value - self._bottom_order) >= abs(outside_value - self._bottom_order):
                 break  # there is a barrier between
-            below, above = self._deviance_root(inside), self._deviance_root(outside)
-            if above - below < _INTERPOLATION_ROOT_DIFFERENCE:
+            inside_root, outside_root = (
+                self._deviance_root(inside_value),
+                self._deviance_root(outside_value),
+            )
+            if outside_root - inside_root < _INTERPOLATION_ROOT_DIFFERENCE:
                 break
-            middle = limit_crossing(inside, outside, below**2, above**2)
-            if self._refit_at(middle, self._refits[inside]) ** 2 < CHI_SQUARE_95:
-                inside = middle
+            trial_value = limit_crossing(
+                inside_value, outside_value, inside_root**2, outside_root**2
+            )
+            if self._refit_at(trial_value, self._refits[inside_value]) ** 2 < CHI_SQUARE_95:
+                inside_value = trial_value
             else:
-                outside = middle
+                outside_value = trial_value
 
     def _order_std(self) -> float:
         """Return the standard deviation of the order at the minimum, within 1e-4 to 0.25."""
-        (scaled, scale), index = self._bottom.equations.scaled_hessian(), self._order_index
-        inverse = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))
+        (scaled_hessian, scale), index = self._bottom.equations.scaled_hessian(), self._order_index
+        inverse = np.linalg.inv(scaled_hessian + 1e-12 * np.eye(scale.size))
         variance = inverse[index, index] / scale[index] ** 2
         std = (
             math.sqrt(variance * self._bottom.cost / self._value_count)
@@ -463,14 +474,14 @@ class OrderProfiler:
         lowest = self.costs[self._bottom_order]
         return math.sqrt(max(self._value_count * math.log(self.costs[value] / lowest), 0.0))
 
-    def _refit_at(self, value: float, near: Refit) -> float:
+    def _refit_at(self, value: float, nearest_refit: Refit) -> float:
         """Fit all other parameters at a fixed order. Return the square root of the deviance."""
         hold, highest_cost = (
             (self.order,),
             self.costs[self._bottom_order] * math.exp(FAR_BEHIND / self._value_count),
         )
         refit = self._descend(
-            self._tangent(value, near),
+            self._tangent(value, nearest_refit),
             _MAX_EVALUATIONS,
             hold=hold,
             hopeless=(_TRIAL_EVALUATIONS, highest_cost),
@@ -478,7 +489,9 @@ class OrderProfiler:
         if refit.cost > highest_cost:
             # Near 0 and 2 damping acts as stiffness or inertia, and the tangent may lead to a point
             # from which no descent converges. So all other unknowns keep their values.
-            refit = self._better_refit(refit, near, value, (_TRIAL_EVALUATIONS, highest_cost))
+            refit = self._better_refit(
+                refit, nearest_refit, value, (_TRIAL_EVALUATIONS, highest_cost)
+            )
         if refit.cost > highest_cost:
             # Without the damping its order has no effect on the cost.
             refit = self._better_refit(refit, self._without_damping, value)
@@ -488,7 +501,7 @@ class OrderProfiler:
     def _better_refit(
         self,
         first_refit: Refit,
-        other: Refit,
+        start_refit: Refit,
         value: float,
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
@@ -496,7 +509,7 @@ class OrderProfiler:
 
         Return the better of both fits.
         """
-        start = other.x.copy()
+        start = start_refit.x.copy()
         start[self._order_index] = value
         second_refit = self._descend(start, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless)
         return min(first_refit, second_refit, key=lambda refit: refit.cost)
@@ -535,12 +548,16 @@ class OrderProfiler:
     def _tangent(self, value: float, near: Refit) -> NDArray[np.float64]:
         """Extrapolate the optimal unknowns linearly to another value of the order, shape (k,)."""
         x, index = near.x.copy(), self._order_index
-        scaled, scale = near.equations.scaled_hessian()
+        scaled_hessian, scale = near.equations.scaled_hessian()
         lower, upper = self._unknowns.bounds
-        others = (x > lower) & (x < upper) & (np.arange(x.size) != index)
-        block = scaled[np.ix_(others, others)] + 1e-9 * np.eye(int(others.sum()))
-        slope = -np.linalg.solve(block, scaled[others, index]) / scale[others] * scale[index]
-        x[others] += slope * (value - x[index])
+        is_free = (x > lower) & (x < upper) & (np.arange(x.size) != index)
+        free_hessian = scaled_hessian[np.ix_(is_free, is_free)] + 1e-9 * np.eye(int(is_free.sum()))
+        slope = (
+            -np.linalg.solve(free_hessian, scaled_hessian[is_free, index])
+            / scale[is_free]
+            * scale[index]
+        )
+        x[is_free] += slope * (value - x[index])
         x[index] = value
         return x
 
@@ -565,8 +582,11 @@ def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> 
     deviance : ndarray of float, shape (n,)
         Deviance at each value, minus the lowest one.
     """
-    padded = np.concatenate([[np.inf], deviance, [np.inf]])
-    minimum_indices = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] < padded[2:]))
+    padded_deviance = np.concatenate([[np.inf], deviance, [np.inf]])
+    minimum_indices = np.flatnonzero(
+        (padded_deviance[1:-1] <= padded_deviance[:-2])
+        & (padded_deviance[1:-1] < padded_deviance[2:])
+    )
     minimum_indices = minimum_indices[deviance[minimum_indices] < CHI_SQUARE_95]
     distinct: list[int] = []
     for low in minimum_indices[np.argsort(deviance[minimum_indices], kind="stable")].tolist():
@@ -595,15 +615,19 @@ def admitted_interval(
     open_below, open_above : bool
         Whether the deviance stays within the limit down to the first, and up to the last value.
     """
-    inside = np.flatnonzero(deviance <= CHI_SQUARE_95)
-    first, last = int(inside[0]), int(inside[-1])
-    low = values[0] if first == 0 else _limit_crossing_between(values, deviance, first, first - 1)
+    inside_indices = np.flatnonzero(deviance <= CHI_SQUARE_95)
+    first_inside, last_inside = int(inside_indices[0]), int(inside_indices[-1])
+    low = (
+        values[0]
+        if first_inside == 0
+        else _limit_crossing_between(values, deviance, first_inside, first_inside - 1)
+    )
     high = (
         values[-1]
-        if last == values.size - 1
-        else _limit_crossing_between(values, deviance, last, last + 1)
+        if last_inside == values.size - 1
+        else _limit_crossing_between(values, deviance, last_inside, last_inside + 1)
     )
-    return (float(low), float(high)), first == 0, last == values.size - 1
+    return (float(low), float(high)), first_inside == 0, last_inside == values.size - 1
 
 
 def limit_crossing(inside: float, outside: float, below: float, above: float) -> float:
@@ -648,10 +672,10 @@ def coarse_minima_values(curve: dict[float, float]) -> list[float]:
     heights = [math.inf, *(curve[value] for value in values), math.inf]
     return [
         value
-        for value, (before, here, after) in zip(
+        for value, (left_height, height, right_height) in zip(
             values, zip(heights, heights[1:], heights[2:], strict=False), strict=True
         )
-        if here <= before and here <= after
+        if height <= left_height and height <= right_height
     ]
 
 

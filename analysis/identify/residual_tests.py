@@ -34,7 +34,7 @@ tests together."""
 
 
 def largest_of(count: int) -> float:
-    """Return half the square of the largest of `count` normal deviates that chance may reach."""
+    """Return the significance limit of x²/2 for the largest x of `count` normal deviates."""
     return SIGNIFICANT_STD**2 / 2 + math.log(max(count, 1))
 
 
@@ -166,11 +166,11 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
         Frequencies of these bins.
     """
     count = residual.size
-    line = np.arange(1, count + 1) / count
-    distance = float(np.abs(cumulative_periodogram(residual) - line).max())
+    straight_line = np.arange(1, count + 1) / count
+    distance = float(np.abs(cumulative_periodogram(residual) - straight_line).max())
     power = residual.real**2 + residual.imag**2
     cumulative_power = np.concatenate([[0.0], np.cumsum(power)])
-    loudest, edges, ratio, loud = -math.inf, (0.0, 0.0), 1.0, False
+    loudest, edges, loudest_ratio, loud = -math.inf, (0.0, 0.0), 1.0, False
     for width in _WINDOW_BINS:
         if width >= count:
             continue
@@ -180,7 +180,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
         if deviate > loudest:
             loudest = deviate
             edges = (float(frequency_hz[i]), float(frequency_hz[i + width - 1]))
-            ratio = float(window_power[i]) / (2 * width)
+            loudest_ratio = float(window_power[i]) / (2 * width)
         loud |= (
             deviate > SIGNIFICANT_STD + 0.5
             and float(window_power[i]) / (2 * width) > _LOUD_POWER_RATIO
@@ -190,7 +190,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
         band=KOLMOGOROV_95 / math.sqrt(count),
         probability=kolmogorov_p_value(distance * math.sqrt(count)),
         loudest_hz=edges,
-        loudest_ratio=ratio,
+        loudest_ratio=loudest_ratio,
         loud=loud,
     )
 
@@ -214,44 +214,47 @@ def input_relation(
     power = np.abs(angle) ** 2
     neighbours = min(_AVERAGING_BINS, power.size)
     mean_power = np.convolve(power, np.full(neighbours, 1 / neighbours), mode="same")
-    driven = angle / np.sqrt(np.maximum(mean_power, np.finfo(float).tiny))
+    normalized_angle = angle / np.sqrt(np.maximum(mean_power, np.finfo(float).tiny))
     # The limit keeps a hum, which is no linear dynamics, from dominating.
-    limited = residual / np.maximum(np.abs(residual) / _RESIDUAL_LIMIT, 1.0)
-    cross = limited * driven.conj()
-    blocks = residual.size // _COHERENT_BINS
-    first_bins = np.arange(0, blocks * _COHERENT_BINS, _COHERENT_BINS)
+    limited_residual = residual / np.maximum(np.abs(residual) / _RESIDUAL_LIMIT, 1.0)
+    cross_spectrum = limited_residual * normalized_angle.conj()
+    block_count = residual.size // _COHERENT_BINS
+    first_bins = np.arange(0, block_count * _COHERENT_BINS, _COHERENT_BINS)
 
     def block_sums(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the sum of values over each block of neighbouring bins."""
         sums: NDArray[np.complex128] = np.add.reduceat(
-            values[: blocks * _COHERENT_BINS], first_bins
+            values[: block_count * _COHERENT_BINS], first_bins
         )
         return sums
 
-    angle_power = block_sums(driven * driven.conj()).real
-    used = np.flatnonzero(angle_power > _DRIVEN_POWER_RATIO * _COHERENT_BINS)
-    largest_cross_power = block_sums(limited * limited.conj()).real[used] * angle_power[used]
-    coherence = np.abs(block_sums(cross)[used]) ** 2 / np.maximum(
+    angle_power = block_sums(normalized_angle * normalized_angle.conj()).real
+    used_blocks = np.flatnonzero(angle_power > _DRIVEN_POWER_RATIO * _COHERENT_BINS)
+    largest_cross_power = (
+        block_sums(limited_residual * limited_residual.conj()).real[used_blocks]
+        * angle_power[used_blocks]
+    )
+    coherence = np.abs(block_sums(cross_spectrum)[used_blocks]) ** 2 / np.maximum(
         largest_cross_power, np.finfo(float).tiny
     )
     # Under chance (1 - coherence)^(m - 1) is uniform, whatever the angle.
-    surprise = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
-    worst = int(np.argmax(surprise))
-    local = bool(surprise[worst] > largest_of(used.size))
-    deviate = chi_square_deviate(2 * float(surprise.sum()), 2 * used.size)
+    ln_chance = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
+    least_likely = int(np.argmax(ln_chance))
+    local = bool(ln_chance[least_likely] > largest_of(used_blocks.size))
+    deviate = chi_square_deviate(2 * float(ln_chance.sum()), 2 * used_blocks.size)
 
     spacing_hz = float(frequency_hz[1] - frequency_hz[0])
     length = 4 * residual.size
-    lags = np.fft.ifft(cross, length)
+    lags = np.fft.ifft(cross_spectrum, length)
     at_s = np.fft.fftfreq(length, spacing_hz)  # bins are spaced as the lags' inverse
     carrier = np.exp(2j * np.pi * frequency_hz[0] * at_s)
-    correlation = np.abs((lags * carrier).real) * length / np.linalg.norm(driven)
+    correlation = np.abs((lags * carrier).real) * length / np.linalg.norm(normalized_angle)
     correlation[np.abs(at_s) > _MAX_LAG_S] = 0.0
     at = int(np.argmax(correlation))
     lag_count = int(np.count_nonzero(correlation))
     return InputRelation(
-        coherence=float(coherence[worst]),
-        at_hz=float(frequency_hz[first_bins[used[worst]] + _COHERENT_BINS // 2]),
+        coherence=float(coherence[least_likely]),
+        at_hz=float(frequency_hz[first_bins[used_blocks[least_likely]] + _COHERENT_BINS // 2]),
         local=local,
         deviate=deviate,
         correlation=float(correlation[at]),
@@ -321,8 +324,8 @@ def harmonics(
         First and last frequency at which the residual is known.
     """
     length = round(_BLOCK_S * rate_hz)
-    blocks = angle_rad.size // length
-    analytic = _analytic_signal(angle_rad)[: blocks * length].reshape(blocks, length)
+    block_count = angle_rad.size // length
+    analytic = _analytic_signal(angle_rad)[: block_count * length].reshape(block_count, length)
     phase = np.unwrap(np.angle(analytic), axis=1)
     drive_hz = (phase[:, -1] - phase[:, 0]) / (2 * np.pi * (length - 1) / rate_hz)
     amplitude = np.abs(analytic).mean(axis=1)
@@ -338,7 +341,7 @@ def harmonics(
         & (drive_hz > _MIN_DRIVE_HZ)
     )
     window = np.hanning(length)
-    windowed_blocks = residual[: blocks * length].reshape(blocks, length) * window
+    windowed_blocks = residual[: block_count * length].reshape(block_count, length) * window
     tests = []
     for multiple in TESTED_MULTIPLES:
         usable_blocks = (

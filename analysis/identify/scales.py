@@ -174,10 +174,13 @@ def density_check(
         return None
     indices = [fit.determined.index(name) for name in _COMPENSATING_PARAMETERS]
     statistical_variance = float(fit.covariance[np.ix_(indices, indices)].sum())
-    found = fit.parameters[_DENSITY_OVER_STIFFNESS] * fit.parameters[_BENDING_STIFFNESS]
+    found_kg_per_m = fit.parameters[_DENSITY_OVER_STIFFNESS] * fit.parameters[_BENDING_STIFFNESS]
     relative = math.sqrt(
         statistical_variance + _relative_scale_uncertainty(_DENSITY_EXPONENTS, uncertainty) ** 2
     )
     return DensityCheck(
-        found, found * relative, stated_kg_per_m, stated_kg_per_m * uncertainty["density"]
+        found_kg_per_m,
+        found_kg_per_m * relative,
+        stated_kg_per_m,
+        stated_kg_per_m * uncertainty["density"],
     )

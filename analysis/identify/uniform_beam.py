@@ -85,7 +85,10 @@ _MAX_EVALUATIONS: Final = 80
 """Largest number of evaluations of chi-square in one descent."""
 
 TestStatus = Literal["passed", "refused", "not tested"]
+"""Result of the uniform-beam test."""
+
 EstimateBasis = Literal["geometry", "losses", "none"]
+"""Data that an estimate with tolerance uses."""
 
 REFUSED_BELOW: Final = 0.01
 """p-value below which the test refuses a uniform beam."""
@@ -231,14 +234,14 @@ class ConstantsProblem:
 
     def plant(self, x: NDArray[np.float64]) -> Plant:
         """Return the rig with the uniform beam and damping that a vector of unknowns describes."""
-        zeta, alpha, gamma, lambda_, ratio, stiffness, delay_s = self.parameters(x).tolist()
-        bending = math.exp(stiffness)
+        zeta, alpha, gamma, lambda_, ln_ratio, ln_stiffness, delay_s = self.parameters(x).tolist()
+        bending_stiffness = math.exp(ln_stiffness)
         return replace(
             self.nominal,
             beam=Beam(
                 length_m=self.nominal.beam.length_m,
-                density_kg_per_m=math.exp(ratio) * bending,
-                bending_stiffness_n_m2=bending,
+                density_kg_per_m=math.exp(ln_ratio) * bending_stiffness,
+                bending_stiffness_n_m2=bending_stiffness,
             ),
             damping=Damping(
                 zeta=math.exp(zeta), alpha=alpha, gamma=math.exp(gamma), lambda_=lambda_
@@ -584,17 +587,17 @@ def uniform_beam_test(
         no_prediction = np.full(measured.size, np.nan)
         return UniformBeamTest("not tested", math.nan, 0, None, modes, measured, no_prediction, std)
     problem = ConstantsProblem(fit, modes, nominal, tilt_deg=tilt_deg)
-    best = problem.minima()[0]
-    degrees_of_freedom += _count_idle_unknowns(problem, best)
-    p_value = float(chi_square_p_value(best.cost, degrees_of_freedom))
+    best_minimum = problem.minima()[0]
+    degrees_of_freedom += _count_idle_unknowns(problem, best_minimum)
+    p_value = float(chi_square_p_value(best_minimum.cost, degrees_of_freedom))
     return UniformBeamTest(
         status="passed" if p_value >= REFUSED_BELOW else "refused",
-        chi_square=best.cost,
+        chi_square=best_minimum.cost,
         degrees_of_freedom=degrees_of_freedom,
         p_value=p_value,
         modes=modes,
         measured=measured,
-        predicted=problem.constants(best.x[None])[0],
+        predicted=problem.constants(best_minimum.x[None])[0],
         std=std,
     )
 
@@ -661,21 +664,22 @@ def tolerant_estimate(
     if basis == "geometry":
         problem = ConstantsProblem(fit, modes, nominal, _LOOSE_TOLERANCE, tilt_deg)
         minima = problem.minima()
-    best = minima[0]
+    best_minimum = minima[0]
     rises = {
-        order: problem.minimize_with_fixed(PARAMETERS.index(order), 1.0, best.x).cost - best.cost
+        order: problem.minimize_with_fixed(PARAMETERS.index(order), 1.0, best_minimum.x).cost
+        - best_minimum.cost
         for order in orders_without_one
     }
     return replace(estimate, deviance_of_one=estimate.deviance_of_one | rises)
 
 
-def _count_idle_unknowns(problem: ConstantsProblem, best: Minimum) -> int:
+def _count_idle_unknowns(problem: ConstantsProblem, minimum: Minimum) -> int:
     """Count the unknowns that do not affect chi-square at a minimum.
 
     Absent damping has such unknowns.
     """
-    curvature = np.diag(best.equations.hessian)
-    at_bound = best.equations.held(best.x, problem.lower, problem.upper)
+    curvature = np.diag(minimum.equations.hessian)
+    at_bound = minimum.equations.held(minimum.x, problem.lower, problem.upper)
     return int(np.count_nonzero(at_bound | (curvature < _IDLE_CURVATURE)))
 
 
@@ -686,25 +690,28 @@ def _estimate_at_minimum(
     p_value: float | None,
 ) -> TolerantEstimate:
     """Return beam parameters with standard deviations and 95 % intervals at the lowest minimum."""
-    best = minima[0]
-    plant = problem.plant(best.x)
-    hessian = best.equations.hessian + np.diag(1 / (problem.upper - problem.lower) ** 2)
+    best_minimum = minima[0]
+    plant = problem.plant(best_minimum.x)
+    hessian = best_minimum.equations.hessian + np.diag(1 / (problem.upper - problem.lower) ** 2)
     covariance = problem.transform @ np.linalg.inv(hessian) @ problem.transform.T
-    values = problem.parameters(best.x)
+    values = problem.parameters(best_minimum.x)
     spreads = np.sqrt(np.diag(covariance))
     deviance_without = {
-        name: problem.minimize_without_damping(PARAMETERS.index(name), best.x).cost - best.cost
+        name: problem.minimize_without_damping(PARAMETERS.index(name), best_minimum.x).cost
+        - best_minimum.cost
         for name in _DAMPING_COEFFICIENTS
     }
-    near_minima = [each for each in minima if each.cost - best.cost < NORMAL_95**2]
+    near_minima = [each for each in minima if each.cost - best_minimum.cost < NORMAL_95**2]
     intervals: dict[str, tuple[float, float]] = {}
     std: dict[str, float] = {}
     for index, name in enumerate(PARAMETERS):
         value, spread = float(values[index]), float(spreads[index])
         if name in _PROFILED_PARAMETERS:
-            low, high = (_interval_end(problem, index, best, side * spread) for side in (-1.0, 1.0))
-            others = [float(problem.parameters(each.x)[index]) for each in near_minima]
-            low, high = min(low, *others), max(high, *others)
+            low, high = (
+                _interval_end(problem, index, best_minimum, side * spread) for side in (-1.0, 1.0)
+            )
+            other_values = [float(problem.parameters(each.x)[index]) for each in near_minima]
+            low, high = min(low, *other_values), max(high, *other_values)
         else:
             low, high = value - NORMAL_95 * spread, value + NORMAL_95 * spread
         if name in LOGARITHMIC:
@@ -726,36 +733,40 @@ def _estimate_at_minimum(
     )
 
 
-def _interval_end(problem: ConstantsProblem, index: int, best: Minimum, spread: float) -> float:
+def _interval_end(
+    problem: ConstantsProblem, index: int, best_minimum: Minimum, spread: float
+) -> float:
     """Return one end of the 95 % interval of a parameter, where chi-square has risen by 3.84.
 
     Return the edge of the range if chi-square does not rise so far. `index` is the position of the
     parameter in `PARAMETERS`. `spread` is its standard deviation, negative for the lower end.
     """
-    centre = float(problem.parameters(best.x)[index])
-    edge = math.copysign(math.inf, spread)
+    centre = float(problem.parameters(best_minimum.x)[index])
+    range_edge = math.copysign(math.inf, spread)
     if PARAMETERS[index] in ("alpha", "lambda"):
-        edge = _ORDER_RANGE[0 if spread < 0 else 1]
-    inside, inside_root, x = centre, 0.0, best.x
+        range_edge = _ORDER_RANGE[0 if spread < 0 else 1]
+    inside_value, inside_root, x = centre, 0.0, best_minimum.x
     trial = centre + NORMAL_95 * spread
-    outside: float | None = None
+    outside_value: float | None = None
     for _ in range(_MAX_PROFILE_STEPS):
-        trial = max(trial, edge) if spread < 0 else min(trial, edge)
-        minimum = problem.minimize_with_fixed(index, trial, x)
-        root = math.sqrt(max(minimum.cost - best.cost, 0.0))
+        trial = max(trial, range_edge) if spread < 0 else min(trial, range_edge)
+        trial_minimum = problem.minimize_with_fixed(index, trial, x)
+        root = math.sqrt(max(trial_minimum.cost - best_minimum.cost, 0.0))
         if abs(root - NORMAL_95) < _INTERVAL_END_TOLERANCE:
             return trial
         if root < NORMAL_95:
-            inside, inside_root, x = trial, root, minimum.x
-            if trial == edge:
-                return edge
+            inside_value, inside_root, x = trial, root, trial_minimum.x
+            if trial == range_edge:
+                return range_edge
         else:
-            outside, outside_root = trial, root
-        if outside is None:
-            step = (inside - centre) * min(NORMAL_95 / max(inside_root, 0.2), _MAX_DISTANCE_GROWTH)
+            outside_value, outside_root = trial, root
+        if outside_value is None:
+            step = (inside_value - centre) * min(
+                NORMAL_95 / max(inside_root, 0.2), _MAX_DISTANCE_GROWTH
+            )
             trial = centre + step
         else:
-            trial = inside + (outside - inside) * (NORMAL_95 - inside_root) / (
+            trial = inside_value + (outside_value - inside_value) * (NORMAL_95 - inside_root) / (
                 outside_root - inside_root
             )
-    return trial if outside is not None else edge
+    return trial if outside_value is not None else range_edge

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from analysis.models import Structure
 
 Status = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
+"""Status of a damping order."""
 
 BIC_DECISIVE: Final = 10.0
 """Difference of BIC from which the worse structure may be dismissed (Kass and Raftery, J. American

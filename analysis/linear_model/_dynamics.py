@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from analysis.identify import ModalModel, Plant
 
 Response = Callable[[NDArray[np.complex128]], NDArray[np.complex128]]
+"""Function from s in rad/s to a frequency response."""
 
 BEAM_BAND_HZ: Final = (0.05, 100.0)
 """Band in which a beam is realised, in hertz."""

@@ -292,12 +292,12 @@ def _accuracy(uncertain: UncertainDynamics, fit: PoleFit, system: StateSpace) ->
     inner_hz = pole_and_zero_hz[(pole_and_zero_hz > low) & (pole_and_zero_hz < high)]
     frequency_hz = np.sort(np.concatenate([np.geomspace(low, high, _TABLE_POINTS), inner_hz]))
     s = imaginary_axis(frequency_hz)
-    exact = fit.dynamics.filtered(s)
+    exact_response = fit.dynamics.filtered(s)
     return Accuracy(
         fit.dynamics.band_hz,
         frequency_hz,
-        exact * np.exp(-fit.dynamics.delay_s * s),
-        np.abs(angle_response(system, s) / exact - 1),
+        exact_response * np.exp(-fit.dynamics.delay_s * s),
+        np.abs(angle_response(system, s) / exact_response - 1),
         _relative_std(uncertain, s),
         float(fit.error(system).max()),
     )
@@ -314,13 +314,16 @@ def _relative_std(uncertain: UncertainDynamics, s: NDArray[np.complex128]) -> ND
         return dynamics.filtered(s) * np.exp(-dynamics.delay_s * s)
 
     variances, directions = np.linalg.eigh(uncertain.covariance)
-    total = np.zeros(s.size)
+    total_variance = np.zeros(s.size)
     for variance, direction in zip(variances, directions.T, strict=True):
         if variance > 0:
-            change = np.sqrt(variance) * _STEP_STD * direction
-            above, below = response(uncertain.values + change), response(uncertain.values - change)
-            total += np.abs((above - below) / (2 * _STEP_STD)) ** 2
-    std: NDArray[np.float64] = np.sqrt(total) / np.abs(response(uncertain.values))
+            value_step = np.sqrt(variance) * _STEP_STD * direction
+            above, below = (
+                response(uncertain.values + value_step),
+                response(uncertain.values - value_step),
+            )
+            total_variance += np.abs((above - below) / (2 * _STEP_STD)) ** 2
+    std: NDArray[np.float64] = np.sqrt(total_variance) / np.abs(response(uncertain.values))
     return std
 
 

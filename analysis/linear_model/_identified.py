@@ -137,12 +137,12 @@ class IdentifiedModel:
 
     def beam_covariance(self) -> tuple[tuple[str, ...], NDArray[np.float64]] | None:
         """Return names and covariance of the beam parameters, or None if they are not stated."""
-        return self._covariance("covariance", self._beam_block.get("covariance"), "matrix")
+        return self._covariance("covariance", self._beam_part.get("covariance"), "matrix")
 
     @property
     def beam_notes(self) -> tuple[str, ...]:
         """Return doubts about the beam parameters, and effects that a linear model leaves out."""
-        parameters = self._beam_block["parameters"]
+        parameters = self._beam_part["parameters"]
         flagged = [name for name, each in parameters.items() if _doubt_about(each)]
         notes = [f"flagged by the analysis: {', '.join(flagged)}"] if flagged else []
         notes += [
@@ -171,15 +171,15 @@ class IdentifiedModel:
         return (f"flagged by the analysis: mode {', '.join(flagged)}",) if flagged else ()
 
     @property
-    def _beam_block(self) -> Mapping[str, Any]:
+    def _beam_part(self) -> Mapping[str, Any]:
         """Return the part of the headline that contains the parameters of the exported beam.
 
         This is the exactly uniform beam, if its covariance is stated: parameters with a tolerance
         of the geometry reproduce the resonances less exactly than they were measured.
         """
-        exact = self.headline.get("exact_geometry")
-        if isinstance(exact, dict) and isinstance(exact.get("parameters"), dict):
-            return exact if "covariance" in exact else self.headline
+        exact_geometry = self.headline.get("exact_geometry")
+        if isinstance(exact_geometry, dict) and isinstance(exact_geometry.get("parameters"), dict):
+            return exact_geometry if "covariance" in exact_geometry else self.headline
         return self.headline
 
     def beam(self) -> UncertainDynamics:
@@ -192,7 +192,7 @@ class IdentifiedModel:
         LinearModelError
             If the length or the covariance cannot be used.
         """
-        values = parameter_values(self.where, self._beam_block["parameters"])
+        values = parameter_values(self.where, self._beam_part["parameters"])
         length_m = self.length_m
         if length_m is None:
             raise LinearModelError(
@@ -246,15 +246,15 @@ class IdentifiedModel:
         count = len(modal.poles_rad_s)
         names, covariance = self.modal_covariance() or ((), np.zeros((0, 0)))
         values = [constant_value(modal, name) for name in names]
-        known = [value for value in values if value is not None]
-        if len(known) < len(names):
+        known_values = [value for value in values if value is not None]
+        if len(known_values) < len(names):
             raise self._error(
                 "modal_model.names", f"{names[values.index(None)]!r} has no such constant"
             )
-        nominal = dict(zip(names, known, strict=True))
-        listed = self.headline["modal_model"].get("modes")
-        stated = isinstance(listed, list) and len(listed) == count
-        numbers = listed if stated else list(range(1, count + 1))
+        nominal = dict(zip(names, known_values, strict=True))
+        stated_modes = self.headline["modal_model"].get("modes")
+        numbers_are_stated = isinstance(stated_modes, list) and len(stated_modes) == count
+        numbers = stated_modes if numbers_are_stated else list(range(1, count + 1))
 
         def at(parameters: Mapping[str, float]) -> ModalModel:
             """Return the modal model with given values of its constants."""
@@ -265,7 +265,7 @@ class IdentifiedModel:
         return UncertainDynamics(
             lambda parameters: modal_dynamics(at(parameters), band_hz, numbers),
             names,
-            np.array(known),
+            np.array(known_values),
             covariance,
             lambda parameters: all(
                 pole.real < 0 < pole.imag for pole in at(parameters).poles_rad_s
@@ -273,11 +273,11 @@ class IdentifiedModel:
         )
 
     def _covariance(
-        self, key: str, block: object, matrix_key: str
+        self, key: str, part: object, matrix_key: str
     ) -> tuple[tuple[str, ...], NDArray[np.float64]] | None:
         """Read names and covariance matrix from a part of the headline, or return None."""
-        names = block.get("names") if isinstance(block, dict) else None
-        matrix = block.get(matrix_key) if isinstance(block, dict) else None
+        names = part.get("names") if isinstance(part, dict) else None
+        matrix = part.get(matrix_key) if isinstance(part, dict) else None
         if not isinstance(names, list) or not isinstance(matrix, list):
             return None
         try:
@@ -287,9 +287,10 @@ class IdentifiedModel:
         if len(set(map(str, names))) < len(names):
             raise self._error(f"{key}.names", "must be different from each other")
         scale = np.sqrt(np.abs(np.diag(covariance)))
-        scaled = covariance / np.outer(scale + (scale == 0), scale + (scale == 0))
+        scaled_covariance = covariance / np.outer(scale + (scale == 0), scale + (scale == 0))
         if not np.isfinite(covariance).all() or (
-            len(names) and np.linalg.eigvalsh((scaled + scaled.T) / 2).min() < -1e-6
+            len(names)
+            and np.linalg.eigvalsh((scaled_covariance + scaled_covariance.T) / 2).min() < -1e-6
         ):
             raise self._error(f"{key}.{matrix_key}", "must be positive semidefinite")
         return tuple(map(str, names)), (covariance + covariance.T) / 2
@@ -327,10 +328,10 @@ def identified_in_document(path: Path) -> IdentifiedModel:
     def entries(key: str) -> list[dict[str, Any]]:
         """Return the entries of a list in the document that belong to the analysed file."""
         listed = document.get(key)
-        found = (
+        dicts = (
             [each for each in listed if isinstance(each, dict)] if isinstance(listed, list) else []
         )
-        return [each for each in found if file is None or each.get("file") == file]
+        return [each for each in dicts if file is None or each.get("file") == file]
 
     lengths = {finite_number(each.get("beam_length_m")) for each in entries("files")}
     (length_m,) = lengths if len(lengths) == 1 else (None,)
@@ -401,7 +402,10 @@ def _is_possible_beam(values: Mapping[str, float]) -> bool:
 
 def _plant_of_parameters(values: Mapping[str, float], length_m: float) -> Plant:
     """Return the rig with a beam of given parameters."""
-    ratio, stiffness = values["density_over_stiffness"], values["bending_stiffness_n_m2"]
+    density_over_stiffness, stiffness = (
+        values["density_over_stiffness"],
+        values["bending_stiffness_n_m2"],
+    )
     last_offset_mode = max(
         (
             int(each.removeprefix(_STIFFNESS_OFFSET_PREFIX))
@@ -416,7 +420,7 @@ def _plant_of_parameters(values: Mapping[str, float], length_m: float) -> Plant:
             f"{_ANALYZE_AGAIN_ADVICE}."
         )
     return Plant(
-        beam=Beam(length_m, ratio * stiffness, stiffness),
+        beam=Beam(length_m, density_over_stiffness * stiffness, stiffness),
         damping=Damping(
             zeta=values.get("zeta", 0.0),
             alpha=values.get("alpha", 1.0),

@@ -31,7 +31,7 @@ _MAX_INTEGRATORS: Final = 2
 """Largest number of integrals of the acceleration: velocity and angle."""
 
 
-def realise(fit: PoleFit, order: int | None, given: Input) -> tuple[PoleStructure, StateSpace]:
+def realise(fit: PoleFit, order: int | None, input_kind: Input) -> tuple[PoleStructure, StateSpace]:
     """Realise a response by a state space with a given number of states, or the fewest.
 
     Parameters
@@ -41,7 +41,7 @@ def realise(fit: PoleFit, order: int | None, given: Input) -> tuple[PoleStructur
     order : int or None
         Number of states, including those of filters. None for as few as suffice for an error of
         `MAX_RELATIVE_ERROR`.
-    given : str
+    input_kind : str
         Input: "acceleration", or "angle" for angle, velocity and acceleration.
 
     Raises
@@ -53,8 +53,10 @@ def realise(fit: PoleFit, order: int | None, given: Input) -> tuple[PoleStructur
     if order is not None:
         fixed_states = len(dynamics.real_poles) + sum(each for _, each in dynamics.filters)
         most_states = fixed_states + 2 * len(dynamics.pairs) + _MAX_REAL_POLES
-        least_real_poles = dict.fromkeys(range(len(dynamics.pairs) + 1), 0)
-        realisation = _best_realisation(fit, order - fixed_states, given, least_real_poles, np.inf)
+        no_real_poles = dict.fromkeys(range(len(dynamics.pairs) + 1), 0)
+        realisation = _best_realisation(
+            fit, order - fixed_states, input_kind, no_real_poles, np.inf
+        )
         if realisation is not None:
             return realisation
         raise LinearModelError(
@@ -69,16 +71,22 @@ def realise(fit: PoleFit, order: int | None, given: Input) -> tuple[PoleStructur
         for pairs in range(dynamics.in_band, len(dynamics.pairs) + 1)
     }
     least_real_poles = {
-        pairs: real for pairs, real in least_real_poles.items() if real <= _MAX_REAL_POLES
+        pairs: real_poles
+        for pairs, real_poles in least_real_poles.items()
+        if real_poles <= _MAX_REAL_POLES
     }
-    first_states = min((2 * pairs + real for pairs, real in least_real_poles.items()), default=0)
+    first_states = min(
+        (2 * pairs + real_poles for pairs, real_poles in least_real_poles.items()), default=0
+    )
     last_states = (
         max((2 * pairs for pairs in least_real_poles), default=-1)
         + _MAX_REAL_POLES
         + _MAX_INTEGRATORS
     )
     for states in range(first_states, last_states + 1):
-        realisation = _best_realisation(fit, states, given, least_real_poles, MAX_RELATIVE_ERROR)
+        realisation = _best_realisation(
+            fit, states, input_kind, least_real_poles, MAX_RELATIVE_ERROR
+        )
         if realisation is not None:
             return realisation
     raise LinearModelError(
@@ -88,52 +96,63 @@ def realise(fit: PoleFit, order: int | None, given: Input) -> tuple[PoleStructur
     )
 
 
-def _real_poles_suffice(fit: PoleFit, pairs: int, real: int) -> bool:
+def _real_poles_suffice(fit: PoleFit, pairs: int, real_poles: int) -> bool:
     """Return whether a number of real poles suffices for the accuracy, with both integrators."""
-    ladders = _structures_with_real_poles(pairs, real, _MAX_INTEGRATORS)
-    return any(fit.solve(structure)[1] <= MAX_RELATIVE_ERROR for structure in ladders)
+    structures = _structures_with_real_poles(pairs, real_poles, _MAX_INTEGRATORS)
+    return any(fit.solve(structure)[1] <= MAX_RELATIVE_ERROR for structure in structures)
 
 
-def _structures_with_states(pairs: int, states: int, given: Input) -> Iterator[PoleStructure]:
+def _structures_with_states(pairs: int, states: int, input_kind: Input) -> Iterator[PoleStructure]:
     """Yield the structures with a number of pairs and a total number of states.
 
     `states` does not count the states that all structures have.
     """
-    if given == "angle":  # which has the velocity and the acceleration as inputs
+    if input_kind == "angle":  # which has the velocity and the acceleration as inputs
         yield from _structures_with_real_poles(pairs, states - 2 * pairs, _MAX_INTEGRATORS)
         return
     for integrators in range(_MAX_INTEGRATORS + 1):
         yield from _structures_with_real_poles(pairs, states - 2 * pairs - integrators, integrators)
 
 
-def _structures_with_real_poles(pairs: int, real: int, integrators: int) -> Iterator[PoleStructure]:
+def _structures_with_real_poles(
+    pairs: int, real_poles: int, integrators: int
+) -> Iterator[PoleStructure]:
     """Yield the structures with a number of pairs, of added real poles and of integrators."""
-    if not 0 <= real <= _MAX_REAL_POLES:
+    if not 0 <= real_poles <= _MAX_REAL_POLES:
         return
-    for low, high in _REAL_POLE_RANGES_RAD_S[: None if real else 1]:
-        poles = np.geomspace(low, high, real) if real > 1 else np.full(real, (low * high) ** 0.5)
+    for low, high in _REAL_POLE_RANGES_RAD_S[: None if real_poles else 1]:
+        poles = (
+            np.geomspace(low, high, real_poles)
+            if real_poles > 1
+            else np.full(real_poles, (low * high) ** 0.5)
+        )
         yield PoleStructure(pairs, tuple((-poles).tolist()), integrators)
 
 
 def _best_realisation(
-    fit: PoleFit, states: int, given: Input, least: Mapping[int, int], tolerance: float
+    fit: PoleFit,
+    states: int,
+    input_kind: Input,
+    least_real_poles: Mapping[int, int],
+    tolerance: float,
 ) -> tuple[PoleStructure, StateSpace] | None:
     """Return the most accurate stable realisation within a tolerance, or None if there is none.
 
-    `least` gives the admissible numbers of pairs and, for each, the smallest number of real poles.
+    `least_real_poles` gives the admissible numbers of pairs and, for each, the smallest number of
+    real poles.
     """
-    found: list[tuple[float, int, PoleStructure, NDArray[np.float64]]] = []
+    accurate_fits: list[tuple[float, int, PoleStructure, NDArray[np.float64]]] = []
     for structure in (
         each
-        for pairs, real in least.items()
-        for each in _structures_with_states(pairs, states, given)
-        if len(each.added_real_poles_rad_s) >= real
+        for pairs, real_poles in least_real_poles.items()
+        for each in _structures_with_states(pairs, states, input_kind)
+        if len(each.added_real_poles_rad_s) >= real_poles
     ):
         coefficients, error = fit.solve(structure)
         if error <= tolerance:
-            found.append((error, len(found), structure, coefficients))
-    for _, _, structure, coefficients in sorted(found, key=lambda each: each[:2]):
-        system = fit.system(structure, coefficients, given)
+            accurate_fits.append((error, len(accurate_fits), structure, coefficients))
+    for _, _, structure, coefficients in sorted(accurate_fits, key=lambda each: each[:2]):
+        system = fit.system(structure, coefficients, input_kind)
         accurate = tolerance == np.inf or fit.error(system).max() <= tolerance
         if accurate and fit.is_stable_on_motor(structure, coefficients):
             return structure, system

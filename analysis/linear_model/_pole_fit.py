@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     Real = NDArray[np.float64]
 
 Input = Literal["acceleration", "angle"]
+"""Input of an exported model."""
+
 INPUTS: Final[tuple[Input, ...]] = ("acceleration", "angle")
 """Possible inputs of an exported model."""
 
@@ -164,23 +166,23 @@ class PoleFit:
         error : float
             Largest relative error in the band, at the points of the fit.
         """
-        real = self.real_poles(structure)
-        direct = 1 + structure.integrators
-        columns = np.concatenate(
+        real_poles = self.real_poles(structure)
+        direct_terms = 1 + structure.integrators
+        basis = np.concatenate(
             [
                 *self._pair_basis[: structure.pairs],
-                [1 / (self._s - pole) for pole in real] or np.empty((0, self._s.size)),
-                [self._s**-power for power in range(direct)],
+                [1 / (self._s - pole) for pole in real_poles] or np.empty((0, self._s.size)),
+                [self._s**-power for power in range(direct_terms)],
             ]
         )
-        columns = columns * self._scale
-        bounded = direct if self.dynamics.motor_inertia_kg_m2 is not None else 0
-        coefficients = _least_squares(columns, self._target, bounded)
-        residual = coefficients @ columns - self._target
+        basis = basis * self._scale
+        bounded_count = direct_terms if self.dynamics.motor_inertia_kg_m2 is not None else 0
+        coefficients = _least_squares(basis, self._target, bounded_count)
+        residual = coefficients @ basis - self._target
         return coefficients, float(np.abs(residual[self._in_band]).max())
 
     def system(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64], given: Input
+        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: Input
     ) -> StateSpace:
         """Return the state space of a fit, with tool inertia, filters and delay.
 
@@ -190,10 +192,10 @@ class PoleFit:
             States of the realisation.
         coefficients : ndarray
             Coefficients that `solve` returned.
-        given : str
+        input_kind : str
             Input: "acceleration", or "angle" for angle, velocity and acceleration.
         """
-        system = self._system_without_filters(structure, coefficients, given)
+        system = self._system_without_filters(structure, coefficients, input_kind)
         for constant_s, order in self.dynamics.filters:
             system = with_filter(system, constant_s, order)
         return replace(system, delay_s=self.dynamics.delay_s)
@@ -228,26 +230,30 @@ class PoleFit:
         return bool(np.linalg.eigvals(coupled).real.max(initial=0.0) <= _MAX_GROWTH_PER_S)
 
     def _system_without_filters(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64], given: Input
+        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: Input
     ) -> StateSpace:
         """Return the state space of a fit with tool inertia, without filters and delay."""
-        upper, real = self.dynamics.pairs[: structure.pairs], self.real_poles(structure)
-        poles = 2 * upper.size + len(real)
+        upper_poles, real_poles = self.dynamics.pairs[: structure.pairs], self.real_poles(structure)
+        poles = 2 * upper_poles.size + len(real_poles)
         a = np.zeros((poles, poles))
-        even = np.arange(0, 2 * upper.size, 2)
-        a[even, even] = a[even + 1, even + 1] = upper.real
-        a[even, even + 1] = upper.imag
-        a[even + 1, even] = -upper.imag
-        others = np.arange(2 * upper.size, poles)
-        a[others, others] = real
+        pair_rows = np.arange(0, 2 * upper_poles.size, 2)
+        a[pair_rows, pair_rows] = a[pair_rows + 1, pair_rows + 1] = upper_poles.real
+        a[pair_rows, pair_rows + 1] = upper_poles.imag
+        a[pair_rows + 1, pair_rows] = -upper_poles.imag
+        real_rows = np.arange(2 * upper_poles.size, poles)
+        a[real_rows, real_rows] = real_poles
         b = np.ones((poles, 1))
-        b[even + 1] = 0.0
+        b[pair_rows + 1] = 0.0
         c = coefficients[None, :poles]
         inertia, viscosity, stiffness = np.append(coefficients[poles:], np.zeros(2))[:3].tolist()
         inertia += self.dynamics.tool_inertia_kg_m2
-        names = [f"{name}_{part}" for name in self.dynamics.names[: upper.size] for part in "ab"]
-        names += [f"relaxation_{number}" for number in range(1, len(real) + 1)]
-        if given == "angle":
+        names = [
+            f"{name}_{suffix}"
+            for name in self.dynamics.names[: upper_poles.size]
+            for suffix in "ab"
+        ]
+        names += [f"relaxation_{number}" for number in range(1, len(real_poles) + 1)]
+        if input_kind == "angle":
             # s² / (s - p) = s + p + p² / (s - p)
             stiffness += (c @ a @ b).item()
             viscosity += (c @ b).item()
@@ -312,16 +318,19 @@ class PoleFit:
         """Return which frequencies are far enough from poles and zeros for a relative error."""
         omega = 2 * np.pi * frequency_hz
         distance = np.abs(1j * omega[:, None] - self._poles_and_zeros()).min(axis=1, initial=np.inf)
-        apart: NDArray[np.bool_] = distance > _MIN_RELATIVE_DISTANCE * omega
-        return apart
+        is_apart: NDArray[np.bool_] = distance > _MIN_RELATIVE_DISTANCE * omega
+        return is_apart
 
     def _response_minima(self) -> NDArray[np.complex128]:
         """Return the points s = j omega of local minima of the response per acceleration."""
         low, high = self.dynamics.band_hz
         s = imaginary_axis(np.geomspace(low / 2, high * 2, _SCAN_POINTS))
-        size = np.abs(self.dynamics.response(s) / s**2)
-        inner = np.flatnonzero((size[1:-1] < size[:-2]) & (size[1:-1] < size[2:])) + 1
-        return s[inner]
+        magnitude = np.abs(self.dynamics.response(s) / s**2)
+        minimum_indices = (
+            np.flatnonzero((magnitude[1:-1] < magnitude[:-2]) & (magnitude[1:-1] < magnitude[2:]))
+            + 1
+        )
+        return s[minimum_indices]
 
     def _find_zeros(self, starts: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the zeros of the response that Newton's method finds near the start points."""
@@ -363,8 +372,8 @@ def angle_response(system: StateSpace, s: NDArray[np.complex128]) -> NDArray[np.
         Points in rad/s.
     """
     motion = np.array([np.ones_like(s), s, s * s])[-system.d.shape[1] :]
-    total: NDArray[np.complex128] = np.einsum("km,mk->k", system.response(s)[:, 0], motion)
-    return total
+    response: NDArray[np.complex128] = np.einsum("km,mk->k", system.response(s)[:, 0], motion)
+    return response
 
 
 def _least_squares(
@@ -384,6 +393,6 @@ def _least_squares(
         )[0]
         bounded_values = solution[first_bounded:]
         if not (bounded_values < 0).any():
-            found: NDArray[np.float64] = solution / scale
-            return found
+            coefficients: NDArray[np.float64] = solution / scale
+            return coefficients
         used_columns = used_columns[used_columns != first_bounded + np.argmin(bounded_values)]

@@ -69,10 +69,10 @@ class StateSpace:
             Points in rad/s, none of them a pole.
         """
         response = np.empty((s.size, *self.d.shape), dtype=np.complex128)
-        for first in range(0, s.size, _POINTS_PER_BLOCK):
-            block = s[first : first + _POINTS_PER_BLOCK, None, None]
+        for first_point in range(0, s.size, _POINTS_PER_BLOCK):
+            block = s[first_point : first_point + _POINTS_PER_BLOCK, None, None]
             resolvent = np.linalg.solve(block * np.eye(self.order) - self.a, self.b[None] + 0j)
-            response[first : first + _POINTS_PER_BLOCK] = self.c @ resolvent + self.d
+            response[first_point : first_point + _POINTS_PER_BLOCK] = self.c @ resolvent + self.d
         return response
 
     def sampled(self, rate_hz: float) -> StateSpace:
@@ -127,9 +127,9 @@ def with_filter(system: StateSpace, time_constant_s: float, order: int) -> State
     )
 
 
-def concatenate_names(parts: Sequence[SignalNames]) -> SignalNames:
+def concatenate_names(vectors: Sequence[SignalNames]) -> SignalNames:
     """Return the names and units of several vectors one after the other."""
     return SignalNames(
-        tuple(name for each in parts for name in each.names),
-        tuple(unit for each in parts for unit in each.units),
+        tuple(name for each in vectors for name in each.names),
+        tuple(unit for each in vectors for unit in each.units),
     )
