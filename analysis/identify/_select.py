@@ -665,13 +665,15 @@ def _add_impacts_and_unexplained(
 ) -> tuple[Finding, ...]:
     """Add impacts before the other findings, and the unexplained residual after them."""
     explained = whiteness_test.white and not input_test.related
-    impact_findings = of_knocks(candidate_set.comparison.measurement.knocks, explained=explained)
+    findings_of_impacts = of_knocks(
+        candidate_set.comparison.measurement.knocks, explained=explained
+    )
     unexplained_findings = (
         ()
         if explained
         else (unexplained(whiteness_test, input_test, candidate_set.best.fit.modes),)
     )
-    return (*impact_findings, *findings_of_model, *unexplained_findings)
+    return (*findings_of_impacts, *findings_of_model, *unexplained_findings)
 
 
 def _test_residual(

@@ -98,14 +98,14 @@ class TemporalChange:
     size, std : float
         Estimate and standard deviation: the relative change from the first sample to the last, the
         relative difference of the clock rates, or the backlash in rad.
-    behind : float
+    bic_difference : float
         BIC with this effect minus the lowest BIC without it.
     """
 
     what: Effect
     size: float
     std: float
-    behind: float
+    bic_difference: float
 
     @property
     def name(self) -> str:
@@ -115,7 +115,7 @@ class TemporalChange:
     @property
     def certain(self) -> bool:
         """Return whether no model without this effect explains the record as well."""
-        return self.behind < -BIC_DECISIVE
+        return self.bic_difference < -BIC_DECISIVE
 
 
 def along_time(
@@ -147,13 +147,17 @@ def along_time(
         change = TemporalChange(
             what, unit * float(amplitudes[-1]), unit * float(std[-1]), bic - candidate_set.best.bic
         )
-        if change.behind < BIC_DECISIVE and _has_possible_size(change):
+        if change.bic_difference < BIC_DECISIVE and _has_possible_size(change):
             possible_changes.append((change, refit))
-    possible_changes.sort(key=lambda pair: pair[0].behind)
+    possible_changes.sort(key=lambda pair: pair[0].bic_difference)
     if not possible_changes:
         return candidate_set, ()
     best_change, refit = possible_changes[0]
-    changes = tuple(c for c, _ in possible_changes if c.behind < best_change.behind + BIC_DECISIVE)
+    changes = tuple(
+        c
+        for c, _ in possible_changes
+        if c.bic_difference < best_change.bic_difference + BIC_DECISIVE
+    )
     if not best_change.certain or len(changes) > 1:
         return candidate_set, changes
     return candidate_set.with_columns(refit.columns, refit.noise_here()), changes

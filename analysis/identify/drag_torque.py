@@ -67,10 +67,10 @@ if TYPE_CHECKING:
 
     from analysis.identify.free_decay import Pole
 
-MODES: Final = 5
+DRAG_MODES: Final = 5
 """Number of beam modes that the drag force can excite in the computation."""
 
-POINTS: Final = 16
+DRAG_POINTS: Final = 16
 """Number of points along the beam at which the drag force is computed."""
 
 _OVERSAMPLING: Final = 3
@@ -204,12 +204,12 @@ class DragResponse:
         fine_time_s = np.arange(_OVERSAMPLING * n) / (_OVERSAMPLING * rate_hz)
         self._growth = np.exp(sigma * fine_time_s)
         beam, damping = plant.beam, plant.damping
-        self._grid = DragGrid.of(beam, MODES, POINTS)
-        k = (eigenvalues(MODES) / beam.length_m) ** 4
+        self._grid = DragGrid.of(beam, DRAG_MODES, DRAG_POINTS)
+        k = (eigenvalues(DRAG_MODES) / beam.length_m) ** 4
         log_s = np.log(s)
         p = beam.density_over_stiffness * s * s + damping.gamma * np.exp(damping.lambda_ * log_s)
         z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * log_s))
-        self._inertial_response = p / z  # p / Z_i, shape (MODES, bins)
+        self._inertial_response = p / z  # p / Z_i, shape (modes, bins)
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
         self._inertia_term = p
         self._torque_channel = torque_channel(plant, s)
@@ -289,13 +289,13 @@ class DragResponse:
 
     @property
     def poles(self) -> Complex:
-        """Return the upper pole of each mode in rad/s, shape (MODES,)."""
+        """Return the upper pole of each mode in rad/s, shape (modes,)."""
         upper: Complex = self._pole_pairs[:, 0]
         return upper
 
     @property
     def _leverage(self) -> Real:
-        """Return the leverage L b_i of each mode i in m, shape (MODES,)."""
+        """Return the leverage L b_i of each mode i in m, shape (modes,)."""
         return self.plant.beam.length_m * self._grid.leverage_m
 
     def _mean_speed(self, speed: Real) -> float:
@@ -306,7 +306,7 @@ class DragResponse:
         return power / total if total > 0 else 0.0
 
     def _linear_speed(self) -> Real:
-        """Return the speeds of the beam points without drag in m/s, shape (3 m, POINTS)."""
+        """Return the speeds of the beam points without drag in m/s, shape (3 m, points)."""
         speed = np.outer(self._oversampled_values(self._speed_transform), self._grid.x_m)
         for shape, modal_speed in zip(self._grid.shapes, self._modal_speed_by_angle, strict=True):
             speed += np.outer(self._oversampled_values(modal_speed), shape)
@@ -317,9 +317,9 @@ class DragResponse:
         speed_by_state, by_state, by_force = self._time_step_matrices()
         step = np.concatenate([self._grid.shapes.T @ speed_by_state, by_state])
         state_by_force = by_force @ self._grid.to_modes
-        state, force, magnitude = np.zeros(len(by_state)), *np.zeros((2, POINTS))
+        state, force, magnitude = np.zeros(len(by_state)), *np.zeros((2, DRAG_POINTS))
         output = np.zeros(len(step))
-        drag_speed, free_state = output[:POINTS], output[POINTS:]
+        drag_speed, free_state = output[:DRAG_POINTS], output[DRAG_POINTS:]
         constant, slowing = -HALF_DENSITY * law.constant_m, -HALF_DENSITY * law.slowing
         step_dot, force_dot = step.dot, state_by_force.dot
         add, multiply, absolute, cbrt = np.add, np.multiply, np.absolute, np.cbrt
@@ -344,7 +344,7 @@ class DragResponse:
         """Return the first-order change of the modal forces by added speeds and by the drag law.
 
         To first order the points are not needed: the effect of the speed of one mode on the force
-        on another is one number at each step. `speed`, shape (3 m, POINTS), is with drag. Each
+        on another is one number at each step. `speed`, shape (3 m, points), is with drag. Each
         element of `sources` holds the index of a mode and the speed, shape (3 m,), that is added to
         it.
         """
@@ -354,10 +354,10 @@ class DragResponse:
             [by_force, np.zeros((len(by_force), 1))]
         )  # the moment is no input
         run_count, force_weights = len(sources) + 2, self._point_to_modal_forces
-        coupling = (force_weights[:, None] * self._grid.shapes).reshape(-1, POINTS).T
+        coupling = (force_weights[:, None] * self._grid.shapes).reshape(-1, DRAG_POINTS).T
         force_changes = np.empty((len(speed), len(force_weights), run_count))
         state, out = np.zeros((len(by_state), run_count)), np.zeros((len(step), run_count))
-        modal_speed, free_state = out[:MODES], out[MODES:]
+        modal_speed, free_state = out[:DRAG_MODES], out[DRAG_MODES:]
         force, dot, add = np.empty(force_changes.shape[1:]), np.dot, np.add
         for first_step in range(0, len(speed), _STEPS_PER_CHUNK):
             chunk = slice(first_step, first_step + _STEPS_PER_CHUNK)
@@ -366,7 +366,7 @@ class DragResponse:
             slope = -2 * HALF_DENSITY * law.constant_m * magnitude
             if law.slowing:
                 slope -= (1 + _SLOWING_EXPONENT) * HALF_DENSITY * law.slowing * cube_root
-            by_speed = (slope @ coupling).reshape(-1, len(force_weights), MODES)
+            by_speed = (slope @ coupling).reshape(-1, len(force_weights), DRAG_MODES)
             for run, (mode, added_speed) in enumerate(sources):
                 np.multiply(by_speed[:, :, mode], added_speed[chunk, None], out=now[:, :, run])
             for run, power in (-2, magnitude), (-1, cube_root):
@@ -386,7 +386,7 @@ class DragResponse:
         and the third the next state from the modal forces. The state holds two numbers for each
         mode, then the modal forces of the last three steps.
         """
-        n, step_s = MODES, 1 / (_OVERSAMPLING * self._rate_hz)
+        n, step_s = DRAG_MODES, 1 / (_OVERSAMPLING * self._rate_hz)
         states = 2 * n + _PAST_FORCES * n
         by_state, by_force = np.zeros((states, states)), np.zeros((states, n))
         output = np.zeros((n, states))
@@ -420,7 +420,7 @@ class DragResponse:
         return output[:, : 2 * n] @ with_extrapolated_force, by_state, by_force
 
     def _impedance_slopes(self) -> Complex:
-        """Return the derivative of Z_i by s at both poles of each mode, shape (MODES, 2)."""
+        """Return the derivative of Z_i by s at both poles of each mode, shape (modes, 2)."""
         s, damping = self._pole_pairs, self.plant.damping
         ratio = self.plant.beam.density_over_stiffness
         log_s = np.log(s)
@@ -438,12 +438,12 @@ class DragResponse:
         return np.vstack([self._grid.to_modes, self._grid.to_moment])
 
     def _modal_forces(self, force: Real) -> Real:
-        """Return modal forces and, last, root moment, shape (MODES + 1, 3 m), of point forces."""
+        """Return modal forces and, last, root moment, shape (modes + 1, 3 m), of point forces."""
         modal: Real = self._point_to_modal_forces @ force.T
         return modal
 
     def _transform_forces(self, forces: Real) -> Complex:
-        """Transform modal forces and root moment to the points `s`, shape (MODES + 1, bins)."""
+        """Transform modal forces and root moment to the points `s`, shape (modes + 1, bins)."""
         transforms = np.fft.rfft(forces / self._growth, _OVERSAMPLING * self._length)
         spectra: Complex = transforms[:, : self.s.size] / _OVERSAMPLING
         return spectra
@@ -499,7 +499,7 @@ def _drag_force(speed: Real, law: DragLaw) -> Real:
 
 
 def _pole_pairs(k_of_length: Real, plant: Plant) -> Complex:
-    """Return both poles of each mode, shape (MODES, 2), from its ``(k L)^4``."""
+    """Return both poles of each mode, shape (modes, 2), from its ``(k L)^4``."""
     pairs = poles_for_eigenvalues(k_of_length**0.25, plant.beam, plant.damping)
     return pairs.astype(np.complex128)
 

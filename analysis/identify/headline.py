@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from analysis.identify._plant import OF_BEAM
-from analysis.identify.verdict import ANOTHER_DAMPING, BIC_DECISIVE, EXCLUDED, WITH_DRAG
+from analysis.identify.verdict import ANOTHER_DAMPING, BIC_DECISIVE, EXCLUDED, WITH_DRAG_REASON
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
@@ -357,7 +357,8 @@ def headline(
         drag = candidate_set.drag
         reported_drag = ReportedValue(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
         loss_factors = (
-            each.flagged(WITH_DRAG) if each.damping == "external" else each for each in result.sizes
+            each.flagged(WITH_DRAG_REASON) if each.damping == "external" else each
+            for each in result.sizes
         )
         result = replace(
             result,

@@ -38,7 +38,7 @@ a thousand records."""
 NOT_DETERMINED: Final = "the record does not determine the order"
 """Reason against an order whose profile is too wide or has several minima."""
 
-WITH_DRAG: Final = "air drag contributes to it, and its law is known to a few per cent only"
+WITH_DRAG_REASON: Final = "air drag contributes to it, and its law is known to a few per cent only"
 """Reason against external damping if the record shows air drag: of two records of one rig, one had
 lambda four standard deviations off, with a drag that fell with the speed."""
 
@@ -181,7 +181,7 @@ def _order_status(
     if doubt is not None:
         return "open", doubt
     if order == "lambda" and candidate_set.drag is not None:
-        return "open", WITH_DRAG
+        return "open", WITH_DRAG_REASON
     if profile.admits_one:
         return "compatible", None
     return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
