@@ -53,7 +53,7 @@ class ModeEstimate:
     frequency_hz: float
     """Frequency of the free decay in hertz, 0 if over-damped."""
     frequency_std_hz: float
-    """Standard deviation of the frequency."""
+    """Standard deviation of the frequency in hertz."""
     damping_ratio: float
     """Fraction of the critical damping, above 1 if over-damped."""
     damping_ratio_std: float

@@ -480,13 +480,15 @@ def _fit_further_effects(
     candidate_set = linear if from_earlier else with_evident_drag(linear)
     if candidate_set is linear:
         candidate_set = linear if linear.misread else with_air_drag(linear)
-    visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
+    visible_numbers = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     candidate_set, forces = (
-        (candidate_set, ()) if candidate_set.misread else nonlinear_forces(candidate_set, visible)
+        (candidate_set, ())
+        if candidate_set.misread
+        else nonlinear_forces(candidate_set, visible_numbers)
     )
     if forces and candidate_set.drag is not None:
         # A stiffness that depends on the deflection may have been mistaken for weak drag.
-        without_drag, forces_without_drag = nonlinear_forces(linear, visible)
+        without_drag, forces_without_drag = nonlinear_forces(linear, visible_numbers)
         if forces_without_drag and without_drag.bic < candidate_set.bic:
             candidate_set, forces = without_drag, forces_without_drag
     candidate_set, changes = along_time(candidate_set.with_orders_free())
@@ -549,7 +551,7 @@ def _fit_freest_with_known_impacts(
     if not misread:
         candidate_set = candidate_set.with_special_cases()
     modal = _fit_modal_model(candidate_set)
-    visible = _visible_mode_numbers(candidate_set, modal)
+    visible_numbers = _visible_mode_numbers(candidate_set, modal)
     whiteness_test, input_test, harmonic_tests = _test_residual(candidate_set, modal, band_hz)
     all_findings = findings(candidate_set, (), harmonic_tests)
     kinds = {finding.kind for finding in all_findings}
@@ -558,8 +560,8 @@ def _fit_freest_with_known_impacts(
     result = of_fit(
         candidate_set.best.name,
         candidate_set.best.fit,
-        visible,
-        {} if misread else _unidentifiable_orders(candidate_set, visible),
+        visible_numbers,
+        {} if misread else _unidentifiable_orders(candidate_set, visible_numbers),
         unexplained=model_reason,
         both=None if misread else candidate_set.with_both_dampings(candidate_set.best),
     )
@@ -584,10 +586,12 @@ def _fit_freest_with_known_impacts(
     return _Assessment((result, all_findings, analysis), candidate_set, explained, kinds)
 
 
-def _unidentifiable_orders(candidate_set: CandidateSet, visible: tuple[int, ...]) -> dict[str, str]:
+def _unidentifiable_orders(
+    candidate_set: CandidateSet, visible_numbers: tuple[int, ...]
+) -> dict[str, str]:
     """Return the orders that the fit of the freest structure does not determine, with reasons."""
     freest, *other_candidates = candidate_set.candidates
-    reason = not_reported_reason(candidate_set, visible)
+    reason = not_reported_reason(candidate_set, visible_numbers)
     reasons = {}
     for name in COEFFICIENT_OF.keys() & set(freest.structure.free):
         low, high = freest.fit.interval[name] or (-math.inf, math.inf)

@@ -354,12 +354,12 @@ def memory_torque(
     total_torque = np.zeros(n)
 
     def in_time(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the values of a spectrum over time, shape (n,)."""
+        """Return the values over time of a quantity with a given spectrum, shape (n,)."""
         values: NDArray[np.float64] = np.fft.irfft(spectrum, length)[:n] * growth
         return values
 
     def weighted(spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the spectrum of w times the values of a spectrum over time."""
+        """Return the spectrum of a quantity times w, from the spectrum of the quantity."""
         transform: NDArray[np.complex128] = np.fft.rfft(w * in_time(spectrum) / growth, length)
         return transform
 

@@ -35,7 +35,7 @@ _UNDETERMINED_LN_STD: Final = 20.0
 way."""
 
 _MAX_LN_PIVOT_FREQUENCY: Final = 50.0
-"""Largest magnitude of ln(pivot frequency) from which a loss factor is reported."""
+"""Largest magnitude of ln(pivot frequency) at which a loss factor is reported."""
 
 
 # Unknowns and parameters

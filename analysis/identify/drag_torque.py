@@ -98,7 +98,7 @@ _DIVERGED_SPEED_RATIO: Final = 10.0
 """Speed, relative to the highest one without drag, that no beam with drag can reach."""
 
 _STEPS_PER_CHUNK: Final = 4096
-"""Number of time steps whose matrices are held in memory together."""
+"""Number of time steps whose matrices are computed together."""
 
 _QUADRATURE_POINTS: Final = 12
 """Number of Gauss-Legendre points for the integral over one time step."""
@@ -320,20 +320,23 @@ class DragResponse:
         state, force, magnitude = np.zeros(len(by_state)), *np.zeros((2, DRAG_POINTS))
         output = np.zeros(len(step))
         drag_speed, free_state = output[:DRAG_POINTS], output[DRAG_POINTS:]
-        constant, slowing = -HALF_DENSITY * law.constant_m, -HALF_DENSITY * law.slowing
+        constant_factor, slowing_factor = (
+            -HALF_DENSITY * law.constant_m,
+            -HALF_DENSITY * law.slowing,
+        )
         step_dot, force_dot = step.dot, state_by_force.dot
         add, multiply, absolute, cbrt = np.add, np.multiply, np.absolute, np.cbrt
         for point_speed in speed:
             step_dot(state, output)
             add(point_speed, drag_speed, point_speed)
             absolute(point_speed, magnitude)
-            if slowing:
+            if slowing_factor:
                 cbrt(magnitude, force)
-                multiply(force, slowing, force)
-                multiply(magnitude, constant, magnitude)
+                multiply(force, slowing_factor, force)
+                multiply(magnitude, constant_factor, magnitude)
                 add(force, magnitude, magnitude)
             else:
-                multiply(magnitude, constant, magnitude)
+                multiply(magnitude, constant_factor, magnitude)
             multiply(magnitude, point_speed, force)
             force_dot(force, state)
             add(state, free_state, state)
@@ -458,7 +461,7 @@ class DragResponse:
         return self.in_time(self._torque_transform(self._transform_forces(forces)))
 
     def in_time(self, torque: Complex) -> Real:
-        """Return the sampled torque of a transform, after the torque channel, shape (..., m).
+        """Convert the transform of a torque to samples, after the torque channel, (..., m).
 
         Parameters
         ----------
@@ -526,8 +529,8 @@ def _force_weights_of_step(pole: Complex, step_s: float) -> Complex:
             for own_node in nodes
         ]
     )
-    growth = np.exp(pole[:, None] * (step_s * (1 - fraction)))
-    weights_of_forces: Complex = growth * (0.5 * step_s * weight) @ lagrange.T
+    decay = np.exp(pole[:, None] * (step_s * (1 - fraction)))
+    weights_of_forces: Complex = decay * (0.5 * step_s * weight) @ lagrange.T
     return weights_of_forces
 
 

@@ -144,12 +144,12 @@ class DecaySpectra:
 
         An oscillating decay has two rows: real and imaginary part.
         """
-        return self._spectra(poles, self._sum)
+        return self._real_spectra(poles, self._transform_of_decay)
 
     def gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        """Return the derivatives of ``amplitudes @ columns(poles)`` through the poles, (k, K).
+        """Return the derivatives of ``amplitudes @ columns(poles)`` by the unknowns, shape (k, K).
 
         Parameters
         ----------
@@ -177,7 +177,7 @@ class DecaySpectra:
 
     def growing(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
         """Return the spectra of the decays times the time since the first sample, shape (m, K)."""
-        return self._spectra(poles, self._sum_of_time)
+        return self._real_spectra(poles, self._transform_of_growing_decay)
 
     def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:
         """Return spectra of n oscillations over the whole record, shape (4 n, K).
@@ -194,10 +194,10 @@ class DecaySpectra:
         ]
         return np.concatenate([self.columns(poles), self.growing(poles)])
 
-    def _spectra(
+    def _real_spectra(
         self, poles: Sequence[Pole], spectrum_of_pole: Callable[[complex], NDArray[np.complex128]]
     ) -> NDArray[np.complex128]:
-        """Return one row for each real decay, two rows for each oscillating one, shape (m, K)."""
+        """Return one spectrum for each real pole, two for each oscillating one, shape (m, K)."""
         rows = np.empty((decay_columns(poles), self._sample_rotation.size), complex)
         index = 0
         for pole in poles:
@@ -212,14 +212,14 @@ class DecaySpectra:
                 index += 1
         return rows
 
-    def _sum(self, pole: complex) -> NDArray[np.complex128]:
-        """Return the sum of ``exp(p t)`` over the samples, rotated to each bin, shape (K,)."""
+    def _transform_of_decay(self, pole: complex) -> NDArray[np.complex128]:
+        """Return the discrete Fourier transform of ``exp(p t)`` over the samples, shape (K,)."""
         step_factor = np.exp(pole * self._period_s) * self._sample_rotation
         spectrum: NDArray[np.complex128] = (1 - np.exp(pole * self._duration_s)) / (1 - step_factor)
         return spectrum
 
-    def _sum_of_time(self, pole: complex) -> NDArray[np.complex128]:
-        """Return the sum of ``t exp(p t)``, the derivative of `_sum` by the pole, shape (K,)."""
+    def _transform_of_growing_decay(self, pole: complex) -> NDArray[np.complex128]:
+        """Return the discrete Fourier transform of ``t exp(p t)`` over the samples, shape (K,)."""
         step_factor = np.exp(pole * self._period_s) * self._sample_rotation
         end_value = np.exp(pole * self._duration_s)
         reciprocal = np.reciprocal(1 - step_factor)
@@ -267,8 +267,8 @@ class LaterDecaySpectra(DecaySpectra):
         self._tick_rotation = np.exp(-1j * omega_rad_s * tick_s)
         self._first_tick_factor = tick_s / self._period_s * np.exp(-1j * omega_rad_s * first_s)
 
-    def _sum(self, pole: complex) -> NDArray[np.complex128]:
-        """Return the sum of ``exp(p t)`` from the first tick, rotated to each bin, shape (K,)."""
+    def _transform_of_decay(self, pole: complex) -> NDArray[np.complex128]:
+        """Return the transform of ``exp(p t)`` from the first tick to the last sample, (K,)."""
         begin_denominator = 1 - np.exp(pole * self._tick_s) * self._tick_rotation
         end_denominator = 1 - np.exp(pole * self._period_s) * self._sample_rotation
         spectrum: NDArray[np.complex128] = (
@@ -277,8 +277,8 @@ class LaterDecaySpectra(DecaySpectra):
         )
         return spectrum
 
-    def _sum_of_time(self, pole: complex) -> NDArray[np.complex128]:
-        """Return the sum of ``t exp(p t)`` from the first tick, rotated to each bin, shape (K,)."""
+    def _transform_of_growing_decay(self, pole: complex) -> NDArray[np.complex128]:
+        """Return the transform of ``t exp(p t)`` from the first tick to the last sample, (K,)."""
         tick_factor = np.exp(pole * self._tick_s) * self._tick_rotation
         step_factor = np.exp(pole * self._period_s) * self._sample_rotation
         end_value = np.exp(pole * self._duration_s)

@@ -322,7 +322,7 @@ class Headline(Estimates):
 def headline(
     candidate_set: CandidateSet,
     orders: tuple[OrderVerdict, OrderVerdict],
-    visible: tuple[int, ...],
+    visible_numbers: tuple[int, ...],
     *,
     unexplained: str | None,
 ) -> Headline:
@@ -334,13 +334,13 @@ def headline(
         Candidates of the record.
     orders : tuple of OrderVerdict
         Verdicts on alpha and lambda.
-    visible : tuple of int
+    visible_numbers : tuple of int
         Numbers of the visible modes.
     unexplained : str or None
         Reason against every number. None if the residual is noise only.
     """
     freest = candidate_set.freest
-    fractional = frozenset(each.order for each in orders if each.status == "fractional")
+    fractional_orders = frozenset(each.order for each in orders if each.status == "fractional")
     reasons: dict[str, str] = {
         each.order: each.reason for each in orders if each.reason is not None
     }
@@ -350,7 +350,7 @@ def headline(
         if each.profile.is_computed and each.order in freest.structure.free
     }
     result = of_fit(
-        freest.name, freest.fit, visible, reasons, intervals, unexplained,
+        freest.name, freest.fit, visible_numbers, reasons, intervals, unexplained,
         candidate_set.with_both_dampings(freest),
     )  # fmt: skip
     if candidate_set.drag is not None:
@@ -367,17 +367,19 @@ def headline(
             drag_speed_m_s=drag.speed_m_s,
         )
     conditional_estimate = (
-        _conditional_estimate(candidate_set, fractional) if unexplained is None else None
+        _conditional_estimate(candidate_set, fractional_orders) if unexplained is None else None
     )
     return replace(
-        result, structures=structures(candidate_set, fractional), simpler=conditional_estimate
+        result,
+        structures=structures(candidate_set, fractional_orders),
+        simpler=conditional_estimate,
     )
 
 
 def of_fit(
     name: str,
     fit: RecordFit,
-    visible: Collection[int],
+    visible_numbers: Collection[int],
     reasons: Mapping[str, str] = _EMPTY_MAPPING,
     intervals: Mapping[str, tuple[float, float]] = _EMPTY_MAPPING,
     unexplained: str | None = None,
@@ -391,7 +393,7 @@ def of_fit(
         Name of the structure in tables.
     fit : RecordFit
         Fit whose parameters are reported.
-    visible : collection of int
+    visible_numbers : collection of int
         Numbers of the modes that the record shows.
     reasons : mapping of str to str
         Reasons against "alpha" or "lambda", which also apply to the coefficients.
@@ -403,7 +405,7 @@ def of_fit(
         Result of `CandidateSet.with_both_dampings`: the fit with both dampings, for the modes.
     """
     with_both, uses_both = both or (fit, False)
-    damping_reason = ONE_MODE_REASON if len(visible) < _MODES_TO_SEPARATE_DAMPINGS else None
+    damping_reason = ONE_MODE_REASON if len(visible_numbers) < _MODES_TO_SEPARATE_DAMPINGS else None
     if ANOTHER_DAMPING in reasons.values():
         damping_reason = ANOTHER_DAMPING
     flags: dict[str, str] = {
@@ -434,7 +436,7 @@ def of_fit(
             if size is not None
         ),
         modes=tuple(
-            _reported_mode(mode, visible, unexplained)
+            _reported_mode(mode, visible_numbers, unexplained)
             for mode in (
                 _modes_with_wider_uncertainty(fit, with_both) if uses_both else with_both.modes
             )
@@ -448,30 +450,30 @@ def of_fit(
 
 
 def structures(
-    candidate_set: CandidateSet, fractional: frozenset[str]
+    candidate_set: CandidateSet, fractional_orders: frozenset[str]
 ) -> tuple[tuple[str, StructureStatus], ...]:
     """Return name and status of every structure: which ones the record excludes.
 
     A special case of the freest structure is excluded by the likelihood ratio. Any other structure
     is excluded if its likelihood is lower by as much and its BIC exceeds the lowest BIC by 10. A
     structure that explains the record with unnecessary parameters is not excluded. A structure that
-    fixes an order at 1 is excluded if the order is in `fractional`.
+    fixes an order at 1 is excluded if the order is in `fractional_orders`.
 
     Parameters
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    fractional : frozenset of str
+    fractional_orders : frozenset of str
         Orders for which the record excludes 1.
     """
     return tuple(
-        (each.name, _structure_status(candidate_set, each, fractional))
+        (each.name, _structure_status(candidate_set, each, fractional_orders))
         for each in candidate_set.candidates
     )
 
 
 def _structure_status(
-    candidate_set: CandidateSet, candidate: Candidate, fractional: frozenset[str]
+    candidate_set: CandidateSet, candidate: Candidate, fractional_orders: frozenset[str]
 ) -> StructureStatus:
     """Return whether the structure of a candidate is selected, compatible or excluded."""
     freest = candidate_set.freest
@@ -484,7 +486,7 @@ def _structure_status(
         return "excluded" if is_less_likely and has_worse_bic else "compatible"
     if any(
         candidate.structure.fixed.get(order) == 1.0  # type: ignore[call-overload]
-        for order in fractional
+        for order in fractional_orders
     ):
         return "excluded"
     missing_parameters = freest.parameters - candidate.parameters
@@ -493,7 +495,7 @@ def _structure_status(
 
 
 def _conditional_estimate(
-    candidate_set: CandidateSet, fractional: frozenset[str]
+    candidate_set: CandidateSet, fractional_orders: frozenset[str]
 ) -> ConditionalEstimate | None:
     """Return the estimates of the simplest compatible structure, or None if there is none."""
     freest = candidate_set.freest
@@ -501,7 +503,7 @@ def _conditional_estimate(
         each
         for each in candidate_set.candidates
         if each.parameters < freest.parameters
-        and _structure_status(candidate_set, each, fractional) == "compatible"
+        and _structure_status(candidate_set, each, fractional_orders) == "compatible"
     ]
     if not compatible_candidates:
         return None
@@ -572,10 +574,10 @@ def _modes_with_wider_uncertainty(fit: RecordFit, with_both: RecordFit) -> Itera
 
 
 def _reported_mode(
-    mode: ModeEstimate, visible: Collection[int], reason: str | None
+    mode: ModeEstimate, visible_numbers: Collection[int], reason: str | None
 ) -> ReportedMode:
     """Return the reported frequency and damping ratio of a mode, flagged if it is not visible."""
-    is_visible = mode.number in visible
+    is_visible = mode.number in visible_numbers
     if reason is None and not is_visible:
         reason = "computed from the model: the record does not show this mode"
     return ReportedMode(

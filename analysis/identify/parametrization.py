@@ -198,7 +198,7 @@ class Unknowns:
 
     def plant(self, x: NDArray[np.float64]) -> Plant:
         """Return the plant that a vector of unknowns describes."""
-        return self._plant_of(self._values(x)[0])
+        return self._plant_of(self._values_and_derivatives(x)[0])
 
     def plant_and_gradient(self, x: NDArray[np.float64]) -> tuple[Plant, NDArray[np.float64]]:
         """Return the plant for a vector of unknowns, and the derivatives of its parameters.
@@ -206,7 +206,7 @@ class Unknowns:
         The derivatives have the shape (k, k): [parameter, unknown]. The parameters are
         `gradient_names`, where zeta and gamma are not logarithms.
         """
-        values, derivative = self._values(x)
+        values, derivative = self._values_and_derivatives(x)
         for index, name in enumerate(self.names):
             if name in ("zeta", "gamma"):
                 derivative[index] *= values[name]
@@ -261,10 +261,12 @@ class Unknowns:
 
         The indices are [parameter, unknown]. Parameters in `LOGARITHMIC` count as logarithms.
         """
-        derivative: NDArray[np.float64] = self._values(x)[1]
+        derivative: NDArray[np.float64] = self._values_and_derivatives(x)[1]
         return derivative
 
-    def _values(self, x: NDArray[np.float64]) -> tuple[dict[str, float], NDArray[np.float64]]:
+    def _values_and_derivatives(
+        self, x: NDArray[np.float64]
+    ) -> tuple[dict[str, float], NDArray[np.float64]]:
         """Return all parameters for a vector of unknowns, and `estimates_by_unknowns`."""
         indices = self._indices
         unknown_values: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))

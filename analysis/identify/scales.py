@@ -143,7 +143,7 @@ class DensityCheck:
 
     @property
     def agree(self) -> bool:
-        """Return whether both values differ by no more than the 95 % limit of chance."""
+        """Return whether estimated and stated mass per length agree within the 95 % limit."""
         difference = abs(self.found_kg_per_m - self.stated_kg_per_m)
         return difference <= NORMAL_95 * math.hypot(
             self.found_std_kg_per_m, self.stated_std_kg_per_m

@@ -109,8 +109,8 @@ def _damping_sentences(headline: Headline, orders: tuple[OrderVerdict, OrderVerd
     if headline.tolerant is not None:
         excluded = headline.structures_with_status("excluded")
         return [f"Excluded by the losses: {_list_structures(excluded)}."] if excluded else []
-    free = headline.fit.structure
-    dampings = _DAMPING_PHRASES[free.name]
+    structure = headline.fit.structure
+    dampings = _DAMPING_PHRASES[structure.name]
     if any(each.reason == ANOTHER_DAMPING for each in orders):
         dampings = dampings.replace("only", "alone would do")
     sentences = [f"{dampings}. Numbers are those of type {headline.name}, all orders free."]
@@ -191,13 +191,13 @@ def slope_of_loss(
 
 def _exact_order_sentences(headline: Headline) -> list[str]:
     """Return the sentence on the orders if the beam is exactly uniform, or no sentence."""
-    exact = headline.exact
-    if exact is None:
+    exact_estimates = headline.exact
+    if exact_estimates is None:
         return []
     numbers = [
-        f"{name} = {_value_and_interval_text(exact.parameters[name])}"
+        f"{name} = {_value_and_interval_text(exact_estimates.parameters[name])}"
         for name in ("alpha", "lambda")
-        if name in exact.parameters and exact.parameters[name].flag is None
+        if name in exact_estimates.parameters and exact_estimates.parameters[name].flag is None
     ]
     if not numbers:
         return []
@@ -309,9 +309,9 @@ _MODE_ORDINALS: Final = {1: "first", 2: "second"}
 def experiments(
     candidate_set: CandidateSet,
     orders: tuple[OrderVerdict, ...],
-    visible: tuple[int, ...],
-    found: tuple[Finding, ...],
-    close: tuple[Candidate, ...],
+    visible_numbers: tuple[int, ...],
+    findings: tuple[Finding, ...],
+    close_rivals: tuple[Candidate, ...],
 ) -> list[str]:
     """Return experiments that would clarify the verdict, besides the findings' remedies.
 
@@ -321,20 +321,21 @@ def experiments(
         Candidates of the record.
     orders : tuple of OrderVerdict
         Verdicts on alpha and lambda.
-    visible : tuple of int
+    visible_numbers : tuple of int
         Numbers of the visible modes.
-    found : tuple of Finding
+    findings : tuple of Finding
         Findings on the record.
-    close : tuple of Candidate
+    close_rivals : tuple of Candidate
         Candidates that explain the record about as well as the selected one.
     """
     advice = []
     unidentifiable = [o for o in orders if o.status == "not identifiable"]
     if unidentifiable:
         order_names = " and ".join(o.order for o in unidentifiable)
-        if len(visible) < _MIN_MODES_FOR_AN_ORDER:
+        if len(visible_numbers) < _MIN_MODES_FOR_AN_ORDER:
             advice.append(
-                f"To determine {order_names}, {_advice_for_two_modes(candidate_set, visible)}"
+                f"To determine {order_names}, "
+                f"{_advice_for_two_modes(candidate_set, visible_numbers)}"
             )
         else:
             advice.append(
@@ -342,20 +343,20 @@ def experiments(
                 "wider sweep "
                 "that reaches one more mode."
             )
-    unexplained = any(finding.kind == "unexplained" for finding in found)
-    if close or (not unexplained and any(o.status == "open" for o in orders)):
+    unexplained = any(finding.kind == "unexplained" for finding in findings)
+    if close_rivals or (not unexplained and any(o.status == "open" for o in orders)):
         advice.append(
             "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
         )
     return advice
 
 
-def _advice_for_two_modes(candidate_set: CandidateSet, visible: tuple[int, ...]) -> str:
+def _advice_for_two_modes(candidate_set: CandidateSet, visible_numbers: tuple[int, ...]) -> str:
     """Return the advice, as part of a sentence, how to make both of the first two modes visible."""
     modes = {mode.number: mode.frequency_hz for mode in candidate_set.best.fit.modes}
     first_hz = modes.get(1, 0.0)
     at_hz = {1: first_hz, 2: modes.get(2, _SECOND_OVER_FIRST_FREQUENCY * first_hz)}
-    missing_mode = next(number for number in (1, 2) if number not in visible)
+    missing_mode = next(number for number in (1, 2) if number not in visible_numbers)
     other_mode = 3 - missing_mode
     last_hz = float(candidate_set.comparison.frequency_hz[-1])
     if at_hz[missing_mode] > last_hz:

@@ -280,13 +280,13 @@ class ConstantsProblem:
             internal = zeta * np.exp(alpha * log_s) * terms.stiffness
             external = gamma * np.exp(lambda_ * log_s)
             inertia = ratio * s * s
-            derivative = (alpha * internal + lambda_ * external) / s + 2 * ratio * s * mass
+            impedance_slope = (alpha * internal + lambda_ * external) / s + 2 * ratio * s * mass
             impedance = static_stiffness + internal + inertia * mass + external
             if relaxation_strength:
                 relaxed = relaxation_strength * time_s / (1 + time_s * s) * terms.stiffness
                 impedance = impedance + relaxed * s
-                derivative = derivative + relaxed / (1 + time_s * s)
-            step = impedance / derivative
+                impedance_slope = impedance_slope + relaxed / (1 + time_s * s)
+            step = impedance / impedance_slope
             s = s - step
             if np.abs(step).max() < _POLE_TOLERANCE * np.abs(s).max():
                 break
@@ -298,7 +298,7 @@ class ConstantsProblem:
         modal_force = inertia * (lever_arm + rotation)
         modal_force = modal_force + external * terms.medium_arm + ratio * terms.tension_arm
         volume = self.nominal.beam.length_m**3
-        log_residues = np.log(1j * volume * modal_force**2 / derivative * channel) + stiffness
+        log_residues = np.log(1j * volume * modal_force**2 / impedance_slope * channel) + stiffness
         constant_rows = (
             np.log(s.imag / (2 * np.pi)),
             np.log(-s.real / np.abs(s)),
@@ -340,9 +340,9 @@ class ConstantsProblem:
         )
 
     def starts(self) -> list[NDArray[np.float64]]:
-        """Return one start vector for each pair of orders in `_START_ORDERS`.
+        """Return the start vectors of the descents, one for each pair of orders in `_START_ORDERS`.
 
-        Its losses are those that best fit the measured damping ratios.
+        The losses of each are those that best fit the measured damping ratios.
         """
         omega, first_omega, last_omega = (
             self._omega_rad_s,
@@ -665,12 +665,12 @@ def tolerant_estimate(
         problem = ConstantsProblem(fit, modes, nominal, _LOOSE_TOLERANCE, tilt_deg)
         minima = problem.minima()
     best_minimum = minima[0]
-    rises = {
+    deviances = {
         order: problem.minimize_with_fixed(PARAMETERS.index(order), 1.0, best_minimum.x).cost
         - best_minimum.cost
         for order in orders_without_one
     }
-    return replace(estimate, deviance_of_one=estimate.deviance_of_one | rises)
+    return replace(estimate, deviance_of_one=estimate.deviance_of_one | deviances)
 
 
 def _count_idle_unknowns(problem: ConstantsProblem, minimum: Minimum) -> int:

@@ -90,7 +90,7 @@ class OrderVerdict:
 def order_verdict(
     candidate_set: CandidateSet,
     profile: LikelihoodProfile,
-    visible: tuple[int, ...],
+    visible_numbers: tuple[int, ...],
     *,
     doubt: str | None,
 ) -> OrderVerdict:
@@ -102,12 +102,12 @@ def order_verdict(
         Candidates of the record.
     profile : LikelihoodProfile
         Profile of the order on the selected beam.
-    visible : tuple of int
+    visible_numbers : tuple of int
         Numbers of the visible modes.
     doubt : str or None
         Reason against the structure. None if it is valid.
     """
-    status, reason = _order_status(candidate_set, profile, visible, doubt=doubt)
+    status, reason = _order_status(candidate_set, profile, visible_numbers, doubt=doubt)
     is_reported = status not in ("not identifiable", "absent")
     return OrderVerdict(
         order=profile.order,
@@ -119,34 +119,36 @@ def order_verdict(
     )
 
 
-def not_reported_reason(candidate_set: CandidateSet, visible: tuple[int, ...]) -> str | None:
+def not_reported_reason(
+    candidate_set: CandidateSet, visible_numbers: tuple[int, ...]
+) -> str | None:
     """Return why a record cannot determine any order, or None if it may.
 
     Parameters
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    visible : tuple of int
+    visible_numbers : tuple of int
         Numbers of the visible modes.
     """
-    return too_few_modes(candidate_set.freest.structure, len(visible))
+    return too_few_modes(candidate_set.freest.structure, len(visible_numbers))
 
 
-def too_few_modes(structure: Structure, modes: int) -> str | None:
+def too_few_modes(structure: Structure, mode_count: int) -> str | None:
     """Return why a number of visible modes cannot determine an order, or None if it can.
 
     Parameters
     ----------
     structure : Structure
         Freest structure that the data support.
-    modes : int
+    mode_count : int
         Number of visible modes.
     """
     # One mode shows the loss at one frequency only. Its order could follow only from the assumption
     # that the beam is exactly uniform.
-    if modes < _MIN_MODES_FOR_AN_ORDER:
+    if mode_count < _MIN_MODES_FOR_AN_ORDER:
         return "a single mode determines the amount of damping, not its order"
-    if structure.internal != structure.external and modes < _MIN_MODES_FOR_A_SINGLE_DAMPING:
+    if structure.internal != structure.external and mode_count < _MIN_MODES_FOR_A_SINGLE_DAMPING:
         return ANOTHER_DAMPING
     return None
 
@@ -165,13 +167,13 @@ def deviance_of_one(profile: LikelihoodProfile) -> float:
 def _order_status(
     candidate_set: CandidateSet,
     profile: LikelihoodProfile,
-    visible: tuple[int, ...],
+    visible_numbers: tuple[int, ...],
     *,
     doubt: str | None,
 ) -> tuple[Status, str | None]:
     """Return the status of an order, and the reason against it or None."""
     freest, order = candidate_set.freest, profile.order
-    reason = not_reported_reason(candidate_set, visible)
+    reason = not_reported_reason(candidate_set, visible_numbers)
     if reason is not None:
         return "not identifiable", reason
     if not freest.structure.has(order):
@@ -278,17 +280,17 @@ class Verdict:
         return document
 
 
-def rivals(candidate_set: CandidateSet, within: float) -> tuple[Candidate, ...]:
+def rivals(candidate_set: CandidateSet, max_bic_difference: float) -> tuple[Candidate, ...]:
     """Return the candidates whose BIC exceeds the lowest one by less than a limit.
 
     Parameters
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    within : float
+    max_bic_difference : float
         Limit of the difference of BIC.
     """
-    limit = candidate_set.best.bic + within
+    limit = candidate_set.best.bic + max_bic_difference
     return tuple(c for c in candidate_set.candidates[1:] if c.bic < limit)
 
 

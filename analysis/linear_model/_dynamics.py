@@ -37,10 +37,11 @@ _MAX_BEAM_MODES: Final = 40
 _MAX_OSCILLATING_DAMPING_RATIO: Final = 0.8
 """Damping ratio from which a mode beyond the band is represented by real poles."""
 _RESIDUAL_FREQUENCY_RATIOS: Final = (1.5, 2.2, 3.3, 5.0)
-"""Frequencies of the pairs for the background of a modal model, relative to the end of the band."""
+"""Frequencies of the pole pairs that represent the background of a modal model, relative to the end
+of the band."""
 
 _RESIDUAL_DAMPING_RATIO: Final = 0.5
-"""Damping ratio of these pairs."""
+"""Damping ratio of the pole pairs that represent the background of a modal model."""
 
 _BUTTERWORTH_COEFFICIENT: Final = 2**0.5
 """Coefficient of s in the denominator of a second-order Butterworth filter."""

@@ -110,7 +110,7 @@ class Accuracy:
 
     @property
     def error_median(self) -> float:
-        """Median of the relative error over the frequencies."""
+        """Median relative error of the realisation over the frequencies."""
         return float(np.median(self.error))
 
     @property

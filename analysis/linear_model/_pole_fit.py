@@ -43,20 +43,22 @@ _OUTPUT_SIGNAL: Final = SignalNames(("coupling_torque",), ("N.m",))
 """Name and unit of the output."""
 
 _FIT_POINTS: Final = (200, 10)
-"""Number of frequencies over the band, and at each pole and zero, in a fit."""
+"""Number of frequencies over the band, and at each pole and zero, to which the response is
+fitted."""
 
 _CHECK_POINTS: Final = (1200, 34)
-"""Number of frequencies over the band, and at each pole and zero, in the check of a fit."""
+"""Number of frequencies over the band, and at each pole and zero, at which the error of a fit is
+checked."""
 _BAND_MARGIN_FACTOR: Final = 1.1
 """Factor by which the fitted frequencies exceed the band on either side."""
 
 _TAIL_FACTORS: Final = (500.0, 10.0)
-"""Factors by which frequencies with little weight extend below and above the band."""
+"""Factors by which the frequencies with little weight extend below and above the band."""
 _TAIL_POINTS: Final = 25
-"""Number of frequencies in each of these tails."""
+"""Number of frequencies with little weight on either side of the band."""
 
 _TAIL_WEIGHT: Final = 1e-5
-"""Weight of the relative error in the tails."""
+"""Weight of the relative error at frequencies outside of the band."""
 
 _MIN_RELATIVE_DISTANCE: Final = 3e-7
 """Relative distance from a pole or zero below which a relative error has no meaning."""
@@ -213,7 +215,7 @@ class PoleFit:
     def is_stable_on_motor(
         self, structure: PoleStructure, coefficients: NDArray[np.float64]
     ) -> bool:
-        """Return whether a frictionless motor, as heavy as the beam, is stable with the model.
+        """Return whether a frictionless motor with the beam's inertia is stable with the model.
 
         Parameters
         ----------
