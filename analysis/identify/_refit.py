@@ -154,7 +154,7 @@ class Refit:
 
     @property
     def plant(self) -> Plant:
-        """Return the fitted plant."""
+        """Return the rig and beam with the fitted parameters."""
         return self.objective.unknowns.plant(self.x)
 
     def amplitudes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -166,7 +166,7 @@ class CoarseResponse:
         )
 
     def _mean_square(self, deviation: NDArray[np.complex128]) -> float:
-        """Return the weighted mean square of a deviation of the response."""
+        """Return the weighted mean square of differences of the response, in (N·m/rad)²."""
         return float(self._weights @ (deviation.real**2 + deviation.imag**2))
 
 
@@ -248,7 +248,7 @@ class Descent:
 
     @property
     def plant(self) -> Plant:
-        """Return the plant at the current point of the descent."""
+        """Return rig and beam at the current point of the descent."""
         return self.objective.unknowns.plant(self.x)
 
     def to_minimum(

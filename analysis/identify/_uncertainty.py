@@ -42,7 +42,7 @@ _MAX_LN_PIVOT_FREQUENCY: Final = 50.0
 
 
 def covariance_of_unknowns(
-    jacobian: NDArray[np.complex128], scatter: float, held: NDArray[np.bool_]
+    jacobian: NDArray[np.complex128], scatter: float, at_bound: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the covariance of those unknowns that the data determine.
 
@@ -52,7 +52,7 @@ def covariance_of_unknowns(
         Derivatives of the whitened residual by the unknowns.
     scatter : float
         Variance of real and imaginary parts of the whitened residual.
-    held : ndarray of bool, shape (k,)
+    at_bound : ndarray of bool, shape (k,)
         True for unknowns at a bound.
 
     Returns
@@ -64,7 +64,7 @@ def covariance_of_unknowns(
     """
     hessian = (jacobian.conj() @ jacobian.T).real
     scale = np.sqrt(np.diag(hessian))
-    determined = ~held & (scale > 0) & np.isfinite(scale)
+    determined = ~at_bound & (scale > 0) & np.isfinite(scale)
     covariance = np.zeros_like(hessian)
     if not determined.any():
         return covariance, determined
@@ -93,9 +93,9 @@ class ParameterUncertainty:
 def parameter_uncertainty(
     unknowns: Unknowns,
     x: NDArray[np.float64],
-    held: NDArray[np.bool_],
+    at_bound: NDArray[np.bool_],
     of_unknowns: NDArray[np.float64],
-    known: NDArray[np.bool_],
+    is_determined: NDArray[np.bool_],
 ) -> ParameterUncertainty:
     """Propagate the covariance of the unknowns to the plant parameters.
 
@@ -105,20 +105,24 @@ def parameter_uncertainty(
         Unknowns of the fitted structure.
     x : ndarray, shape (k,)
         Unknowns at the minimum.
-    held : ndarray of bool, shape (k,)
+    at_bound : ndarray of bool, shape (k,)
         True for unknowns that rest on a bound at the minimum.
     of_unknowns : ndarray, shape (k, k)
         Covariance of the unknowns, 0 in rows and columns of those that are not determined.
-    known : ndarray of bool, shape (k,)
+    is_determined : ndarray of bool, shape (k,)
         True for unknowns that the data determine.
     """
     derivatives = unknowns.estimates_by_unknowns(x)
     parameter_covariance = derivatives @ of_unknowns @ derivatives.T
     names, values = unknowns.names, unknowns.parameters(x)
     logarithmic = np.array([name in LOGARITHMIC for name in names])
-    known = known & ~(logarithmic & (np.diag(parameter_covariance) > _UNDETERMINED_LN_STD**2))
-    covariance = parameter_covariance[np.ix_(known, known)]
-    determined = tuple(name for name, is_known in zip(names, known, strict=True) if is_known)
+    is_determined = is_determined & ~(
+        logarithmic & (np.diag(parameter_covariance) > _UNDETERMINED_LN_STD**2)
+    )
+    covariance = parameter_covariance[np.ix_(is_determined, is_determined)]
+    determined = tuple(
+        name for name, is_known in zip(names, is_determined, strict=True) if is_known
+    )
     std: dict[str, float | None] = dict.fromkeys(values, 0.0) | dict.fromkeys(names, None)
     intervals: dict[str, tuple[float, float] | None] = dict.fromkeys(names, None)
     for name, spread in zip(determined, np.sqrt(np.diag(covariance)).tolist(), strict=True):
@@ -130,7 +134,7 @@ def parameter_uncertainty(
         interval=intervals,
         determined=determined,
         covariance=covariance,
-        at_bounds=tuple(name for name, is_held in zip(names, held, strict=True) if is_held),
+        at_bounds=tuple(name for name, is_held in zip(names, at_bound, strict=True) if is_held),
         internal=damping_size("zeta", "alpha", values, determined, covariance, first_omega_rad_s),
         external=damping_size("gamma", "lambda", values, determined, covariance, first_omega_rad_s),
     )

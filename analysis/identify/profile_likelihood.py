@@ -139,15 +139,19 @@ class ProfileWithPlants:
 
 
 def profile(
-    candidate_set: CandidateSet, candidate: Candidate, order: Order, *, elsewhere: bool = True
+    candidate_set: CandidateSet,
+    candidate: Candidate,
+    order: Order,
+    *,
+    search_other_minima: bool = True,
 ) -> ProfileWithPlants:
     """Compute the profile likelihood of one order of a candidate.
 
     The order is varied from the minimum in both directions until the record excludes the values
     beyond. It is freed in the structure of `candidate`, if it is not free. Each refit starts on the
     tangent of the last one, and each step goes to the value at which a parabolic deviance would
-    reach the next level. If much of the range is admitted and `elsewhere` is set, the remaining
-    range is searched for another local minimum, from which the order is varied as well.
+    reach the next level. If much of the range is admitted and `search_other_minima` is set, the
+    remaining range is searched for another local minimum, from which the order is varied as well.
 
     Parameters
     ----------
@@ -157,13 +161,13 @@ def profile(
         Candidate at whose fit the profile begins.
     order : {"alpha", "lambda"}
         Order that is fixed at each value.
-    elsewhere : bool
+    search_other_minima : bool
         Whether to search for further local minima.
     """
     profiler = OrderProfiler(candidate_set, candidate, order)
     profiler.extend_both_ways()
     profiler.extend_from_candidates()
-    if elsewhere:
+    if search_other_minima:
         profiler.extend_from_other_minima()
     values, deviance = profiler.curve()
     minima = local_minima(values, deviance)
@@ -225,7 +229,9 @@ def profile_both_orders(
         freest = candidate_set.freest
         # The order of an insignificant damping is undetermined: no profile would help.
         profiles = {
-            order: profile(candidate_set, freest, order, elsewhere=order not in determined)
+            order: profile(
+                candidate_set, freest, order, search_other_minima=order not in determined
+            )
             for order in _BOTH_ORDERS
             if compute and freest.structure.has(order)
         }

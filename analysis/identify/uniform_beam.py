@@ -53,7 +53,7 @@ _ORDER_RANGE: Final = (0.02, 1.98)
 """Smallest and largest value of alpha and lambda in the search."""
 
 _LN_LOSS_RANGE: Final = (-18.0, 2.0)
-"""Range of ln loss: what a damping adds to stiffness or inertia, relatively, at its reference
+"""Range of the logarithm of a damping's loss, relative to stiffness or inertia at its reference
 mode."""
 
 _LN_BEAM_HALF_RANGE: Final = 2.0

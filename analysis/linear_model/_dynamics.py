@@ -115,7 +115,7 @@ class UncertainDynamics:
 
     Attributes
     ----------
-    at : callable
+    dynamics_of : callable
         Function from parameters by name to dynamics.
     names : tuple of str
         Names of the uncertain parameters. A name with ``ln_`` denotes a natural logarithm.
@@ -123,22 +123,22 @@ class UncertainDynamics:
         Estimates of the parameters.
     covariance : ndarray, shape (k, k)
         Covariance of the estimates.
-    allowed : callable
+    is_possible : callable
         Function that returns whether parameters are physically possible.
     """
 
-    at: Callable[[Mapping[str, float]], Dynamics]
+    dynamics_of: Callable[[Mapping[str, float]], Dynamics]
     names: tuple[str, ...] = ()
     values: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
-    allowed: Callable[[Mapping[str, float]], bool] = lambda _parameters: True
+    is_possible: Callable[[Mapping[str, float]], bool] = lambda _parameters: True
 
     @property
     def nominal(self) -> Dynamics:
         """Dynamics for the estimated values of the parameters."""
-        return self.at(self.named(self.values))
+        return self.dynamics_of(self.by_name(self.values))
 
-    def named(self, values: NDArray[np.float64]) -> dict[str, float]:
+    def by_name(self, values: NDArray[np.float64]) -> dict[str, float]:
         """Return parameter values as a dict by name.
 
         Parameters

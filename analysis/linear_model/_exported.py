@@ -310,7 +310,7 @@ def _relative_std(uncertain: UncertainDynamics, s: NDArray[np.complex128]) -> ND
 
     def response(values: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the exact response with filters and delay for given parameters."""
-        dynamics = uncertain.at(uncertain.named(values))
+        dynamics = uncertain.dynamics_of(uncertain.by_name(values))
         return dynamics.filtered(s) * np.exp(-dynamics.delay_s * s)
 
     variances, directions = np.linalg.eigh(uncertain.covariance)
@@ -369,11 +369,11 @@ def _dynamics_of_sample(
 
     Return None if they are impossible or need other states.
     """
-    parameters = uncertain.named(values)
-    if not uncertain.allowed(parameters):
+    parameters = uncertain.by_name(values)
+    if not uncertain.is_possible(parameters):
         return None
     try:
-        dynamics = uncertain.at(parameters)
+        dynamics = uncertain.dynamics_of(parameters)
     except LinearModelError:
         return None
     same_modes = dynamics.names[: structure.pairs] == nominal.names[: structure.pairs] and len(

@@ -201,11 +201,13 @@ class IdentifiedModel:
             )
         names, covariance = self.beam_covariance() or ((), np.zeros((0, 0)))
         for name in names:
-            plain = name.removeprefix(_LOGARITHM_PREFIX)
-            if plain not in values or (plain != name and values[plain] <= 0):
+            parameter_name = name.removeprefix(_LOGARITHM_PREFIX)
+            if parameter_name not in values or (
+                parameter_name != name and values[parameter_name] <= 0
+            ):
                 raise self._error("covariance.names", f"{name!r} has no such parameter")
 
-        def at(parameters: Mapping[str, float]) -> Mapping[str, float]:
+        def all_values(parameters: Mapping[str, float]) -> Mapping[str, float]:
             """Return all parameter values, with logarithms converted."""
             return values | {
                 name.removeprefix(_LOGARITHM_PREFIX): math.exp(min(value, 300.0))
@@ -215,7 +217,9 @@ class IdentifiedModel:
             }
 
         return UncertainDynamics(
-            lambda parameters: beam_dynamics(_plant_of_parameters(at(parameters), length_m)),
+            lambda parameters: beam_dynamics(
+                _plant_of_parameters(all_values(parameters), length_m)
+            ),
             names,
             np.array(
                 [
@@ -226,7 +230,7 @@ class IdentifiedModel:
                 ]
             ),
             covariance,
-            lambda parameters: _is_possible_beam(at(parameters)),
+            lambda parameters: _is_possible_beam(all_values(parameters)),
         )
 
     def modes(self) -> UncertainDynamics:
@@ -256,19 +260,19 @@ class IdentifiedModel:
         numbers_are_stated = isinstance(stated_modes, list) and len(stated_modes) == count
         numbers = stated_modes if numbers_are_stated else list(range(1, count + 1))
 
-        def at(parameters: Mapping[str, float]) -> ModalModel:
+        def modal_model_of(parameters: Mapping[str, float]) -> ModalModel:
             """Return the modal model with given values of its constants."""
             return with_changed_constants(
                 modal, {name: parameters[name] - nominal[name] for name in parameters}
             )
 
         return UncertainDynamics(
-            lambda parameters: modal_dynamics(at(parameters), band_hz, numbers),
+            lambda parameters: modal_dynamics(modal_model_of(parameters), band_hz, numbers),
             names,
             np.array(known_values),
             covariance,
             lambda parameters: all(
-                pole.real < 0 < pole.imag for pole in at(parameters).poles_rad_s
+                pole.real < 0 < pole.imag for pole in modal_model_of(parameters).poles_rad_s
             ),
         )
 
