@@ -54,8 +54,8 @@ if TYPE_CHECKING:
 Effect = Literal["damping", "stiffness", "gain", "clock", "play"]
 """Property that changes along the record, or "play" for backlash."""
 
-_SIMPLE_STRUCTURES: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
-"""Simple structures that may explain the record if one property changes along it."""
+_STRUCTURES_TO_TEST: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
+"""Structures that are tested with a change along the record, in addition to the best one."""
 
 _GRADIENT_PARAMETERS: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness")
 """Parameters by which the predicted torque is differentiated."""
@@ -172,10 +172,10 @@ def _has_possible_size(change: TemporalChange) -> bool:
 
 
 def _candidates_to_test(candidate_set: CandidateSet) -> Iterator[Candidate]:
-    """Yield the best candidate, then the simple ones that a change may make the best."""
+    """Yield the candidates that are tested with a change along the record, the best one first."""
     yield candidate_set.best
     for candidate in candidate_set.candidates[1:]:
-        if candidate.structure in _SIMPLE_STRUCTURES:
+        if candidate.structure in _STRUCTURES_TO_TEST:
             yield candidate
 
 
