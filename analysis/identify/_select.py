@@ -594,10 +594,12 @@ def _unidentifiable_orders(
     reason = not_reported_reason(candidate_set, visible_numbers)
     reasons = {}
     for name in COEFFICIENT_OF.keys() & set(freest.structure.free):
-        low, high = freest.fit.interval[name] or (-math.inf, math.inf)
-        interval_too_wide = high - low > WIDEST_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
+        lower_end, upper_end = freest.fit.interval[name] or (-math.inf, math.inf)
+        interval_too_wide = upper_end - lower_end > WIDEST_FRACTION * (
+            ORDER_RANGE[1] - ORDER_RANGE[0]
+        )
         # A narrow interval without 1, although order 1 fits as well, is that of a local minimum.
-        at_local_minimum = not low <= 1 <= high and any(
+        at_local_minimum = not lower_end <= 1 <= upper_end and any(
             each.structure.fixed.get(name) == 1.0  # type: ignore[call-overload]
             and each.deviance - freest.deviance < NORMAL_95**2
             for each in other_candidates

@@ -129,23 +129,28 @@ def along_time(
     """
     if candidate_set.misread:
         return candidate_set, ()
-    lag = _play_angle(candidate_set.comparison)
+    play_angle = _play_angle(candidate_set.comparison)
     highest_bic = candidate_set.best.bic + min(
         BIC_DECISIVE, _RIVAL_BIC_FRACTION * (rival_bic - candidate_set.bic)
     )
     fitted_changes: dict[Effect, tuple[float, Refit]] = {}
     for candidate in _candidates_to_test(candidate_set):
-        for what, predicted_bic in _promising_changes(candidate_set, candidate, lag, highest_bic):
-            if predicted_bic < fitted_changes.get(what, (math.inf,))[0]:
-                refit, bic = _fit_with_change(candidate_set, candidate, what, lag)
-                if bic < fitted_changes.get(what, (math.inf,))[0]:
-                    fitted_changes[what] = (bic, refit)
+        for effect, predicted_bic in _promising_changes(
+            candidate_set, candidate, play_angle, highest_bic
+        ):
+            if predicted_bic < fitted_changes.get(effect, (math.inf,))[0]:
+                refit, bic = _fit_with_change(candidate_set, candidate, effect, play_angle)
+                if bic < fitted_changes.get(effect, (math.inf,))[0]:
+                    fitted_changes[effect] = (bic, refit)
     possible_changes = []
-    for what, (bic, refit) in fitted_changes.items():
+    for effect, (bic, refit) in fitted_changes.items():
         amplitudes, std = refit.amplitudes()
-        unit = _SIZE_UNITS.get(what, 1.0)
+        unit = _SIZE_UNITS.get(effect, 1.0)
         change = TemporalChange(
-            what, unit * float(amplitudes[-1]), unit * float(std[-1]), bic - candidate_set.best.bic
+            effect,
+            unit * float(amplitudes[-1]),
+            unit * float(std[-1]),
+            bic - candidate_set.best.bic,
         )
         if change.bic_difference < BIC_DECISIVE and _has_possible_size(change):
             possible_changes.append((change, refit))
@@ -180,32 +185,38 @@ def _candidates_to_test(candidate_set: CandidateSet) -> Iterator[Candidate]:
 
 
 def _promising_changes(
-    candidate_set: CandidateSet, candidate: Candidate, lag: NDArray[np.float64], highest_bic: float
+    candidate_set: CandidateSet,
+    candidate: Candidate,
+    play_angle: NDArray[np.float64],
+    highest_bic: float,
 ) -> Iterator[tuple[Effect, float]]:
     """Yield the changes that would make a candidate the best one, with their predicted BIC.
 
     A change must reduce the deviance significantly, and its BIC must be below `highest_bic`.
     """
     refit = candidate_set.refit(candidate, 1)
-    columns = _torque_spectra(candidate_set.comparison, candidate.fit.plant, lag)
+    columns = _torque_spectra(candidate_set.comparison, candidate.fit.plant, play_angle)
     reductions = refit.saved_by(np.array(list(columns.values())))
-    for what, reduction in zip(columns, reductions.tolist(), strict=True):
+    for effect, reduction in zip(columns, reductions.tolist(), strict=True):
         remaining_cost = max(refit.cost - reduction, 1e-3 * refit.cost)
         deviance_reduction = candidate.values * math.log(refit.cost / remaining_cost)
         bic = candidate.bic - deviance_reduction + math.log(candidate.values)
         if deviance_reduction > _MIN_DEVIANCE_REDUCTION and bic < highest_bic:
-            yield what, bic
+            yield effect, bic
 
 
 def _fit_with_change(
-    candidate_set: CandidateSet, candidate: Candidate, what: Effect, lag: NDArray[np.float64]
+    candidate_set: CandidateSet,
+    candidate: Candidate,
+    effect: Effect,
+    play_angle: NDArray[np.float64],
 ) -> tuple[Refit, float]:
     """Fit a candidate with one change along the record. Return the fit and its BIC."""
     refit = candidate_set.refit(candidate, 1)
     unknowns = refit.objective.unknowns
     size = 0.0
     for _ in range(_MAX_SIZE_FITS):
-        column = _torque_spectrum(candidate_set.comparison, refit.plant, lag, what, size)
+        column = _torque_spectrum(candidate_set.comparison, refit.plant, play_angle, effect, size)
         columns = np.concatenate([candidate_set.columns, column[None]])
         cost_before = refit.cost
         refit = Refit.descend(
@@ -225,12 +236,13 @@ def _fit_with_change(
 
 
 def _torque_spectra(
-    comparison: Comparison, plant: Plant, lag: NDArray[np.float64]
+    comparison: Comparison, plant: Plant, play_angle: NDArray[np.float64]
 ) -> dict[Effect, NDArray[np.complex128]]:
     """Return the torque spectrum of each effect per unit size, each of shape (K,)."""
     slopes = _torque_slopes(comparison, plant)
     return {
-        what: _torque_spectrum(comparison, plant, lag, what, 0.0, slopes) for what in _EFFECT_NAMES
+        effect: _torque_spectrum(comparison, plant, play_angle, effect, 0.0, slopes)
+        for effect in _EFFECT_NAMES
     }
 
 
@@ -249,8 +261,8 @@ def _torque_slopes(comparison: Comparison, plant: Plant) -> dict[Effect, NDArray
 def _torque_spectrum(
     comparison: Comparison,
     plant: Plant,
-    lag: NDArray[np.float64],
-    what: Effect,
+    play_angle: NDArray[np.float64],
+    effect: Effect,
     size: float,
     slopes: Mapping[Effect, NDArray[np.float64]] | None = None,
 ) -> NDArray[np.complex128]:
@@ -258,14 +270,14 @@ def _torque_spectrum(
 
     `slopes` is the result of `_torque_slopes`, if it is known already.
     """
-    if what == "play":
-        return comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
-    if what == "clock":
+    if effect == "play":
+        return comparison.spectrum(comparison.prediction.of_other(play_angle).torque(plant)[0])
+    if effect == "clock":
         return comparison.spectrum(_clock_torque(comparison, plant, size))
     ramp = np.linspace(-0.5, 0.5, comparison.samples)
-    change = ramp * (slopes or _torque_slopes(comparison, plant))[what]
-    if what != "gain":
-        change += memory_torque(comparison, plant, ramp, what, size)
+    change = ramp * (slopes or _torque_slopes(comparison, plant))[effect]
+    if effect != "gain":
+        change += memory_torque(comparison, plant, ramp, effect, size)
     return comparison.spectrum(change)
 
 
@@ -329,13 +341,13 @@ def memory_torque(
     comparison: Comparison,
     plant: Plant,
     change: NDArray[np.float64],
-    what: Literal["damping", "stiffness"],
+    effect: Literal["damping", "stiffness"],
     size: float = 0.0,
 ) -> NDArray[np.float64]:
     """Return the torque change by past values of a changing property, per unit size, (samples,).
 
     This is the torque beyond the instantaneous derivative. `change`, shape (samples,), is w at the
-    retained samples, constant before and after. For `what` of "stiffness" the mass is constant.
+    retained samples, constant before and after. For `effect` of "stiffness" the mass is constant.
     `size` is e.
     """
     n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
@@ -343,13 +355,13 @@ def memory_torque(
     sigma = _DECAY_EXPONENT * rate_hz / length
     s = sigma + 2j * np.pi * rate_hz / length * np.arange(length // 2 + 1)
     growth = np.exp(sigma * np.arange(n) / rate_hz)
-    retained = comparison.retained
-    w = np.interp(np.arange(n), np.arange(retained.start, retained.stop), change)
+    retained_samples = comparison.retained
+    w = np.interp(np.arange(n), np.arange(retained_samples.start, retained_samples.stop), change)
     damping, beam = plant.damping, plant.beam
     internal = damping.zeta * s**damping.alpha
     external = damping.gamma * s**damping.lambda_
     inertial = beam.density_over_stiffness * s * s + external
-    changing_factor = internal + 1 if what == "stiffness" else internal
+    changing_factor = internal + 1 if effect == "stiffness" else internal
     angle = np.fft.rfft(comparison.angle_rad / growth, length) * torque_channel(plant, s)
     total_torque = np.zeros(n)
 
@@ -389,7 +401,7 @@ def memory_torque(
             - w
             * in_time(external * (1 - rigid_response) * angle - rigid_response * constant_stress)
         )
-    return total_torque[retained]
+    return total_torque[retained_samples]
 
 
 # Findings
@@ -480,9 +492,9 @@ _TWO_WAY_SWEEP_ADVICE: Final = (
 def _established_finding(change: TemporalChange) -> Finding:
     """Return the finding that a change along the record is established."""
     half_width = NORMAL_95 * change.std
-    of_play = change.what == "play"
+    is_backlash = change.what == "play"
     remedy = f"S{_TWO_WAY_SWEEP_ADVICE}"
-    if of_play:
+    if is_backlash:
         remedy = "Remove the backlash in gear and clamp."
     elif change.what == "clock":
         remedy = f"Sample angle and torque by one clock, or s{_TWO_WAY_SWEEP_ADVICE}"
@@ -494,12 +506,12 @@ def _established_finding(change: TemporalChange) -> Finding:
             "It was fitted too"
             + (
                 ", to first order in its size."
-                if of_play
+                if is_backlash
                 else "; all parameters are those at the middle of the record."
             )
         ),
         value=change.size,
         interval=(change.size - half_width, change.size + half_width),
-        unit="rad" if of_play else "1",
+        unit="rad" if is_backlash else "1",
         remedy=remedy,
     )

@@ -94,7 +94,7 @@ def parameter_uncertainty(
     unknowns: Unknowns,
     x: NDArray[np.float64],
     at_bound: NDArray[np.bool_],
-    of_unknowns: NDArray[np.float64],
+    unknown_covariance: NDArray[np.float64],
     is_determined: NDArray[np.bool_],
 ) -> ParameterUncertainty:
     """Propagate the covariance of the unknowns to the plant parameters.
@@ -107,13 +107,13 @@ def parameter_uncertainty(
         Unknowns at the minimum.
     at_bound : ndarray of bool, shape (k,)
         True for unknowns that rest on a bound at the minimum.
-    of_unknowns : ndarray, shape (k, k)
+    unknown_covariance : ndarray, shape (k, k)
         Covariance of the unknowns, 0 in rows and columns of those that are not determined.
     is_determined : ndarray of bool, shape (k,)
         True for unknowns that the data determine.
     """
     derivatives = unknowns.estimates_by_unknowns(x)
-    parameter_covariance = derivatives @ of_unknowns @ derivatives.T
+    parameter_covariance = derivatives @ unknown_covariance @ derivatives.T
     names, values = unknowns.names, unknowns.parameters(x)
     logarithmic = np.array([name in LOGARITHMIC for name in names])
     is_determined = is_determined & ~(
@@ -148,10 +148,10 @@ def interval(name: str, value: float, std: float) -> tuple[float, float]:
 
     `std` is the standard deviation of the logarithm for parameters in `LOGARITHMIC`.
     """
-    half = NORMAL_95 * std
+    half_width = NORMAL_95 * std
     if name in LOGARITHMIC:
-        return value * math.exp(-half), value * math.exp(half)
-    return value - half, value + half
+        return value * math.exp(-half_width), value * math.exp(half_width)
+    return value - half_width, value + half_width
 
 
 def interval_from_zero(value: float, std: float) -> tuple[float, float]:
@@ -168,8 +168,8 @@ def interval_from_zero(value: float, std: float) -> tuple[float, float]:
     std : float
         Standard deviation without the bound at 0.
     """
-    half = NORMAL_95 * std
-    return max(value - half, 0.0), value + half
+    half_width = NORMAL_95 * std
+    return max(value - half_width, 0.0), value + half_width
 
 
 # Loss factor at its pivot frequency
@@ -251,10 +251,12 @@ def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[
             if other_poles
             else (p.conjugate(), dp.conj())
         )
-        natural = math.sqrt((p * q).real)
-        damping_ratio = -(p + q).real / (2 * natural)
-        natural_slope = (q * dp + p * dq).real / (2 * natural)
-        ratio_slope = -(dp + dq).real / (2 * natural) - damping_ratio * natural_slope / natural
+        natural_rad_s = math.sqrt((p * q).real)
+        damping_ratio = -(p + q).real / (2 * natural_rad_s)
+        natural_slope = (q * dp + p * dq).real / (2 * natural_rad_s)
+        ratio_slope = (
+            -(dp + dq).real / (2 * natural_rad_s) - damping_ratio * natural_slope / natural_rad_s
+        )
         frequency_slope = np.zeros(dp.size) if other_poles else dp.imag / (2 * np.pi)
         table.append(
             ModeEstimate(

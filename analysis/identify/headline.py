@@ -602,5 +602,7 @@ def symmetric(
     half_width : float
         Half width of the interval, in standard deviations.
     """
-    half = half_width * std
-    return ReportedValue(value, std, (value - half, value + half), reason)
+    interval_half_width = half_width * std
+    return ReportedValue(
+        value, std, (value - interval_half_width, value + interval_half_width), reason
+    )

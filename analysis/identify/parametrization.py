@@ -132,8 +132,8 @@ class Unknowns:
             "delay_s": (-largest_delay, largest_delay),
             "tool_inertia_kg_m2": (0.0, 1.0),
         }
-        low, high = zip(*(ranges[name] for name in self.names), strict=True)
-        return np.array(low), np.array(high)
+        lower_bounds, upper_bounds = zip(*(ranges[name] for name in self.names), strict=True)
+        return np.array(lower_bounds), np.array(upper_bounds)
 
     def start(self, sizes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the unknowns for given damping sizes, with nominal settings, shape (k,).

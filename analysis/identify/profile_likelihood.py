@@ -350,11 +350,11 @@ class OrderProfiler:
         self._refits: dict[float, Refit] = {}
         self._start_at(first_minimum)
 
-    def _start_at(self, bottom: Refit) -> None:
+    def _start_at(self, minimum: Refit) -> None:
         """Store a minimum with free order, and continue the profile from it."""
-        self._bottom = bottom
-        self._bottom_order = float(bottom.x[self._order_index])
-        self._store_lower(self._bottom_order, bottom)
+        self._minimum = minimum
+        self._minimum_order = float(minimum.x[self._order_index])
+        self._store_lower(self._minimum_order, minimum)
 
     def plant(self, value: float) -> Plant:
         """Return the plant that was fitted at a computed value of the order."""
@@ -383,9 +383,12 @@ class OrderProfiler:
             )
             if not is_special_case:
                 continue
-            (low, high), *_ = admitted_interval(*self.curve())
+            (lower_end, upper_end), *_ = admitted_interval(*self.curve())
             deviance = self._value_count * math.log(candidate.fit.cost / min(self.costs.values()))
-            if deviance < CHI_SQUARE_95 and not low <= candidate.fit.parameters[self.order] <= high:
+            if (
+                deviance < CHI_SQUARE_95
+                and not lower_end <= candidate.fit.parameters[self.order] <= upper_end
+            ):
                 start = self._unknowns.vector(candidate.fit.plant)
                 self._start_at(self._descend(start, _MAX_EVALUATIONS, hold=(self.order,)))
                 self.extend_both_ways()
@@ -395,15 +398,15 @@ class OrderProfiler:
 
         Extend the profile from each.
         """
-        (low, high), open_below, open_above = admitted_interval(*self.curve())
-        is_wide = high - low > _DOUBTFUL_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
+        (lower_end, upper_end), open_below, open_above = admitted_interval(*self.curve())
+        is_wide = upper_end - lower_end > _DOUBTFUL_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
         orders = values_outside_known(list(self.costs), ORDER_RANGE, _TRIAL_ORDER_SPACING)
         if not (is_wide or open_below or open_above) or not orders:
             return
         # Loss and order are separate unknowns: the loss stays constant as the order changes.
         trials = {}
         for value in orders:
-            start = self._bottom.x.copy()
+            start = self._minimum.x.copy()
             start[self._order_index] = value
             trials[value] = self._descend(start, _TRIAL_EVALUATIONS, hold=(self.order,))
         highest_cost = min(self.costs.values()) * math.exp(FAR_BEHIND / self._value_count)
@@ -429,12 +432,12 @@ class OrderProfiler:
 
         Then refine the value at which the deviance crosses the 95 % limit.
         """
-        low, high = ORDER_RANGE
-        value, distance, root = self._bottom_order, self._order_std(), 0.0
+        smallest_order, largest_order = ORDER_RANGE
+        value, distance, root = self._minimum_order, self._order_std(), 0.0
         inside_value, outside_value = value, None
-        while low < value < high and root**2 < _LAST_DEVIANCE:
+        while smallest_order < value < largest_order and root**2 < _LAST_DEVIANCE:
             nearest_refit = self._refits[value]
-            value = min(max(self._bottom_order + sign * distance, low), high)
+            value = min(max(self._minimum_order + sign * distance, smallest_order), largest_order)
             root = self._refit_at(value, nearest_refit)
             if root**2 < CHI_SQUARE_95:
                 inside_value, target_deviance = value, CHI_SQUARE_95
@@ -447,7 +450,7 @@ class OrderProfiler:
             distance *= min(max(growth, _MIN_DISTANCE_GROWTH), _MAX_DISTANCE_GROWTH)
         for _ in range(_MAX_LIMIT_REFITS if outside_value is not None else 0):
             assert outside_value is not None
-            if abs(inside_value - self._bottom_order) >= abs(outside_value - self._bottom_order):
+            if abs(inside_value - self._minimum_order) >= abs(outside_value - self._minimum_order):
                 break  # there is a barrier between
             inside_root, outside_root = (
                 self._deviance_root(inside_value),
@@ -465,11 +468,11 @@ class OrderProfiler:
 
     def _order_std(self) -> float:
         """Return the standard deviation of the order at the minimum, within 1e-4 to 0.25."""
-        (scaled_hessian, scale), index = self._bottom.equations.scaled_hessian(), self._order_index
+        (scaled_hessian, scale), index = self._minimum.equations.scaled_hessian(), self._order_index
         inverse = np.linalg.inv(scaled_hessian + 1e-12 * np.eye(scale.size))
         variance = inverse[index, index] / scale[index] ** 2
         std = (
-            math.sqrt(variance * self._bottom.cost / self._value_count)
+            math.sqrt(variance * self._minimum.cost / self._value_count)
             if variance > 0
             else _DEFAULT_ORDER_STD
         )
@@ -477,14 +480,14 @@ class OrderProfiler:
 
     def _deviance_root(self, value: float) -> float:
         """Return the square root of the deviance at a computed value of the order."""
-        lowest = self.costs[self._bottom_order]
+        lowest = self.costs[self._minimum_order]
         return math.sqrt(max(self._value_count * math.log(self.costs[value] / lowest), 0.0))
 
     def _refit_at(self, value: float, nearest_refit: Refit) -> float:
         """Fit all other parameters at a fixed order. Return the square root of the deviance."""
         hold, highest_cost = (
             (self.order,),
-            self.costs[self._bottom_order] * math.exp(FAR_BEHIND / self._value_count),
+            self.costs[self._minimum_order] * math.exp(FAR_BEHIND / self._value_count),
         )
         refit = self._descend(
             self._tangent(value, nearest_refit),
@@ -524,7 +527,7 @@ class OrderProfiler:
     def _without_damping(self) -> Refit:
         """Return the fit without the damping of this order, whose cost holds for any order."""
         coefficient = COEFFICIENT_OF[self.order]
-        start = self._bottom.x.copy()
+        start = self._minimum.x.copy()
         index = self._unknowns.names.index(coefficient)
         start[index] = self._unknowns.bounds[0][index]
         return self._descend(start, _MAX_EVALUATIONS, hold=(self.order, coefficient))
@@ -551,10 +554,10 @@ class OrderProfiler:
             hopeless=hopeless,
         )
 
-    def _tangent(self, value: float, near: Refit) -> NDArray[np.float64]:
+    def _tangent(self, value: float, nearest_refit: Refit) -> NDArray[np.float64]:
         """Extrapolate the optimal unknowns linearly to another value of the order, shape (k,)."""
-        x, index = near.x.copy(), self._order_index
-        scaled_hessian, scale = near.equations.scaled_hessian()
+        x, index = nearest_refit.x.copy(), self._order_index
+        scaled_hessian, scale = nearest_refit.equations.scaled_hessian()
         lower, upper = self._unknowns.bounds
         is_free = (x > lower) & (x < upper) & (np.arange(x.size) != index)
         free_hessian = scaled_hessian[np.ix_(is_free, is_free)] + 1e-9 * np.eye(int(is_free.sum()))
@@ -623,17 +626,17 @@ def admitted_interval(
     """
     inside_indices = np.flatnonzero(deviance <= CHI_SQUARE_95)
     first_inside, last_inside = int(inside_indices[0]), int(inside_indices[-1])
-    low = (
+    lower_end = (
         values[0]
         if first_inside == 0
         else _limit_crossing_between(values, deviance, first_inside, first_inside - 1)
     )
-    high = (
+    upper_end = (
         values[-1]
         if last_inside == values.size - 1
         else _limit_crossing_between(values, deviance, last_inside, last_inside + 1)
     )
-    return (float(low), float(high)), first_inside == 0, last_inside == values.size - 1
+    return (float(lower_end), float(upper_end)), first_inside == 0, last_inside == values.size - 1
 
 
 def limit_crossing(inside: float, outside: float, below: float, above: float) -> float:
@@ -648,8 +651,8 @@ def limit_crossing(inside: float, outside: float, below: float, above: float) ->
     below, above : float
         Deviances at these values.
     """
-    low, high = math.sqrt(max(below, 0.0)), math.sqrt(max(above, 0.0))
-    fraction = (math.sqrt(CHI_SQUARE_95) - low) / (high - low)
+    root_inside, root_outside = math.sqrt(max(below, 0.0)), math.sqrt(max(above, 0.0))
+    fraction = (math.sqrt(CHI_SQUARE_95) - root_inside) / (root_outside - root_inside)
     return inside + fraction * (outside - inside)
 
 
@@ -668,8 +671,12 @@ def values_outside_known(
         Distance between neighbouring values.
     """
     grid = np.arange(span[0] + spacing / 2, span[1], spacing).tolist()
-    low, high = min(known), max(known)
-    return [value for value in grid if value < low - spacing / 4 or value > high + spacing / 4]
+    smallest_known, largest_known = min(known), max(known)
+    return [
+        value
+        for value in grid
+        if value < smallest_known - spacing / 4 or value > largest_known + spacing / 4
+    ]
 
 
 def coarse_minima_values(curve: dict[float, float]) -> list[float]:

@@ -104,18 +104,19 @@ def _with_scale_uncertainty(
 ) -> ReportedValue:
     """Return a value whose 95 % interval includes the uncertainty of the scales, in quadrature."""
     assert quantity.interval_95 is not None
-    value, (low, high) = quantity.value, quantity.interval_95
+    value, (lower_end, upper_end) = quantity.value, quantity.interval_95
     std = math.hypot(quantity.std or 0.0, value * relative)
     if logarithmic:
         ln_below, ln_above = (
-            math.hypot(math.log(end / value), NORMAL_95 * relative) for end in (low, high)
+            math.hypot(math.log(end / value), NORMAL_95 * relative)
+            for end in (lower_end, upper_end)
         )
         interval_95 = value * math.exp(-ln_below), value * math.exp(min(ln_above, 300.0))
     else:
         half_width = NORMAL_95 * relative * value
         interval_95 = (
-            value - math.hypot(value - low, half_width),
-            value + math.hypot(high - value, half_width),
+            value - math.hypot(value - lower_end, half_width),
+            value + math.hypot(upper_end - value, half_width),
         )
         # The interval of a quantity that cannot be negative ends at 0.
         interval_95 = max(interval_95[0], 0.0), interval_95[1]

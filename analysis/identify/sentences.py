@@ -207,10 +207,12 @@ def _exact_order_sentences(headline: Headline) -> list[str]:
 def order_sentence(verdict: OrderVerdict) -> str:
     """Return the sentence on one order, estimated on an exactly uniform beam."""
     profile = verdict.profile
-    low, high = profile.interval
+    lower_end, upper_end = profile.interval
     name, damping_name = verdict.order, _DAMPING_OF_ORDER[verdict.order]
-    std = (high - low) / (2 * NORMAL_95)
-    estimate_text, first_text, last_text = to_uncertainty((profile.estimate, low, high), std)
+    std = (upper_end - lower_end) / (2 * NORMAL_95)
+    estimate_text, first_text, last_text = to_uncertainty(
+        (profile.estimate, lower_end, upper_end), std
+    )
     value = f"{estimate_text} (95 %: {first_text} to {last_text})"
     if verdict.status == "absent":
         return f"No {damping_name} was found, so its order {name} has no meaning."
@@ -259,38 +261,38 @@ def _value_and_interval_text(quantity: ReportedValue) -> str:
     """Return a value with its 95 % interval as text, rounded to significant digits."""
     if quantity.interval_95 is None or not quantity.std:
         return f"{quantity.value:.4g}"
-    low, high = quantity.interval_95
+    lower_end, upper_end = quantity.interval_95
     power = math.floor(math.log10(abs(quantity.value))) if quantity.value else 0
     scale = 10.0**power if power < -2 else 1.0
     digits = decimals(quantity.std / scale)
     exponent = f"e{power}" if power < -2 else ""
     return (
         f"{quantity.value / scale:.{digits}f}{exponent} "
-        f"({low / scale:.{digits}f}{exponent} to {high / scale:.{digits}f}{exponent})"
+        f"({lower_end / scale:.{digits}f}{exponent} to {upper_end / scale:.{digits}f}{exponent})"
     )
 
 
 def _unidentifiable_reason(verdict: OrderVerdict) -> str:
     """Return, as part of a sentence, why an order is not identifiable."""
     profile = verdict.profile
-    low, high = profile.interval
+    lower_end, upper_end = profile.interval
     if verdict.reason is not None and (profile.identifiable or not profile.is_computed):
         return verdict.reason
     if len(profile.local_minima) > 1:
         minima_text = " and ".join(f"{value:.3f}" for value in sorted(profile.local_minima))
         return (
             f"{minima_text} fit the record equally well, each with a different damping (95 %: "
-            f"{low:.3f} "
-            f"to {high:.3f}, with all that lies between)"
+            f"{lower_end:.3f} "
+            f"to {upper_end:.3f}, with all that lies between)"
         )
     return (
         "any value between 0 and 2 fits"
         if profile.open_below and profile.open_above
-        else f"anything below {high:.2f} fits"
+        else f"anything below {upper_end:.2f} fits"
         if profile.open_below
-        else f"anything above {low:.2f} fits"
+        else f"anything above {lower_end:.2f} fits"
         if profile.open_above
-        else f"anything from {low:.2f} to {high:.2f} fits"
+        else f"anything from {lower_end:.2f} to {upper_end:.2f} fits"
     )
 
 

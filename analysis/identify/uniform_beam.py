@@ -189,12 +189,12 @@ class ConstantsProblem:
         )
         ln_stiffness = constants[:, 2] - np.log(self._omega_rad_s) + np.log(length / 2)
         self._ln_stiffness = float(np.mean(ln_stiffness))
-        low, high = _LN_LOSS_RANGE
+        smallest_ln_loss, largest_ln_loss = _LN_LOSS_RANGE
         self.lower = np.array(
             [
-                low,
+                smallest_ln_loss,
                 _ORDER_RANGE[0],
-                low,
+                smallest_ln_loss,
                 _ORDER_RANGE[0],
                 self._ln_density_over_stiffness - _LN_BEAM_HALF_RANGE,
                 self._ln_stiffness - _LN_BEAM_HALF_RANGE,
@@ -203,9 +203,9 @@ class ConstantsProblem:
         )
         self.upper = np.array(
             [
-                high,
+                largest_ln_loss,
                 _ORDER_RANGE[1],
-                high,
+                largest_ln_loss,
                 _ORDER_RANGE[1],
                 self._ln_density_over_stiffness + _LN_BEAM_HALF_RANGE,
                 self._ln_stiffness + _LN_BEAM_HALF_RANGE,
@@ -402,9 +402,9 @@ class ConstantsProblem:
         x : ndarray of float, shape (7,)
             Vector of unknowns at which the descent starts.
         """
-        high = self.upper.copy()
-        high[index] = self.lower[index]
-        return _minimize_within_bounds(self.equations, x, self.lower, high)
+        upper_bounds = self.upper.copy()
+        upper_bounds[index] = self.lower[index]
+        return _minimize_within_bounds(self.equations, x, self.lower, upper_bounds)
 
     def minimize_with_fixed(self, index: int, value: float, x: NDArray[np.float64]) -> Minimum:
         """Minimize chi-square with one of `PARAMETERS` fixed, and return the minimum.
@@ -422,8 +422,10 @@ class ConstantsProblem:
         forward = np.eye(x.size)
         forward[index] = self.transform[index] / self.transform[index, index]
         backward = np.linalg.inv(forward)
-        low, high = self.lower.copy(), self.upper.copy()
-        low[index] = high[index] = (value - self._offset[index]) / self.transform[index, index]
+        lower_bounds, upper_bounds = self.lower.copy(), self.upper.copy()
+        lower_bounds[index] = upper_bounds[index] = (value - self._offset[index]) / self.transform[
+            index, index
+        ]
 
         def equations(y: NDArray[np.float64]) -> NormalEquations:
             """Return the normal equations in the transformed unknowns."""
@@ -432,7 +434,7 @@ class ConstantsProblem:
                 found.cost, backward.T @ found.gradient, backward.T @ found.hessian @ backward
             )
 
-        found = _minimize_within_bounds(equations, forward @ x, low, high)
+        found = _minimize_within_bounds(equations, forward @ x, lower_bounds, upper_bounds)
         return replace(found, x=backward @ found.x)
 
 
@@ -707,17 +709,17 @@ def _estimate_at_minimum(
     for index, name in enumerate(PARAMETERS):
         value, spread = float(values[index]), float(spreads[index])
         if name in _PROFILED_PARAMETERS:
-            low, high = (
+            lower_end, upper_end = (
                 _interval_end(problem, index, best_minimum, side * spread) for side in (-1.0, 1.0)
             )
             other_values = [float(problem.parameters(each.x)[index]) for each in near_minima]
-            low, high = min(low, *other_values), max(high, *other_values)
+            lower_end, upper_end = min(lower_end, *other_values), max(upper_end, *other_values)
         else:
-            low, high = value - NORMAL_95 * spread, value + NORMAL_95 * spread
+            lower_end, upper_end = value - NORMAL_95 * spread, value + NORMAL_95 * spread
         if name in LOGARITHMIC:
             value, spread = math.exp(value), math.exp(value) * spread
-            low, high = math.exp(low), math.exp(min(high, _MAX_EXPONENT))
-        intervals[name], std[name] = (low, high), spread
+            lower_end, upper_end = math.exp(lower_end), math.exp(min(upper_end, _MAX_EXPONENT))
+        intervals[name], std[name] = (lower_end, upper_end), spread
     return TolerantEstimate(
         basis=basis,
         uniformity=problem.uniformity,
@@ -741,32 +743,32 @@ def _interval_end(
     Return the edge of the range if chi-square does not rise so far. `index` is the position of the
     parameter in `PARAMETERS`. `spread` is its standard deviation, negative for the lower end.
     """
-    centre = float(problem.parameters(best_minimum.x)[index])
+    estimate = float(problem.parameters(best_minimum.x)[index])
     range_edge = math.copysign(math.inf, spread)
     if PARAMETERS[index] in ("alpha", "lambda"):
         range_edge = _ORDER_RANGE[0 if spread < 0 else 1]
-    inside_value, inside_root, x = centre, 0.0, best_minimum.x
-    trial = centre + NORMAL_95 * spread
+    inside_value, inside_root, x = estimate, 0.0, best_minimum.x
+    trial_value = estimate + NORMAL_95 * spread
     outside_value: float | None = None
     for _ in range(_MAX_PROFILE_STEPS):
-        trial = max(trial, range_edge) if spread < 0 else min(trial, range_edge)
-        trial_minimum = problem.minimize_with_fixed(index, trial, x)
+        trial_value = max(trial_value, range_edge) if spread < 0 else min(trial_value, range_edge)
+        trial_minimum = problem.minimize_with_fixed(index, trial_value, x)
         root = math.sqrt(max(trial_minimum.cost - best_minimum.cost, 0.0))
         if abs(root - NORMAL_95) < _INTERVAL_END_TOLERANCE:
-            return trial
+            return trial_value
         if root < NORMAL_95:
-            inside_value, inside_root, x = trial, root, trial_minimum.x
-            if trial == range_edge:
+            inside_value, inside_root, x = trial_value, root, trial_minimum.x
+            if trial_value == range_edge:
                 return range_edge
         else:
-            outside_value, outside_root = trial, root
+            outside_value, outside_root = trial_value, root
         if outside_value is None:
-            step = (inside_value - centre) * min(
+            distance = (inside_value - estimate) * min(
                 NORMAL_95 / max(inside_root, 0.2), _MAX_DISTANCE_GROWTH
             )
-            trial = centre + step
+            trial_value = estimate + distance
         else:
-            trial = inside_value + (outside_value - inside_value) * (NORMAL_95 - inside_root) / (
-                outside_root - inside_root
-            )
-    return trial if outside_value is not None else range_edge
+            trial_value = inside_value + (outside_value - inside_value) * (
+                NORMAL_95 - inside_root
+            ) / (outside_root - inside_root)
+    return trial_value if outside_value is not None else range_edge

@@ -257,7 +257,8 @@ def linear_model(
     if options.samples and not uncertain.names:
         key = "covariance" if export_beam else "modal_model.covariance"
         raise LinearModelError(
-            f"{identified.where} has no {key}, as of an older version or of a campaign, so no "
+            f"{identified.headline_name} has no {key}, as of an older version or of a campaign, "
+            "so no "
             "samples can be drawn; analyze a session again, or add --samples 0."
         )
     on_step("order")
@@ -287,10 +288,10 @@ def linear_model(
 
 def _accuracy(uncertain: UncertainDynamics, fit: PoleFit, system: StateSpace) -> Accuracy:
     """Return error and uncertainty of a realisation over its band."""
-    low, high = fit.dynamics.band_hz
+    low_hz, high_hz = fit.dynamics.band_hz
     pole_and_zero_hz = np.concatenate([fit.dynamics.pairs, fit.zeros]).imag / (2 * np.pi)
-    inner_hz = pole_and_zero_hz[(pole_and_zero_hz > low) & (pole_and_zero_hz < high)]
-    frequency_hz = np.sort(np.concatenate([np.geomspace(low, high, _TABLE_POINTS), inner_hz]))
+    inner_hz = pole_and_zero_hz[(pole_and_zero_hz > low_hz) & (pole_and_zero_hz < high_hz)]
+    frequency_hz = np.sort(np.concatenate([np.geomspace(low_hz, high_hz, _TABLE_POINTS), inner_hz]))
     s = imaginary_axis(frequency_hz)
     exact_response = fit.dynamics.filtered(s)
     return Accuracy(

@@ -77,7 +77,7 @@ class IdentifiedModel:
     ----------
     source : str
         Name of the file that was analysed or read.
-    where : str
+    headline_name : str
         Name of the headline in messages.
     headline : mapping
         Element of ``headlines`` in the document of the analysis.
@@ -88,7 +88,7 @@ class IdentifiedModel:
     """
 
     source: str
-    where: str
+    headline_name: str
     headline: Mapping[str, Any]
     length_m: float | None
     band_hz: tuple[float, float]
@@ -192,11 +192,12 @@ class IdentifiedModel:
         LinearModelError
             If the length or the covariance cannot be used.
         """
-        values = parameter_values(self.where, self._beam_part["parameters"])
+        values = parameter_values(self.headline_name, self._beam_part["parameters"])
         length_m = self.length_m
         if length_m is None:
             raise LinearModelError(
-                f"{self.where}: no file of the document states beam_length_m, or several state "
+                f"{self.headline_name}: no file of the document states beam_length_m, or several "
+                "state "
                 f"different ones; {_ANALYZE_AGAIN_ADVICE}."
             )
         names, covariance = self.beam_covariance() or ((), np.zeros((0, 0)))
@@ -244,7 +245,8 @@ class IdentifiedModel:
         modal, band_hz = self.modal, self.band_hz
         if modal is None:
             raise LinearModelError(
-                f"{self.where} has no modal_model, as of an older version or of a campaign; "
+                f"{self.headline_name} has no modal_model, as of an older version or of a "
+                "campaign; "
                 f"{_ANALYZE_AGAIN_ADVICE}, or export the beam's model with --beam."
             )
         count = len(modal.poles_rad_s)
@@ -301,7 +303,7 @@ class IdentifiedModel:
 
     def _error(self, key: str, what: str) -> LinearModelError:
         """Return the error that a key of the headline cannot be used."""
-        return LinearModelError(f"{self.where}.{key}: {what}; {_ANALYZE_AGAIN_ADVICE}.")
+        return LinearModelError(f"{self.headline_name}.{key}: {what}; {_ANALYZE_AGAIN_ADVICE}.")
 
 
 def identified_in_document(path: Path) -> IdentifiedModel:
@@ -320,7 +322,7 @@ def identified_in_document(path: Path) -> IdentifiedModel:
         If the document has several headlines and none for all sessions together.
     """
     document = read_document(path)
-    where, headline = select_headline(path, document)
+    headline_name, headline = select_headline(path, document)
     assert isinstance(document, dict)
     file = headline.get("file")
     if file is not None and len(document["headlines"]) > 1:
@@ -331,9 +333,11 @@ def identified_in_document(path: Path) -> IdentifiedModel:
 
     def entries(key: str) -> list[dict[str, Any]]:
         """Return the entries of a list in the document that belong to the analysed file."""
-        listed = document.get(key)
+        stated_list = document.get(key)
         dicts = (
-            [each for each in listed if isinstance(each, dict)] if isinstance(listed, list) else []
+            [each for each in stated_list if isinstance(each, dict)]
+            if isinstance(stated_list, list)
+            else []
         )
         return [each for each in dicts if file is None or each.get("file") == file]
 
@@ -342,7 +346,7 @@ def identified_in_document(path: Path) -> IdentifiedModel:
     bands = [each.get("band_hz") for each in entries("records")]
     return IdentifiedModel(
         path.name,
-        where,
+        headline_name,
         headline,
         length_m if length_m and length_m > 0 and is_usable_size(length_m) else None,
         _band_hz(bands[0] if bands else None),
@@ -383,9 +387,14 @@ def _doubt_about(quantity: object) -> object:
 def _band_hz(stated: object) -> tuple[float, float]:
     """Return a stated band, or the default band if the statement cannot be used."""
     if isinstance(stated, list) and len(stated) == 2:
-        low, high = map(finite_number, stated)
-        if low is not None and high is not None and 0 <= low < high and high > _MIN_FIRST_HZ:
-            return max(low, _MIN_FIRST_HZ), high
+        low_hz, high_hz = map(finite_number, stated)
+        if (
+            low_hz is not None
+            and high_hz is not None
+            and 0 <= low_hz < high_hz
+            and high_hz > _MIN_FIRST_HZ
+        ):
+            return max(low_hz, _MIN_FIRST_HZ), high_hz
     return _DEFAULT_BAND_HZ
 
 

@@ -120,11 +120,11 @@ def _structures_with_real_poles(
     """Yield the structures with a number of pairs, of added real poles and of integrators."""
     if not 0 <= real_poles <= _MAX_REAL_POLES:
         return
-    for low, high in _REAL_POLE_RANGES_RAD_S[: None if real_poles else 1]:
+    for first_pole, last_pole in _REAL_POLE_RANGES_RAD_S[: None if real_poles else 1]:
         poles = (
-            np.geomspace(low, high, real_poles)
+            np.geomspace(first_pole, last_pole, real_poles)
             if real_poles > 1
-            else np.full(real_poles, (low * high) ** 0.5)
+            else np.full(real_poles, (first_pole * last_pole) ** 0.5)
         )
         yield PoleStructure(pairs, tuple((-poles).tolist()), integrators)
 

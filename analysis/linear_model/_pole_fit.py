@@ -325,8 +325,8 @@ class PoleFit:
 
     def _response_minima(self) -> NDArray[np.complex128]:
         """Return the points s = j omega of local minima of the response per acceleration."""
-        low, high = self.dynamics.band_hz
-        s = imaginary_axis(np.geomspace(low / 2, high * 2, _SCAN_POINTS))
+        low_hz, high_hz = self.dynamics.band_hz
+        s = imaginary_axis(np.geomspace(low_hz / 2, high_hz * 2, _SCAN_POINTS))
         magnitude = np.abs(self.dynamics.response(s) / s**2)
         minimum_indices = (
             np.flatnonzero((magnitude[1:-1] < magnitude[:-2]) & (magnitude[1:-1] < magnitude[2:]))
@@ -341,8 +341,14 @@ class PoleFit:
             return s
         for _ in range(_MAX_NEWTON_ITERATIONS):
             step = 1e-6 * np.abs(s)
-            above, below = response(np.concatenate([s + step, s - step])).reshape(2, -1)
-            change = step * (above + below) / np.where(above == below, 1.0, above - below)
+            response_above, response_below = response(np.concatenate([s + step, s - step])).reshape(
+                2, -1
+            )
+            change = (
+                step
+                * (response_above + response_below)
+                / np.where(response_above == response_below, 1.0, response_above - response_below)
+            )
             s = s - change
             has_left = np.abs(s / starts - 1) > _MAX_RELATIVE_ZERO_CHANGE
             s[has_left] = starts[has_left]
