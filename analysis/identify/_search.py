@@ -117,7 +117,7 @@ class CoarseResponse:
         self._costs: dict[Plant, float] = {}
 
     def whitened(self, noise: NoiseSpectrum, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
-        """Return the same points of the response with weights for a noise spectrum.
+        """Return this coarse response with weights for another noise spectrum.
 
         Parameters
         ----------
@@ -223,10 +223,11 @@ _MAX_RIVALS: Final = 2
 """Largest number of coarse minima from which the whole record is fitted."""
 
 _RIVAL_COST_RATIO: Final = 1.5
-"""Cost, relative to the lowest coarse minimum, from which a coarse minimum is ignored."""
+"""Cost of a coarse minimum, relative to the lowest one, from which it is ignored."""
 
 _BETTER_COST_RATIO: Final = 0.9
-"""Cost, relative to the end of a descent, below which another coarse minimum is refined."""
+"""Cost of another coarse minimum, relative to that at the end of a descent, below which it is
+refined."""
 
 _MAX_STORED_MINIMA: Final = 4
 """Largest number of stored minima that are compared again under another noise spectrum."""

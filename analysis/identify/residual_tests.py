@@ -281,7 +281,7 @@ _STEADINESS_LIMIT: Final = 0.3
 median, of a usable block."""
 
 _MIN_BLOCKS: Final = 5
-"""Smallest number of usable blocks for a test."""
+"""Smallest number of usable blocks for the test of a harmonic."""
 
 
 @dataclass(frozen=True, slots=True)
