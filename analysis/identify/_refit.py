@@ -31,11 +31,12 @@ if TYPE_CHECKING:
 
 
 FEW: Final = 8
-"""Number of evaluations within which a fit converges under slightly other noise, or a start proves
-useless."""
+"""Number of evaluations of the sum of squares after which a fit under slightly other noise has
+converged, or a start has proved useless."""
 
 MANY: Final = 40
-"""Number of evaluations within which a descent from another start converges."""
+"""Number of evaluations of the sum of squares after which a descent from another start has
+converged."""
 
 MISSED: Final = 1e-5
 """Fraction of a sum of squares (some 1e4) by which a lower minimum counts as missed. The BIC

@@ -212,7 +212,7 @@ class RecordAnalysis:
 
     @property
     def noise(self) -> NoiseSpectrum:
-        """Return the noise spectrum of the fits, as power of each bin."""
+        """Return the noise spectrum of the torque under which the fits were made."""
         scale = self.comparison.samples * self.comparison.decimation.rate_hz / 2
         return NoiseSpectrum(self.noise_nm2_per_hz * scale, self.compared, self.lines)
 

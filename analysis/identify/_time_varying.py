@@ -84,7 +84,7 @@ _MAX_SIZE_FITS: Final = 8
 """Largest number of fits. After each, the torque spectrum is recomputed for the fitted size."""
 
 _SIZE_TOLERANCE: Final = 0.01
-"""Relative change of the fitted size at which these fits end."""
+"""Relative change of the fitted size at which the repeated fits end."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,7 @@ _LN_BEAM_HALF_RANGE: Final = math.log(3.0)
 """Largest change of ln(rho/EI) and ln(EI) from the nominal beam: a factor of 3."""
 
 _DELAY_UNIT_S: Final = 1e-3
-"""Delay that corresponds to 1 of its unknown, in seconds."""
+"""Delay in seconds at which the delay unknown is 1."""
 
 _DELAY_RANGE_S: Final = 0.02
 """Largest magnitude of the delay in seconds."""

@@ -372,7 +372,7 @@ class OrderProfiler:
             self._extend(sign)
 
     def extend_from_candidates(self) -> None:
-        """Extend the profile from equally good candidates whose fixed order is not yet admitted.
+        """Extend the profile from equally good candidates whose order is outside of the interval.
 
         Most of them fix the order at 1. A barrier may separate them from the minimum.
         """
@@ -394,9 +394,9 @@ class OrderProfiler:
                 self.extend_both_ways()
 
     def extend_from_other_minima(self) -> None:
-        """Search for other local minima if much of the range is admitted.
+        """Search for other local minima if the 95 % interval covers much of the range of the order.
 
-        Extend the profile from each.
+        Extend the profile from each of them.
         """
         (lower_end, upper_end), open_below, open_above = admitted_interval(*self.curve())
         is_wide = upper_end - lower_end > _DOUBTFUL_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])

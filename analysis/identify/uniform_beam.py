@@ -60,7 +60,7 @@ _LN_BEAM_HALF_RANGE: Final = 2.0
 """Largest change of ln(rho/EI) and of ln(EI) from the start of the search."""
 
 _DELAY_UNIT_S: Final = 0.01
-"""Delay that corresponds to 1 of the unknown, in seconds."""
+"""Delay in seconds at which the delay unknown is 1."""
 
 _DELAY_UNKNOWN_LIMIT: Final = 1.0
 """Largest magnitude of the delay unknown, in units of `_DELAY_UNIT_S`."""

@@ -94,7 +94,7 @@ def order_verdict(
     *,
     doubt: str | None,
 ) -> OrderVerdict:
-    """Return the verdict on one order in the freest structure.
+    """Return the verdict on one damping order from its profile in the freest structure.
 
     Parameters
     ----------

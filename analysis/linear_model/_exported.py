@@ -9,7 +9,7 @@ import numpy as np
 
 from analysis.linear_model._dynamics import LinearModelError
 from analysis.linear_model._identified import PASSED_STATUS
-from analysis.linear_model._order import realise
+from analysis.linear_model._order import realise_response
 from analysis.linear_model._pole_fit import PoleFit, angle_response, imaginary_axis
 
 if TYPE_CHECKING:
@@ -264,7 +264,7 @@ def linear_model(
     on_step("order")
     nominal = uncertain.nominal
     fit = PoleFit(nominal)
-    structure, system = realise(fit, options.order, options.given)
+    structure, system = realise_response(fit, options.order, options.given)
     on_step("accuracy")
     accuracy = _accuracy(uncertain, fit, system)
     on_step("samples")

@@ -31,7 +31,9 @@ _MAX_INTEGRATORS: Final = 2
 """Largest number of integrals of the acceleration: velocity and angle."""
 
 
-def realise(fit: PoleFit, order: int | None, input_kind: Input) -> tuple[PoleStructure, StateSpace]:
+def realise_response(
+    fit: PoleFit, order: int | None, input_kind: Input
+) -> tuple[PoleStructure, StateSpace]:
     """Realise a response by a state space with a given number of states, or the fewest.
 
     Parameters
