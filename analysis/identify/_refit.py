@@ -1,7 +1,8 @@
-"""Refit from the end of a fit: another structure, other noise, a held order, or further columns.
+"""Refit from the end of a fit: another structure, other noise, a fixed order, or added torques.
 
 A nonlinear effect (for example a stiffness that depends on the deflection) adds to the torque a
-column of known shape and unknown size, which is projected out like the free decay.
+spectrum of known shape and unknown size, called a column. It is projected out like the free
+decay.
 """
 
 from __future__ import annotations
@@ -30,29 +31,35 @@ if TYPE_CHECKING:
 
 
 FEW: Final = 8
-"""Evaluations that settle a fit under slightly other noise, or show that a start leads nowhere."""
+"""Number of evaluations of the sum of squares after which a fit under slightly other noise has
+converged, or a start has proved useless."""
 
 MANY: Final = 40
-"""Evaluations of a descent that is to end."""
+"""Number of evaluations of the sum of squares after which a descent from another start has
+converged."""
 
 MISSED: Final = 1e-5
-"""Significant fraction of a sum of squares (some 1e4); the BIC penalty of a parameter is 9."""
+"""Fraction of a sum of squares (some 1e4) by which a lower minimum counts as missed. The BIC
+penalty of a parameter is 9."""
 
-_TOLERANCE: Final = 1e-8
+_COST_TOLERANCE: Final = 1e-8
 """Relative tolerance of the sum of squares (some 1e4): 1e-4 of a significant difference of BIC."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refit:
-    """Minimum of a sum of squares under one noise spectrum.
+    """Minimum of the sum of squares of a structure under one noise spectrum.
 
     Attributes
     ----------
     objective : Objective
+        Sum of squares of the whitened residual.
     x : ndarray, shape (k,)
+        Unknowns at the minimum.
     equations : NormalEquations
-        At `x`.
-    noise : Noise
+        Sum of squares with its derivatives at `x`.
+    noise : NoiseSpectrum
+        Noise that weights the residual.
     """
 
     objective: Objective
@@ -70,22 +77,23 @@ class Refit:
         columns: NDArray[np.complex128] | None = None,
         *,
         max_evaluations: int = 60,
-        relative_tolerance: float = _TOLERANCE,
+        relative_tolerance: float = _COST_TOLERANCE,
         hold: Sequence[str] = (),
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
-        """Descend from `start`, with unknown torques filled by the prediction there.
+        """Descend from a start vector, after unknown torques are filled with the prediction there.
 
-        `columns`, shape (c, K), are projected out in addition to the free decay. `hold` names
-        unknowns that stay at their start. `relative_tolerance` and `hopeless` are those of
-        `analysis.optimizer.descend`; with `max_evaluations` of 1 nothing moves.
+        `columns`, shape (c, K), are torque spectra of unknown size that are projected out in
+        addition to the free decay. `hold` names unknowns that keep their start values.
+        `relative_tolerance` and `hopeless` are those of `analysis.optimizer.descend`. With
+        `max_evaluations` of 1 the start is only evaluated.
         """
         region = Steps.of(unknowns, NEXT_TO_NOTHING)
         x = np.clip(start, region.lower, region.upper)
         for name in hold:
             index = unknowns.names.index(name)
             region.lower[index] = region.upper[index] = x[index]
-        objective, found = Objective(comparison, unknowns, columns).minimum(
+        objective, minimum = Objective(comparison, unknowns, columns).minimum(
             x,
             noise.weight,
             region,
@@ -93,117 +101,122 @@ class Refit:
             max_evaluations=max_evaluations,
             hopeless=hopeless,
         )
-        return cls(objective, found.x, found.equations, noise)
+        return cls(objective, minimum.x, minimum.equations, noise)
 
     def further(self, max_evaluations: int) -> Refit:
-        """Continue the descent from here, with nothing held, as `descend` does from the same point.
+        """Continue the descent with no unknown fixed, as `descend` from the same point would.
 
-        The evaluation at this point, which counts, is not repeated unless torques are unknown.
+        The evaluation at this point counts, but is not repeated unless torques are unknown.
         """
-        objective, found = self.objective.minimum(
+        objective, minimum = self.objective.minimum(
             self.x,
             self.noise.weight,
             Steps.of(self.objective.unknowns, NEXT_TO_NOTHING),
-            relative_tolerance=_TOLERANCE,
+            relative_tolerance=_COST_TOLERANCE,
             max_evaluations=max_evaluations,
         )
-        return Refit(objective, found.x, found.equations, self.noise)
+        return Refit(objective, minimum.x, minimum.equations, self.noise)
 
     @property
     def columns(self) -> NDArray[np.complex128]:
-        """Return the columns that were projected out in addition to the free decay, (c, K)."""
+        """Return the torque spectra that are projected out besides the free decay, (c, K)."""
         return self.objective.columns
 
     @property
     def cost(self) -> float:
-        """Return the sum of squares here."""
+        """Return the sum of squares of the whitened residual at this minimum."""
         return self.equations.cost
 
     @property
     def expected_cost(self) -> float:
-        """Return the expected sum of squares if only noise remains."""
+        """Return the sum of squares that is expected if the residual is noise only."""
         known_fraction = self.objective.comparison.measurement.known_torque_fraction
         return float(2 * np.count_nonzero(self.noise.counts) * known_fraction)
 
     @property
     def predicted_cost(self) -> float:
-        """Return the cost at the minimum that the Gauss-Newton step predicts."""
+        """Return the sum of squares that the Gauss-Newton step predicts at the true minimum."""
         return max(self.cost + float(self.equations.gradient @ self.predicted_step), 0.0)
 
     @property
     def predicted_step(self) -> NDArray[np.float64]:
-        """Return the Gauss-Newton step to that minimum, shape (k,)."""
+        """Return the Gauss-Newton step of the unknowns to the true minimum, shape (k,)."""
         equations = self.equations
-        held = equations.held(self.x, *self.objective.unknowns.bounds)
-        free = ~held & (np.diag(equations.hessian) > 0)
-        scaled, scale = equations.scaled_hessian()
-        slope = equations.gradient[free] / scale[free]
+        at_bound = equations.held(self.x, *self.objective.unknowns.bounds)
+        is_free = ~at_bound & (np.diag(equations.hessian) > 0)
+        scaled_hessian, scale = equations.scaled_hessian()
+        slope = equations.gradient[is_free] / scale[is_free]
         step = np.zeros(self.x.size)
-        solved = np.linalg.solve(scaled[np.ix_(free, free)] + 1e-12 * np.eye(slope.size), slope)
-        step[free] = -solved / scale[free]
+        solved = np.linalg.solve(
+            scaled_hessian[np.ix_(is_free, is_free)] + 1e-12 * np.eye(slope.size), slope
+        )
+        step[is_free] = -solved / scale[is_free]
         return step
 
     @property
     def plant(self) -> Plant:
-        """Return the fitted plant."""
+        """Return the rig and beam with the fitted parameters."""
         return self.objective.unknowns.plant(self.x)
 
     def amplitudes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return amplitudes of the further columns, and their standard deviations, shape (c,).
+        """Return the sizes of the added torque spectra, shape (c,), and their standard deviations.
 
-        The deviations include the uncertainty of all other fitted parameters.
+        The standard deviations include the uncertainty of all other fitted parameters.
         """
         values, covariance = self.amplitude_covariance()
         return values, np.sqrt(np.diag(covariance))
 
     def amplitude_covariance(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return amplitudes of the further columns, (c,), and their covariance, (c, c)."""
-        at = self.objective.linearise(self.x)
-        projected = self.objective.project(at, self.noise.weight)
-        white = at.columns * self.noise.weight
-        # As it was before the projection: that has made it orthogonal to the columns, whose
-        # amplitudes would then seem to have nothing in common with the unknowns.
-        everything = np.concatenate([at.jacobian * self.noise.weight, white])
-        scale = np.sqrt(np.sum(np.abs(everything) ** 2, axis=1))
+        """Return the sizes of the added torque spectra, (c,), and their covariance, (c, c)."""
+        linearisation = self.objective.linearise(self.x)
+        projected = self.objective.project(linearisation, self.noise.weight)
+        white = linearisation.columns * self.noise.weight
+        # The Jacobian before the projection is needed: after it the columns are orthogonal to the
+        # Jacobian, so their amplitudes would seem independent of the unknowns.
+        derivatives = np.concatenate([linearisation.jacobian * self.noise.weight, white])
+        scale = np.sqrt(np.sum(np.abs(derivatives) ** 2, axis=1))
         scale[scale == 0] = 1.0
-        everything = everything / scale[:, None]
-        gram = (everything.conj() @ everything.T).real + 1e-12 * np.eye(scale.size)
-        first = scale.size - len(self.columns)
-        own = scale[first:]
-        covariance = np.linalg.inv(gram)[first:, first:] / np.outer(own, own)
+        derivatives = derivatives / scale[:, None]
+        gram = (derivatives.conj() @ derivatives.T).real + 1e-12 * np.eye(scale.size)
+        first_column = scale.size - len(self.columns)
+        column_scale = scale[first_column:]
+        covariance = np.linalg.inv(gram)[first_column:, first_column:] / np.outer(
+            column_scale, column_scale
+        )
         return projected.amplitudes[projected.amplitudes.size - len(self.columns) :], covariance
 
     def unexplained_columns(
         self, columns: NDArray[np.complex128], *, beam_free: bool = True
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Whiten further columns and remove the part that other free terms explain.
+        """Whiten torque spectra and remove the part that other free terms explain, shape (c, K).
 
-        Also returns the whitened residual (prediction minus measurement), shape (K,). With
-        `beam_free` the unknowns may explain a part as well, else only the terms that are projected
-        out.
+        The whitened residual (prediction minus measurement), shape (K,), is returned as well. With
+        `beam_free` the unknowns may explain a part of the spectra, too. Otherwise only the terms
+        that are projected out may.
         """
-        weight, at = self.noise.weight, self.objective.linearise(self.x)
-        projected = self.objective.project(at, weight)
-        known = at.columns * weight
+        weight, linearisation = self.noise.weight, self.objective.linearise(self.x)
+        projected = self.objective.project(linearisation, weight)
+        explaining_spectra = linearisation.columns * weight
         if beam_free:
-            known = np.concatenate([projected.jacobian, known])
-        return unexplained_part(columns * weight, known), projected.residual
+            explaining_spectra = np.concatenate([projected.jacobian, explaining_spectra])
+        return unexplained_part(columns * weight, explaining_spectra), projected.residual
 
     def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the first-order cost reduction by each further column alone, shape (c,).
+        """Return the first-order cost reduction by each added torque spectrum alone, shape (c,).
 
         Parameters
         ----------
         columns : ndarray of complex, shape (c, K)
+            Torque spectra of unknown size.
         """
-        free, residual = self.unexplained_columns(columns)
-        along = (free.conj() @ residual).real
-        squares = np.maximum(np.sum(np.abs(free) ** 2, axis=1), np.finfo(float).tiny)
-        saved: NDArray[np.float64] = along**2 / squares
-        return saved
+        unexplained, residual = self.unexplained_columns(columns)
+        correlation = (unexplained.conj() @ residual).real
+        squares = np.maximum(np.sum(np.abs(unexplained) ** 2, axis=1), np.finfo(float).tiny)
+        reduction: NDArray[np.float64] = correlation**2 / squares
+        return reduction
 
     def fit(self) -> RecordFit:
-        """Return the full result at this minimum."""
+        """Return the fit at this minimum with parameters, modes and uncertainties."""
         fit = summary(self.objective, self.x, self.noise)
         if not len(self.columns):
             return fit
@@ -213,37 +226,42 @@ class Refit:
         scale = np.sqrt(np.diag(projected.amplitude_gram))
         scale[scale == 0] = 1.0
         gram = projected.amplitude_gram / np.outer(scale, scale) + 1e-12 * np.eye(scale.size)
-        own, shared, others = gram[:decays, :decays], gram[:decays, decays:], gram[decays:, decays:]
+        decay_gram, cross_gram, column_gram = (
+            gram[:decays, :decays],
+            gram[:decays, decays:],
+            gram[decays:, decays:],
+        )
         # Inverse covariance of the decays alone, the other columns free (Schur complement).
-        alone = own - shared @ np.linalg.solve(others, shared.T)
+        decay_precision = decay_gram - cross_gram @ np.linalg.solve(column_gram, cross_gram.T)
         a = (projected.amplitudes * scale)[:decays]
-        chi_square = float(a @ alone @ a) * fit.degrees_of_freedom / fit.cost
+        chi_square = float(a @ decay_precision @ a) * fit.degrees_of_freedom / fit.cost
         return replace(
             fit, ringing=replace(fit.ringing, chi_square=chi_square, degrees_of_freedom=decays)
         )
 
     def candidate(self) -> Candidate:
-        """Return the result as a candidate."""
-        of = self.objective.unknowns
-        return Candidate(of.structure, self.fit(), len(self.columns))
+        """Return the fit at this minimum as a candidate of its structure."""
+        unknowns = self.objective.unknowns
+        return Candidate(unknowns.structure, self.fit(), len(self.columns))
 
     def noise_here(self) -> NoiseSpectrum:
-        """Return the noise of the residual that no column explains; lines stay excluded."""
+        """Return the noise of the residual at this minimum. Lines stay excluded."""
         residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
         known_fraction = self.objective.comparison.measurement.known_torque_fraction
         return replace(self.noise, power=smooth_power(residual) / known_fraction)
 
 
 def unexplained_part(
-    columns: NDArray[np.complex128], known: NDArray[np.complex128]
+    columns: NDArray[np.complex128], explaining_spectra: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
-    """Return the part of whitened columns that other free terms do not explain, shape (c, K).
+    """Return the part of whitened spectra that other free terms do not explain, shape (c, K).
 
-    `known`, shape (k, K), are the whitened derivatives by all free parameters and amplitudes.
+    `explaining_spectra`, shape (k, K), are the whitened derivatives by all free parameters and
+    amplitudes.
     """
-    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
-    basis = known[scale > 0] / scale[scale > 0, None]
+    scale = np.sqrt(np.sum(np.abs(explaining_spectra) ** 2, axis=1))
+    basis = explaining_spectra[scale > 0] / scale[scale > 0, None]
     gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
     coefficients = np.linalg.solve(gram, (basis.conj() @ columns.T).real)
-    part: NDArray[np.complex128] = columns - coefficients.T @ basis
-    return part
+    remainder: NDArray[np.complex128] = columns - coefficients.T @ basis
+    return remainder

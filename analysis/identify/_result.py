@@ -1,4 +1,4 @@
-"""Result of a fit of the whole record: parameters, their uncertainty, modes and residual."""
+"""Result of a fit to the whole record: parameters, their uncertainty, modes and residual."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from analysis.identify.noise import NoiseLine
     from analysis.models import Structure
 
-_RARE: Final = 1e-4
-"""p-value below which a beam rang when the record began."""
+_RINGING_P_VALUE: Final = 1e-4
+"""p-value of the free decay below which the beam rang when the record began."""
 
 
 @dataclass(frozen=True, slots=True)
 class DampingSize:
-    """Loss factor of a damping at the frequency where it depends least on its order.
+    """Loss factor of one damping at its pivot frequency, where it depends least on the order.
 
     Attributes
     ----------
     omega_rad_s : float or None
-        That frequency, not below the first mode; None if the order is fixed or not determined.
+        Pivot frequency, not below the first mode. None if the order is fixed or not determined.
     value, std : float
-        ``zeta omega^alpha sin(alpha pi/2)`` of internal damping, of external damping ``gamma
-        omega^lambda sin(lambda pi/2)`` over ``rho/EI omega²``: energy lost per radian over stored
-        energy. Without that frequency zeta or gamma itself.
+        Loss factor (energy lost per radian over stored energy) and its standard deviation: ``zeta
+        omega^alpha sin(alpha pi/2)`` of internal damping, ``gamma omega^lambda sin(lambda pi/2)``
+        over ``rho/EI omega²`` of external damping. Without pivot frequency zeta or gamma.
     """
 
     omega_rad_s: float | None
@@ -46,31 +46,32 @@ class DampingSize:
 
 @dataclass(frozen=True, slots=True)
 class ModeEstimate:
-    """One mode of the beam with locked hub (clamped–free), from the fitted plant."""
+    """Frequency and damping ratio of one mode of the fitted beam with locked hub."""
 
     number: int
-    """From 1 on."""
+    """Number of the mode, from 1."""
     frequency_hz: float
-    """Frequency of the free decay, 0 if over-damped."""
+    """Frequency of the free decay in hertz, 0 if over-damped."""
     frequency_std_hz: float
-    """Its standard deviation."""
+    """Standard deviation of the frequency in hertz."""
     damping_ratio: float
-    """Above 1 if over-damped."""
+    """Fraction of the critical damping, above 1 if over-damped."""
     damping_ratio_std: float
-    """Its standard deviation."""
+    """Standard deviation of the damping ratio."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ringing:
-    """Free decay with which the record begins, in addition to the response to the motor.
+    """Free decay of the beam at the start of a record, besides the response to the motor.
 
     Attributes
     ----------
     amplitude_nm : tuple of float
-        By mode, at the first sample compared.
+        Torque amplitude of each mode at the first compared sample.
     chi_square : float
-        Chi-square of all its amplitudes together, with the hum, if any, fitted as well.
+        Chi-square of all amplitudes together, with any hum fitted as well.
     degrees_of_freedom : int
+        Number of fitted amplitudes.
     """
 
     amplitude_nm: tuple[float, ...]
@@ -79,9 +80,9 @@ class Ringing:
 
     @property
     def significant(self) -> bool:
-        """Return whether chance gives as much in less than one record of ten thousand."""
+        """Return whether chance gives such amplitudes in less than one of 10 000 records."""
         freedom = self.degrees_of_freedom
-        return bool(freedom and chi_square_p_value(self.chi_square, freedom) < _RARE)
+        return bool(freedom and chi_square_p_value(self.chi_square, freedom) < _RINGING_P_VALUE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,39 +92,42 @@ class RecordFit:
     Attributes
     ----------
     structure : Structure
+        Damping structure of the fit.
     plant : Plant
         Fitted plant, for use with `rigd.beam`.
     parameters : dict of str to float
         zeta, alpha, gamma, lambda, density_over_stiffness (s²/m⁴), bending_stiffness_n_m2, delay_s
         and tool_inertia_kg_m2, the fixed ones included.
     std : dict of str to (float or None)
-        Standard deviations of the same: 0 for the fixed ones, None for those that rest on a bound
-        or that the data do not determine. For a tool inertia at the bound 0: the value without that
-        bound. An estimate of 0 that cannot be negative is 0 in half of the records, and has a
-        half-normal error in the others: its mean is 1/sqrt(2 pi) = 0.40 of this deviation too
-        large, and it scatters by 0.58 of it.
+        Standard deviations of the same parameters: 0 for fixed ones, None for those that rest on a
+        bound or that the data do not determine. For a tool inertia at the bound 0, the standard
+        deviation without that bound. If its true value is 0, the estimate is 0 in half of the
+        records, and has a half-normal error in the others: its mean is 1/sqrt(2 pi) = 0.40 of this
+        standard deviation too large, and it scatters by 0.58 of it.
     interval : dict of str to ((float, float) or None)
-        95 % confidence intervals of the free ones, None as above. Those of positive parameters are
-        symmetric in the logarithm; that of a tool inertia ends at 0 (`interval_from_zero`).
+        95 % confidence intervals of the free parameters, None where `std` is None. Intervals of
+        positive parameters are symmetric in the logarithm. The interval of a tool inertia ends at 0
+        (`interval_from_zero`).
     determined : tuple of str
         Free parameters in the order of `covariance`.
     covariance : ndarray, shape (k, k)
-        Covariance of the determined parameters; zeta, gamma, density over stiffness and stiffness
-        counted as logarithms.
+        Covariance of the determined parameters, with zeta, gamma, density over stiffness and
+        stiffness as logarithms.
     at_bounds : tuple of str
-        Free parameters that rest on the edge of their range.
+        Free parameters that rest on a bound of their range.
     internal, external : DampingSize or None
-        Decorrelated sizes of the damping; None where absent or not determined.
+        Loss factors of internal and external damping. None if absent or not determined.
     modes : tuple of ModeEstimate
-        Those within the band.
+        Modes within the band.
     ringing : Ringing
+        Free decay at the start of the record.
     cost : float
         Sum of squares of the whitened residual.
     degrees_of_freedom : int
-        Expected cost by chance alone.
+        Cost that is expected if the residual is noise only.
     residual : ndarray of complex, shape (K,)
-        Whitened spectrum of the residual in the band (prediction minus measurement): real and
-        imaginary parts of variance 1 if chance is all that remains.
+        Whitened spectrum of the residual (prediction minus measurement) in the band. Its real and
+        imaginary parts have variance 1 if it is noise only.
     """
 
     structure: Structure
@@ -144,7 +148,7 @@ class RecordFit:
 
     @property
     def correlation(self) -> NDArray[np.float64]:
-        """Return the correlations of the determined parameters, shape (k, k)."""
+        """Return the correlation matrix of the determined parameters, shape (k, k)."""
         std = np.sqrt(np.diag(self.covariance))
         correlation: NDArray[np.float64] = self.covariance / np.outer(std, std)
         return correlation
@@ -164,15 +168,15 @@ class RecordAnalysis:
     fits : tuple of RecordFit
         Fits in the requested order; their costs are comparable.
     frequency_hz : ndarray, shape (K,)
-        Bins of the residuals.
+        Frequencies of the bins of the residuals.
     compared : ndarray of bool, shape (K,)
-        False at the lines; the residuals are 0 there.
+        False at the bins of `lines`, where the residuals are 0.
     noise_nm2_per_hz : ndarray, shape (K,)
         One-sided power spectral density of the torque's noise, without lines.
     lines : tuple of NoiseLine
         Narrow-band disturbances of the torque, excluded from all comparisons.
     comparison : Comparison
-        Data that all of them were compared with.
+        Data of the record that all fits were compared with.
     """
 
     fits: tuple[RecordFit, ...]
@@ -186,16 +190,16 @@ class RecordAnalysis:
     def of(
         cls, fits: Iterable[RecordFit], noise: NoiseSpectrum, comparison: Comparison
     ) -> RecordAnalysis:
-        """Return the analysis of fits to one comparison under one noise.
+        """Return the analysis that contains fits to the same data under the same noise.
 
         Parameters
         ----------
         fits : iterable of RecordFit
             Fits in the requested order.
-        noise : Noise
-            Noise under which all of them were made.
+        noise : NoiseSpectrum
+            Noise spectrum of all fits.
         comparison : Comparison
-            Record and band that all of them were compared with.
+            Data of the record that all fits were compared with.
         """
         return cls(
             fits=tuple(fits),
@@ -208,12 +212,12 @@ class RecordAnalysis:
 
     @property
     def noise(self) -> NoiseSpectrum:
-        """Return the noise spectrum of the fits: the power of each bin."""
+        """Return the noise spectrum of the torque under which the fits were made."""
         scale = self.comparison.samples * self.comparison.decimation.rate_hz / 2
         return NoiseSpectrum(self.noise_nm2_per_hz * scale, self.compared, self.lines)
 
     def fit_percent(self, fit: RecordFit | ModalFit) -> float:
-        """Return the fit of a model to the measured torque in the band (`nrmse_percent`).
+        """Return how well a model fits the measured torque in the band, in per cent (NRMSE).
 
         Narrow-band disturbances are removed, and bins at their lines are not compared. A decay that
         began before the record counts as explained, as initial conditions do.

@@ -1,9 +1,9 @@
 """Search for the lowest minimum of one structure: coarse response first, then the whole record.
 
-The ratio of the whole record's two transforms (the empirical transfer function estimate) is exact
-except for ringing before and after the record. A few hundred of its points, densest at the
+The ratio of the two transforms of the whole record (the empirical transfer function estimate) is
+exact except for ringing before and after the record. A few hundred of its points, densest at the
 resonances, distinguish the minima in a hundredth of the time. The descents on the whole record
-start at its minima.
+start at the minima of this coarse response.
 """
 
 from __future__ import annotations
@@ -38,46 +38,59 @@ if TYPE_CHECKING:
 
 # Resonances
 
-_SCAN: Final = np.linspace(-0.5, 0.5, 101)
-_MODERATE: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
-"""Damping for these scans, as `Unknowns.start` takes it."""
+_LN_RATIO_SHIFTS: Final = np.linspace(-0.5, 0.5, 101)
+"""Shifts of ln(rho/EI) at which the resonances are compared with the record."""
+
+_SCAN_DAMPING: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
+"""Damping for the scan of these shifts, as `Unknowns.start` accepts it."""
 
 
 def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArray[np.float64]:
-    """Return the shift of the unknowns that aligns the resonances, shape (k,).
+    """Return the shift of the unknowns that aligns the resonances with the record, (k,).
 
     If a resonance is off by more than its width, no descent finds it.
 
     Parameters
     ----------
     cost : callable
-        Cost of a plant, on few points of a frequency response.
+        Function from a plant to its cost, on few points of a frequency response.
     unknowns : Unknowns
+        Unknowns of the structure.
     """
-    moderate = unknowns.start(np.array([_MODERATE[name] for name in unknowns.structure.free]))
+    moderate = unknowns.start(np.array([_SCAN_DAMPING[name] for name in unknowns.structure.free]))
     shift = np.zeros(moderate.size)
     if "density_over_stiffness" in unknowns.names:
         index = unknowns.names.index("density_over_stiffness")
         costs = []
-        for step in _SCAN:
+        for step in _LN_RATIO_SHIFTS:
             shift[index] = step
             costs.append(cost(unknowns.plant(moderate + shift)))
-        shift[index] = _SCAN[int(np.argmin(costs))]
+        shift[index] = _LN_RATIO_SHIFTS[int(np.argmin(costs))]
     return shift
 
 
 # Coarse response
 
-_POINTS: Final = 400
-_TOLERANCE: Final = 1e-2
-_SAME_MINIMUM: Final = 0.05
-"""Minima whose plants differ by less than this fraction of the cost are one."""
+_COARSE_POINTS: Final = 400
+"""Number of points of the coarse response."""
 
-_MAX_EVALUATIONS: Final = 60
-_SIZES: Final = {name: tuple(np.log([1e-4, 1e-3, 1e-2, 1e-1])) for name in ("zeta", "gamma")}
-"""Relative to stiffness and to inertia at a mode: about twice a damping ratio."""
+_COARSE_TOLERANCE: Final = 1e-2
+"""Relative tolerance of the cost in a descent on the coarse response."""
 
-_ORDERS: Final = (0.5, 1.5)
+_SAME_MINIMUM_FRACTION: Final = 0.05
+"""Minima whose plants differ by less than this fraction of the cost count as one."""
+
+_MAX_COARSE_EVALUATIONS: Final = 60
+"""Largest number of evaluations in a descent on the coarse response."""
+
+_START_LN_SIZES: Final = {
+    name: tuple(np.log([1e-4, 1e-3, 1e-2, 1e-1])) for name in ("zeta", "gamma")
+}
+"""Logarithms of the start values of zeta and gamma, relative to stiffness and inertia at a mode:
+about twice a damping ratio."""
+
+_START_ORDERS: Final = (0.5, 1.5)
+"""Start values of alpha and lambda besides 1."""
 
 
 class CoarseResponse:
@@ -88,56 +101,59 @@ class CoarseResponse:
     def __init__(self, comparison: Comparison) -> None:
         length = comparison.angle_rad.size
         hz = np.fft.rfftfreq(length, 1 / comparison.decimation.rate_hz)
-        first, last = comparison.frequency_hz[[0, -1]]
-        band = np.flatnonzero((hz >= first) & (hz <= last))
+        first_hz, last_hz = comparison.frequency_hz[[0, -1]]
+        band = np.flatnonzero((hz >= first_hz) & (hz <= last_hz))
         angle = np.fft.rfft(comparison.angle_rad)[band]
         torque = np.fft.rfft(comparison.torque_nm)[band]
         # Without excitation the motor moved with the noise: such bins show no response.
-        given = np.fft.rfft(comparison.coherent_rad())[band]
-        power = given.real**2 + given.imag**2
+        coherent_angle = np.fft.rfft(comparison.coherent_rad())[band]
+        power = coherent_angle.real**2 + coherent_angle.imag**2
         excited = power > 1e-12 * power.max()
         response, weights = torque[excited] / angle[excited], power[excited]
-        index, self._weights = thinned(response, weights / weights.sum(), _POINTS)
-        self._measured = response[index]
-        self._frequency_hz = hz[band][excited][index]
+        selected, self._weights = thinned(response, weights / weights.sum(), _COARSE_POINTS)
+        self._measured = response[selected]
+        self._frequency_hz = hz[band][excited][selected]
         self._response = ResponseGrid(2j * np.pi * self._frequency_hz)
         self._costs: dict[Plant, float] = {}
 
     def whitened(self, noise: NoiseSpectrum, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
-        """Return the same points with their weights under a noise.
+        """Return this coarse response with weights for another noise spectrum.
 
         Parameters
         ----------
-        noise : Noise
+        noise : NoiseSpectrum
+            Noise of the torque.
         frequency_hz : ndarray, shape (K,)
-            Its bins.
+            Frequencies of the bins of the noise spectrum.
         """
         weight = np.interp(self._frequency_hz, frequency_hz, noise.weight**2)
-        other = copy(self)
-        other._weights = self._weights * weight / (self._weights @ weight)
-        other._costs = {}
-        return other
+        response = copy(self)
+        response._weights = self._weights * weight / (self._weights @ weight)
+        response._costs = {}
+        return response
 
     def cost(self, plant: Plant) -> float:
-        """Return the weighted mean square of the deviation, in (N·m/rad)²."""
+        """Return the weighted mean square of predicted minus measured response, in (N·m/rad)²."""
         # Cached: structures that differ only in the free parameters are scanned at the same plants.
         if plant not in self._costs:
             deviation = self._response.evaluate(plant)[0] - self._measured
             self._costs[plant] = self._mean_square(deviation)
         return self._costs[plant]
 
-    def distance(self, one: Plant, other: Plant) -> float:
-        """Return the weighted mean square of the difference between two plants."""
+    def distance(self, first_plant: Plant, second_plant: Plant) -> float:
+        """Return the weighted mean square of the difference between two plants' responses."""
         return self._mean_square(
-            self._response.evaluate(one)[0] - self._response.evaluate(other)[0]
+            self._response.evaluate(first_plant)[0] - self._response.evaluate(second_plant)[0]
         )
 
-    def alike(self, one: Plant, other: Plant) -> bool:
-        """Return whether two plants belong to the same minimum."""
-        return self.distance(one, other) <= _SAME_MINIMUM * min(self.cost(one), self.cost(other))
+    def alike(self, first_plant: Plant, second_plant: Plant) -> bool:
+        """Return whether two plants are so similar that they belong to the same minimum."""
+        return self.distance(first_plant, second_plant) <= _SAME_MINIMUM_FRACTION * min(
+            self.cost(first_plant), self.cost(second_plant)
+        )
 
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
-        """Return the cost and its derivatives by the unknowns."""
+        """Return the coarse cost with its gradient and Gauss-Newton matrix by the unknowns."""
         plant, chain = unknowns.plant_and_gradient(x)
         response, *gradient = self._response.evaluate(plant, unknowns.gradient_names)
         deviation = response - self._measured
@@ -150,95 +166,105 @@ class CoarseResponse:
         )
 
     def _mean_square(self, deviation: NDArray[np.complex128]) -> float:
+        """Return the weighted mean square of differences of the response, in (N·m/rad)²."""
         return float(self._weights @ (deviation.real**2 + deviation.imag**2))
 
 
 def initial_guesses(coarse: CoarseResponse, unknowns: Unknowns) -> list[NDArray[np.float64]]:
-    """Return points from which descents lead to all relevant minima, each of shape (k,).
+    """Return start vectors from which descents reach all relevant minima, each of shape (k,).
 
-    The first is the best fit with all orders 1, which most materials and air come close to. The
+    The first is the best fit with all orders 1, which is close to most materials and to air. The
     others have the same losses with different orders.
     """
     shift = resonance_shift(coarse.cost, unknowns)
-    sizes = [_SIZES.get(name, (1.0,)) for name in unknowns.structure.free]
-    found = [unknowns.start(np.array(point)) + shift for point in itertools.product(*sizes)]
-    first = min(found, key=lambda x: coarse.cost(unknowns.plant(x)))
-    points = [first]
+    sizes = [_START_LN_SIZES.get(name, (1.0,)) for name in unknowns.structure.free]
+    starts = [unknowns.start(np.array(guess)) + shift for guess in itertools.product(*sizes)]
+    best_start = min(starts, key=lambda x: coarse.cost(unknowns.plant(x)))
+    guesses = [best_start]
     orders = [i for i, name in enumerate(unknowns.names) if name in ("alpha", "lambda")]
-    for values in itertools.product(_ORDERS, repeat=len(orders)) if orders else ():
-        point = first.copy()
-        point[orders] = values
-        points.append(point)
-    return points
+    for values in itertools.product(_START_ORDERS, repeat=len(orders)) if orders else ():
+        guess = best_start.copy()
+        guess[orders] = values
+        guesses.append(guess)
+    return guesses
 
 
 def coarse_minima(
     coarse: CoarseResponse, unknowns: Unknowns, points: Iterable[NDArray[np.float64]]
 ) -> list[Minimum]:
-    """Return the distinct minima of the coarse cost from some points, the lowest first."""
+    """Return the distinct minima of the coarse cost from some start vectors, the lowest first."""
     steps = Steps.of(unknowns)
-    found = [
+    minima = [
         descend(
             lambda x: coarse.normal_equations(unknowns, x),
             point,
             steps,
-            relative_tolerance=_TOLERANCE,
-            max_evaluations=_MAX_EVALUATIONS,
+            relative_tolerance=_COARSE_TOLERANCE,
+            max_evaluations=_MAX_COARSE_EVALUATIONS,
         )
         for point in points
     ]
     distinct: list[Minimum] = []
-    for minimum in sorted(found, key=lambda m: m.cost):
+    for minimum in sorted(minima, key=lambda m: m.cost):
         plant = unknowns.plant(minimum.x)
-        if not any(coarse.alike(plant, unknowns.plant(other.x)) for other in distinct):
+        if not any(
+            coarse.alike(plant, unknowns.plant(known_minimum.x)) for known_minimum in distinct
+        ):
             distinct.append(minimum)
     return distinct
 
 
 # Descents on the whole record
 
-_BETWEEN_RIVALS: Final = 1e-2
-"""Relative tolerance that decides which of several minima is lower."""
+_RIVAL_TOLERANCE: Final = 1e-2
+"""Relative tolerance of the descents that decide which of several minima is lower."""
 
-_RIVALS: Final = 2
-_NO_RIVAL: Final = 1.5
-"""A coarse minimum whose cost is larger than the lowest one's by this factor is not gone after."""
+_MAX_RIVALS: Final = 2
+"""Largest number of coarse minima from which the whole record is fitted."""
 
-_CLEARLY: Final = 0.9
-"""Cost, relative to the end of a descent, below which another coarse minimum is refined."""
+_RIVAL_COST_RATIO: Final = 1.5
+"""Cost of a coarse minimum, relative to the lowest one, from which it is ignored."""
 
-_MOST_MINIMA: Final = 4
+_BETTER_COST_RATIO: Final = 0.9
+"""Cost of another coarse minimum, relative to that at the end of a descent, below which it is
+refined."""
+
+_MAX_STORED_MINIMA: Final = 4
+"""Largest number of stored minima that are compared again under another noise spectrum."""
+
 RENEWALS: Final = 4
-"""Limit of re-estimates of the angle that follows the reference."""
+"""Largest number of re-estimates of the angle that follows the reference."""
 
-_HUM_SEARCHES: Final = 3
-"""Number of searches for hum: the first fit attributed part of it to the beam."""
+_MAX_HUM_SEARCHES: Final = 3
+"""Largest number of searches for hum. More than one is needed, since the first fit attributed part
+of the hum to the beam."""
 
 
 @dataclass(frozen=True, slots=True)
 class Descent:
-    """State of the descent of one structure."""
+    """Current point of the descent of one structure on a record: its objective and unknowns."""
 
     objective: Objective
     x: NDArray[np.float64]
 
     @property
     def plant(self) -> Plant:
-        """Return the plant at this point."""
+        """Return rig and beam at the current point of the descent."""
         return self.objective.unknowns.plant(self.x)
 
     def to_minimum(
         self, noise: NoiseSpectrum, tolerance: float, hopeless: tuple[int, float] | None = None
     ) -> Descent:
-        """Descend to the minimum under a noise spectrum.
+        """Descend to the local minimum under a noise spectrum.
 
         Parameters
         ----------
-        noise : Noise
+        noise : NoiseSpectrum
+            Noise that weights the residual.
         tolerance : float
-            Relative, of the sum of squares.
+            Relative tolerance of the sum of squares.
         hopeless : tuple of int and float, optional
-            Argument of `descend`.
+            Number of evaluations and cost above which `descend` gives up.
         """
         region = Steps.of(self.objective.unknowns)
         objective, minimum = self.objective.minimum(
@@ -247,26 +273,26 @@ class Descent:
         return Descent(objective, minimum.x)
 
     def cost(self, noise: NoiseSpectrum) -> float:
-        """Return the sum of squares here under a noise spectrum."""
+        """Return the sum of squares at the current point under a noise spectrum."""
         return self.objective.normal_equations(self.x, noise.weight).cost
 
     def renewed(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
-        """Re-estimate the angle that follows the reference until it converges.
+        """Re-estimate the angle that follows the reference, and descend again, until it converges.
 
-        Return `self` if it has converged.
+        Return `self` if it has converged already.
         """
-        here = self
+        descent = self
         for _ in range(RENEWALS):
-            comparison = here.objective.comparison.renewed(here.plant, noise)
-            if comparison is here.objective.comparison:
+            comparison = descent.objective.comparison.renewed(descent.plant, noise)
+            if comparison is descent.objective.comparison:
                 break
-            here = Descent(Objective(comparison, here.objective.unknowns), here.x)
-            noise = here.noise()
-            here = here.to_minimum(noise, tolerance)
-        return here
+            descent = Descent(Objective(comparison, descent.objective.unknowns), descent.x)
+            noise = descent.noise()
+            descent = descent.to_minimum(noise, tolerance)
+        return descent
 
     def hum(self) -> tuple[Hum, ...]:
-        """Search for narrow-band disturbances near the modes of the current beam."""
+        """Return the narrow-band disturbances found near the modes of the current beam."""
         comparison = self.objective.comparison
         at, noise = self.objective.linearise(self.x), self.noise()
         amplitudes = self.objective.project(at, noise.weight).amplitudes
@@ -275,21 +301,21 @@ class Descent:
         return hum_near_modes(comparison, self.plant, at.poles, noise, decaying_nm)
 
     def without_hum(self, tolerance: float) -> Descent:
-        """Remove the hum near modes and descend again; return `self` if there is none."""
-        here = self
-        for _ in range(_HUM_SEARCHES):
-            hum = here.hum()
+        """Remove the hum near modes and descend again. Return `self` if there is no hum."""
+        descent = self
+        for _ in range(_MAX_HUM_SEARCHES):
+            hum = descent.hum()
             if not hum:
                 return self
             objective = Objective(
-                here.objective.comparison.without_hum(hum), here.objective.unknowns
+                descent.objective.comparison.without_hum(hum), descent.objective.unknowns
             )
-            here = Descent(objective, here.x)
-            here = here.to_minimum(here.noise(), tolerance)
-        return here
+            descent = Descent(objective, descent.x)
+            descent = descent.to_minimum(descent.noise(), tolerance)
+        return descent
 
     def noise(self, *, with_lines: bool = False) -> NoiseSpectrum:
-        """Return the noise of the residual here without the free decay."""
+        """Return the noise spectrum of the current residual, without the free decay."""
         objective, comparison = self.objective, self.objective.comparison
         at = objective.linearise(self.x)
         near_mode = None
@@ -315,11 +341,13 @@ class StructureSearch:
     Attributes
     ----------
     objective : Objective
+        Sum of squares of the whole record.
     coarse : CoarseResponse
+        Some points of the frequency response of the record.
     first : ndarray, shape (k,)
-        Minimum with orders of 1.
+        Unknowns of the best start with all orders 1.
     minima : list of Minimum
-        Minima of the coarse response, noise taken as white; the lowest first.
+        Minima of the coarse response under white noise, the lowest first.
     """
 
     objective: Objective
@@ -329,42 +357,44 @@ class StructureSearch:
 
     @classmethod
     def of(cls, objective: Objective, coarse: CoarseResponse) -> StructureSearch:
-        """Search the whole range of the unknowns on the coarse response."""
+        """Search the whole range of the unknowns for minima of the coarse response."""
         starts = initial_guesses(coarse, objective.unknowns)
         return cls(objective, coarse, starts[0], coarse_minima(coarse, objective.unknowns, starts))
 
     @property
     def unknowns(self) -> Unknowns:
-        """Return the unknowns of the search."""
+        """Return the unknowns of the structure."""
         return self.objective.unknowns
 
     def on(self, comparison: Comparison) -> StructureSearch:
-        """Return the search on another comparison, with the same starts."""
+        """Return the same search, with the same starts, on other data of the record."""
         return replace(self, objective=Objective(comparison, self.unknowns))
 
     def lowest(self) -> Descent:
-        """Return the point where the coarse response has its lowest cost."""
+        """Return a descent that starts at the lowest minimum of the coarse response."""
         return Descent(self.objective, self.minima[0].x)
 
     def under(self, noise: NoiseSpectrum, near: Descent | None = None) -> Descent:
-        """Descend to the lowest minimum of the whole record.
+        """Descend to the lowest minimum of the whole record under a noise spectrum.
 
-        Under another noise another minimum may be the lowest. So all are compared again on the
-        coarse response, which is cheap, and the best few are refined.
+        Under another noise spectrum another minimum may be the lowest. So all minima are compared
+        again on the coarse response, which is cheap, and the best few are refined on the whole
+        record.
 
         Parameters
         ----------
-        noise : Noise
+        noise : NoiseSpectrum
+            Noise that weights the residual.
         near : Descent, optional
             Descent at a known minimum.
         """
         coarse = self.coarse.whitened(noise, self.objective.comparison.frequency_hz)
-        points = [minimum.x for minimum in self.minima[:_MOST_MINIMA]]
-        found = coarse_minima(coarse, self.unknowns, [*points, self.first])
+        points = [minimum.x for minimum in self.minima[:_MAX_STORED_MINIMA]]
+        minima_under_noise = coarse_minima(coarse, self.unknowns, [*points, self.first])
         rivals = [
             Descent(self.objective, minimum.x)
-            for minimum in found[:_RIVALS]
-            if minimum.cost < _NO_RIVAL * found[0].cost
+            for minimum in minima_under_noise[:_MAX_RIVALS]
+            if minimum.cost < _RIVAL_COST_RATIO * minima_under_noise[0].cost
         ]
         if near is not None:
             plant = self.unknowns.plant(near.x)
@@ -372,9 +402,10 @@ class StructureSearch:
                 rival
                 for rival in rivals
                 if not coarse.alike(plant, self.unknowns.plant(rival.x))
-                and coarse.cost(self.unknowns.plant(rival.x)) < _CLEARLY * coarse.cost(plant)
+                and coarse.cost(self.unknowns.plant(rival.x))
+                < _BETTER_COST_RATIO * coarse.cost(plant)
             ]
         if len(rivals) == 1:
             return rivals[0]
-        ends = [rival.to_minimum(noise, _BETWEEN_RIVALS) for rival in rivals]
-        return min(ends, key=lambda end: end.cost(noise))
+        final_descents = [rival.to_minimum(noise, _RIVAL_TOLERANCE) for rival in rivals]
+        return min(final_descents, key=lambda end: end.cost(noise))

@@ -1,6 +1,6 @@
-"""Verdict on one record: modal model, test of uniformity, orders with a tolerance, candidates.
+"""Verdict on one record: modal model, uniform-beam test, damping orders, candidate structures.
 
-Sentences are in `analysis.identify.sentences`.
+The sentences of the verdict are written in `analysis.identify.sentences`.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from analysis.identify._modal_fit import fit_modes
 from analysis.identify._modal_headline import tolerant_order, with_modal_model
 from analysis.identify._nonlinear import nonlinear_forces
 from analysis.identify._result import RecordAnalysis
-from analysis.identify._small_effects import LARGE, small_effect
+from analysis.identify._small_effects import LARGE_DEVIANCE_REDUCTION, small_effect
 from analysis.identify._step_in_time import step_score
 from analysis.identify._time_varying import along_time, changing, established
 from analysis.identify._visible_modes import visible_modes
-from analysis.identify.headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
-from analysis.identify.profile_likelihood import WIDEST_FRACTION, profiled
+from analysis.identify.headline import MISREAD, UNEXPLAINED_REASON, Headline, headline, of_fit
+from analysis.identify.profile_likelihood import WIDEST_FRACTION, profile_both_orders
 from analysis.identify.residual_tests import (
     InputRelation,
     Whiteness,
@@ -41,7 +41,7 @@ from analysis.identify.residual_tests import (
     input_relation,
     whiteness,
 )
-from analysis.identify.sentences import experiments, of_headline
+from analysis.identify.sentences import experiments, headline_sentences
 from analysis.identify.uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify.verdict import (
     BIC_TIE,
@@ -76,35 +76,49 @@ if TYPE_CHECKING:
     from analysis.identify.uniform_beam import UniformBeamTest
 
 
-_MODES_TO_TEST: Final = 2
+_MODES_WITHOUT_REDUNDANCY: Final = 2
+"""Number of visible modes up to which deviations from a uniform beam leave no degree of freedom."""
+
 _ROUGH_DAMPING_RATIO: Final = 0.01
 """Damping ratio from which the search for a mode begins if no beam provides one."""
-_TILTED: Final = "the axis is tilted, and fits to the whole record are of one that is plumb"
-_CLIPPED: Final = "the torque is clipped"
-INTEGER: Final = STRUCTURES["III"]
-"""Both dampings of order 1. It is fitted from every start: it has no local minima by undetermined
-orders, and no damping that is in fact a stiffness or an inertia."""
 
-_MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
-_NOT_SEARCHED: Final = frozenset({"sign", "unit", "clipping", "stop"})
-"""Findings that make a search for impacts useless. A large impact may drive settings to an edge."""
-_OF_CHANNELS: Final = _MISREAD_KINDS | {"clipping", "stop"}
-"""Findings that are reported if the record contradicts its file."""
+
+_TILTED_AXIS_REASON: Final = (
+    "the axis is tilted, and fits to the whole record are of one that is plumb"
+)
+"""Reason against the estimates on an exactly uniform beam if the axis is tilted."""
+
+_CLIPPED_TORQUE_REASON: Final = "the torque is clipped"
+"""Reason against all numbers if the torque is clipped."""
+
+INTEGER: Final = STRUCTURES["III"]
+"""Structure with internal and external damping of order 1. It is fitted from every start: it has no
+local minima by undetermined orders, and no damping that is in fact a stiffness or an inertia."""
+
+_CONTRADICTING_KINDS: Final = frozenset({"sign", "unit", "implausible"})
+"""Findings that show that the record contradicts its file."""
+
+_KINDS_AGAINST_IMPACT_SEARCH: Final = frozenset({"sign", "unit", "clipping", "stop"})
+"""Findings that make a search for impacts useless. "implausible" is not one of them, since a large
+impact may drive settings to an edge."""
+_CHANNEL_KINDS: Final = _CONTRADICTING_KINDS | {"clipping", "stop"}
+"""Findings that are reported even if the record contradicts its file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Verdict on a record, with the fits that it rests on.
+    """Verdict on a record, with the fits that support it.
 
     Attributes
     ----------
     verdict : Verdict
+        Conclusions on the record.
     headline : Headline
         Reported numbers, with flags.
     candidates : tuple of Candidate
-        All fits, the lowest BIC first.
+        Fits of all structures, the one with the lowest BIC first.
     analysis : RecordAnalysis
-        The same fits with the noise and the bins that are theirs.
+        The same fits with their noise spectrum and frequencies.
     """
 
     verdict: Verdict
@@ -114,12 +128,12 @@ class Selection:
 
     @property
     def fit(self) -> RecordFit:
-        """Return the fit behind the numbers of the headline."""
+        """Return the fit whose numbers are reported."""
         return self.headline.fit
 
     @property
     def determined(self) -> frozenset[Order]:
-        """Return the orders that the record determines: a single minimum along each."""
+        """Return the orders, "alpha" or "lambda", that the record determines."""
         orders = (self.verdict.alpha, self.verdict.lambda_)
         return frozenset(each.order for each in orders if each.profile.identifiable)
 
@@ -133,195 +147,241 @@ def select(
 ) -> Selection:
     """Select the model that a record supports, and report its parameters.
 
-    The modal model is fitted to the record without hum, impacts and gaps; the reported modes are
-    its modes. If its residual is noise, the antenna is linear and constant. Otherwise drag,
-    nonlinear forces, changes along the record and impacts are tested. A uniform beam is tested
-    against the modal constants; orders, coefficients and stiffness are estimated from these with
-    the tolerance of the geometry that the measurement states. All structures are also fitted to the
-    record on an exactly uniform beam: their values are conditional estimates.
+    The modal model is fitted to the record without hum, impacts and gaps. Its modes are reported.
+    If its residual is noise, the antenna is linear and constant. Otherwise drag, nonlinear forces,
+    changes along the record and impacts are tested. A uniform beam is tested against the modal
+    constants. Orders, coefficients and stiffness are estimated from these constants, with the
+    tolerance of the geometry that the measurement states. All structures are also fitted to the
+    record on an exactly uniform beam. Their values are conditional estimates.
 
     Parameters
     ----------
     measurement : Measurement
+        Angle and torque of the record, with the rig and specimen that the file states.
     fixed : iterable of str
-        Settings that stay as the file states them.
+        Settings that keep the values of the file.
     band_hz : tuple of float
+        First and last frequency of the comparison.
     earlier : Selection, optional
         Selection of an earlier part of the record. If its first candidate explains the whole
-        record, all candidates start from the earlier ones, in a third of the time; one of several
-        minima may be missed.
+        record, all candidates start from the earlier ones, in a third of the time. One of several
+        minima may be missed then.
+
+    Returns
+    -------
+    Selection
+        Verdict, reported numbers and fits.
 
     Raises
     ------
     MeasurementError
-        The record cannot be used.
+        If the record cannot be used.
     ValueError
-        There is no such setting.
+        If a name in `fixed` is no setting.
     """
     fixed = tuple(fixed)
-    return _with_knocks(measurement, lambda each: _selected(each, fixed, band_hz, earlier)).result
+    return _assess_with_impacts(
+        measurement, lambda each: _select_with_known_impacts(each, fixed, band_hz, earlier)
+    ).result
 
 
-_T = TypeVar("_T")
+_ResultT = TypeVar("_ResultT")
+"""Result of an assessment."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Assessment(Generic[_T]):
-    """Result on a record, with the candidates that it rests on.
+class _Assessment(Generic[_ResultT]):
+    """Result on a record, with the candidates that support it.
 
     Attributes
     ----------
-    result : _T
+    result : _ResultT
+        Selection, or the result of `freest_alone`.
     candidate_set : CandidateSet
-        Set led by the candidate of the reported numbers.
+        Candidates, the one of the reported numbers first.
     explained : bool
-        Whether its residual is noise only.
+        Whether the residual of this candidate is noise only.
     kinds : collection of str
-        Kinds of the findings.
+        Kinds of the findings on the record.
     """
 
-    result: _T
+    result: _ResultT
     candidate_set: CandidateSet
     explained: bool
     kinds: Collection[str]
 
 
-def _with_knocks(
-    measurement: Measurement, assess: Callable[[Measurement], _Assessment[_T]]
-) -> _Assessment[_T]:
-    """Assess a record; if its residual is more than noise, with the impacts that explain it."""
+def _assess_with_impacts(
+    measurement: Measurement, assess: Callable[[Measurement], _Assessment[_ResultT]]
+) -> _Assessment[_ResultT]:
+    """Assess a record, and assess it again with each impact that explains its residual."""
     assessment = assess(measurement)
     for _ in range(MAX_KNOCKS):
-        if assessment.explained or not _NOT_SEARCHED.isdisjoint(assessment.kinds):
+        if assessment.explained or not _KINDS_AGAINST_IMPACT_SEARCH.isdisjoint(assessment.kinds):
             break
-        better = None
-        # A sweep with harmonics has them all along; but a loud knock may pass for some.
-        for found in knocks_in(assessment.candidate_set, obvious="harmonics" in assessment.kinds):
-            again = assess(with_knock(assessment.candidate_set.comparison.measurement, found))
-            if again.explained or found.evident:
-                better = again
-            if again.explained:
+        better_assessment = None
+        # Harmonics last through the whole sweep, but a strong impact may be mistaken for them.
+        for impact in knocks_in(assessment.candidate_set, obvious="harmonics" in assessment.kinds):
+            with_impact = assess(
+                with_knock(assessment.candidate_set.comparison.measurement, impact)
+            )
+            if with_impact.explained or impact.evident:
+                better_assessment = with_impact
+            if with_impact.explained:
                 break
-        if better is None:
+        if better_assessment is None:
             break
-        assessment = better
+        assessment = better_assessment
     return assessment
 
 
-def _selected(
+def _select_with_known_impacts(
     measurement: Measurement,
     fixed: tuple[Setting, ...],
     band_hz: tuple[float, float],
     earlier: Selection | None,
 ) -> _Assessment[Selection]:
-    """Select the structure with the known impacts."""
-    before = earlier.candidates if earlier else ()
-    again = CandidateSet.from_earlier(before, measurement, fixed, band_hz) if before else None
-    linear = again or CandidateSet.of(measurement, fixed, band_hz)
-    modal = _modal(linear)
-    candidate_set, small = linear, None
+    """Select the structure of a record whose known impacts are part of the measurement."""
+    earlier_candidates = earlier.candidates if earlier else ()
+    refitted = (
+        CandidateSet.from_earlier(earlier_candidates, measurement, fixed, band_hz)
+        if earlier_candidates
+        else None
+    )
+    linear = refitted or CandidateSet.of(measurement, fixed, band_hz)
+    modal = _fit_modal_model(linear)
+    candidate_set, small_linear_effect = linear, None
     forces: tuple[NonlinearForce, ...] = ()
     changes: tuple[TemporalChange, ...] = ()
-    plain = modal is not None and _linear_and_constant(linear, modal, band_hz)
+    is_linear = modal is not None and _is_linear_and_constant(linear, modal, band_hz)
     if modal is not None:
-        small = small_effect(linear.comparison, modal, modal.plant_like(linear.likeliest.plant))
-    alone, suffices = modal, plain
-    if small is not None:
-        alone = _modal(linear, small.column[None])
-        suffices = alone is not None and _linear_and_constant(linear, alone, band_hz)
-    if not (plain or suffices or measurement.knocks):
-        for knock in knocks_in(linear, obvious=True):
-            with_impact = _selected(with_knock(measurement, knock), fixed, band_hz, None)
+        small_linear_effect = small_effect(
+            linear.comparison, modal, modal.plant_like(linear.likeliest.plant)
+        )
+    modal_with_effect, effect_suffices = modal, is_linear
+    if small_linear_effect is not None:
+        modal_with_effect = _fit_modal_model(linear, small_linear_effect.column[None])
+        effect_suffices = modal_with_effect is not None and _is_linear_and_constant(
+            linear, modal_with_effect, band_hz
+        )
+    if not (is_linear or effect_suffices or measurement.knocks):
+        for impact in knocks_in(linear, obvious=True):
+            with_impact = _select_with_known_impacts(
+                with_knock(measurement, impact), fixed, band_hz, None
+            )
             if with_impact.explained:
                 return with_impact
-    step = None
+    stiffness_step = None
     if modal is not None and measurement.one_sweep:
-        if not (plain or suffices) or (small is not None and small.large):
-            step = _likely_step(linear, modal, small)
-        if step is not None:
-            small, alone, suffices = None, modal, plain
-    if not (plain or suffices) or (small is not None and small.large):
-        candidate_set, forces, changes = _with_effects(linear, of_amplitude=step is None)
-        modal = _modal(candidate_set)
-        if suffices and not (
-            modal is not None and _linear_and_constant(candidate_set, modal, band_hz)
+        if not (is_linear or effect_suffices) or (
+            small_linear_effect is not None and small_linear_effect.large
         ):
-            candidate_set, forces, changes, modal = linear, (), (), alone
+            stiffness_step = _likely_stiffness_step(linear, modal, small_linear_effect)
+        if stiffness_step is not None:
+            small_linear_effect, modal_with_effect, effect_suffices = None, modal, is_linear
+    if not (is_linear or effect_suffices) or (
+        small_linear_effect is not None and small_linear_effect.large
+    ):
+        candidate_set, forces, changes = _fit_further_effects(
+            linear, test_amplitude_effects=stiffness_step is None
+        )
+        modal = _fit_modal_model(candidate_set)
+        if effect_suffices and not (
+            modal is not None and _is_linear_and_constant(candidate_set, modal, band_hz)
+        ):
+            candidate_set, forces, changes, modal = linear, (), (), modal_with_effect
         else:
-            small = None
-    elif small is not None and small.saved > LARGE:
-        candidate_set = linear.with_effect(small.column[None])
-        modal = _modal(candidate_set)
+            small_linear_effect = None
+    elif small_linear_effect is not None and small_linear_effect.saved > LARGE_DEVIANCE_REDUCTION:
+        candidate_set = linear.with_effect(small_linear_effect.column[None])
+        modal = _fit_modal_model(candidate_set)
     else:
-        modal = alone
+        modal = modal_with_effect
     candidate_set = candidate_set.with_orders_free()
-    visible = _visible(candidate_set, modal)
-    test = _uniform_beam_test(measurement, modal)
-    refused = test is not None and test.status == "refused"
-    # The whole record excludes every local minimum that a part of it excludes.
-    determined = earlier.determined if earlier and again else ()
-    walk = not_reported_reason(candidate_set, visible) is None and not refused
-    candidate_set, *profiles = profiled(candidate_set, determined, walk=walk)
+    visible_numbers = _visible_mode_numbers(candidate_set, modal)
+    beam_test = _uniform_beam_test(measurement, modal)
+    uniform_beam_refused = beam_test is not None and beam_test.status == "refused"
+    # A local minimum that a part of the record excludes is excluded by the whole record.
+    determined = earlier.determined if earlier and refitted else ()
+    compute_profiles = (
+        not_reported_reason(candidate_set, visible_numbers) is None and not uniform_beam_refused
+    )
+    candidate_set, *profiles = profile_both_orders(
+        candidate_set, determined, compute=compute_profiles
+    )
     leading = candidate_set.led_by(candidate_set.freest)
-    white, related, multiples = _tests(leading, modal, band_hz)
-    explained = white.white and not related.related
-    found = findings(leading, forces, multiples)
-    kinds = {finding.kind for finding in found}
-    wrong = _wrong_model_reason(kinds, explained=explained)
-    clipped = _CLIPPED if "clipping" in kinds else None
-    doubt = wrong or clipped or _doubt_reason(changes, one_sweep=measurement.one_sweep)
-    alpha, lambda_ = (order_verdict(candidate_set, each, visible, doubt=doubt) for each in profiles)
-    orders, close = (alpha, lambda_), rivals(candidate_set, BIC_TIE)
-    numbers = headline(candidate_set, orders, visible, unexplained=wrong)
+    whiteness_test, input_test, harmonic_tests = _test_residual(leading, modal, band_hz)
+    explained = whiteness_test.white and not input_test.related
+    all_findings = findings(leading, forces, harmonic_tests)
+    kinds = {finding.kind for finding in all_findings}
+    model_reason = _wrong_model_reason(kinds, explained=explained)
+    clipped_reason = _CLIPPED_TORQUE_REASON if "clipping" in kinds else None
+    doubt = (
+        model_reason or clipped_reason or _doubt_reason(changes, one_sweep=measurement.one_sweep)
+    )
+    alpha, lambda_ = (
+        order_verdict(candidate_set, each, visible_numbers, doubt=doubt) for each in profiles
+    )
+    orders, close_rivals = (alpha, lambda_), rivals(candidate_set, BIC_TIE)
+    reported = headline(candidate_set, orders, visible_numbers, unexplained=model_reason)
     if doubt is not None:
-        numbers = numbers.doubted(doubt)
-    # A change that was fitted too moved the modes to the middle of the record.
-    mode_doubt = doubt if changes and changes[0].certain else wrong or clipped
-    numbers = _with_modes(numbers, measurement, modal, test, doubt, mode_doubt)
-    if numbers.tolerant is not None:
+        reported = reported.doubted(doubt)
+    # With a fitted change the modes are those at the middle of the record.
+    mode_doubt = doubt if changes and changes[0].certain else model_reason or clipped_reason
+    reported = _add_modal_model(reported, measurement, modal, beam_test, doubt, mode_doubt)
+    if reported.tolerant is not None:
         alpha, lambda_ = (
-            tolerant_order(each.order, numbers.tolerant, each, doubt, refused=refused)
+            tolerant_order(each.order, reported.tolerant, each, doubt, refused=uniform_beam_refused)
             for each in profiles
         )
         orders = alpha, lambda_
     if "nonlinear stiffness" in kinds:
-        numbers = numbers.with_law_assumed()
+        reported = reported.with_stiffness_law_flag()
     sentences, advice = [], []
-    if wrong == MISREAD:
-        found = tuple(each for each in found if each.kind in _OF_CHANNELS)
+    if model_reason == MISREAD:
+        all_findings = tuple(each for each in all_findings if each.kind in _CHANNEL_KINDS)
     else:
-        along = tuple(changing(changes, one_sweep=measurement.one_sweep))
-        found += _settings(leading, numbers, kinds)
-        found += () if small is None else (small.finding(),)
-        if modal is not None and test is not None and refused and wrong is None:
-            found += _explanation(measurement, leading, modal, test)
-        found = _with_doubts(found, along, wrong, doubt, numbers.flags, explained=explained)
-        found = _with_knocks_and_unexplained(leading, found, white, related, step)
-        sentences = of_headline(numbers, orders, alone=doubt is None)
-        advice = experiments(candidate_set, orders, visible, found, close)
-    advice += [each.remedy for each in found if each.remedy]
-    best = candidate_set.best
+        change_findings = tuple(changing(changes, one_sweep=measurement.one_sweep))
+        all_findings += _setting_findings(leading, reported, kinds)
+        all_findings += () if small_linear_effect is None else (small_linear_effect.finding(),)
+        if (
+            modal is not None
+            and beam_test is not None
+            and uniform_beam_refused
+            and model_reason is None
+        ):
+            all_findings += _explain_deviations(measurement, leading, modal, beam_test)
+        all_findings = _mark_doubtful_findings(
+            all_findings, change_findings, model_reason, doubt, reported.flags, explained=explained
+        )
+        all_findings = _add_impacts_and_unexplained(
+            leading, all_findings, whiteness_test, input_test, stiffness_step
+        )
+        sentences = headline_sentences(reported, orders, without_rival=doubt is None)
+        advice = experiments(candidate_set, orders, visible_numbers, all_findings, close_rivals)
+    advice += [each.remedy for each in all_findings if each.remedy]
+    best_candidate = candidate_set.best
     selection = Selection(
         candidates=candidate_set.candidates,
-        headline=numbers,
+        headline=reported,
         analysis=RecordAnalysis.of(
             (c.fit for c in candidate_set.candidates), candidate_set.noise, candidate_set.comparison
         ),
         verdict=Verdict(
             name=measurement.name,
-            structure=best.structure.name,
-            rivals=tuple(c.name for c in close),
-            parameters={k: q.value for k, q in numbers.parameters.items() if q.flag is None},
-            adequate=wrong is None,
+            structure=best_candidate.structure.name,
+            rivals=tuple(c.name for c in close_rivals),
+            parameters={k: q.value for k, q in reported.parameters.items() if q.flag is None},
+            adequate=model_reason is None,
             alpha=alpha,
             lambda_=lambda_,
-            visible_modes=visible,
-            findings=found,
-            table=_table(candidate_set),
-            whiteness=white,
-            input_relation=related,
-            harmonics=multiples,
-            sentences=(*sentences, *(each.sentence for each in found)),
+            visible_modes=visible_numbers,
+            findings=all_findings,
+            table=_candidate_table(candidate_set),
+            whiteness=whiteness_test,
+            input_relation=input_test,
+            harmonics=harmonic_tests,
+            sentences=(*sentences, *(each.sentence for each in all_findings)),
             experiments=tuple(dict.fromkeys(advice)),
             damping_with_amplitude=damping_with_amplitude(leading),
         ),
@@ -329,159 +389,170 @@ def _selected(
     return _Assessment(selection, leading, explained, kinds)
 
 
-def _modal(
-    candidate_set: CandidateSet, further: NDArray[np.complex128] | None = None
+def _fit_modal_model(
+    candidate_set: CandidateSet, added_spectra: NDArray[np.complex128] | None = None
 ) -> ModalFit | None:
-    """Fit the modal model to the data of a candidate set; return None if no mode is visible.
+    """Fit the modal model to the record of a candidate set, or return None if no mode is visible.
 
-    `further`, shape (c, K), are spectra of unknown size in addition to those of the candidates.
+    `added_spectra`, shape (c, K), are torque spectra of unknown size in addition to those of the
+    candidates.
     """
     if candidate_set.misread:
         return None
     starts = _mode_starts(candidate_set.likeliest.modes)
     columns, drag = candidate_set.columns, candidate_set.comparison.drag
-    if further is not None:
-        columns = np.concatenate([columns, further])
-    if drag is not None:  # its size is not known exactly
+    if added_spectra is not None:
+        columns = np.concatenate([columns, added_spectra])
+    if drag is not None:  # the size of the drag is not known exactly
         columns = np.concatenate([columns, drag.by_law])
     return fit_modes(candidate_set.comparison, candidate_set.noise, starts, columns)
 
 
 def _mode_starts(modes: Iterable[ModeEstimate]) -> list[tuple[int, float, float]]:
-    """Return number, frequency (Hz) and damping ratio of each mode where the search begins.
+    """Return number, frequency in hertz and damping ratio of each mode as start of its search.
 
-    A beam that fits badly may have an overdamped mode below one that oscillates. That mode begins
-    at the frequency ratio of a uniform beam.
+    A beam that fits badly may have an overdamped mode below one that oscillates. The search for the
+    overdamped mode starts at the frequency ratio of a uniform beam.
     """
-    known = {mode.number: mode for mode in modes if mode.frequency_hz > 0}
-    if not known:
+    oscillating_modes = {mode.number: mode for mode in modes if mode.frequency_hz > 0}
+    if not oscillating_modes:
         return []
-    numbers = range(1, max(known) + 1)
+    numbers = range(1, max(oscillating_modes) + 1)
     eigenvalues = clamped_free_eigenvalues(len(numbers)).tolist()
     starts = []
     for number in numbers:
-        mode = known.get(number)
+        mode = oscillating_modes.get(number)
         if mode is not None:
             starts.append((number, mode.frequency_hz, mode.damping_ratio))
             continue
-        nearest = min(known.values(), key=lambda each: abs(each.number - number))
-        ratio = (eigenvalues[number - 1] / eigenvalues[nearest.number - 1]) ** 2
-        starts.append((number, nearest.frequency_hz * ratio, _ROUGH_DAMPING_RATIO))
+        nearest = min(oscillating_modes.values(), key=lambda each: abs(each.number - number))
+        frequency_ratio = (eigenvalues[number - 1] / eigenvalues[nearest.number - 1]) ** 2
+        starts.append((number, nearest.frequency_hz * frequency_ratio, _ROUGH_DAMPING_RATIO))
     return starts
 
 
-def _visible(candidate_set: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
+def _visible_mode_numbers(candidate_set: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
     """Return the numbers of the modes that a record shows."""
     if modal is None:
         return visible_modes(candidate_set.comparison, candidate_set.noise, candidate_set.best.fit)
     return modal.visible
 
 
-def _with_modes(
-    exact: Headline,
+def _add_modal_model(
+    exact_headline: Headline,
     measurement: Measurement,
     modal: ModalFit | None,
     test: UniformBeamTest | None,
     doubt: str | None,
     mode_doubt: str | None,
 ) -> Headline:
-    """Add the modal model to a headline of a uniform beam, and apply the stated tolerance.
+    """Add the modal model and the estimates with tolerance to the headline of a uniform beam.
 
-    Return `exact` if there is no modal model. `doubt` and `mode_doubt` are the reasons against
-    every number and against every mode.
+    Return `exact_headline` if there is no modal model. `doubt` is the reason against every number,
+    and `mode_doubt` the reason against every mode. They are None if there is no such reason.
     """
     if modal is None or test is None:
-        return exact
+        return exact_headline
     tolerant = None
     if measurement.axis_tilt_deg:
-        exact = exact.doubted(_TILTED)
+        exact_headline = exact_headline.doubted(_TILTED_AXIS_REASON)
     if measurement.uniformity or test.status == "refused" or measurement.axis_tilt_deg:
         tolerant = tolerant_estimate(
             modal, measurement.nominal, measurement.uniformity, measurement.axis_tilt_deg
         )
-    return with_modal_model(exact, modal, test, tolerant, doubt, mode_doubt)
+    return with_modal_model(exact_headline, modal, test, tolerant, doubt, mode_doubt)
 
 
 def _uniform_beam_test(measurement: Measurement, modal: ModalFit | None) -> UniformBeamTest | None:
-    """Test whether a uniform beam with free parameters predicts the modes."""
+    """Test whether a uniform beam predicts the modes. Return None without a modal model."""
     if modal is None:
         return None
     return uniform_beam_test(modal, measurement.nominal, measurement.axis_tilt_deg)
 
 
-def _explanation(
+def _explain_deviations(
     measurement: Measurement, candidate_set: CandidateSet, modal: ModalFit, test: UniformBeamTest
 ) -> tuple[Finding, ...]:
-    """Name simple causes of the deviations from a uniform beam.
+    """Return a finding that names simple causes of the deviations from a uniform beam.
 
-    Two modes leave no degree of freedom for this test.
+    Return no finding with only two modes, which leave no degree of freedom for this test.
     """
-    if len(modal.visible) <= _MODES_TO_TEST:
+    if len(modal.visible) <= _MODES_WITHOUT_REDUNDANCY:
         return ()
     causes = explanations(modal, measurement.nominal, measurement.axis_tilt_deg)
-    step = step_score(candidate_set.comparison, modal) if measurement.one_sweep else None
-    return (explanation_finding(test, causes, step),)
+    stiffness_step = step_score(candidate_set.comparison, modal) if measurement.one_sweep else None
+    return (explanation_finding(test, causes, stiffness_step),)
 
 
-def _settings(
+def _setting_findings(
     candidate_set: CandidateSet, result: Headline, kinds: Collection[str]
 ) -> tuple[Finding, ...]:
-    """Find settings that differ from the file, if at least two modes show and nothing is absurd."""
-    if "implausible" in kinds or len(result.visible_modes) < _MODES_TO_TEST:
+    """Return findings on settings that differ from the file, if the record can show them."""
+    if "implausible" in kinds or len(result.visible_modes) < _MODES_WITHOUT_REDUNDANCY:
         return ()
     return tuple(of_settings(candidate_set, result))
 
 
-def _linear_and_constant(
+def _is_linear_and_constant(
     candidate_set: CandidateSet, modal: ModalFit, band_hz: tuple[float, float]
 ) -> bool:
-    """Return whether the residual of the modal model is noise: then no other effect is tested."""
-    _, _, multiples = _tests(candidate_set, modal, band_hz)
-    return modal.explained and not any(each.present for each in multiples)
+    """Return whether noise and no harmonic remains, so that no other effect need be tested."""
+    _, _, harmonic_tests = _test_residual(candidate_set, modal, band_hz)
+    return modal.explained and not any(each.present for each in harmonic_tests)
 
 
-def _with_effects(
-    linear: CandidateSet, *, of_amplitude: bool
+def _fit_further_effects(
+    linear: CandidateSet, *, test_amplitude_effects: bool
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[TemporalChange, ...]]:
-    """Test for nonlinear and time-varying effects, or for the latter alone.
+    """Test a record for nonlinear and time-varying effects, or for the latter alone.
 
-    Return the set with the best explanation, its nonlinear forces, and its changes along the
-    record.
+    Return the candidate set with the best explanation, its nonlinear forces, and its changes along
+    the record.
     """
-    if not of_amplitude:
+    if not test_amplitude_effects:
         candidate_set, changes = along_time(linear.with_orders_free())
         return candidate_set, (), changes
     candidate_set = linear if linear.misread else with_air_drag(linear)
-    visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
+    visible_numbers = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     candidate_set, forces = (
-        (candidate_set, ()) if candidate_set.misread else nonlinear_forces(candidate_set, visible)
+        (candidate_set, ())
+        if candidate_set.misread
+        else nonlinear_forces(candidate_set, visible_numbers)
     )
     if forces and candidate_set.drag is not None:
-        # A stiffness that depends on the deflection may have passed for a little drag.
-        without, alone = nonlinear_forces(linear, visible)
-        if alone and without.bic < candidate_set.bic:
-            candidate_set, forces = without, alone
+        # A stiffness that depends on the deflection may have been mistaken for weak drag.
+        without_drag, forces_without_drag = nonlinear_forces(linear, visible_numbers)
+        if forces_without_drag and without_drag.bic < candidate_set.bic:
+            candidate_set, forces = without_drag, forces_without_drag
     candidate_set, changes = along_time(candidate_set.with_orders_free())
     one_sweep = linear.comparison.measurement.one_sweep
     if not one_sweep and (forces or candidate_set.drag is not None):
         # A change along the record may have been mistaken for a dependence on the amplitude.
-        other, other_changes = along_time(linear.with_orders_free(), rival_bic=candidate_set.bic)
-        if other_changes and other.bic < candidate_set.bic:
-            return other, (), other_changes
+        with_changes, other_changes = along_time(
+            linear.with_orders_free(), rival_bic=candidate_set.bic
+        )
+        if other_changes and with_changes.bic < candidate_set.bic:
+            return with_changes, (), other_changes
     return candidate_set, forces, changes
 
 
-def _likely_step(linear: CandidateSet, modal: ModalFit, small: SmallEffect | None) -> Step | None:
+def _likely_stiffness_step(
+    linear: CandidateSet, modal: ModalFit, small_linear_effect: SmallEffect | None
+) -> Step | None:
     """Return the step of the stiffness if it explains more than any effect of the amplitude."""
-    step = step_score(linear.comparison, modal)
-    rival = 0.0 if small is None else small.saved
-    return step if step.score > max(rival, LARGE) else None
+    stiffness_step = step_score(linear.comparison, modal)
+    rival_reduction = 0.0 if small_linear_effect is None else small_linear_effect.saved
+    return (
+        stiffness_step
+        if stiffness_step.score > max(rival_reduction, LARGE_DEVIANCE_REDUCTION)
+        else None
+    )
 
 
 def freest_alone(
     measurement: Measurement, band_hz: tuple[float, float] = BAND_HZ
 ) -> tuple[Headline, tuple[Finding, ...], RecordAnalysis]:
-    """Fit the freest structure on a uniform beam, in a quarter of `select`'s time.
+    """Fit only the freest structure on a uniform beam, in a quarter of `select`'s time.
 
     The modes are those of `select` if that selects such a beam with all orders free. If it selects
     another model (drag, nonlinear forces), the residual is not noise, and every number carries a
@@ -491,28 +562,33 @@ def freest_alone(
     Parameters
     ----------
     measurement : Measurement
+        Angle and torque of the record, with the rig and specimen that the file states.
     band_hz : tuple of float
+        First and last frequency of the comparison.
 
     Returns
     -------
     headline : Headline
+        Reported numbers, with flags.
     findings : tuple of Finding
         Findings that need no comparison of candidates.
     analysis : RecordAnalysis
-        That fit, then one of `INTEGER`, with the noise.
+        Fit of the freest structure, then the fit of `INTEGER`, with the noise spectrum.
 
     Raises
     ------
     MeasurementError
-        The record cannot be used.
+        If the record cannot be used.
     """
-    return _with_knocks(measurement, lambda each: _freest_alone(each, band_hz)).result
+    return _assess_with_impacts(
+        measurement, lambda each: _fit_freest_with_known_impacts(each, band_hz)
+    ).result
 
 
-def _freest_alone(
+def _fit_freest_with_known_impacts(
     measurement: Measurement, band_hz: tuple[float, float]
 ) -> _Assessment[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
-    """Fit the freest structure alone with the known impacts."""
+    """Fit only the freest structure to a record whose known impacts are part of the measurement."""
     misread = tuple(wrong_scale(Comparison.of(measurement, band_hz)))
     additional = () if misread else (INTEGER,)
     candidate_set = replace(
@@ -520,78 +596,90 @@ def _freest_alone(
     )
     if not misread:
         candidate_set = candidate_set.with_special_cases()
-    modal = _modal(candidate_set)
-    visible = _visible(candidate_set, modal)
-    white, related, multiples = _tests(candidate_set, modal, band_hz)
-    found = findings(candidate_set, (), multiples)
-    kinds = {finding.kind for finding in found}
-    explained = white.white and not related.related
-    wrong = _wrong_model_reason(kinds, explained=explained)
+    modal = _fit_modal_model(candidate_set)
+    visible_numbers = _visible_mode_numbers(candidate_set, modal)
+    whiteness_test, input_test, harmonic_tests = _test_residual(candidate_set, modal, band_hz)
+    all_findings = findings(candidate_set, (), harmonic_tests)
+    kinds = {finding.kind for finding in all_findings}
+    explained = whiteness_test.white and not input_test.related
+    model_reason = _wrong_model_reason(kinds, explained=explained)
     result = of_fit(
         candidate_set.best.name,
         candidate_set.best.fit,
-        visible,
-        {} if misread else _unidentifiable_orders(candidate_set, visible),
-        unexplained=wrong,
+        visible_numbers,
+        {} if misread else _unidentifiable_orders(candidate_set, visible_numbers),
+        unexplained=model_reason,
         both=None if misread else candidate_set.with_both_dampings(candidate_set.best),
     )
-    doubt = wrong or (_CLIPPED if "clipping" in kinds else None)
-    test = _uniform_beam_test(measurement, modal)
-    result = _with_modes(result, measurement, modal, test, doubt, doubt)
-    if wrong == MISREAD:
-        found = tuple(each for each in found if each.kind in _OF_CHANNELS)
+    doubt = model_reason or (_CLIPPED_TORQUE_REASON if "clipping" in kinds else None)
+    beam_test = _uniform_beam_test(measurement, modal)
+    result = _add_modal_model(result, measurement, modal, beam_test, doubt, doubt)
+    if model_reason == MISREAD:
+        all_findings = tuple(each for each in all_findings if each.kind in _CHANNEL_KINDS)
     else:
-        found += _settings(candidate_set, result, kinds)
-        found = _with_doubts(found, (), wrong, doubt, result.flags, explained=explained)
-        found = _with_knocks_and_unexplained(candidate_set, found, white, related)
-    result = result.doubted(_CLIPPED) if "clipping" in kinds else result
-    others = (each.fit for each in candidate_set.candidates if each.structure is INTEGER)
+        all_findings += _setting_findings(candidate_set, result, kinds)
+        all_findings = _mark_doubtful_findings(
+            all_findings, (), model_reason, doubt, result.flags, explained=explained
+        )
+        all_findings = _add_impacts_and_unexplained(
+            candidate_set, all_findings, whiteness_test, input_test
+        )
+    result = result.doubted(_CLIPPED_TORQUE_REASON) if "clipping" in kinds else result
+    other_fits = (each.fit for each in candidate_set.candidates if each.structure is INTEGER)
     analysis = RecordAnalysis.of(
-        (result.fit, *others), candidate_set.noise, candidate_set.comparison
+        (result.fit, *other_fits), candidate_set.noise, candidate_set.comparison
     )
-    return _Assessment((result, found, analysis), candidate_set, explained, kinds)
+    return _Assessment((result, all_findings, analysis), candidate_set, explained, kinds)
 
 
-def _unidentifiable_orders(candidate_set: CandidateSet, visible: tuple[int, ...]) -> dict[str, str]:
-    """Return the orders that are not identifiable by the fit alone, with reasons."""
-    freest, *others = candidate_set.candidates
-    reason = not_reported_reason(candidate_set, visible)
-    found = {}
+def _unidentifiable_orders(
+    candidate_set: CandidateSet, visible_numbers: tuple[int, ...]
+) -> dict[str, str]:
+    """Return the orders that the fit of the freest structure does not determine, with reasons."""
+    freest, *other_candidates = candidate_set.candidates
+    reason = not_reported_reason(candidate_set, visible_numbers)
+    reasons = {}
     for name in COEFFICIENT_OF.keys() & set(freest.structure.free):
         low, high = freest.fit.interval[name] or (-math.inf, math.inf)
-        too_wide = high - low > WIDEST_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
-        # An interval that is too narrow for what lies between: a local minimum of its own.
-        astray = not low <= 1 <= high and any(
+        interval_too_wide = high - low > WIDEST_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
+        # A narrow interval without 1, although order 1 fits as well, is that of a local minimum.
+        at_local_minimum = not low <= 1 <= high and any(
             each.structure.fixed.get(name) == 1.0  # type: ignore[call-overload]
             and each.deviance - freest.deviance < NORMAL_95**2
-            for each in others
+            for each in other_candidates
         )
-        if reason or too_wide or astray or freest.fit.interval[COEFFICIENT_OF[name]] is None:
-            found[name] = reason or NOT_DETERMINED
-    return found
+        if (
+            reason
+            or interval_too_wide
+            or at_local_minimum
+            or freest.fit.interval[COEFFICIENT_OF[name]] is None
+        ):
+            reasons[name] = reason or NOT_DETERMINED
+    return reasons
 
 
 def _wrong_model_reason(kinds: Collection[str], *, explained: bool) -> str | None:
-    """Return why the findings refute the model; None if they do not."""
-    if not _MISREAD_KINDS.isdisjoint(kinds):
+    """Return the reason why findings or residual refute the model, or None if they do not."""
+    if not _CONTRADICTING_KINDS.isdisjoint(kinds):
         return MISREAD
-    return UNEXPLAINED if "harmonics" in kinds or not explained else None
+    return UNEXPLAINED_REASON if "harmonics" in kinds or not explained else None
 
 
 def _doubt_reason(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> str | None:
-    """Return why no parameter is valid although the record is explained, or None.
+    """Return the reason why no parameter is valid although the record is explained, or None.
 
-    The mode parameters are those at the time when the sweep passed each mode.
+    With a change along the record, the mode parameters are those at the time when the sweep passed
+    each mode.
     """
     if established(changes, one_sweep=one_sweep):
         return None
     return next((f"{change.name} would explain the record as well" for change in changes), None)
 
 
-def _with_doubts(
-    from_model: tuple[Finding, ...],
-    along: tuple[Finding, ...],
-    wrong: str | None,
+def _mark_doubtful_findings(
+    fitted_findings: tuple[Finding, ...],
+    change_findings: tuple[Finding, ...],
+    model_reason: str | None,
     doubt: str | None,
     flags: Mapping[str, str],
     *,
@@ -599,58 +687,70 @@ def _with_doubts(
 ) -> tuple[Finding, ...]:
     """Return all findings, with the doubtful ones marked as not established.
 
-    `from_model` are effects that were fitted with the beam, `along` the changes along the record,
-    which already state their certainty. `wrong` is the reason against the model, `doubt` the reason
-    against all numbers and `flags` those against single parameters. `explained` states that
-    harmonics are all that remains.
+    `fitted_findings` are effects that were fitted with the beam. `change_findings` are changes
+    along the record, which already state their certainty. `model_reason` is the reason against the
+    model, `doubt` the reason against all numbers, and `flags` are the reasons against single
+    parameters. `explained` states that harmonics are all that remains.
     """
 
     def qualified(each: Finding) -> Finding:
+        """Mark a finding as not established if a reason against it exists."""
         flag = next((flags[name] for name in each.parameters if name in flags), None)
         reason = doubt or flag
         if reason is None or (each.kind == "harmonics" and explained):
             return each
         return doubted(each, reason)
 
-    from_model = tuple(map(qualified, from_model))
-    if wrong is not None:
-        along = tuple(doubted(each, wrong) for each in along)
-    return (*from_model, *along)
+    fitted_findings = tuple(map(qualified, fitted_findings))
+    if model_reason is not None:
+        change_findings = tuple(doubted(each, model_reason) for each in change_findings)
+    return (*fitted_findings, *change_findings)
 
 
-def _with_knocks_and_unexplained(
+def _add_impacts_and_unexplained(
     candidate_set: CandidateSet,
-    found: tuple[Finding, ...],
-    white: Whiteness,
-    related: InputRelation,
-    step: Step | None = None,
+    findings_of_model: tuple[Finding, ...],
+    whiteness_test: Whiteness,
+    input_test: InputRelation,
+    stiffness_step: Step | None = None,
 ) -> tuple[Finding, ...]:
     """Add impacts before the other findings, and the unexplained residual after them."""
-    explained = white.white and not related.related
-    knocks = of_knocks(candidate_set.comparison.measurement.knocks, explained=explained)
-    rest = () if explained else (unexplained(white, related, candidate_set.best.fit.modes, step),)
-    return (*knocks, *found, *rest)
+    explained = whiteness_test.white and not input_test.related
+    findings_of_impacts = of_knocks(
+        candidate_set.comparison.measurement.knocks, explained=explained
+    )
+    unexplained_findings = (
+        ()
+        if explained
+        else (
+            unexplained(whiteness_test, input_test, candidate_set.best.fit.modes, stiffness_step),
+        )
+    )
+    return (*findings_of_impacts, *findings_of_model, *unexplained_findings)
 
 
-def _tests(
+def _test_residual(
     candidate_set: CandidateSet, modal: ModalFit | None, band_hz: tuple[float, float]
 ) -> tuple[Whiteness, InputRelation, tuple[Harmonic, ...]]:
     """Test the residual of the modal model, or of the first candidate if there is none."""
-    comparison, counts = candidate_set.comparison, candidate_set.noise.counts
+    comparison, compared_bins = candidate_set.comparison, candidate_set.noise.counts
     residual = candidate_set.best.fit.residual if modal is None else modal.residual
     angle_rad = comparison.angle_rad[comparison.retained]
-    of_variance_1 = comparison.in_time(residual) * math.sqrt(comparison.samples / 2)
-    multiples = harmonics(angle_rad, of_variance_1, comparison.decimation.rate_hz, band_hz)
+    unit_variance_residual = comparison.in_time(residual) * math.sqrt(comparison.samples / 2)
+    harmonic_tests = harmonics(
+        angle_rad, unit_variance_residual, comparison.decimation.rate_hz, band_hz
+    )
     if modal is not None:
-        return modal.whiteness, modal.input_relation, multiples
+        return modal.whiteness, modal.input_relation, harmonic_tests
     return (
-        whiteness(residual[counts], comparison.frequency_hz[counts]),
+        whiteness(residual[compared_bins], comparison.frequency_hz[compared_bins]),
         input_relation(residual, comparison.spectrum(angle_rad), comparison.frequency_hz),
-        multiples,
+        harmonic_tests,
     )
 
 
-def _table(candidate_set: CandidateSet) -> tuple[CandidateRow, ...]:
+def _candidate_table(candidate_set: CandidateSet) -> tuple[CandidateRow, ...]:
+    """Return one table row for each candidate, the one with the lowest BIC first."""
     best, least_aic = candidate_set.best, min(c.aic for c in candidate_set.candidates)
     return tuple(
         CandidateRow(

@@ -1,9 +1,9 @@
-"""Small nonlinear effects, as columns in addition to the modal model.
+"""Small nonlinear effects, as torque spectra in addition to the modal model.
 
-To first order in its size each adds to the torque a column of known shape: stiffness that rises
-with the deflection, air drag, backlash, dry friction, a sensor whose gain depends on the torque. An
-effect that improves the modal model is fitted with it, so that it biases no mode. Its name is only
-a hypothesis: a record seldom distinguishes between several small effects.
+To first order in its size each effect adds to the torque a spectrum of known shape: stiffness that
+rises with the deflection, air drag, backlash, dry friction, a sensor whose gain depends on the
+torque. An effect that improves the modal model is fitted with it, so that it biases no mode. Its
+name is only a hypothesis: a record seldom distinguishes between several small effects.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from analysis.identify._drag import small_drag
 from analysis.identify._finding import Finding
 from analysis.identify._nonlinear import ModalForces, Term
-from analysis.identify._time_varying import UNIT_PLAY_RAD, play
+from analysis.identify._time_varying import UNIT_PLAY_RAD, play_spectrum
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,34 +29,36 @@ if TYPE_CHECKING:
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._plant import Plant
 
-SIGNIFICANT: Final = 16.0
-"""Deviance that an effect must save: by chance one of nine does in two records of a thousand."""
+MIN_DEVIANCE_REDUCTION: Final = 16.0
+"""Deviance by which an effect must reduce the residual. By chance one of nine effects does so in
+two records of a thousand."""
 
-LARGE: Final = 100.0
-"""Deviance from which the first order may not suffice, and the effect is searched for by itself."""
+LARGE_DEVIANCE_REDUCTION: Final = 100.0
+"""Reduction of deviance from which the first order may not suffice, so that the effect is searched
+for by its own model."""
 
-_LINEAR: Final[frozenset[Kind]] = frozenset({"nonlinear gain", "friction"})
-"""Effects that do not change the motion of the beam: the first order is exact."""
+_EXACT_KINDS: Final[frozenset[Kind]] = frozenset({"nonlinear gain", "friction"})
+"""Effects that do not change the motion of the beam, so that the first order is exact."""
 
-_SLIDING_RAD_S: Final = 0.01
-"""Speed of the motor at which 70 % of the dry friction is reached; what it is exactly matters at
-the turning points alone."""
+_FRICTION_SPEED_RAD_S: Final = 0.01
+"""Motor speed at which 70 % of the dry friction is reached. Its value matters at the turning points
+only."""
 
 
 @dataclass(frozen=True, slots=True)
 class SmallEffect:
-    """Small effect that would improve the modal model.
+    """Small nonlinear effect that would improve the modal model.
 
     Attributes
     ----------
     kind : str
-        Kind of the `Finding`.
+        Kind of the `Finding` on the effect.
     words : str
-        Description, as the beginning of a sentence.
+        Description of the effect, as the beginning of a sentence.
     column : ndarray of complex, shape (K,)
-        Spectrum of its torque in N·m per unit of its size.
+        Spectrum of the torque by the effect, in N·m per unit of its size.
     saved : float
-        Reduction of deviance.
+        Reduction of deviance by the effect.
     """
 
     kind: Kind
@@ -66,16 +68,16 @@ class SmallEffect:
 
     @property
     def linear(self) -> bool:
-        """Return whether the first order in its size is exact."""
-        return self.kind in _LINEAR
+        """Return whether the torque by this effect is exact to first order in its size."""
+        return self.kind in _EXACT_KINDS
 
     @property
     def large(self) -> bool:
-        """Return whether it needs a model of its own."""
-        return self.saved > LARGE and not self.linear
+        """Return whether the effect is so large that it needs a model of its own."""
+        return self.saved > LARGE_DEVIANCE_REDUCTION and not self.linear
 
     def finding(self) -> Finding:
-        """Return the finding that names it as not established."""
+        """Return the finding that names the effect as not established."""
         return Finding(
             kind=self.kind,
             sentence=(
@@ -88,22 +90,23 @@ class SmallEffect:
 
 
 def small_effect(comparison: Comparison, modal: ModalFit, plant: Plant) -> SmallEffect | None:
-    """Return the effect that would improve the modal model most; None if none does.
+    """Return the small effect that improves the modal model most, or None if none is significant.
 
     The effects are computed for the motion of `plant`, a beam close to the modal model.
     """
-    effects = list(_effects(comparison, modal, plant))
-    saved = modal.saved_by(np.array([column for _, _, column in effects]))
-    most = int(np.argmax(saved))
-    if saved[most] < SIGNIFICANT:
+    effects = list(_possible_effects(comparison, modal, plant))
+    reductions = modal.saved_by(np.array([column for _, _, column in effects]))
+    best_index = int(np.argmax(reductions))
+    if reductions[best_index] < MIN_DEVIANCE_REDUCTION:
         return None
-    kind, words, column = effects[most]
-    return SmallEffect(kind, words, column, float(saved[most]))
+    kind, words, column = effects[best_index]
+    return SmallEffect(kind, words, column, float(reductions[best_index]))
 
 
-def _effects(
+def _possible_effects(
     comparison: Comparison, modal: ModalFit, plant: Plant
 ) -> Iterator[tuple[Kind, str, NDArray[np.complex128]]]:
+    """Yield kind, description and torque spectrum, shape (K,), of each possible small effect."""
     forces = ModalForces(comparison, plant)
     for mode in modal.visible:
         yield (
@@ -118,21 +121,25 @@ def _effects(
         )
     (drag,) = small_drag(comparison, plant)
     yield "air drag", "Air drag", drag
-    yield "play", "Backlash between encoder and beam", play(comparison, plant) / UNIT_PLAY_RAD
-    yield "friction", "Dry friction between sensor and beam", _friction(comparison)
+    yield (
+        "play",
+        "Backlash between encoder and beam",
+        play_spectrum(comparison, plant) / UNIT_PLAY_RAD,
+    )
+    yield "friction", "Dry friction between sensor and beam", _friction_spectrum(comparison)
     torque = comparison.prediction.torque(modal.model)[0]
     largest = float(np.abs(torque).max())
     if largest > 0 and math.isfinite(largest):
-        for power, words in ((3, "A gain of the torque that depends on its size"),
+        for power, description in ((3, "A gain of the torque that depends on its size"),
                              (2, "A gain of the torque that depends on its sign")):  # fmt: skip
             column = comparison.spectrum(torque * (torque / largest) ** (power - 1))
-            yield "nonlinear gain", words, column
+            yield "nonlinear gain", description, column
 
 
-def _friction(comparison: Comparison) -> NDArray[np.complex128]:
-    """Return the spectrum of a dry friction of 1 N·m against the motor's motion, shape (K,)."""
+def _friction_spectrum(comparison: Comparison) -> NDArray[np.complex128]:
+    """Return the torque spectrum of a dry friction of 1 N·m against the motion, (K,)."""
     measurement = comparison.measurement
     angle = measurement.angle_from_rest(float(comparison.frequency_hz[-1]))
     speed = np.gradient(angle) * measurement.rate_hz
-    torque = comparison.decimation.apply(speed / np.hypot(speed, _SLIDING_RAD_S))
+    torque = comparison.decimation.apply(speed / np.hypot(speed, _FRICTION_SPEED_RAD_S))
     return comparison.spectrum(torque[comparison.retained])

@@ -1,10 +1,10 @@
 """Score of a step of the stiffness in time: a clamp that slips, a beam that cracks.
 
 If the stiffness of a ringing mode q of frequency omega rises by the fraction e at an instant, its
-response changes to first order by that to a force ``-e omega² q`` from then on; its state is
-continuous. In one sweep each mode is passed once, so such a step makes the modes inconsistent. The
-largest reduction of the modal model's residual over all instants shows whether a step is a likely
-cause.
+response changes to first order by the response to a force ``-e omega² q`` from then on. Its motion
+is continuous. In one sweep each mode is passed once, so such a step makes the modes inconsistent.
+The largest reduction of the modal model's residual over all instants shows whether a step is a
+likely cause.
 """
 
 from __future__ import annotations
@@ -23,30 +23,36 @@ if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
     from analysis.identify._modal_fit import ModalFit
 
-NAMED_ABOVE: Final = 20.0
-"""Deviance saved above which a step is named: records without one stay below 13 or so."""
+MIN_REPORTED_SCORE: Final = 20.0
+"""Reduction of deviance from which a step is reported. Records without a step stay below 13 or
+so."""
 
-_INSTANTS: Final = 80
-_FINER: Final = 3
-"""Instants tried all along the record, and then on either side of the best."""
+_COARSE_INSTANTS: Final = 80
+"""Number of instants tried along the whole record."""
 
-_PADDED: Final = 1.1
-_DECAY: Final = 6.6
-"""As in `analysis.identify._predictor`: on s = sigma + j omega what wraps round has decayed."""
+_FINE_INSTANTS_PER_SIDE: Final = 3
+"""Number of instants tried to either side of the best one."""
+
+_PADDING_RATIO: Final = 1.1
+"""Length of the transforms over that of the record."""
+
+_DECAY_EXPONENT: Final = 6.6
+"""Exponent by which the transforms decay over their length, as in `analysis.identify._predictor`:
+on s = sigma + j omega the part that wraps round has decayed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Step of the stiffness that explains most of a residual.
+    """Step of the stiffness in time that best explains a residual.
 
     Attributes
     ----------
     score : float
-        First-order reduction of deviance.
+        First-order reduction of deviance by the step.
     instant_s : float
-        Since the record's first tick.
+        Time of the step since the first tick of the record.
     relative_change : float
-        Change of the stiffness, from before to after.
+        Relative change of the stiffness by the step.
     """
 
     score: float
@@ -55,12 +61,12 @@ class Step:
 
     @property
     def named(self) -> bool:
-        """Return whether it explains more than chance would."""
-        return self.score > NAMED_ABOVE
+        """Return whether the step explains more of the residual than chance would."""
+        return self.score > MIN_REPORTED_SCORE
 
     @property
     def words(self) -> str:
-        """Return the step in words, for sentences."""
+        """Return the step in words, as part of a sentence."""
         change = float(f"{100 * self.relative_change:.1g}")
         return (
             f"a step of the stiffness by about {change:+g} % near {self.instant_s:.0f} s (each "
@@ -68,7 +74,7 @@ class Step:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the step as `json.dumps` takes it."""
+        """Return the step as a JSON-ready dict."""
         return {
             "name": "step in time",
             "score": self.score,
@@ -80,60 +86,69 @@ class Step:
 def step_score(comparison: Comparison, fit: ModalFit) -> Step:
     """Return the stiffness step that best explains the residual of the modal model."""
     residual = fit.residual.view(np.float64)
-    stiffened = _Stiffened(comparison, fit)
-    best, instants = Step(0.0, 0.0, 0.0), np.linspace(0, comparison.samples, _INSTANTS + 2)[1:-1]
+    step_torque = _StiffnessStepTorque(comparison, fit)
+    best_step, instants = (
+        Step(0.0, 0.0, 0.0),
+        np.linspace(0, comparison.samples, _COARSE_INSTANTS + 2)[1:-1],
+    )
     spacing = float(instants[1] - instants[0])
     for _ in range(2):
-        found = np.array([stiffened.spectrum(int(instant)) for instant in instants])
-        rows = np.ascontiguousarray(found * fit.noise.weight).view(np.float64)
-        rows = rows - (rows @ fit.span.T) @ fit.span
-        sizes = np.einsum("ij,ij->i", rows, rows)
-        sizes[sizes == 0] = np.inf
-        along = -(rows @ residual)  # the residual is model less measurement
-        scores = along**2 / sizes
-        first = int(np.argmax(scores))
-        if scores[first] > best.score:
-            best = Step(
-                score=float(scores[first]),
+        spectra = np.array([step_torque.spectrum(int(instant)) for instant in instants])
+        whitened_spectra = np.ascontiguousarray(spectra * fit.noise.weight).view(np.float64)
+        whitened_spectra = whitened_spectra - (whitened_spectra @ fit.span.T) @ fit.span
+        squares = np.einsum("ij,ij->i", whitened_spectra, whitened_spectra)
+        squares[squares == 0] = np.inf
+        correlation = -(whitened_spectra @ residual)  # the residual is model less measurement
+        scores = correlation**2 / squares
+        best_index = int(np.argmax(scores))
+        if scores[best_index] > best_step.score:
+            best_step = Step(
+                score=float(scores[best_index]),
                 instant_s=comparison.first_s
-                + float(instants[first]) / comparison.decimation.rate_hz,
-                relative_change=float(along[first] / sizes[first]),
+                + float(instants[best_index]) / comparison.decimation.rate_hz,
+                relative_change=float(correlation[best_index] / squares[best_index]),
             )
-        instants = instants[first] + spacing * np.linspace(-1, 1, 2 * _FINER + 3)[1:-1]
+        instants = (
+            instants[best_index]
+            + spacing * np.linspace(-1, 1, 2 * _FINE_INSTANTS_PER_SIDE + 3)[1:-1]
+        )
         instants = instants[(instants > 0) & (instants < comparison.samples)]
-    return best
+    return best_step
 
 
-class _Stiffened:
-    """Torque by a higher stiffness from an instant on."""
+class _StiffnessStepTorque:
+    """Torque change of the modal model by a stiffness that is higher from an instant on."""
 
     def __init__(self, comparison: Comparison, fit: ModalFit) -> None:
         self._comparison = comparison
-        n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
-        self._length = fast_length(math.ceil(_PADDED * n))
-        sigma = _DECAY * rate_hz / self._length
+        count, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
+        self._length = fast_length(math.ceil(_PADDING_RATIO * count))
+        sigma = _DECAY_EXPONENT * rate_hz / self._length
         s = sigma + 2j * np.pi * rate_hz / self._length * np.arange(self._length // 2 + 1)
-        self._decay = np.exp(-sigma * np.arange(n) / rate_hz)
+        self._decay = np.exp(-sigma * np.arange(count) / rate_hz)
         angle = np.fft.rfft(comparison.angle_rad * self._decay, self._length)
-        vibrations, answers = [], []
+        vibrations, torque_per_force = [], []
         for number, pole, residue in zip(
             fit.numbers, fit.model.poles_rad_s, fit.model.residues, strict=True
         ):
             if number:
-                # Of G its part is inertia s⁴ / (s² + 2 xi omega s + omega²), but for constants.
-                square, inertia = abs(pole) ** 2, 2 * abs(residue) / abs(pole) ** 3
-                follows = s * s / (s * s - 2 * pole.real * s + square)
-                vibrations.append(np.fft.irfft(angle * follows, self._length)[:n])
-                turned = residue / (1j * abs(residue))
-                answers.append(turned * inertia * square * follows)
-        self._vibrations, self._answers = np.array(vibrations), np.array(answers)
+                # The mode adds inertia s⁴ / (s² + 2 xi omega s + omega²) to G, without constants.
+                omega_squared, inertia = abs(pole) ** 2, 2 * abs(residue) / abs(pole) ** 3
+                mode_response = s * s / (s * s - 2 * pole.real * s + omega_squared)
+                vibrations.append(np.fft.irfft(angle * mode_response, self._length)[:count])
+                phase_factor = residue / (1j * abs(residue))
+                torque_per_force.append(phase_factor * inertia * omega_squared * mode_response)
+        self._vibrations, self._torque_per_force = np.array(vibrations), np.array(torque_per_force)
 
     def spectrum(self, instant: int) -> NDArray[np.complex128]:
-        """Return the spectrum of the torque by a step at a sample, per unit change, (K,)."""
+        """Return the torque spectrum of a step per unit relative change, shape (K,).
+
+        `instant` is the index of the sample at which the stiffness steps.
+        """
         retained = self._comparison.retained
-        later = self._vibrations.copy()
-        later[:, : retained.start + instant] = 0.0
-        forces = np.fft.rfft(later, self._length)
-        torque = np.fft.irfft(np.sum(forces * self._answers, axis=0), self._length)
+        later_vibrations = self._vibrations.copy()
+        later_vibrations[:, : retained.start + instant] = 0.0
+        forces = np.fft.rfft(later_vibrations, self._length)
+        torque = np.fft.irfft(np.sum(forces * self._torque_per_force, axis=0), self._length)
         torque = torque[: self._decay.size] / self._decay
         return self._comparison.spectrum(torque[retained])

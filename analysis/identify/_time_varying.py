@@ -1,10 +1,11 @@
 """Changes along the record (damping, stiffness, gain), clocks of different rates, and backlash.
 
-The columns have a known shape and unknown size, as for `analysis.identify._refit`: the change of
-the torque if damping, stiffness or gain rise in proportion to time, and the effect of a hub that
-follows the shaft with backlash. In one sweep time and frequency go together, so a damping that
-drifts competes with an order of the damping, and a gain that drifts with a filter. Where torque and
-angle were sampled by clocks of different rates, the torque's delay changes along the record.
+Each effect adds to the torque a spectrum of known shape and unknown size, called a column as in
+`analysis.identify._refit`: the change of the torque if damping, stiffness or gain rise in
+proportion to time, and the effect of a hub that follows the shaft with backlash. In one sweep time
+and frequency increase together, so a drifting damping competes with an order of the damping, and a
+drifting gain with a filter. If torque and angle were sampled by clocks of different rates, the
+delay of the torque changes along the record.
 
 A mode that rings for seconds depends on its damping and stiffness in the past: with 0.4 % of
 stiffness in 22 s, a mode of 2.6 Hz is 0.03 rad out of phase with a mode of its present frequency.
@@ -15,8 +16,8 @@ that changes as ``1 + e w(t)``::
     D = o k⁴ q + gamma s^lambda u,    q = -R a angle - e (c k⁴ + p)^-1 w D
 
 the torque gains ``e a EI (w gamma s^lambda u - R w D)``, where w multiplies the term to its right
-in time; o is ``zeta s^alpha`` for a damping that changes, and c for the stiffness of a beam whose
-mass stays. The second equation put into the first, again and again, gives D.
+in time. o is ``zeta s^alpha`` for a damping that changes, and c for the stiffness of a beam whose
+mass is constant. Repeated substitution of the second equation into the first gives D.
 """
 
 from __future__ import annotations
@@ -48,137 +49,176 @@ if TYPE_CHECKING:
     from analysis.identify._plant import Plant
 
 
-# Search for changes
+# Search for changes along the record
 
-What = Literal["damping", "stiffness", "gain", "clock", "play"]
+Effect = Literal["damping", "stiffness", "gain", "clock", "play"]
+"""Property that changes along the record, or "play" for backlash."""
 
-_LEADS: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
-_GRADIENT: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness")
-_GAIN: Final = SIGNIFICANT_STD**2 + 2 * math.log(20)
-"""Deviance that a column must save: five of them are tried on four candidates."""
+_STRUCTURES_TO_TEST: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
+"""Structures that are tested with a change along the record, in addition to the best one."""
 
-_IN_SIGHT: Final = 0.75
-"""Fraction of a rival's lower BIC that a column has to reach by prediction. The first order
-predicts it to a tenth."""
+_GRADIENT_PARAMETERS: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness")
+"""Parameters by which the predicted torque is differentiated."""
+
+_MIN_DEVIANCE_REDUCTION: Final = SIGNIFICANT_STD**2 + 2 * math.log(20)
+"""Deviance by which an effect must reduce the residual: five effects are tried on four
+candidates."""
+
+_RIVAL_BIC_FRACTION: Final = 0.75
+"""Fraction of the BIC advantage of another explanation that an effect must be predicted to reach.
+The first order predicts this advantage to a tenth."""
 
 UNIT_PLAY_RAD: Final = 1e-4
-_CLOCK_UNIT: Final = 1e-5
-_UNITS: Final[Mapping[What, float]] = {"play": UNIT_PLAY_RAD, "clock": _CLOCK_UNIT}
-_TERMS: Final = 16
-"""Terms of a Taylor series in time: enough for three radians."""
+"""Backlash that corresponds to 1 of the fitted size, in rad."""
 
-_ROUNDS: Final = 8
-_CONVERGED: Final = 0.01
+_CLOCK_UNIT: Final = 1e-5
+"""Relative difference of the clock rates that corresponds to 1 of the fitted size."""
+
+_SIZE_UNITS: Final[Mapping[Effect, float]] = {"play": UNIT_PLAY_RAD, "clock": _CLOCK_UNIT}
+"""Value that corresponds to 1 of the fitted size, by effect. It is 1 for the other effects."""
+
+_TAYLOR_TERMS: Final = 16
+"""Number of terms of the Taylor series in time: enough for three radians."""
+
+_MAX_SIZE_FITS: Final = 8
+"""Largest number of fits. After each, the torque spectrum is recomputed for the fitted size."""
+
+_SIZE_TOLERANCE: Final = 0.01
+"""Relative change of the fitted size at which the repeated fits end."""
 
 
 @dataclass(frozen=True, slots=True)
 class TemporalChange:
-    """Change of one property along the record, or the backlash.
+    """Change of one property along the record, or backlash, with its estimated size.
 
     Attributes
     ----------
     what : str
+        Changing property: "damping", "stiffness", "gain", "clock" or "play" (backlash).
     size, std : float
-        Relative change from the first sample to the last; for clocks the relative difference of
-        their rates; the backlash in rad.
-    behind : float
-        BIC with it minus the lowest BIC without it.
+        Estimate and standard deviation: the relative change from the first sample to the last, the
+        relative difference of the clock rates, or the backlash in rad.
+    bic_difference : float
+        BIC with this effect minus the lowest BIC without it.
     """
 
-    what: What
+    what: Effect
     size: float
     std: float
-    behind: float
+    bic_difference: float
 
     @property
     def name(self) -> str:
-        """Return the name, as the beginning of a sentence."""
-        return _NAMES[self.what]
+        """Return the effect in words, as the beginning of a sentence."""
+        return _EFFECT_NAMES[self.what]
 
     @property
     def certain(self) -> bool:
-        """Return whether nothing else explains the record as well."""
-        return self.behind < -BIC_DECISIVE
+        """Return whether no model without this effect explains the record as well."""
+        return self.bic_difference < -BIC_DECISIVE
 
 
 def along_time(
     candidate_set: CandidateSet, rival_bic: float = math.inf
 ) -> tuple[CandidateSet, tuple[TemporalChange, ...]]:
-    """Find changes along the record; refit all candidates with a certain one.
+    """Search for changes along the record. Refit all candidates with a change that is certain.
 
-    Only columns that may come near `rival_bic`, the BIC of another explanation
-    (`CandidateSet.bic`), are fitted. Returns the candidates and the changes that explain the record
+    Only changes whose predicted BIC may come near `rival_bic`, the BIC of another explanation
+    (`CandidateSet.bic`), are fitted. Return the candidates, and the changes that explain the record
     best or equally well.
     """
     if candidate_set.misread:
         return candidate_set, ()
-    lag = _lag_of_play(candidate_set.comparison)
-    most = candidate_set.best.bic + min(BIC_DECISIVE, _IN_SIGHT * (rival_bic - candidate_set.bic))
-    tried: dict[What, tuple[float, Refit]] = {}
-    for lead in _leads(candidate_set):
-        for what, predicted in _promising(candidate_set, lead, lag, most):
-            if predicted < tried.get(what, (math.inf,))[0]:
-                refit, bic = _fitted(candidate_set, lead, what, lag)
-                if bic < tried.get(what, (math.inf,))[0]:
-                    tried[what] = (bic, refit)
-    found = []
-    for what, (bic, refit) in tried.items():
-        sizes, std = refit.amplitudes()
-        unit = _UNITS.get(what, 1.0)
+    play_angle = _play_angle(candidate_set.comparison)
+    highest_bic = candidate_set.best.bic + min(
+        BIC_DECISIVE, _RIVAL_BIC_FRACTION * (rival_bic - candidate_set.bic)
+    )
+    fitted_changes: dict[Effect, tuple[float, Refit]] = {}
+    for candidate in _candidates_to_test(candidate_set):
+        for effect, predicted_bic in _promising_changes(
+            candidate_set, candidate, play_angle, highest_bic
+        ):
+            if predicted_bic < fitted_changes.get(effect, (math.inf,))[0]:
+                refit, bic = _fit_with_change(candidate_set, candidate, effect, play_angle)
+                if bic < fitted_changes.get(effect, (math.inf,))[0]:
+                    fitted_changes[effect] = (bic, refit)
+    possible_changes = []
+    for effect, (bic, refit) in fitted_changes.items():
+        amplitudes, std = refit.amplitudes()
+        unit = _SIZE_UNITS.get(effect, 1.0)
         change = TemporalChange(
-            what, unit * float(sizes[-1]), unit * float(std[-1]), bic - candidate_set.best.bic
+            effect,
+            unit * float(amplitudes[-1]),
+            unit * float(std[-1]),
+            bic - candidate_set.best.bic,
         )
-        if change.behind < BIC_DECISIVE and _possible(change):
-            found.append((change, refit))
-    found.sort(key=lambda pair: pair[0].behind)
-    if not found:
+        if change.bic_difference < BIC_DECISIVE and _has_possible_size(change):
+            possible_changes.append((change, refit))
+    possible_changes.sort(key=lambda pair: pair[0].bic_difference)
+    if not possible_changes:
         return candidate_set, ()
-    first, refit = found[0]
-    changes = tuple(c for c, _ in found if c.behind < first.behind + BIC_DECISIVE)
-    if not first.certain or len(changes) > 1:
+    best_change, refit = possible_changes[0]
+    changes = tuple(
+        c
+        for c, _ in possible_changes
+        if c.bic_difference < best_change.bic_difference + BIC_DECISIVE
+    )
+    if not best_change.certain or len(changes) > 1:
         return candidate_set, changes
     return candidate_set.with_columns(refit.columns, refit.noise_here()), changes
 
 
-def _possible(change: TemporalChange) -> bool:
-    """Return whether a size is possible: backlash is positive, and no change exceeds 100 %."""
+def _has_possible_size(change: TemporalChange) -> bool:
+    """Return whether the size of a change is possible.
+
+    Backlash is positive, and other changes are below 100 %.
+    """
     return change.size > 0 if change.what == "play" else abs(change.size) < 1
 
 
-def _leads(candidate_set: CandidateSet) -> Iterator[Candidate]:
-    """Return the best candidate, and simple ones that a change may explain instead."""
+def _candidates_to_test(candidate_set: CandidateSet) -> Iterator[Candidate]:
+    """Yield the candidates that are tested with a change along the record, the best one first."""
     yield candidate_set.best
     for candidate in candidate_set.candidates[1:]:
-        if candidate.structure in _LEADS:
+        if candidate.structure in _STRUCTURES_TO_TEST:
             yield candidate
 
 
-def _promising(
-    candidate_set: CandidateSet, lead: Candidate, lag: NDArray[np.float64], most_bic: float
-) -> Iterator[tuple[What, float]]:
-    """Return the columns whose predicted BIC would make a candidate the best, with the BIC."""
-    refit = candidate_set.refit(lead, 1)
-    columns = _columns(candidate_set.comparison, lead.fit.plant, lag)
-    saved = refit.saved_by(np.array(list(columns.values())))
-    for what, squares in zip(columns, saved.tolist(), strict=True):
-        left = max(refit.cost - squares, 1e-3 * refit.cost)
-        gain = lead.values * math.log(refit.cost / left)
-        bic = lead.bic - gain + math.log(lead.values)
-        if gain > _GAIN and bic < most_bic:
-            yield what, bic
+def _promising_changes(
+    candidate_set: CandidateSet,
+    candidate: Candidate,
+    play_angle: NDArray[np.float64],
+    highest_bic: float,
+) -> Iterator[tuple[Effect, float]]:
+    """Yield the changes that would make a candidate the best one, with their predicted BIC.
+
+    A change must reduce the deviance significantly, and its BIC must be below `highest_bic`.
+    """
+    refit = candidate_set.refit(candidate, 1)
+    columns = _torque_spectra(candidate_set.comparison, candidate.fit.plant, play_angle)
+    reductions = refit.saved_by(np.array(list(columns.values())))
+    for effect, reduction in zip(columns, reductions.tolist(), strict=True):
+        remaining_cost = max(refit.cost - reduction, 1e-3 * refit.cost)
+        deviance_reduction = candidate.values * math.log(refit.cost / remaining_cost)
+        bic = candidate.bic - deviance_reduction + math.log(candidate.values)
+        if deviance_reduction > _MIN_DEVIANCE_REDUCTION and bic < highest_bic:
+            yield effect, bic
 
 
-def _fitted(
-    candidate_set: CandidateSet, lead: Candidate, what: What, lag: NDArray[np.float64]
+def _fit_with_change(
+    candidate_set: CandidateSet,
+    candidate: Candidate,
+    effect: Effect,
+    play_angle: NDArray[np.float64],
 ) -> tuple[Refit, float]:
-    """Fit a candidate with one additional column; return its BIC as well."""
-    refit = candidate_set.refit(lead, 1)
+    """Fit a candidate with one change along the record. Return the fit and its BIC."""
+    refit = candidate_set.refit(candidate, 1)
     unknowns = refit.objective.unknowns
     size = 0.0
-    for _ in range(_ROUNDS):
-        column = _column(candidate_set.comparison, refit.plant, lag, what, size)
+    for _ in range(_MAX_SIZE_FITS):
+        column = _torque_spectrum(candidate_set.comparison, refit.plant, play_angle, effect, size)
         columns = np.concatenate([candidate_set.columns, column[None]])
-        before = refit.cost
+        cost_before = refit.cost
         refit = Refit.descend(
             candidate_set.comparison,
             unknowns,
@@ -187,183 +227,206 @@ def _fitted(
             columns,
             max_evaluations=MANY,
         )
-        moved, size = size, float(refit.amplitudes()[0][-1])
-        converged = abs(size - moved) < _CONVERGED * abs(size)
-        if converged and abs(lead.values * math.log(before / refit.cost)) < 1:
+        previous_size, size = size, float(refit.amplitudes()[0][-1])
+        converged = abs(size - previous_size) < _SIZE_TOLERANCE * abs(size)
+        if converged and abs(candidate.values * math.log(cost_before / refit.cost)) < 1:
             break
-    deviance = lead.values * math.log(refit.cost / lead.values)
-    return refit, deviance + (lead.parameters + 1) * math.log(lead.values)
+    deviance = candidate.values * math.log(refit.cost / candidate.values)
+    return refit, deviance + (candidate.parameters + 1) * math.log(candidate.values)
 
 
-def _columns(
-    comparison: Comparison, plant: Plant, lag: NDArray[np.float64]
-) -> dict[What, NDArray[np.complex128]]:
-    """Return spectra of the torque by a change of 1 over the record, each of (K,)."""
-    slopes = _slopes(comparison, plant)
-    return {what: _column(comparison, plant, lag, what, 0.0, slopes) for what in _NAMES}
-
-
-def _slopes(comparison: Comparison, plant: Plant) -> dict[What, NDArray[np.float64]]:
-    """Return the torque per relative change of each property, each of shape (samples,)."""
-    _, (zeta, gamma, gain, ratio) = comparison.prediction.torque(plant, _GRADIENT)
+def _torque_spectra(
+    comparison: Comparison, plant: Plant, play_angle: NDArray[np.float64]
+) -> dict[Effect, NDArray[np.complex128]]:
+    """Return the torque spectrum of each effect per unit size, each of shape (K,)."""
+    slopes = _torque_slopes(comparison, plant)
     return {
-        "damping": plant.damping.zeta * zeta + plant.damping.gamma * gamma,
-        "stiffness": gain - ratio,  # EI rises, rho stays
-        "gain": gain,
+        effect: _torque_spectrum(comparison, plant, play_angle, effect, 0.0, slopes)
+        for effect in _EFFECT_NAMES
     }
 
 
-def _column(
+def _torque_slopes(comparison: Comparison, plant: Plant) -> dict[Effect, NDArray[np.float64]]:
+    """Return the torque per relative change of damping, stiffness and gain, each (samples,)."""
+    _, (by_zeta, by_gamma, by_gain, by_density_over_stiffness) = comparison.prediction.torque(
+        plant, _GRADIENT_PARAMETERS
+    )
+    return {
+        "damping": plant.damping.zeta * by_zeta + plant.damping.gamma * by_gamma,
+        "stiffness": by_gain - by_density_over_stiffness,  # EI rises, rho stays
+        "gain": by_gain,
+    }
+
+
+def _torque_spectrum(
     comparison: Comparison,
     plant: Plant,
-    lag: NDArray[np.float64],
-    what: What,
+    play_angle: NDArray[np.float64],
+    effect: Effect,
     size: float,
-    slopes: Mapping[What, NDArray[np.float64]] | None = None,
+    slopes: Mapping[Effect, NDArray[np.float64]] | None = None,
 ) -> NDArray[np.complex128]:
-    """Return the column at a finite size, divided by the size, shape (K,).
+    """Return the torque spectrum of an effect at a given size, divided by that size, shape (K,).
 
-    `slopes` are the results of `_slopes`, if known.
+    `slopes` is the result of `_torque_slopes`, if it is known already.
     """
-    if what == "play":
-        return comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
-    if what == "clock":
-        return comparison.spectrum(_sampled_late(comparison, plant, size))
+    if effect == "play":
+        return comparison.spectrum(comparison.prediction.of_other(play_angle).torque(plant)[0])
+    if effect == "clock":
+        return comparison.spectrum(_clock_torque(comparison, plant, size))
     ramp = np.linspace(-0.5, 0.5, comparison.samples)
-    change = ramp * (slopes or _slopes(comparison, plant))[what]
-    if what != "gain":
-        change += memory_torque(comparison, plant, ramp, what, size)
+    change = ramp * (slopes or _torque_slopes(comparison, plant))[effect]
+    if effect != "gain":
+        change += memory_torque(comparison, plant, ramp, effect, size)
     return comparison.spectrum(change)
 
 
-def _sampled_late(comparison: Comparison, plant: Plant, size: float) -> NDArray[np.float64]:
-    """Return the torque by a faster clock per difference of the rates, shape (samples,).
+def _clock_torque(comparison: Comparison, plant: Plant, size: float) -> NDArray[np.float64]:
+    """Return the torque change by a faster clock, per unit rate difference, shape (samples,).
 
-    The torque with time stamp t is that of t plus the difference times the time since the middle of
-    the record, by its Taylor series. `size` is in `_CLOCK_UNIT`.
+    The torque with time stamp t is that at t plus the rate difference times the time since the
+    middle of the record. It is computed by its Taylor series. `size` is in units of `_CLOCK_UNIT`.
     """
     prediction, time_s = comparison.prediction, comparison.times_s()
-    since_s = _CLOCK_UNIT * (time_s - time_s.mean())
+    offset_s = _CLOCK_UNIT * (time_s - time_s.mean())
     grid = ResponseGrid(prediction.s)
     derivative = grid.evaluate(plant)[0]
-    factor = since_s
-    added = np.zeros(since_s.size)
-    for number in range(1, _TERMS + 1 if size else 2):
+    taylor_factor = offset_s
+    torque_change = np.zeros(offset_s.size)
+    for number in range(1, _TAYLOR_TERMS + 1 if size else 2):
         derivative = derivative * grid.s
-        added += factor * prediction.in_time(derivative)
-        factor = factor * size * since_s / (number + 1)
-    return added
+        torque_change += taylor_factor * prediction.in_time(derivative)
+        taylor_factor = taylor_factor * size * offset_s / (number + 1)
+    return torque_change
 
 
-def play(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Return the spectrum of the torque by a backlash of `UNIT_PLAY_RAD`, shape (K,)."""
-    return _column(comparison, plant, _lag_of_play(comparison), "play", 0.0)
+def play_spectrum(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
+    """Return the torque spectrum of a backlash of `UNIT_PLAY_RAD`, shape (K,)."""
+    return _torque_spectrum(comparison, plant, _play_angle(comparison), "play", 0.0)
 
 
-def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
-    """Return the angle of the hub less that of the shaft with backlash, at the decimated rate."""
+def _play_angle(comparison: Comparison) -> NDArray[np.float64]:
+    """Return the hub angle minus the shaft angle under backlash, in rad, at the decimated rate."""
     highest_hz = float(comparison.frequency_hz[-1])
-    half, here, hub = UNIT_PLAY_RAD / 2, 0.0, []
+    half_play, hub_angle, hub_angles = UNIT_PLAY_RAD / 2, 0.0, []
     shaft = comparison.measurement.angle_from_rest(highest_hz)
     for angle in shaft.tolist():
         # A comparison each: min and max take three times as long, at every tick of the record.
-        if here < angle - half:
-            here = angle - half
-        elif here > angle + half:
-            here = angle + half
-        hub.append(here)
-    lag: NDArray[np.float64] = comparison.decimation.apply(np.array(hub) - shaft)
+        if hub_angle < angle - half_play:
+            hub_angle = angle - half_play
+        elif hub_angle > angle + half_play:
+            hub_angle = angle + half_play
+        hub_angles.append(hub_angle)
+    lag: NDArray[np.float64] = comparison.decimation.apply(np.array(hub_angles) - shaft)
     return lag
 
 
-# What a mode remembers
+# Effect of past values of damping and stiffness
 
-_PADDED: Final = 1.5
-_DECAY: Final = 9.0
-"""As in `analysis.identify._nonlinear`: on s = sigma + j omega what wraps round has decayed."""
+_PADDING_RATIO: Final = 1.5
+"""Length of the transforms over that of the record."""
 
-_ORDERS: Final = 12
-_SMALL: Final = 1e-4
-"""Highest order of the size, and smallest fraction of the stress that is significant."""
+_DECAY_EXPONENT: Final = 9.0
+"""Exponent by which the transforms decay over their length, as in `analysis.identify._nonlinear`:
+on s = sigma + j omega the part that wraps round has decayed."""
+
+_MAX_SIZE_ORDER: Final = 12
+"""Highest order in the size of the change to which the torque is computed."""
+
+_STRESS_TOLERANCE: Final = 1e-4
+"""Relative change of the stress below which higher orders are left out."""
 
 
 def memory_torque(
     comparison: Comparison,
     plant: Plant,
     change: NDArray[np.float64],
-    what: Literal["damping", "stiffness"],
+    effect: Literal["damping", "stiffness"],
     size: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the torque by the past of a change, per unit size, shape (samples,).
+    """Return the torque change by past values of a changing property, per unit size, (samples,).
 
     This is the torque beyond the instantaneous derivative. `change`, shape (samples,), is w at the
-    retained samples, constant before and after. With `what` of "stiffness" the mass stays. `size`
-    is e.
+    retained samples, constant before and after. For `effect` of "stiffness" the mass is constant.
+    `size` is e.
     """
     n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
-    length = fast_length(int(np.ceil(_PADDED * n)))
-    sigma = _DECAY * rate_hz / length
+    length = fast_length(int(np.ceil(_PADDING_RATIO * n)))
+    sigma = _DECAY_EXPONENT * rate_hz / length
     s = sigma + 2j * np.pi * rate_hz / length * np.arange(length // 2 + 1)
     growth = np.exp(sigma * np.arange(n) / rate_hz)
-    retained = comparison.retained
-    w = np.interp(np.arange(n), np.arange(retained.start, retained.stop), change)
+    retained_samples = comparison.retained
+    w = np.interp(np.arange(n), np.arange(retained_samples.start, retained_samples.stop), change)
     damping, beam = plant.damping, plant.beam
     internal = damping.zeta * s**damping.alpha
     external = damping.gamma * s**damping.lambda_
     inertial = beam.density_over_stiffness * s * s + external
-    own = internal + 1 if what == "stiffness" else internal
+    changing_factor = internal + 1 if effect == "stiffness" else internal
     angle = np.fft.rfft(comparison.angle_rad / growth, length) * torque_channel(plant, s)
-    total = np.zeros(n)
+    total_torque = np.zeros(n)
 
     def in_time(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Return the values over time of a quantity with a given spectrum, shape (n,)."""
         values: NDArray[np.float64] = np.fft.irfft(spectrum, length)[:n] * growth
         return values
 
     def weighted(spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        found: NDArray[np.complex128] = np.fft.rfft(w * in_time(spectrum) / growth, length)
-        return found
+        """Return the spectrum of a quantity times w, from the spectrum of the quantity."""
+        transform: NDArray[np.complex128] = np.fft.rfft(w * in_time(spectrum) / growth, length)
+        return transform
 
-    of_modes = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
-    stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * of_modes)
-    for stiffness, k in zip(stiffnesses.tolist(), of_modes.tolist(), strict=True):
+    k4_of_modes = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
+    stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * k4_of_modes)
+    for stiffness, k in zip(stiffnesses.tolist(), k4_of_modes.tolist(), strict=True):
         compliance = 1 / ((1 + internal) * k + inertial)
-        follows = inertial * compliance
-        at_first = own * k * -follows + external * (1 - follows)
-        steady = stress = at_first * angle
-        moved = np.zeros_like(stress)
-        for _ in range(_ORDERS if size else 1):
-            moved = -compliance * weighted(stress)
-            before, stress = stress, steady + size * (own * k + external) * moved
-            if np.abs(stress - before).max() < _SMALL * np.abs(steady).max():
+        rigid_response = inertial * compliance
+        stress_per_angle = changing_factor * k * -rigid_response + external * (1 - rigid_response)
+        constant_stress = stress = stress_per_angle * angle
+        vibration_change = np.zeros_like(stress)
+        for _ in range(_MAX_SIZE_ORDER if size else 1):
+            vibration_change = -compliance * weighted(stress)
+            previous_stress, stress = (
+                stress,
+                constant_stress + size * (changing_factor * k + external) * vibration_change,
+            )
+            if (
+                np.abs(stress - previous_stress).max()
+                < _STRESS_TOLERANCE * np.abs(constant_stress).max()
+            ):
                 break
-        deflection = (1 - follows) * angle + size * moved
-        late = in_time(inertial * moved) + w * in_time(external * deflection)
-        total += stiffness * (
-            late - w * in_time(external * (1 - follows) * angle - follows * steady)
+        deflection = (1 - rigid_response) * angle + size * vibration_change
+        torque_part = in_time(inertial * vibration_change) + w * in_time(external * deflection)
+        total_torque += stiffness * (
+            torque_part
+            - w
+            * in_time(external * (1 - rigid_response) * angle - rigid_response * constant_stress)
         )
-    return total[retained]
+    return total_torque[retained_samples]
 
 
-# Words
+# Findings
 
-_NAMES: Final[dict[What, str]] = {
+_EFFECT_NAMES: Final[dict[Effect, str]] = {
     "damping": "Damping that changes along the record",
     "stiffness": "Stiffness that changes along the record",
     "gain": "A torque gain that changes along the record",
     "clock": "Clocks of different rates",
     "play": "Backlash between encoder and beam",
 }
-_KINDS: Final[dict[What, Kind]] = {
+"""Name of each effect, as the beginning of a sentence."""
+
+_FINDING_KINDS: Final[dict[Effect, Kind]] = {
     "damping": "drifting damping",
     "stiffness": "drifting stiffness",
     "gain": "drifting gain",
     "clock": "clock rate difference",
     "play": "play",
 }
+"""Kind of the finding on each effect."""
 
 
 def established(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> bool:
-    """Return whether one change, and nothing else, explains the record.
+    """Return whether one change, and no other model, explains the record.
 
     A change with time is never established by one sweep: it may depend on frequency instead.
     Backlash may be established.
@@ -371,8 +434,9 @@ def established(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> bool
     Parameters
     ----------
     changes : tuple of TemporalChange
+        Changes that explain the record best or equally well.
     one_sweep : bool
-        As `Measurement` has it.
+        Whether the excitation is a single sweep.
     """
     if len(changes) != 1 or not changes[0].certain:
         return False
@@ -380,16 +444,17 @@ def established(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> bool
 
 
 def changing(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> Iterator[Finding]:
-    """Yield findings on the changes along the record.
+    """Yield a finding on each change along the record.
 
     Parameters
     ----------
     changes : tuple of TemporalChange
+        Changes that explain the record best or equally well.
     one_sweep : bool
-        As `Measurement` has it.
+        Whether the excitation is a single sweep.
     """
     for change in changes:
-        finding = _finding(change)
+        finding = _established_finding(change)
         if established(changes, one_sweep=one_sweep):
             yield finding
         else:
@@ -397,15 +462,16 @@ def changing(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> Iterato
             yield replace(
                 finding,
                 sentence=(
-                    f"{_NAMES[change.what]} ({_size(change)}) would explain the record as well as "
-                    f"{others}: in one sweep, time and frequency vary together."
+                    f"{_EFFECT_NAMES[change.what]} ({_size_text(change)}) would explain the record "
+                    f"as well as {others}: in one sweep, time and frequency vary together."
                 ),
                 value=None,
                 interval=None,
             )
 
 
-def _size(change: TemporalChange) -> str:
+def _size_text(change: TemporalChange) -> str:
+    """Return the size of a change as text with its unit."""
     if change.what == "play":
         return f"{1e3 * change.size:.2g} mrad"
     if change.what == "clock":
@@ -413,36 +479,39 @@ def _size(change: TemporalChange) -> str:
     return f"{100 * change.size:+.2g} % from beginning to end"
 
 
-_SHOWN: Final[Mapping[What, float]] = {"play": 1e3, "clock": 1e6}
-"""Factor in which a size is shown; that of a change in % otherwise."""
+_DISPLAY_FACTORS: Final[Mapping[Effect, float]] = {"play": 1e3, "clock": 1e6}
+"""Factor from the size to its value in text: mrad, ppm. It is 100 for changes in per cent."""
 
-_THERE_AND_BACK: Final = (
+_TWO_WAY_SWEEP_ADVICE: Final = (
     "weep up and down in one session (rigd run chirp --there-and-back): that separates changes "
     "with time from those with frequency."
 )
+"""Advice to sweep in both directions, without its first letter."""
 
 
-def _finding(change: TemporalChange) -> Finding:
-    half = NORMAL_95 * change.std
-    of_play = change.what == "play"
-    remedy = f"S{_THERE_AND_BACK}"
-    if of_play:
+def _established_finding(change: TemporalChange) -> Finding:
+    """Return the finding that a change along the record is established."""
+    half_width = NORMAL_95 * change.std
+    is_backlash = change.what == "play"
+    remedy = f"S{_TWO_WAY_SWEEP_ADVICE}"
+    if is_backlash:
         remedy = "Remove the backlash in gear and clamp."
     elif change.what == "clock":
-        remedy = f"Sample angle and torque by one clock, or s{_THERE_AND_BACK}"
+        remedy = f"Sample angle and torque by one clock, or s{_TWO_WAY_SWEEP_ADVICE}"
     return Finding(
-        kind=_KINDS[change.what],
+        kind=_FINDING_KINDS[change.what],
         sentence=(
-            f"{_NAMES[change.what]}: {_size(change)} "
-            f"(± {_SHOWN.get(change.what, 100.0) * half:.1g}; 95 %). It was fitted too"
+            f"{_EFFECT_NAMES[change.what]}: {_size_text(change)} "
+            f"(± {_DISPLAY_FACTORS.get(change.what, 100.0) * half_width:.1g}; 95 %). "
+            "It was fitted too"
             + (
                 ", to first order in its size."
-                if of_play
+                if is_backlash
                 else "; all parameters are those at the middle of the record."
             )
         ),
         value=change.size,
-        interval=(change.size - half, change.size + half),
-        unit="rad" if of_play else "1",
+        interval=(change.size - half_width, change.size + half_width),
+        unit="rad" if is_backlash else "1",
         remedy=remedy,
     )

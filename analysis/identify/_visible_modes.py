@@ -1,4 +1,4 @@
-"""Visible modes of a record, and excitation near the other modes."""
+"""Modes that a record shows, and test of whether a mode was excited."""
 
 from __future__ import annotations
 
@@ -14,92 +14,108 @@ if TYPE_CHECKING:
     from analysis.identify._result import RecordFit
     from analysis.identify.noise import NoiseSpectrum
 
-_EVIDENCE: Final = 400.0
-"""Deviance by which a response with a resonance must be better than a smooth one: the resonance is
+_MIN_EVIDENCE: Final = 400.0
+"""Deviance by which a response with a resonance must be better than a smooth one. The resonance is
 then known to a twentieth of its height, and its damping to about a tenth."""
 
-_OVER_NOISE: Final = 1.4
-"""Least residual of a smooth response over the noise, which is known to 10-20 % only."""
+_MIN_RESIDUAL_OVER_NOISE: Final = 1.4
+"""Residual of a smooth response over the noise, from which a mode is visible. The noise is known to
+10-20 % only."""
 
-_NEAR: Final = 0.05
-_HALF_WIDTHS: Final = 4.0
-_FARTHEST: Final = 0.4
-"""Window to either side of a mode, relative to its frequency: at least, in half-widths of the
-resonance, and at most."""
+_MIN_RELATIVE_REACH: Final = 0.05
+"""Smallest half width of the window around a mode, relative to its frequency."""
 
-_FEWEST_BINS: Final = 8
-"""To either side."""
+_REACH_IN_HALF_WIDTHS: Final = 4.0
+"""Half width of the window, in half widths of the resonance."""
 
-_DEGREE: Final = 2
+_MAX_RELATIVE_REACH: Final = 0.4
+"""Largest half width of the window, relative to the frequency of the mode."""
+
+_MIN_BINS_PER_SIDE: Final = 8
+"""Smallest number of bins to either side of a mode."""
+
+_SMOOTH_DEGREE: Final = 2
 """Degree in frequency of the polynomial for a response without a resonance near the mode."""
 
-_DRIVEN: Final = 0.2
-"""Amplitude of the reference, relative to that at mode 1, from which a mode counts as driven: a
-sweep has 1 there at all modes it passes, a step 1/6 at mode 2."""
+_MIN_EXCITATION_RATIO: Final = 0.2
+"""Amplitude of the reference, relative to that near the other mode, from which a mode counts as
+excited. A sweep has 1 at all modes that it passes, a step 1/6 at mode 2 relative to mode 1."""
 
 
 def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) -> tuple[int, ...]:
-    """Return the modes whose resonance is needed to explain the record.
+    """Return the numbers of the modes whose resonance is needed to explain the record.
 
-    Near each mode the torque is compared with the best smooth response to the angle. Without a
-    resonance the residual is noise, with chi-square of known mean and scatter; the energy of a
-    resonance against the noise is the evidence. The position of the resonance in the window does
-    not matter, so the modes of a beam that is not uniform are found as well. A fit that is better
-    than the smooth response is evidence as well, for weaker resonances in a long record. `fit`
+    Near each mode the torque is compared with the best smooth response to the angle. If there is no
+    resonance, the residual is noise, with chi-square of known mean and scatter. The energy of a
+    resonance relative to the noise is the evidence. The position of the resonance in the window
+    does not matter, so the modes of a beam that is not uniform are found as well. A fit that is
+    better than the smooth response is evidence, too, for weaker resonances in a long record. `fit`
     provides the frequencies and widths of the modes.
     """
     torque = comparison.spectrum(comparison.torque_nm[comparison.retained])
     angle = comparison.spectrum(comparison.angle_rad[comparison.retained])
-    found = []
+    visible = []
     for mode in fit.modes:
         offset = comparison.frequency_hz - mode.frequency_hz
-        reach_hz = _reach_hz(comparison, mode.frequency_hz, mode.damping_ratio)
-        near = (np.abs(offset) < reach_hz) & noise.counts
-        freedom = 2 * (int(np.count_nonzero(near)) - _DEGREE - 1)
-        if freedom < _FEWEST_BINS:
+        reach_hz = _window_half_width_hz(comparison, mode.frequency_hz, mode.damping_ratio)
+        in_window = (np.abs(offset) < reach_hz) & noise.counts
+        degrees_of_freedom = 2 * (int(np.count_nonzero(in_window)) - _SMOOTH_DEGREE - 1)
+        if degrees_of_freedom < _MIN_BINS_PER_SIDE:
             continue
-        weight = noise.weight[near]
-        left = _chi_square_of_smooth(
-            torque[near] * weight, angle[near] * weight, offset[near] / reach_hz
+        weight = noise.weight[in_window]
+        smooth_chi_square = _smooth_response_chi_square(
+            torque[in_window] * weight, angle[in_window] * weight, offset[in_window] / reach_hz
         )
         # Chance does neither: together they are nearly eight standard deviations, or more.
-        significant = left - freedom > _EVIDENCE and left > _OVER_NOISE * freedom
-        # In many bins a resonance need not stand out of the noise, where the fit knows where it is.
-        own = float(np.vdot(fit.residual[near], fit.residual[near]).real)
-        if significant or left - own > _EVIDENCE:
-            found.append(mode.number)
-    return tuple(found)
+        significant = (
+            smooth_chi_square - degrees_of_freedom > _MIN_EVIDENCE
+            and smooth_chi_square > _MIN_RESIDUAL_OVER_NOISE * degrees_of_freedom
+        )
+        # With many bins a resonance may be below the noise of each and still be significant.
+        fit_chi_square = float(np.vdot(fit.residual[in_window], fit.residual[in_window]).real)
+        if significant or smooth_chi_square - fit_chi_square > _MIN_EVIDENCE:
+            visible.append(mode.number)
+    return tuple(visible)
 
 
 def driven(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
-    """Return whether the excitation near one frequency is almost as large as near another."""
+    """Return whether the excitation near a frequency is almost as large as near another one."""
     measurement = comparison.measurement
     reference = measurement.reference_rad
-    moved_rad = measurement.angle_from_rest(1.0) if reference is None else reference - reference[0]
-    power = np.abs(np.fft.rfft(moved_rad)) ** 2
-    hz = np.fft.rfftfreq(moved_rad.size, 1 / measurement.rate_hz)
+    excitation_rad = (
+        measurement.angle_from_rest(1.0) if reference is None else reference - reference[0]
+    )
+    power = np.abs(np.fft.rfft(excitation_rad)) ** 2
+    hz = np.fft.rfftfreq(excitation_rad.size, 1 / measurement.rate_hz)
 
     def amplitude(at_hz: float) -> float:
-        near = np.abs(hz - at_hz) <= max(_NEAR * at_hz, _FEWEST_BINS * hz[1])
-        return math.sqrt(float(np.mean(power[near]))) if near.any() else 0.0
+        """Return the root-mean-square amplitude of the excitation near a frequency."""
+        in_window = np.abs(hz - at_hz) <= max(
+            _MIN_RELATIVE_REACH * at_hz, _MIN_BINS_PER_SIDE * hz[1]
+        )
+        return math.sqrt(float(np.mean(power[in_window]))) if in_window.any() else 0.0
 
-    return amplitude(frequency_hz) > _DRIVEN * amplitude(relative_to_hz) > 0
+    return amplitude(frequency_hz) > _MIN_EXCITATION_RATIO * amplitude(relative_to_hz) > 0
 
 
-def _reach_hz(comparison: Comparison, frequency_hz: float, damping_ratio: float) -> float:
-    """Return the half width of the window around a mode."""
+def _window_half_width_hz(
+    comparison: Comparison, frequency_hz: float, damping_ratio: float
+) -> float:
+    """Return the half width of the window around a mode, in hertz."""
     spacing_hz = float(comparison.frequency_hz[1] - comparison.frequency_hz[0])
-    fraction = min(max(_NEAR, _HALF_WIDTHS * damping_ratio), _FARTHEST)
-    return max(fraction * frequency_hz, (_FEWEST_BINS + 0.5) * spacing_hz)
+    fraction = min(
+        max(_MIN_RELATIVE_REACH, _REACH_IN_HALF_WIDTHS * damping_ratio), _MAX_RELATIVE_REACH
+    )
+    return max(fraction * frequency_hz, (_MIN_BINS_PER_SIDE + 0.5) * spacing_hz)
 
 
-def _chi_square_of_smooth(
+def _smooth_response_chi_square(
     torque: NDArray[np.complex128], angle: NDArray[np.complex128], position: NDArray[np.float64]
 ) -> float:
-    """Return the sum of squares of the best smooth response to whitened spectra of shape (K,).
+    """Return the sum of squares that the best smooth response leaves of whitened spectra, (K,).
 
-    `position` is that within the window, -1 to 1.
+    `position` is the position of each bin within the window, -1 to 1.
     """
-    columns, _ = np.linalg.qr(np.array([position**k * angle for k in range(_DEGREE + 1)]).T)
-    left = torque - columns @ (columns.conj().T @ torque)
-    return float(np.vdot(left, left).real)
+    columns, _ = np.linalg.qr(np.array([position**k * angle for k in range(_SMOOTH_DEGREE + 1)]).T)
+    remainder = torque - columns @ (columns.conj().T @ torque)
+    return float(np.vdot(remainder, remainder).real)

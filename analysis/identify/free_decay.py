@@ -2,7 +2,8 @@
 
 A beam that already rings when the record begins adds a sum of decays to the torque. Their
 amplitudes are unknown, and their poles are those of the model. The same holds after a gap of the
-measured angle. The spectra over the compared samples are geometric sums, in closed form.
+measured angle. The spectra of the decays over the compared samples are geometric sums, in closed
+form.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
     from analysis.identify._plant import Plant
 
 
-_HARDLY: Final = 1e-6
+_HUM_DECAY_EXPONENT: Final = 1e-6
+"""Decay of a hum over the whole record, so small that the hum is practically steady."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +35,11 @@ class Pole:
     Attributes
     ----------
     mode : int
-        From 1.
+        Number of the mode, from 1.
     at_rad_s : complex
+        Position of the pole in rad/s.
     derivative : ndarray of complex, shape (k,)
-        Derivatives by the requested parameters.
+        Derivatives of the position by the requested parameters.
     """
 
     mode: int
@@ -45,187 +48,210 @@ class Pole:
 
     @property
     def oscillates(self) -> bool:
-        """Return whether the decay is an oscillation, with two columns instead of one."""
+        """Return whether the decay of this pole oscillates.
+
+        Then it has two spectra instead of one.
+        """
         return self.at_rad_s.imag != 0
 
 
 def decay_columns(poles: Sequence[Pole]) -> int:
-    """Count the decay spectra of some poles: two for each that oscillates."""
+    """Return the number of decay spectra of some poles: two for each that oscillates."""
     return sum(1 + pole.oscillates for pole in poles)
 
 
 def mode_poles(
     plant: Plant, count: int, wrt: Sequence[str], near_rad_s: Sequence[complex] = ()
 ) -> tuple[Pole, ...]:
-    """Return the poles of the first `count` modes with derivatives; some modes may have none.
+    """Return the poles of the first `count` modes with derivatives. A mode may have none.
 
     Parameters
     ----------
     plant : Plant
+        Rig and beam.
     count : int
+        Number of modes.
     wrt : sequence of str
-        Names of `ResponseGrid`; some do not affect a pole.
+        Parameters of the derivatives, by the names of `ResponseGrid`. Some do not affect a pole.
     near_rad_s : sequence of complex, optional
         Approximate poles in the order of the modes, if all are known.
     """
-    near = np.array(near_rad_s) if len(near_rad_s) == count > 0 else None
+    near_poles = np.array(near_rad_s) if len(near_rad_s) == count > 0 else None
     if plant.tip_mass_kg or plant.root_compliance_rad_per_nm:
-        return _loaded_poles(plant, count, wrt, near)
+        return _loaded_poles(plant, count, wrt, near_poles)
     z = eigenvalues(count).copy()
     for index, offset in enumerate(plant.stiffness_offsets[: count - 1], start=1):
         z[index] *= (1 + offset) ** 0.25
-    found = []
-    for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, near)):
+    poles = []
+    for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, near_poles)):
         if np.isnan(pair[0]):
             continue
         k4_per_m4 = float((z[i] / plant.beam.length_m) ** 4)
         for pole in pair[: 1 if pair[0].imag else 2]:
-            moved = pole_gradient(complex(pole), k4_per_m4, plant.beam, plant.damping, wrt)
-            found.append(Pole(i + 1, complex(pole), moved.astype(np.complex128, copy=False)))
-    return tuple(found)
+            pole_derivative = pole_gradient(
+                complex(pole), k4_per_m4, plant.beam, plant.damping, wrt
+            )
+            poles.append(
+                Pole(i + 1, complex(pole), pole_derivative.astype(np.complex128, copy=False))
+            )
+    return tuple(poles)
 
 
 def _loaded_poles(
     plant: Plant, count: int, wrt: Sequence[str], near: NDArray[np.complex128] | None
 ) -> tuple[Pole, ...]:
-    """Return the same poles with a tip mass or an elastic clamp, on a uniform beam."""
+    """Return the poles of a uniform beam with a tip mass or an elastic clamp, with derivatives."""
     loaded = LoadedBeam(
         plant.beam, plant.damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm
     )
-    found = [
+    mode_and_pole = [
         (mode, pole)
         for mode, pair in enumerate(loaded.poles(eigenvalues(count), near), start=1)
         if not np.isnan(pair).any()
         for pole in pair[: 1 if pair[0].imag else 2]
     ]
-    moved = loaded.pole_gradients(np.array([pole for _, pole in found], dtype=np.complex128), wrt)
+    pole_derivatives = loaded.pole_gradients(
+        np.array([pole for _, pole in mode_and_pole], dtype=np.complex128), wrt
+    )
     return tuple(
-        Pole(mode, complex(pole), row) for (mode, pole), row in zip(found, moved, strict=True)
+        Pole(mode, complex(pole), row)
+        for (mode, pole), row in zip(mode_and_pole, pole_derivatives, strict=True)
     )
 
 
 class DecaySpectra:
-    """Discrete Fourier transforms of decays over ``samples`` samples, at some of its bins.
+    """Discrete Fourier transforms of free decays over a number of samples, at some bins.
 
     Parameters
     ----------
     samples : int
-        The decays start at the first of them.
+        Number of samples. The decays start at the first one.
     rate_hz : float
+        Rate of the samples.
     omega_rad_s : ndarray, shape (K,)
-        Bins of the transform, multiples of ``2 pi rate_hz / samples``.
+        Frequencies of the bins, multiples of ``2 pi rate_hz / samples``.
     """
 
-    __slots__ = ("_duration_s", "_period_s", "_turn")
+    __slots__ = ("_duration_s", "_period_s", "_sample_rotation")
 
     def __init__(self, samples: int, rate_hz: float, omega_rad_s: NDArray[np.float64]) -> None:
         self._period_s = 1 / rate_hz
         self._duration_s = samples / rate_hz
-        self._turn = np.exp(-1j * omega_rad_s * self._period_s)
+        self._sample_rotation = np.exp(-1j * omega_rad_s * self._period_s)
 
     def columns(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Return spectra of ``Re exp(p t)`` and, if it oscillates, ``Im exp(p t)``: (m, K)."""
-        return self._spectra(poles, self._sum)
+        """Return the spectra of ``exp(p t)`` of each pole, shape (m, K).
+
+        An oscillating decay has two rows: real and imaginary part.
+        """
+        return self._real_spectra(poles, self._transform_of_decay)
 
     def gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        """Differentiate ``amplitudes @ columns(poles)`` through the poles, shape (k, K).
+        """Return the derivatives of ``amplitudes @ columns(poles)`` by the unknowns, shape (k, K).
 
         Parameters
         ----------
         poles : sequence of Pole
             Poles with their derivatives by k unknowns.
         amplitudes : ndarray of float, shape (m,)
-            Amplitude of each column, in N·m.
+            Amplitude of each decay spectrum, in N·m.
         """
-        turned = []
+        weighted_derivatives = []
         index = 0
         for pole in poles:
             if pole.oscillates:
-                # t exp(p t) times the pole's motion, seen along the two amplitudes.
-                moved = complex(amplitudes[index], -amplitudes[index + 1]) * pole.derivative
-                turned += [moved.real, -moved.imag]
+                # t exp(p t) times the derivative of the pole, for the two amplitudes.
+                derivative = complex(amplitudes[index], -amplitudes[index + 1]) * pole.derivative
+                weighted_derivatives += [derivative.real, -derivative.imag]
                 index += 2
             else:
-                turned.append(amplitudes[index] * pole.derivative.real)
+                weighted_derivatives.append(amplitudes[index] * pole.derivative.real)
                 index += 1
-        parts: NDArray[np.float64] = np.array(turned).T @ self.growing(poles).view(np.float64)
-        total: NDArray[np.complex128] = parts.view(np.complex128)
-        return total
+        real_parts: NDArray[np.float64] = np.array(weighted_derivatives).T @ self.growing(
+            poles
+        ).view(np.float64)
+        gradient: NDArray[np.complex128] = real_parts.view(np.complex128)
+        return gradient
 
     def growing(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Return spectra of the decays times the time since the first sample: shape (m, K)."""
-        return self._spectra(poles, self._sum_of_time)
+        """Return the spectra of the decays times the time since the first sample, shape (m, K)."""
+        return self._real_spectra(poles, self._transform_of_growing_decay)
 
     def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:
-        """Return spectra of oscillations over the whole record, shape (4 n, K).
+        """Return spectra of n oscillations over the whole record, shape (4 n, K).
 
-        The columns have either phase, and are constant or grow from zero. Together they describe
-        any amplitude and phase at the beginning and any other at the end, which leaks into distant
-        bins.
+        Each oscillation has four spectra: sine and cosine, each constant or growing from zero.
+        Together they describe any amplitude and phase at the beginning and any other at the end,
+        which leaks into distant bins.
         """
-        none = np.zeros(0, dtype=np.complex128)
-        # All but steady: on a bin's own frequency the sums would be 0 / 0.
-        slow = _HARDLY / self._duration_s
-        poles = [Pole(0, complex(-slow, 2 * np.pi * hz), none) for hz in frequency_hz]
+        no_derivatives = np.zeros(0, dtype=np.complex128)
+        # A steady oscillation at the frequency of a bin would give 0 / 0, so it decays a little.
+        decay_rate = _HUM_DECAY_EXPONENT / self._duration_s
+        poles = [
+            Pole(0, complex(-decay_rate, 2 * np.pi * hz), no_derivatives) for hz in frequency_hz
+        ]
         return np.concatenate([self.columns(poles), self.growing(poles)])
 
-    def _spectra(
-        self, poles: Sequence[Pole], upper: Callable[[complex], NDArray[np.complex128]]
+    def _real_spectra(
+        self, poles: Sequence[Pole], spectrum_of_pole: Callable[[complex], NDArray[np.complex128]]
     ) -> NDArray[np.complex128]:
-        """Return spectra of the real and, if it oscillates, the imaginary part of a decay."""
-        rows = np.empty((decay_columns(poles), self._turn.size), complex)
+        """Return one spectrum for each real pole, two for each oscillating one, shape (m, K)."""
+        rows = np.empty((decay_columns(poles), self._sample_rotation.size), complex)
         index = 0
         for pole in poles:
-            of_pole = upper(pole.at_rad_s)
+            pole_spectrum = spectrum_of_pole(pole.at_rad_s)
             if pole.oscillates:
-                of_conjugate = upper(pole.at_rad_s.conjugate())
-                np.multiply(of_pole + of_conjugate, 0.5, out=rows[index])
-                np.multiply(of_pole - of_conjugate, -0.5j, out=rows[index + 1])
+                conjugate_spectrum = spectrum_of_pole(pole.at_rad_s.conjugate())
+                np.multiply(pole_spectrum + conjugate_spectrum, 0.5, out=rows[index])
+                np.multiply(pole_spectrum - conjugate_spectrum, -0.5j, out=rows[index + 1])
                 index += 2
             else:
-                rows[index] = of_pole
+                rows[index] = pole_spectrum
                 index += 1
         return rows
 
-    def _sum(self, pole: complex) -> NDArray[np.complex128]:
-        """Return the sum of ``exp(p t)`` over the samples, rotated to each bin."""
-        ratio = np.exp(pole * self._period_s) * self._turn
-        total: NDArray[np.complex128] = (1 - np.exp(pole * self._duration_s)) / (1 - ratio)
-        return total
+    def _transform_of_decay(self, pole: complex) -> NDArray[np.complex128]:
+        """Return the discrete Fourier transform of ``exp(p t)`` over the samples, shape (K,)."""
+        step_factor = np.exp(pole * self._period_s) * self._sample_rotation
+        spectrum: NDArray[np.complex128] = (1 - np.exp(pole * self._duration_s)) / (1 - step_factor)
+        return spectrum
 
-    def _sum_of_time(self, pole: complex) -> NDArray[np.complex128]:
-        """Return the sum of ``t exp(p t)``: the derivative of `_sum` by the pole."""
-        ratio = np.exp(pole * self._period_s) * self._turn
-        over = np.exp(pole * self._duration_s)
-        reciprocal = np.reciprocal(1 - ratio)
-        total: NDArray[np.complex128] = ratio * reciprocal
-        total *= (1 - over) * self._period_s
-        total -= self._duration_s * over
-        total *= reciprocal
-        return total
+    def _transform_of_growing_decay(self, pole: complex) -> NDArray[np.complex128]:
+        """Return the discrete Fourier transform of ``t exp(p t)`` over the samples, shape (K,)."""
+        step_factor = np.exp(pole * self._period_s) * self._sample_rotation
+        end_value = np.exp(pole * self._duration_s)
+        reciprocal = np.reciprocal(1 - step_factor)
+        spectrum: NDArray[np.complex128] = step_factor * reciprocal
+        spectrum *= (1 - end_value) * self._period_s
+        spectrum -= self._duration_s * end_value
+        spectrum *= reciprocal
+        return spectrum
 
 
 class LaterDecaySpectra(DecaySpectra):
     """Spectra of decays that begin within the record and pass its low-pass filter.
 
-    They begin at a tick of the record. Their part in the compared samples is the sum over the
-    ticks, since the filter has no effect in the band. They end with the samples.
+    They begin at a tick of the record, and end with the samples. Their contribution to the compared
+    samples is the sum over the ticks, since the filter has no effect in the band.
 
     Parameters
     ----------
     samples : int
+        Number of compared samples.
     rate_hz : float
-        Rate of the samples.
+        Rate of the compared samples.
     omega_rad_s : ndarray, shape (K,)
+        Frequencies of the bins.
     first_s : float
-        First tick of the decays since the first sample; there they have their amplitudes.
+        Time of the first tick of the decays since the first sample. There they have their
+        amplitudes.
     tick_s : float
         Time between ticks.
     """
 
-    __slots__ = ("_first", "_tick_s", "_turn_of_tick")
+    __slots__ = ("_first_tick_factor", "_tick_rotation", "_tick_s")
 
     def __init__(
         self,
@@ -238,21 +264,30 @@ class LaterDecaySpectra(DecaySpectra):
         super().__init__(samples, rate_hz, omega_rad_s)
         self._duration_s -= first_s
         self._tick_s = tick_s
-        self._turn_of_tick = np.exp(-1j * omega_rad_s * tick_s)
-        self._first = tick_s / self._period_s * np.exp(-1j * omega_rad_s * first_s)
+        self._tick_rotation = np.exp(-1j * omega_rad_s * tick_s)
+        self._first_tick_factor = tick_s / self._period_s * np.exp(-1j * omega_rad_s * first_s)
 
-    def _sum(self, pole: complex) -> NDArray[np.complex128]:
-        begins = 1 - np.exp(pole * self._tick_s) * self._turn_of_tick
-        ends = 1 - np.exp(pole * self._period_s) * self._turn
-        total: NDArray[np.complex128] = (
-            self._first / begins - np.exp(pole * self._duration_s) / ends
+    def _transform_of_decay(self, pole: complex) -> NDArray[np.complex128]:
+        """Return the transform of ``exp(p t)`` from the first tick to the last sample, (K,)."""
+        begin_denominator = 1 - np.exp(pole * self._tick_s) * self._tick_rotation
+        end_denominator = 1 - np.exp(pole * self._period_s) * self._sample_rotation
+        spectrum: NDArray[np.complex128] = (
+            self._first_tick_factor / begin_denominator
+            - np.exp(pole * self._duration_s) / end_denominator
         )
-        return total
+        return spectrum
 
-    def _sum_of_time(self, pole: complex) -> NDArray[np.complex128]:
-        tick = np.exp(pole * self._tick_s) * self._turn_of_tick
-        ratio = np.exp(pole * self._period_s) * self._turn
-        over = np.exp(pole * self._duration_s)
-        total: NDArray[np.complex128] = self._first * self._tick_s * tick / (1 - tick) ** 2
-        total -= over * (self._duration_s + self._period_s * ratio / (1 - ratio)) / (1 - ratio)
-        return total
+    def _transform_of_growing_decay(self, pole: complex) -> NDArray[np.complex128]:
+        """Return the transform of ``t exp(p t)`` from the first tick to the last sample, (K,)."""
+        tick_factor = np.exp(pole * self._tick_s) * self._tick_rotation
+        step_factor = np.exp(pole * self._period_s) * self._sample_rotation
+        end_value = np.exp(pole * self._duration_s)
+        spectrum: NDArray[np.complex128] = (
+            self._first_tick_factor * self._tick_s * tick_factor / (1 - tick_factor) ** 2
+        )
+        spectrum -= (
+            end_value
+            * (self._duration_s + self._period_s * step_factor / (1 - step_factor))
+            / (1 - step_factor)
+        )
+        return spectrum

@@ -1,9 +1,10 @@
 """Headline numbers of a record: from the freest structure that it supports, with flags.
 
-A structure that fixes an order gives narrow intervals which hold only if that order is right, and
-the criterion that selected it forgives an error of 2.7 standard deviations. So the reported numbers
-are those of the structure with every order free: its intervals are valid whichever simpler one is
-true. The numbers of a simpler structure are reported in addition, as a conditional estimate.
+A structure that fixes an order gives narrow intervals, which are valid only if that order is right,
+and the criterion that selected the structure tolerates an error of 2.7 standard deviations. So the
+reported numbers are those of the structure with every order free: its intervals are valid whichever
+simpler structure is true. The numbers of a simpler structure are reported in addition, as a
+conditional estimate.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from analysis.identify._plant import OF_BEAM
-from analysis.identify.verdict import ANOTHER_DAMPING, BIC_DECISIVE, EXCLUDED, WITH_DRAG
+from analysis.identify.verdict import ANOTHER_DAMPING, BIC_DECISIVE, EXCLUDED, WITH_DRAG_REASON
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
@@ -30,46 +31,68 @@ if TYPE_CHECKING:
     from analysis.identify.verdict import OrderVerdict
 
 EXACT_CONDITION: Final = "if the beam is uniform to 1e-5"
-UNEXPLAINED: Final = "part of the record is unexplained"
+"""Condition of the estimates on an exactly uniform beam."""
+
+UNEXPLAINED_REASON: Final = "part of the record is unexplained"
+"""Reason against all numbers if the residual is more than noise."""
+
 MISREAD: Final = "the record contradicts its file"
-_NONE: Final[Mapping[str, Any]] = MappingProxyType({})
-_NOT_DETERMINED: Final = "not identifiable from this record"
-_AT_EDGE: Final = "at the edge of the range searched"
+"""Reason against all numbers if a sign or unit of the file is wrong."""
+
+_EMPTY_MAPPING: Final[Mapping[str, Any]] = MappingProxyType({})
+"""Empty mapping, the default of optional mappings."""
+
+_NOT_IDENTIFIABLE_FLAG: Final = "not identifiable from this record"
+"""Flag of a parameter without interval."""
+
+_AT_BOUND_FLAG: Final = "at the edge of the range searched"
+"""Flag of a parameter that rests on a bound."""
 
 _MODES_TO_SEPARATE_DAMPINGS: Final = 2
-_NOT_APART: Final = "not separable from a damping of unknown order"
-"""Damping of a low order is a stiffness, of an order near 2 an inertia."""
+"""Number of visible modes from which internal and external damping are separable."""
 
-ONE_MODE: Final = "one mode alone does not separate internal from external damping"
+_NOT_SEPARABLE_FLAG: Final = "not separable from a damping of unknown order"
+"""Flag of the beam parameters if a damping is not separable from them: damping of a low order acts
+as stiffness, damping of an order near 2 as inertia."""
 
-_LAW_ASSUMED: Final = (
+ONE_MODE_REASON: Final = "one mode alone does not separate internal from external damping"
+"""Flag of both loss factors if the record shows a single mode."""
+
+_STIFFNESS_LAW_FLAG: Final = (
     "the stiffness depends on the deflection, and only its lowest power was fitted"
 )
+"""Flag of the parameters that depend on the assumed law of the nonlinear stiffness."""
+
 StructureStatus = Literal["selected", "compatible", "excluded"]
+"""Relation of a structure to the record."""
+
 Damping = Literal["internal", "external"]
+"""Kind of damping: of the material, or of the surroundings."""
+
 NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
     "internal": ("zeta", "alpha"),
     "external": ("gamma", "lambda"),
 }
-"""Coefficient and order of either damping."""
+"""Names of the coefficient and the order of each damping."""
 
 _DAMPINGS: Final[tuple[Damping, Damping]] = ("internal", "external")
+"""Internal damping, then external damping: the order in which loss factors are reported."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReportedValue:
-    """Value with its uncertainty.
+    """Estimated value with its uncertainty, and the reason why it may be invalid.
 
     Attributes
     ----------
     value : float
-        In SI units.
+        Estimate in SI units.
     std : float or None
-        Standard deviation, None if the data do not determine it.
+        Standard deviation. None if the data do not determine it.
     interval_95 : tuple of float or None
-        95 % interval, None as above.
+        95 % interval. None if the data do not determine it.
     flag : str or None
-        Reason why it is not a property of the antenna or the rig; None if it is one.
+        Reason why the value is not a property of the antenna or the rig. None if it is one.
     """
 
     value: float
@@ -83,30 +106,31 @@ class ReportedValue:
         Parameters
         ----------
         flag : str or None
+            Reason why the value is not valid. None changes nothing.
         """
         return self if flag is None else replace(self, flag=self.flag or flag)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the value as `json.dumps` takes it."""
-        ends = None if self.interval_95 is None else list(self.interval_95)
+        """Return value, standard deviation, 95 % interval and flag as a JSON-ready dict."""
+        interval_95 = None if self.interval_95 is None else list(self.interval_95)
         return {
             "value": self.value,
             "std": self.std,
-            "interval_95": ends,
+            "interval_95": interval_95,
             "flag": self.flag,
         }
 
 
 @dataclass(frozen=True, slots=True)
 class ReportedLossFactor:
-    """Loss factor of a damping at the frequency where it depends least on its order.
+    """Loss factor of one damping at its pivot frequency, where it depends least on the order.
 
     Attributes
     ----------
     damping : str
         "internal" or "external".
     omega_rad_s : float or None
-        That frequency; None if the order is fixed: then it is the coefficient itself.
+        Pivot frequency in rad/s. None if the order is fixed: `size` is the coefficient then.
     size : ReportedValue
         Value of the loss factor, as in `DampingSize`.
     """
@@ -117,7 +141,7 @@ class ReportedLossFactor:
 
     @property
     def order(self) -> str:
-        """Return the name of its order: "alpha" or "lambda"."""
+        """Return the name of the order of this damping: "alpha" or "lambda"."""
         return NAMES[self.damping][1]
 
     def flagged(self, flag: str | None) -> ReportedLossFactor:
@@ -126,39 +150,42 @@ class ReportedLossFactor:
         Parameters
         ----------
         flag : str or None
+            Reason why the loss factor is not valid. None changes nothing.
         """
         return replace(self, size=self.size.flagged(flag))
 
 
 @dataclass(frozen=True, slots=True)
 class ReportedMode:
-    """One mode of the beam with locked hub (clamped–free)."""
+    """Reported frequency and damping ratio of one mode of the beam with locked hub."""
 
     number: int
-    """From 1 on."""
+    """Number of the mode, from 1."""
     frequency_hz: ReportedValue
-    """Frequency of the free decay."""
+    """Frequency of the free decay in hertz."""
     damping_ratio: ReportedValue
     """Fraction of the critical damping."""
     shown: bool
-    """Whether the record shows it; else it is computed from the model."""
+    """Whether the record shows the mode. If not, it is computed from the model."""
     source: Literal["modal", "beam"] = "beam"
-    """Model behind the numbers: the modal one, or the beam."""
+    """Model that provides the numbers: the modal model, or the beam."""
     participation: ReportedValue | None = None
-    """Effective inertia about the motor axis, in kg m²; None for a mode from the beam."""
+    """Effective inertia of the mode about the motor axis, in kg m². None for a mode from the
+    beam."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConditionalEstimate:
-    """Estimates of a simpler structure, on condition that this structure is true.
+    """Parameter estimates of a simpler structure, valid if this structure is true.
 
     Attributes
     ----------
     name : str
-        Name in tables.
+        Name of the structure in tables.
     fixed : mapping of str to float
-        Assumed values: orders by name.
+        Assumed values of the orders "alpha" and "lambda".
     parameters : mapping of str to ReportedValue
+        Estimates, by the names of `RecordFit`.
     """
 
     name: str
@@ -173,26 +200,29 @@ class Estimates:
     Attributes
     ----------
     name : str
-        Name in tables of the freest structure that the data support.
+        Name, in tables, of the freest structure that the data support.
     parameters : mapping of str to ReportedValue
         Parameters of the structure, by the names of `RecordFit`.
     sizes : tuple of ReportedLossFactor
+        Loss factors of the dampings, the internal one first.
     modes : tuple of ReportedMode
+        Modes of the beam with locked hub.
     structures : tuple of (str, str)
-        Every structure fitted, by its name in tables, and its status: "selected" for the reported
-        one; "compatible"; "excluded".
+        Name of every fitted structure in tables, and its status: "selected" for the reported one,
+        "compatible" or "excluded".
     simpler : ConditionalEstimate or None
-        Estimates of the simplest sufficient structure, if it is another.
+        Estimates of the simplest sufficient structure. None if the reported one is the simplest.
     drag_speed_m_s : float or None
-        Speed at which the parameter ``drag`` is reported; None without drag.
+        Speed at which the parameter ``drag`` is reported. None without drag.
     exact : Estimates or None
-        Estimates on condition that the beam is uniform to 1e-5; None if these assume that already.
+        Estimates on condition that the beam is uniform to 1e-5. None if these estimates assume
+        this already.
     uniform_beam : UniformBeamTest or None
-        Whether a uniform beam predicts the modal constants; None if no mode shows.
+        Test of whether a uniform beam predicts the modal constants. None if no mode is visible.
     tolerant : TolerantEstimate or None
         Source of parameters and sizes, if they include a tolerance of the geometry.
     modal : ModalEstimate or None
-        Fit of the modal model.
+        Fit of the modal model. None if no mode is visible.
     """
 
     name: str
@@ -214,7 +244,7 @@ class Estimates:
         Parameters
         ----------
         flag : str
-            The reason.
+            Reason why the numbers are not valid.
         """
         return replace(
             self,
@@ -233,17 +263,18 @@ class Estimates:
 
 @dataclass(frozen=True, slots=True)
 class Headline(Estimates):
-    """Reported numbers of one record, and the fit that they come from.
+    """Reported numbers of one record, and the fit that provides them.
 
     Attributes
     ----------
     fit : RecordFit
         Fit of the freest structure that the record supports.
     explained : bool
-        Whether its residual is noise only; else every number carries a flag.
+        Whether the residual of this fit is noise only. If not, every number carries a flag.
     with_both : RecordFit
-        That fit with the damping that it may lack; the modes come from this fit.
+        Fit with internal and external damping, which provides the modes.
     modal : ModalFit or None
+        Fit of the modal model. None if no mode is visible.
     """
 
     fit: RecordFit
@@ -253,7 +284,7 @@ class Headline(Estimates):
 
     @property
     def flags(self) -> dict[str, str]:
-        """Return the flags by parameter."""
+        """Return, for each parameter that is not valid, the reason why."""
         return {name: each.flag for name, each in self.parameters.items() if each.flag}
 
     @property
@@ -261,26 +292,29 @@ class Headline(Estimates):
         """Return the numbers of the modes that the record shows."""
         return tuple(mode.number for mode in self.modes if mode.shown)
 
-    def with_law_assumed(self) -> Headline:
-        """Flag the parameters that rest on the assumed law of stiffness against deflection."""
+    def with_stiffness_law_flag(self) -> Headline:
+        """Return the headline with a flag on numbers that depend on the assumed stiffness law."""
         return replace(
             self,
             parameters={
-                name: each.flagged(_LAW_ASSUMED) if name == "density_over_stiffness" else each
+                name: each.flagged(_STIFFNESS_LAW_FLAG)
+                if name == "density_over_stiffness"
+                else each
                 for name, each in self.parameters.items()
             },
             modes=tuple(
-                replace(each, frequency_hz=each.frequency_hz.flagged(_LAW_ASSUMED))
+                replace(each, frequency_hz=each.frequency_hz.flagged(_STIFFNESS_LAW_FLAG))
                 for each in self.modes
             ),
         )
 
-    def with_status(self, status: StructureStatus) -> tuple[str, ...]:
-        """Return the names of the structures with a status.
+    def structures_with_status(self, status: StructureStatus) -> tuple[str, ...]:
+        """Return the names of the structures with a given status.
 
         Parameters
         ----------
         status : str
+            "selected", "compatible" or "excluded".
         """
         return tuple(name for name, its in self.structures if its == status)
 
@@ -288,7 +322,7 @@ class Headline(Estimates):
 def headline(
     candidate_set: CandidateSet,
     orders: tuple[OrderVerdict, OrderVerdict],
-    visible: tuple[int, ...],
+    visible_numbers: tuple[int, ...],
     *,
     unexplained: str | None,
 ) -> Headline:
@@ -300,100 +334,112 @@ def headline(
         Candidates of the record.
     orders : tuple of OrderVerdict
         Verdicts on alpha and lambda.
-    visible : tuple of int
+    visible_numbers : tuple of int
         Numbers of the visible modes.
     unexplained : str or None
-        Reason against every number; None if only noise remains.
+        Reason against every number. None if the residual is noise only.
     """
     freest = candidate_set.freest
-    fractional = frozenset(each.order for each in orders if each.status == "fractional")
+    fractional_orders = frozenset(each.order for each in orders if each.status == "fractional")
     reasons: dict[str, str] = {
         each.order: each.reason for each in orders if each.reason is not None
     }
     intervals: dict[str, tuple[float, float]] = {
         each.order: each.profile.interval
         for each in orders
-        if each.profile.walked and each.order in freest.structure.free
+        if each.profile.is_computed and each.order in freest.structure.free
     }
     result = of_fit(
-        freest.name, freest.fit, visible, reasons, intervals, unexplained,
+        freest.name, freest.fit, visible_numbers, reasons, intervals, unexplained,
         candidate_set.with_both_dampings(freest),
     )  # fmt: skip
     if candidate_set.drag is not None:
         drag = candidate_set.drag
-        at = ReportedValue(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
-        sizes = (
-            each.flagged(WITH_DRAG) if each.damping == "external" else each for each in result.sizes
+        reported_drag = ReportedValue(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
+        loss_factors = (
+            each.flagged(WITH_DRAG_REASON) if each.damping == "external" else each
+            for each in result.sizes
         )
         result = replace(
             result,
-            parameters={**result.parameters, "drag": at},
-            sizes=tuple(sizes),
+            parameters={**result.parameters, "drag": reported_drag},
+            sizes=tuple(loss_factors),
             drag_speed_m_s=drag.speed_m_s,
         )
-    simpler = _simpler(candidate_set, fractional) if unexplained is None else None
-    return replace(result, structures=structures(candidate_set, fractional), simpler=simpler)
+    conditional_estimate = (
+        _conditional_estimate(candidate_set, fractional_orders) if unexplained is None else None
+    )
+    return replace(
+        result,
+        structures=structures(candidate_set, fractional_orders),
+        simpler=conditional_estimate,
+    )
 
 
 def of_fit(
     name: str,
     fit: RecordFit,
-    visible: Collection[int],
-    reasons: Mapping[str, str] = _NONE,
-    intervals: Mapping[str, tuple[float, float]] = _NONE,
+    visible_numbers: Collection[int],
+    reasons: Mapping[str, str] = _EMPTY_MAPPING,
+    intervals: Mapping[str, tuple[float, float]] = _EMPTY_MAPPING,
     unexplained: str | None = None,
     both: tuple[RecordFit, bool] | None = None,
 ) -> Headline:
-    """Return the headline of one fit, with flags on the numbers that need them.
+    """Return the headline of one fit, with flags on the numbers that are not valid.
 
     Parameters
     ----------
     name : str
-        Name in tables.
+        Name of the structure in tables.
     fit : RecordFit
-    visible : collection of int
-        Modes that the record shows.
+        Fit whose parameters are reported.
+    visible_numbers : collection of int
+        Numbers of the modes that the record shows.
     reasons : mapping of str to str
-        Reasons against the orders; they also hold for the coefficients.
+        Reasons against "alpha" or "lambda", which also apply to the coefficients.
     intervals : mapping of str to (float, float)
         95 % intervals of orders, used instead of those of the fit.
     unexplained : str, optional
         Reason against all numbers.
     both : tuple of (RecordFit, bool), optional
-        The fit with both dampings (`CandidateSet.with_both_dampings`), for the modes.
+        Result of `CandidateSet.with_both_dampings`: the fit with both dampings, for the modes.
     """
-    with_both, bounded = both or (fit, False)
-    few = ONE_MODE if len(visible) < _MODES_TO_SEPARATE_DAMPINGS else None
+    with_both, uses_both = both or (fit, False)
+    damping_reason = ONE_MODE_REASON if len(visible_numbers) < _MODES_TO_SEPARATE_DAMPINGS else None
     if ANOTHER_DAMPING in reasons.values():
-        few = ANOTHER_DAMPING
+        damping_reason = ANOTHER_DAMPING
     flags: dict[str, str] = {
         name: reason for order, reason in reasons.items() for name in (order, COEFFICIENT_OF[order])
     }
-    if few or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
-        flags |= dict.fromkeys(OF_BEAM, _NOT_APART)
+    if damping_reason or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
+        flags |= dict.fromkeys(OF_BEAM, _NOT_SEPARABLE_FLAG)
     return Headline(
         name=name,
         fit=fit,
         parameters={
-            each: _parameter(fit, each, unexplained or flags.get(each), intervals.get(each))
+            each: _reported_parameter(
+                fit, each, unexplained or flags.get(each), intervals.get(each)
+            )
             for each in fit.parameters
             if fit.structure.has(each)
         },
         sizes=tuple(
-            # A loss factor is known without its order; a coefficient alone belongs to it.
+            # A loss factor is valid without its order. A coefficient is valid with its order only.
             size_of(
                 each,
                 size,
                 unexplained
                 or (reasons.get(NAMES[each][1]) if size.omega_rad_s is None else None)
-                or few,
+                or damping_reason,
             )
             for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
             if size is not None
         ),
         modes=tuple(
-            _mode(mode, visible, unexplained)
-            for mode in (_bounded(fit, with_both) if bounded else with_both.modes)
+            _reported_mode(mode, visible_numbers, unexplained)
+            for mode in (
+                _modes_with_wider_uncertainty(fit, with_both) if uses_both else with_both.modes
+            )
         ),
         with_both=with_both,
         structures=((name, "selected"),),
@@ -404,143 +450,159 @@ def of_fit(
 
 
 def structures(
-    candidate_set: CandidateSet, fractional: frozenset[str]
+    candidate_set: CandidateSet, fractional_orders: frozenset[str]
 ) -> tuple[tuple[str, StructureStatus], ...]:
-    """Return the status of every structure: which ones the record excludes.
+    """Return name and status of every structure: which ones the record excludes.
 
     A special case of the freest structure is excluded by the likelihood ratio. Any other structure
-    is excluded if its likelihood is lower by as much and its BIC exceeds the lowest by 10. A
+    is excluded if its likelihood is lower by as much and its BIC exceeds the lowest BIC by 10. A
     structure that explains the record with unnecessary parameters is not excluded. A structure that
-    fixes an order at 1 is excluded if the order is in `fractional`: the record excludes 1 for it.
+    fixes an order at 1 is excluded if the order is in `fractional_orders`.
 
     Parameters
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    fractional : frozenset of str
+    fractional_orders : frozenset of str
         Orders for which the record excludes 1.
     """
     return tuple(
-        (each.name, _status(candidate_set, each, fractional)) for each in candidate_set.candidates
+        (each.name, _structure_status(candidate_set, each, fractional_orders))
+        for each in candidate_set.candidates
     )
 
 
-def _status(
-    candidate_set: CandidateSet, candidate: Candidate, fractional: frozenset[str]
+def _structure_status(
+    candidate_set: CandidateSet, candidate: Candidate, fractional_orders: frozenset[str]
 ) -> StructureStatus:
+    """Return whether the structure of a candidate is selected, compatible or excluded."""
     freest = candidate_set.freest
     if candidate is freest:
         return "selected"
-    simpler = set(candidate.structure.free) < set(freest.structure.free)
-    if not simpler:
-        behind = candidate.deviance - freest.deviance > EXCLUDED[0]
-        worse = candidate.bic > candidate_set.best.bic + BIC_DECISIVE
-        return "excluded" if behind and worse else "compatible"
+    is_special_case = set(candidate.structure.free) < set(freest.structure.free)
+    if not is_special_case:
+        is_less_likely = candidate.deviance - freest.deviance > EXCLUDED[0]
+        has_worse_bic = candidate.bic > candidate_set.best.bic + BIC_DECISIVE
+        return "excluded" if is_less_likely and has_worse_bic else "compatible"
     if any(
         candidate.structure.fixed.get(order) == 1.0  # type: ignore[call-overload]
-        for order in fractional
+        for order in fractional_orders
     ):
         return "excluded"
-    lacks = freest.parameters - candidate.parameters
-    limit = EXCLUDED[min(lacks, len(EXCLUDED)) - 1]
+    missing_parameters = freest.parameters - candidate.parameters
+    limit = EXCLUDED[min(missing_parameters, len(EXCLUDED)) - 1]
     return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
 
 
-def _simpler(candidate_set: CandidateSet, fractional: frozenset[str]) -> ConditionalEstimate | None:
-    """Return the estimates of the simplest sufficient structure."""
+def _conditional_estimate(
+    candidate_set: CandidateSet, fractional_orders: frozenset[str]
+) -> ConditionalEstimate | None:
+    """Return the estimates of the simplest compatible structure, or None if there is none."""
     freest = candidate_set.freest
-    would_do = [
+    compatible_candidates = [
         each
         for each in candidate_set.candidates
         if each.parameters < freest.parameters
-        and _status(candidate_set, each, fractional) == "compatible"
+        and _structure_status(candidate_set, each, fractional_orders) == "compatible"
     ]
-    if not would_do:
+    if not compatible_candidates:
         return None
-    best = min(would_do, key=lambda each: each.bic)
+    simplest = min(compatible_candidates, key=lambda each: each.bic)
     fixed = {
-        order: best.structure.fixed[order]  # type: ignore[index]
+        order: simplest.structure.fixed[order]  # type: ignore[index]
         for order, coefficient in COEFFICIENT_OF.items()
-        if order in best.structure.fixed and coefficient in best.structure.free
+        if order in simplest.structure.fixed and coefficient in simplest.structure.free
     }
     return ConditionalEstimate(
-        name=best.name,
+        name=simplest.name,
         fixed=fixed,
         parameters={
-            name: _parameter(best.fit, name, None, None)
-            for name in best.fit.parameters
-            if best.structure.has(name) and name not in fixed
+            name: _reported_parameter(simplest.fit, name, None, None)
+            for name in simplest.fit.parameters
+            if simplest.structure.has(name) and name not in fixed
         },
     )
 
 
-def _parameter(
+def _reported_parameter(
     fit: RecordFit, name: str, reason: str | None, interval: tuple[float, float] | None
 ) -> ReportedValue:
-    free = name in fit.interval
-    ends = interval or fit.interval.get(name)
+    """Return the reported value of one parameter of a fit, with its interval and flag."""
+    is_free = name in fit.interval
+    interval_95 = interval or fit.interval.get(name)
     flag = reason
-    if flag is None and name in fit.at_bounds and ends is None:
-        flag = _AT_EDGE
-    if flag is None and free and ends is None:
-        flag = _NOT_DETERMINED
-    return ReportedValue(fit.parameters[name], fit.std[name] if free else 0.0, ends, flag)
+    if flag is None and name in fit.at_bounds and interval_95 is None:
+        flag = _AT_BOUND_FLAG
+    if flag is None and is_free and interval_95 is None:
+        flag = _NOT_IDENTIFIABLE_FLAG
+    return ReportedValue(fit.parameters[name], fit.std[name] if is_free else 0.0, interval_95, flag)
 
 
 def size_of(damping: Damping, size: DampingSize, reason: str | None) -> ReportedLossFactor:
-    """Return a loss factor with its 95 % interval.
+    """Return the reported loss factor of a damping, with its 95 % interval.
 
     Parameters
     ----------
     damping : str
+        "internal" or "external".
     size : DampingSize
+        Estimated loss factor.
     reason : str or None
-        Its flag.
+        Flag of the reported value. None if it is valid.
     """
-    # Positive, and uncertain by a factor.
-    spread = NORMAL_95 * size.std / size.value
-    ends = (size.value * math.exp(-spread), size.value * math.exp(min(spread, 300.0)))
+    # A loss factor is positive and uncertain by a factor, so its interval is logarithmic.
+    half_width = NORMAL_95 * size.std / size.value
+    interval_95 = (
+        size.value * math.exp(-half_width),
+        size.value * math.exp(min(half_width, 300.0)),
+    )
     return ReportedLossFactor(
-        damping, size.omega_rad_s, ReportedValue(size.value, size.std, ends, reason)
+        damping, size.omega_rad_s, ReportedValue(size.value, size.std, interval_95, reason)
     )
 
 
-def _bounded(fit: RecordFit, with_both: RecordFit) -> Iterator[ModeEstimate]:
-    """Return the modes of a fit with the uncertainty that includes the other damping."""
-    theirs = {mode.number: mode for mode in with_both.modes}
+def _modes_with_wider_uncertainty(fit: RecordFit, with_both: RecordFit) -> Iterator[ModeEstimate]:
+    """Yield the modes of a fit with the uncertainties of the fit with both dampings."""
+    modes_with_both = {mode.number: mode for mode in with_both.modes}
     for mode in fit.modes:
-        wider = theirs.get(mode.number, mode)
+        mode_with_both = modes_with_both.get(mode.number, mode)
         yield replace(
             mode,
-            frequency_std_hz=wider.frequency_std_hz,
-            damping_ratio_std=wider.damping_ratio_std,
+            frequency_std_hz=mode_with_both.frequency_std_hz,
+            damping_ratio_std=mode_with_both.damping_ratio_std,
         )
 
 
-def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> ReportedMode:
-    shown = mode.number in visible
-    if reason is None and not shown:
+def _reported_mode(
+    mode: ModeEstimate, visible_numbers: Collection[int], reason: str | None
+) -> ReportedMode:
+    """Return the reported frequency and damping ratio of a mode, flagged if it is not visible."""
+    is_visible = mode.number in visible_numbers
+    if reason is None and not is_visible:
         reason = "computed from the model: the record does not show this mode"
     return ReportedMode(
         mode.number,
         symmetric(mode.frequency_hz, mode.frequency_std_hz, reason),
         symmetric(mode.damping_ratio, mode.damping_ratio_std, reason),
-        shown,
+        is_visible,
     )
 
 
 def symmetric(
     value: float, std: float, reason: str | None, half_width: float = NORMAL_95
 ) -> ReportedValue:
-    """Return a value with a symmetric 95 % interval.
+    """Return a reported value with a symmetric 95 % interval.
 
     Parameters
     ----------
     value, std : float
+        Estimate and its standard deviation.
     reason : str or None
-        Its flag.
+        Flag of the reported value. None if it is valid.
     half_width : float
         Half width of the interval, in standard deviations.
     """
-    half = half_width * std
-    return ReportedValue(value, std, (value - half, value + half), reason)
+    interval_half_width = half_width * std
+    return ReportedValue(
+        value, std, (value - interval_half_width, value + interval_half_width), reason
+    )

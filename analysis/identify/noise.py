@@ -1,8 +1,8 @@
 """Noise spectrum of the torque, from the residual of a fit: smooth, and narrow-band lines.
 
 The spectrum is smoothed by medians over blocks of bins. The residual of a wrong model at a mode, or
-a hum at one frequency, does not raise a median. A line is a group of bins far above the spectrum
-that lasts through the whole record.
+a hum at one frequency, does not raise a median. A line is a group of bins far above the smooth
+spectrum that lasts through the whole record.
 """
 
 from __future__ import annotations
@@ -16,49 +16,62 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_BLOCKS: Final = 24
-_FEWEST_BINS: Final = 40
-_FINE_BINS: Final = 60
+_BLOCK_COUNT: Final = 24
+"""Number of blocks of the smooth spectrum, if all have at least `_MIN_BLOCK_BINS` bins."""
+
+_MIN_BLOCK_BINS: Final = 40
+"""Smallest number of bins in a block."""
+
+_NARROW_BLOCK_BINS: Final = 60
+"""Number of bins in a narrow block."""
+
 _PEAK_BINS: Final = 12
-_PEAK: Final = 2.4
-"""Mean power over so many bins, relative to the smooth one, that chance exceeds in one record of a
-hundred."""
+"""Number of bins over which the power of a narrow peak is averaged."""
+
+_PEAK_POWER_RATIO: Final = 2.4
+"""Mean power over `_PEAK_BINS` bins, relative to the smooth power, that chance exceeds in one
+record of a hundred."""
 
 _MEDIAN_OVER_MEAN: Final = float(np.log(2.0))
+"""Median over mean of an exponentially distributed power."""
 
-_LINE: Final = 20.0
-"""Power over that of the noise from which a bin is significant: chance exceeds it once in 5e8
+_LINE_POWER_RATIO: Final = 20.0
+"""Power over that of the noise from which a bin is significant. Chance exceeds it once in 5e8
 bins."""
 
-_GUARD: Final = 16
-"""Bins to either side of a line that resolve its duration: parts of 1/32 of the record."""
+_DURATION_BINS: Final = 16
+"""Number of bins to either side of a line that resolve its duration: parts of 1/32 of the
+record."""
 
-_EIGHTHS: Final = 8
-_STEADY: Final = 0.3
-"""Least power in any eighth of the record, relative to the mean, of a line that is always there."""
+_RECORD_PARTS: Final = 8
+"""Number of parts of the record in which the power of a line is compared."""
+
+_MIN_PART_POWER_RATIO: Final = 0.3
+"""Smallest power in any eighth of the record, relative to the mean, of a line that lasts."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseLine:
-    """An oscillation of one frequency, all through the record, that the motor did not cause."""
+    """Sinusoidal disturbance of the torque, through the whole record, not caused by the motor."""
 
     frequency_hz: float
-    """Frequency of the sinusoid."""
+    """Frequency of the sinusoid in hertz."""
     amplitude_nm: float
-    """Its amplitude in the torque."""
+    """Amplitude of the sinusoid in N·m."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseSpectrum:
-    """Noise in the torque, as estimated from a residual.
+    """Noise spectrum of the torque, as estimated from the residual of a fit.
 
     Attributes
     ----------
     power : ndarray, shape (K,)
         Expected ``|residual|²`` of each bin.
     counts : ndarray of bool, shape (K,)
-        Bins that are compared; False at the lines.
+        True for bins that are compared, False at the lines.
     lines : tuple of NoiseLine
+        Narrow-band disturbances, which are not part of `power`.
     """
 
     power: NDArray[np.float64]
@@ -67,7 +80,10 @@ class NoiseSpectrum:
 
     @property
     def weight(self) -> NDArray[np.float64]:
-        """Return the whitening factor of the residual (parts of variance 1); 0 at the lines."""
+        """Return the factor of each bin that whitens the residual, 0 at the lines, shape (K,).
+
+        Real and imaginary parts of the whitened noise have variance 1.
+        """
         weight: NDArray[np.float64] = np.sqrt(2 / self.power) * self.counts
         return weight
 
@@ -79,42 +95,48 @@ def noise_of(
     known_fraction: float = 1.0,
     near_mode: NDArray[np.bool_] | None = None,
 ) -> NoiseSpectrum:
-    """Separate noise and hum in a residual.
+    """Estimate the noise spectrum and its lines from the residual of a fit.
 
     Parameters
     ----------
     residual : ndarray of complex, shape (K,)
-        Transform of `samples` samples in N·m, on neighbouring bins.
+        Fourier transform of `samples` samples in N·m, on neighbouring bins.
     frequency_hz : ndarray, shape (K,)
+        Frequencies of the bins.
     samples : int
+        Number of samples of the residual.
     known_fraction : float
-        Fraction of the samples at which the residual is known; it is 0 at the others.
+        Fraction of the samples at which the residual is known. It is 0 at the others.
     near_mode : ndarray of bool, shape (K,), optional
-        Bins that are compared in any case, with the skirts of adjacent lines; without this no line
-        is searched for. An excluded resonance is not fitted, and would therefore always appear as a
-        line.
+        True for bins near a mode, which are never excluded: an excluded resonance is not fitted,
+        and would therefore always appear as a line. Without this argument no line is searched for.
+
+    Returns
+    -------
+    NoiseSpectrum
+        Smooth power and lines.
     """
     power = smooth_power(residual) / known_fraction
     counts = np.ones(power.size, dtype=bool)
     lines: list[NoiseLine] = []
     if near_mode is None:
         return NoiseSpectrum(power, counts, ())
-    for part in _standing_out(residual, power):
-        own = np.abs(residual[part]) ** 2
-        if near_mode[part][np.argmax(own)] or not _steady(residual, part):
+    for group in _find_line_groups(residual, power):
+        line_power = np.abs(residual[group]) ** 2
+        if near_mode[group][np.argmax(line_power)] or not _lasts_through_record(residual, group):
             continue
-        counts[part] &= near_mode[part]
+        counts[group] &= near_mode[group]
         lines.append(
             NoiseLine(
-                frequency_hz=float(own @ frequency_hz[part] / own.sum()),
-                amplitude_nm=float(2 * np.sqrt(own.sum()) / (samples * known_fraction)),
+                frequency_hz=float(line_power @ frequency_hz[group] / line_power.sum()),
+                amplitude_nm=float(2 * np.sqrt(line_power.sum()) / (samples * known_fraction)),
             )
         )
     return NoiseSpectrum(power, counts, tuple(lines))
 
 
 def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> NDArray[np.float64]:
-    """Return the smooth power of a residual's spectrum, shape (K,): the mean ``|residual|²``.
+    """Return the smooth power ``|residual|²`` of a residual spectrum, shape (K,).
 
     The power of noise in one bin is exponentially distributed, so its mean is the median over ln 2.
     The median of a block ignores the residual of a wrong model at a mode, and a hum at one
@@ -124,83 +146,89 @@ def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> N
     Parameters
     ----------
     residual : ndarray of complex, shape (K,)
-        Spectrum on neighbouring bins.
+        Spectrum of the residual on neighbouring bins.
     finely : bool
-        Whether all blocks are narrow, which follow a peak in the noise.
+        Whether all blocks are narrow. Narrow blocks follow a peak of the noise.
     """
     power = residual.real**2 + residual.imag**2
-    edges = _fine_edges(power.size) if finely else _edges(power.size)
-    logs = np.array(
+    edges = _narrow_block_borders(power.size) if finely else _block_borders(power.size)
+    ln_power = np.array(
         [
             np.log(max(float(np.median(power[a:b])), np.finfo(float).tiny) / _MEDIAN_OVER_MEAN)
             for a, b in itertools.pairwise(edges)
         ]
     )
-    middles = (edges[:-1] + edges[1:] - 1) / 2
-    smooth: NDArray[np.float64] = np.exp(np.interp(np.arange(power.size), middles, logs))
+    block_centres = (edges[:-1] + edges[1:] - 1) / 2
+    smooth: NDArray[np.float64] = np.exp(np.interp(np.arange(power.size), block_centres, ln_power))
     return smooth
 
 
 def with_peaks(
     residual: NDArray[np.complex128], power: NDArray[np.float64], where: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the noise power with peaks narrower than the blocks of `smooth_power`, (K,).
+    """Return the noise power with peaks that are narrower than the smoothing blocks, (K,).
 
     Parameters
     ----------
     residual : ndarray of complex, shape (K,)
+        Spectrum of the residual on neighbouring bins.
     power : ndarray, shape (K,)
-        Smooth.
+        Smooth power of the residual, as `smooth_power` returns it.
     where : ndarray of bool, shape (K,)
-        Where a peak may be.
+        True for bins at which a peak is possible.
     """
-    ratio = (residual.real**2 + residual.imag**2) / power
-    local = np.convolve(ratio, np.full(_PEAK_BINS, 1 / _PEAK_BINS), mode="same")
-    # Around each significant bin, as far as the mean over so many bins includes it.
-    out = np.convolve(local > _PEAK, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
-    return np.where(out & where, power * np.maximum(local, 1.0), power)
+    power_ratio = (residual.real**2 + residual.imag**2) / power
+    local_ratio = np.convolve(power_ratio, np.full(_PEAK_BINS, 1 / _PEAK_BINS), mode="same")
+    # Include all bins within the averaging width around each significant one.
+    is_peak = (
+        np.convolve(local_ratio > _PEAK_POWER_RATIO, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
+    )
+    return np.where(is_peak & where, power * np.maximum(local_ratio, 1.0), power)
 
 
-def _edges(bins: int) -> NDArray[np.intp]:
-    """Return the block borders: widths grow with frequency, from `_FEWEST_BINS` up."""
-    positions = bins * np.linspace(0, 1, _BLOCKS + 1) ** 2
+def _block_borders(bins: int) -> NDArray[np.intp]:
+    """Return the borders of the blocks.
+
+    Their widths increase with frequency from `_MIN_BLOCK_BINS`.
+    """
+    positions = bins * np.linspace(0, 1, _BLOCK_COUNT + 1) ** 2
     edges = [0]
     for position in positions[1:-1]:
-        if position - edges[-1] >= _FEWEST_BINS and bins - position >= _FEWEST_BINS:
+        if position - edges[-1] >= _MIN_BLOCK_BINS and bins - position >= _MIN_BLOCK_BINS:
             edges.append(round(float(position)))
     return np.array([*edges, bins])
 
 
-def _fine_edges(bins: int) -> NDArray[np.intp]:
-    """Return the borders of equal blocks of `_FINE_BINS` or a little more."""
-    return np.linspace(0, bins, max(bins // _FINE_BINS, 1) + 1).round().astype(np.intp)
+def _narrow_block_borders(bins: int) -> NDArray[np.intp]:
+    """Return the borders of equal blocks of `_NARROW_BLOCK_BINS` bins or a little more."""
+    return np.linspace(0, bins, max(bins // _NARROW_BLOCK_BINS, 1) + 1).round().astype(np.intp)
 
 
-def _standing_out(residual: NDArray[np.complex128], power: NDArray[np.float64]) -> list[slice]:
-    """Find groups of bins far above the noise, each with its skirts.
+def _find_line_groups(residual: NDArray[np.complex128], power: NDArray[np.float64]) -> list[slice]:
+    """Return the groups of bins far above the noise, each as a slice with its skirts.
 
     A line leaks into its neighbours as 1 / distance: at three times the distance at which it is
     significant the leakage is below the noise.
     """
-    bins = np.flatnonzero(np.abs(residual) ** 2 > _LINE * power)
+    bins = np.flatnonzero(np.abs(residual) ** 2 > _LINE_POWER_RATIO * power)
     if bins.size == 0:
         return []
-    groups = np.split(bins, np.flatnonzero(np.diff(bins) > _GUARD // 2) + 1)
-    parts = []
+    groups = np.split(bins, np.flatnonzero(np.diff(bins) > _DURATION_BINS // 2) + 1)
+    groups_with_skirts = []
     for group in groups:
-        first, last = int(group[0]), int(group[-1])
-        skirt = max(last - first, 2)
-        parts.append(slice(max(first - skirt, 0), last + skirt + 1))
-    return parts
+        first_bin, last_bin = int(group[0]), int(group[-1])
+        skirt = max(last_bin - first_bin, 2)
+        groups_with_skirts.append(slice(max(first_bin - skirt, 0), last_bin + skirt + 1))
+    return groups_with_skirts
 
 
-def _steady(residual: NDArray[np.complex128], part: slice) -> bool:
-    """Return whether a line lasts through the whole record.
+def _lasts_through_record(residual: NDArray[np.complex128], group: slice) -> bool:
+    """Return whether the power in a group of bins lasts through the whole record.
 
     The residual of a wrong model at a mode begins when the sweep passes the mode, and decays.
     """
-    around = residual[max(part.start - _GUARD, 0) : part.stop + _GUARD]
-    length = _EIGHTHS * (-(-4 * around.size // _EIGHTHS))
-    envelope = np.abs(np.fft.ifft(around, length)) ** 2
-    eighths = envelope.reshape(_EIGHTHS, -1).mean(axis=1)
-    return bool(eighths.min() > _STEADY * eighths.mean())
+    bins_around = residual[max(group.start - _DURATION_BINS, 0) : group.stop + _DURATION_BINS]
+    length = _RECORD_PARTS * (-(-4 * bins_around.size // _RECORD_PARTS))
+    envelope = np.abs(np.fft.ifft(bins_around, length)) ** 2
+    eighths = envelope.reshape(_RECORD_PARTS, -1).mean(axis=1)
+    return bool(eighths.min() > _MIN_PART_POWER_RATIO * eighths.mean())

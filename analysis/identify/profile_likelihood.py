@@ -1,8 +1,8 @@
 """Profile likelihood of the damping orders: all other parameters are refitted at each value.
 
-The 95 % interval holds all values within the chi-square limit of one degree of freedom. A walk goes
-from the minimum in both directions until the record excludes the values beyond. A coarse grid finds
-other local minima.
+The 95 % interval contains all values within the chi-square limit of one degree of freedom. The
+order is varied from the minimum in both directions until the record excludes the values beyond. A
+coarse grid of orders finds other local minima.
 """
 
 from __future__ import annotations
@@ -32,37 +32,39 @@ if TYPE_CHECKING:
 # Profile
 
 Order = Literal["alpha", "lambda"]
+"""Name of a damping order: alpha of internal, lambda of external damping."""
 
 WIDEST_FRACTION: Final = 0.25
-"""Fraction of the range 0 to 2: an order with ±0.25 does not distinguish materials."""
+"""Largest 95 % interval of an identifiable order, as a fraction of the range 0 to 2: an order with
+±0.25 does not distinguish materials."""
 
 
 @dataclass(frozen=True, slots=True)
 class LikelihoodProfile:
-    """Deviance of the values of an order, with all other parameters refitted at each.
+    """Deviance over the values of one damping order, with all other parameters refitted.
 
     Attributes
     ----------
     order : str
         "alpha" or "lambda".
     structure : str
-        Structure in which the order was free.
+        Name of the structure in which the order was free.
     values : tuple of float
-        Increasing.
+        Values of the order, in increasing order.
     deviance : tuple of float
-        Above the lowest.
+        Deviance at each value, minus the lowest one.
     estimate : float
-        Value of the lowest deviance.
+        Value with the lowest deviance.
     local_minima : tuple of float
-        Values that explain the record equally, the lowest deviance first: local minima within the
-        95 % limit, separated by a barrier.
+        Values at the local minima within the 95 % limit that a barrier separates, the one with the
+        lowest deviance first. They explain the record equally well.
     interval : tuple of float
-        95 % interval, by the likelihood ratio, over all local minima; an open interval ends at the
+        95 % interval by the likelihood ratio, over all local minima. An open interval ends at the
         edge of the range.
     open_below, open_above : bool
-        Whether the record excludes no value on that side.
+        Whether the record excludes no smaller value, and no larger value.
     gain : float
-        Reduction of deviance by freeing the order; 0 if it was free.
+        Reduction of deviance by freeing the order. 0 if the order was free in the candidate.
     """
 
     order: Order
@@ -77,52 +79,57 @@ class LikelihoodProfile:
     gain: float
 
     @classmethod
-    def unwalked(cls, candidate: Candidate, order: Order) -> LikelihoodProfile:
-        """Return the profile of an order that nothing determines: one value without limits.
+    def undetermined(cls, candidate: Candidate, order: Order) -> LikelihoodProfile:
+        """Return the profile of an undetermined order: one value, an interval of the whole range.
 
         Parameters
         ----------
         candidate : Candidate
+            Fit that provides the single value.
         order : str
+            "alpha" or "lambda".
         """
         at = candidate.fit.parameters[order]
         return cls(order, candidate.name, (at,), (0.0,), at, (at,), ORDER_RANGE, True, True, 0.0)
 
     @property
-    def walked(self) -> bool:
-        """Return whether another value was computed."""
+    def is_computed(self) -> bool:
+        """Return whether the profile has more than one value of the order."""
         return len(self.values) > 1
 
     @property
     def relative_width(self) -> float:
-        """Return the fraction of the range that the interval spans."""
+        """Return the width of the 95 % interval as a fraction of the range 0 to 2."""
         return (self.interval[1] - self.interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])
 
     @property
     def identifiable(self) -> bool:
         """Return whether the record determines this order to a useful precision."""
-        narrow = self.relative_width <= WIDEST_FRACTION and not (self.open_below or self.open_above)
-        return narrow and len(self.local_minima) < 2
+        is_narrow = self.relative_width <= WIDEST_FRACTION and not (
+            self.open_below or self.open_above
+        )
+        return is_narrow and len(self.local_minima) < 2
 
     @property
     def admits_one(self) -> bool:
-        """Return whether the interval holds the integer order 1."""
+        """Return whether the 95 % interval contains the integer order 1."""
         return self.interval[0] <= 1 <= self.interval[1]
 
 
 @dataclass(frozen=True, slots=True)
-class Profiled:
-    """Profile with the plants at its local minima.
+class ProfileWithPlants:
+    """Profile of one order, with the fitted plants at its local minima.
 
     Attributes
     ----------
-    profile : Profile
+    profile : LikelihoodProfile
+        Deviance over the values of the order.
     structure : Structure
-        With the order free.
+        Structure in which the order is free.
     plants : tuple of Plant
-        Plants at the local minima, the lowest first.
+        Fitted plants at the local minima, the one with the lowest deviance first.
     cost : float
-        The lowest sum of squares.
+        Lowest sum of squares of the whitened residual.
     """
 
     profile: LikelihoodProfile
@@ -132,43 +139,48 @@ class Profiled:
 
 
 def profile(
-    candidate_set: CandidateSet, candidate: Candidate, order: Order, *, elsewhere: bool = True
-) -> Profiled:
-    """Walk from the minimum in both directions until the record excludes the values beyond.
+    candidate_set: CandidateSet,
+    candidate: Candidate,
+    order: Order,
+    *,
+    search_other_minima: bool = True,
+) -> ProfileWithPlants:
+    """Compute the profile likelihood of one order of a candidate.
 
-    The order is freed in the structure of `candidate`, if it is not free. Each refit starts on the
-    tangent of the last, and each step goes to the value at which a parabolic deviance would reach
-    the next level. If much of the range is admitted and `elsewhere` is set, the remaining range is
-    searched for another local minimum, and a walk starts there as well.
+    The order is varied from the minimum in both directions until the record excludes the values
+    beyond. It is freed in the structure of `candidate`, if it is not free. Each refit starts on the
+    tangent of the last one, and each step goes to the value at which a parabolic deviance would
+    reach the next level. If much of the range is admitted and `search_other_minima` is set, the
+    remaining range is searched for another local minimum, from which the order is varied as well.
 
     Parameters
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
     candidate : Candidate
-        Candidate at whose fit the walk begins.
+        Candidate at whose fit the profile begins.
     order : {"alpha", "lambda"}
-        Order that is held at each value.
-    elsewhere : bool
+        Order that is fixed at each value.
+    search_other_minima : bool
         Whether to search for further local minima.
     """
-    walk = Walk(candidate_set, candidate, order)
-    walk.both_ways()
-    walk.from_candidates()
-    if elsewhere:
-        walk.elsewhere()
-    values, deviance = walk.curve()
-    bottoms = local_minima(values, deviance)
-    interval, open_below, open_above = admitted(values, deviance)
-    lowest = min(walk.costs.values())
-    return Profiled(
+    profiler = OrderProfiler(candidate_set, candidate, order)
+    profiler.extend_both_ways()
+    profiler.extend_from_candidates()
+    if search_other_minima:
+        profiler.extend_from_other_minima()
+    values, deviance = profiler.curve()
+    minima = local_minima(values, deviance)
+    interval, open_below, open_above = admitted_interval(values, deviance)
+    lowest = min(profiler.costs.values())
+    return ProfileWithPlants(
         profile=LikelihoodProfile(
             order=order,
             structure=candidate.name,
             values=tuple(values.tolist()),
             deviance=tuple(deviance.tolist()),
-            estimate=bottoms[0],
-            local_minima=bottoms,
+            estimate=minima[0],
+            local_minima=minima,
             interval=interval,
             open_below=open_below,
             open_above=open_above,
@@ -176,25 +188,26 @@ def profile(
             if order in candidate.structure.free
             else candidate.values * math.log(max(candidate.fit.cost / lowest, 1.0)),
         ),
-        structure=walk.structure,
-        plants=tuple(walk.plant(value) for value in bottoms),
+        structure=profiler.structure,
+        plants=tuple(profiler.plant(value) for value in minima),
         cost=lowest,
     )
 
 
-_ORDERS: Final[tuple[Order, Order]] = ("alpha", "lambda")
-_ROUNDS: Final = 3
+_BOTH_ORDERS: Final[tuple[Order, Order]] = ("alpha", "lambda")
+"""Orders of internal and external damping, as they are returned."""
+
+_MAX_ROUNDS: Final = 3
+"""Largest number of times that both profiles are computed."""
 
 
-def profiled(
-    candidate_set: CandidateSet, determined: Collection[Order] = (), *, walk: bool = True
+def profile_both_orders(
+    candidate_set: CandidateSet, determined: Collection[Order] = (), *, compute: bool = True
 ) -> tuple[CandidateSet, LikelihoodProfile, LikelihoodProfile]:
-    """Profile alpha and lambda in the freest structure.
+    """Compute the profiles of alpha and lambda in the freest structure.
 
-    If a walk finds a lower cost than the candidates, or another local minimum, all candidates start
-    there once more, so that the selected fit and the profile agree.
-
-    Returns the ranked candidates and both profiles.
+    If a profile finds a lower cost than the candidates, or another local minimum, all candidates
+    are refitted from there, so that the selected fit and the profile agree.
 
     Parameters
     ----------
@@ -202,74 +215,98 @@ def profiled(
         Candidates of the record.
     determined : collection of str
         Orders that need no search for another local minimum.
-    walk : bool
-        Whether the orders can be determined; if not, none is profiled.
+    compute : bool
+        Whether to compute the profiles. If not, each has a single value.
+
+    Returns
+    -------
+    candidate_set : CandidateSet
+        Ranked candidates, refitted if a profile found a lower minimum.
+    alpha, lambda_ : LikelihoodProfile
+        Profiles of both orders.
     """
-    for round_ in range(1, _ROUNDS + 1):
+    for round_ in range(1, _MAX_ROUNDS + 1):
         freest = candidate_set.freest
-        # The order of an insignificant damping is undetermined: a walk would not help.
-        walks = {
-            order: profile(candidate_set, freest, order, elsewhere=order not in determined)
-            for order in _ORDERS
-            if walk and freest.structure.has(order)
+        # The order of an insignificant damping is undetermined: no profile would help.
+        profiles = {
+            order: profile(
+                candidate_set, freest, order, search_other_minima=order not in determined
+            )
+            for order in _BOTH_ORDERS
+            if compute and freest.structure.has(order)
         }
-        before = [candidate.fit.cost for candidate in candidate_set.candidates]
-        if round_ == _ROUNDS:
+        costs_before = [candidate.fit.cost for candidate in candidate_set.candidates]
+        if round_ == _MAX_ROUNDS:
             break
-        for found in walks.values():
-            if _may_improve(candidate_set, found):
-                for plant in found.plants:
+        for profile_fit in profiles.values():
+            if _may_improve(candidate_set, profile_fit):
+                for plant in profile_fit.plants:
                     candidate_set = candidate_set.restarted_from(plant)
-        if [candidate.fit.cost for candidate in candidate_set.candidates] == before:
+        if [candidate.fit.cost for candidate in candidate_set.candidates] == costs_before:
             break
-    of_alpha, of_lambda = (
-        walks[order].profile if order in walks else LikelihoodProfile.unwalked(freest, order)
-        for order in _ORDERS
+    alpha_profile, lambda_profile = (
+        profiles[order].profile
+        if order in profiles
+        else LikelihoodProfile.undetermined(freest, order)
+        for order in _BOTH_ORDERS
     )
-    return candidate_set, of_alpha, of_lambda
+    return candidate_set, alpha_profile, lambda_profile
 
 
-def _may_improve(candidate_set: CandidateSet, found: Profiled) -> bool:
-    """Return whether a candidate may have a lower minimum elsewhere."""
-    if len(found.plants) > 1:
+def _may_improve(candidate_set: CandidateSet, profile_fit: ProfileWithPlants) -> bool:
+    """Return whether a refit from the minima of a profile may lower the cost of a candidate."""
+    if len(profile_fit.plants) > 1:
         return True
-    free = set(found.structure.free)
-    as_free = [
+    free_parameters = set(profile_fit.structure.free)
+    costs = [
         candidate.fit.cost
         for candidate in candidate_set.candidates
-        if free <= set(candidate.structure.free)
+        if free_parameters <= set(candidate.structure.free)
     ]
-    return bool(as_free) and found.cost < min(as_free) * (1 - MISSED)
+    return bool(costs) and profile_fit.cost < min(costs) * (1 - MISSED)
 
 
-# Walk along an order
+# Profile of one order
 
-_FAR: Final = 25.0
-_BEYOND: Final = 1.04
-"""How much further a step goes than to where it should reach a deviance."""
+_LAST_DEVIANCE: Final = 25.0
+"""Deviance up to which the order is varied. The 95 % limit is 3.84."""
 
-_FIRST_STEP: Final = 0.02
-_SHORTEST: Final = 1.2
-_LONGEST: Final = 2.6
+_OVERSHOOT_FACTOR: Final = 1.04
+"""Factor by which a step goes beyond the value at which the deviance should reach its level."""
+
+_DEFAULT_ORDER_STD: Final = 0.02
+"""Substitute for the standard deviation of the order if the curvature does not give one."""
+
+_MIN_DISTANCE_GROWTH: Final = 1.2
+"""Smallest factor by which a step increases the distance from the minimum."""
+
+_MAX_DISTANCE_GROWTH: Final = 2.6
+"""Largest factor by which a step increases the distance from the minimum."""
+
 _MAX_EVALUATIONS: Final = 30
-_TOLERANCE: Final = 1e-6
-"""Relative tolerance of the sum of squares: a hundredth in the deviance."""
+"""Largest number of evaluations of the sum of squares in one refit."""
 
-_NARROW: Final = 1.1
-"""Between two roots of a deviance: it is straight enough there to say where it is crossed."""
+_COST_TOLERANCE: Final = 1e-6
+"""Relative tolerance of the sum of squares in a refit, equivalent to 0.01 of the deviance."""
 
-_SHARPENINGS: Final = 2
+_INTERPOLATION_ROOT_DIFFERENCE: Final = 1.1
+"""Difference of the roots of two deviances below which the root is straight enough to interpolate
+the limit."""
+
+_MAX_LIMIT_REFITS: Final = 2
+"""Largest number of refits that narrow down the value at the 95 % limit."""
 
 _DOUBTFUL_FRACTION: Final = 0.025
-"""Fraction of the range 0 to 2 within the 95 % limit from which there may be another local
-minimum."""
+"""Admitted fraction of the range 0 to 2 from which another local minimum is searched for."""
 
-_GRID: Final = 0.2
+_TRIAL_ORDER_SPACING: Final = 0.2
+"""Distance between the orders in the search for another local minimum."""
+
 _TRIAL_EVALUATIONS: Final = 8
-"""Spacing of the orders in that search, and evaluations at each."""
+"""Evaluations of the sum of squares at each order of this search."""
 
 
-def with_order(structure: Structure, order: Order) -> Structure:
+def with_free_order(structure: Structure, order: Order) -> Structure:
     """Return a structure with one order of its damping free.
 
     A missing damping is added, with a free coefficient.
@@ -283,179 +320,214 @@ def with_order(structure: Structure, order: Order) -> Structure:
     """
     coefficient = COEFFICIENT_OF[order]
     fixed = {name: at for name, at in structure.fixed.items() if name not in (coefficient, order)}
-    free = tuple(name for name in PARAMETERS if name not in fixed)
-    return Structure(structure.name, free, MappingProxyType(fixed))
+    free_parameters = tuple(name for name in PARAMETERS if name not in fixed)
+    return Structure(structure.name, free_parameters, MappingProxyType(fixed))
 
 
-class Walk:
-    """Refits with one order held, and their costs.
+class OrderProfiler:
+    """Profile of one damping order under construction: refits at fixed values, and their costs.
 
     Parameters
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
     candidate : Candidate
-        Candidate at whose fit the walk begins.
+        Candidate at whose fit the profile begins.
     order : {"alpha", "lambda"}
-        Order that is held.
+        Order that is fixed at each value.
     """
 
     def __init__(self, candidate_set: CandidateSet, candidate: Candidate, order: Order) -> None:
         self.order = order
-        self.structure = with_order(candidate.structure, order)
-        self._field, self._values = candidate_set, candidate.values
+        self.structure = with_free_order(candidate.structure, order)
+        self._candidate_set, self._value_count = candidate_set, candidate.values
         self._unknowns = unknowns = candidate_set.unknowns(self.structure)
-        self._index = unknowns.names.index(order)
-        first = candidate_set.descent(
+        self._order_index = unknowns.names.index(order)
+        first_minimum = candidate_set.descent(
             unknowns, unknowns.vector(candidate.fit.plant), _MAX_EVALUATIONS
         )
         self.costs: dict[float, float] = {}
-        self._at: dict[float, Refit] = {}
-        self._start_at(first)
+        self._refits: dict[float, Refit] = {}
+        self._start_at(first_minimum)
 
-    def _start_at(self, bottom: Refit) -> None:
-        """Start the walk from a minimum with the order free."""
-        self._first = bottom
-        self._centre = float(bottom.x[self._index])
-        self._store_lower(self._centre, bottom)
+    def _start_at(self, minimum: Refit) -> None:
+        """Store a minimum with free order, and continue the profile from it."""
+        self._minimum = minimum
+        self._minimum_order = float(minimum.x[self._order_index])
+        self._store_lower(self._minimum_order, minimum)
 
     def plant(self, value: float) -> Plant:
-        """Return the fitted plant at a computed value."""
-        return self._at[value].plant
+        """Return the plant that was fitted at a computed value of the order."""
+        return self._refits[value].plant
 
     def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the values in order, shape (n,), and their deviances above the lowest."""
+        """Return the computed order values, increasing, and their deviances, each of shape (n,)."""
         values = np.array(sorted(self.costs))
         costs = np.array([self.costs[value] for value in values])
-        return values, self._values * np.log(costs / costs.min())
+        return values, self._value_count * np.log(costs / costs.min())
 
-    def both_ways(self) -> None:
-        """Walk in both directions from the current minimum."""
+    def extend_both_ways(self) -> None:
+        """Extend the profile in both directions from the current minimum."""
         for sign in (-1.0, 1.0):
-            self._outwards(sign)
+            self._extend(sign)
 
-    def from_candidates(self) -> None:
-        """Walk from equally good special cases outside of the admitted interval.
+    def extend_from_candidates(self) -> None:
+        """Extend the profile from equally good candidates whose order is outside of the interval.
 
-        Their order is fixed, mostly to 1. A barrier may separate them from the minimum.
+        Most of them fix the order at 1. A barrier may separate them from the minimum.
         """
-        coefficient, free = COEFFICIENT_OF[self.order], set(self.structure.free)
-        for candidate in self._field.candidates:
-            special = candidate.structure.has(coefficient) and free > set(candidate.structure.free)
-            if not special:
+        coefficient, free_parameters = COEFFICIENT_OF[self.order], set(self.structure.free)
+        for candidate in self._candidate_set.candidates:
+            is_special_case = candidate.structure.has(coefficient) and free_parameters > set(
+                candidate.structure.free
+            )
+            if not is_special_case:
                 continue
-            (low, high), *_ = admitted(*self.curve())
-            behind = self._values * math.log(candidate.fit.cost / min(self.costs.values()))
-            if behind < CHI_SQUARE_95 and not low <= candidate.fit.parameters[self.order] <= high:
+            (lower_end, upper_end), *_ = admitted_interval(*self.curve())
+            deviance = self._value_count * math.log(candidate.fit.cost / min(self.costs.values()))
+            if (
+                deviance < CHI_SQUARE_95
+                and not lower_end <= candidate.fit.parameters[self.order] <= upper_end
+            ):
                 start = self._unknowns.vector(candidate.fit.plant)
                 self._start_at(self._descend(start, _MAX_EVALUATIONS, hold=(self.order,)))
-                self.both_ways()
+                self.extend_both_ways()
 
-    def elsewhere(self) -> None:
-        """Search for another local minimum if much of the range is admitted, and walk from it."""
-        (low, high), open_below, open_above = admitted(*self.curve())
-        wide = high - low > _DOUBTFUL_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
-        orders = gaps(list(self.costs), ORDER_RANGE, _GRID)
-        if not (wide or open_below or open_above) or not orders:
+    def extend_from_other_minima(self) -> None:
+        """Search for other local minima if the 95 % interval covers much of the range of the order.
+
+        Extend the profile from each of them.
+        """
+        (lower_end, upper_end), open_below, open_above = admitted_interval(*self.curve())
+        is_wide = upper_end - lower_end > _DOUBTFUL_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
+        orders = values_outside_known(list(self.costs), ORDER_RANGE, _TRIAL_ORDER_SPACING)
+        if not (is_wide or open_below or open_above) or not orders:
             return
-        # Loss at a mode and order are separate unknowns: the loss stays as the order changes.
+        # Loss and order are separate unknowns: the loss stays constant as the order changes.
         trials = {}
         for value in orders:
-            start = self._first.x.copy()
-            start[self._index] = value
+            start = self._minimum.x.copy()
+            start[self._order_index] = value
             trials[value] = self._descend(start, _TRIAL_EVALUATIONS, hold=(self.order,))
-        most = min(self.costs.values()) * math.exp(FAR_BEHIND / self._values)
-        for value in dips({value: trial.cost for value, trial in trials.items()}):
-            bottom = self._descend(
-                trials[value].x, _MAX_EVALUATIONS, hopeless=(_TRIAL_EVALUATIONS, most)
+        highest_cost = min(self.costs.values()) * math.exp(FAR_BEHIND / self._value_count)
+        for value in coarse_minima_values({value: trial.cost for value, trial in trials.items()}):
+            minimum = self._descend(
+                trials[value].x, _MAX_EVALUATIONS, hopeless=(_TRIAL_EVALUATIONS, highest_cost)
             )
             values, deviance = self.curve()
-            at = float(bottom.x[self._index])
-            here = self._values * math.log(bottom.cost / min(self.costs.values()))
-            known = float(np.interp(at, values, deviance, math.inf, math.inf))
-            if here < min(CHI_SQUARE_95, known - MIN_BARRIER):
-                self._start_at(bottom)
-                self.both_ways()
+            at = float(minimum.x[self._order_index])
+            minimum_deviance = self._value_count * math.log(minimum.cost / min(self.costs.values()))
+            known_deviance = float(np.interp(at, values, deviance, math.inf, math.inf))
+            if minimum_deviance < min(CHI_SQUARE_95, known_deviance - MIN_BARRIER_DEVIANCE):
+                self._start_at(minimum)
+                self.extend_both_ways()
 
-    def _store_lower(self, value: float, found: Refit) -> None:
-        """Store the lower of two refits at one value."""
-        if found.cost < self.costs.get(value, math.inf):
-            self.costs[value], self._at[value] = found.cost, found
+    def _store_lower(self, value: float, refit: Refit) -> None:
+        """Store a refit at one value of the order, unless a stored one has a lower cost."""
+        if refit.cost < self.costs.get(value, math.inf):
+            self.costs[value], self._refits[value] = refit.cost, refit
 
-    def _outwards(self, sign: float) -> None:
-        """Cross the threshold, continue a little, and refine the crossing."""
-        low, high = ORDER_RANGE
-        here, distance, root = self._centre, self._spread(), 0.0
-        inside, outside = here, None
-        while low < here < high and root**2 < _FAR:
-            near = self._at[here]
-            here = min(max(self._centre + sign * distance, low), high)
-            root = self._hold(here, near)
+    def _extend(self, sign: float) -> None:
+        """Extend the profile in one direction until the record excludes the values beyond.
+
+        Then refine the value at which the deviance crosses the 95 % limit.
+        """
+        smallest_order, largest_order = ORDER_RANGE
+        value, distance, root = self._minimum_order, self._order_std(), 0.0
+        inside_value, outside_value = value, None
+        while smallest_order < value < largest_order and root**2 < _LAST_DEVIANCE:
+            nearest_refit = self._refits[value]
+            value = min(max(self._minimum_order + sign * distance, smallest_order), largest_order)
+            root = self._refit_at(value, nearest_refit)
             if root**2 < CHI_SQUARE_95:
-                inside, level = here, CHI_SQUARE_95
+                inside_value, target_deviance = value, CHI_SQUARE_95
             else:
-                outside, level = outside if outside is not None else here, _FAR
-            growth = _BEYOND * math.sqrt(level) / max(root, 1e-3)
-            distance *= min(max(growth, _SHORTEST), _LONGEST)
-        for _ in range(_SHARPENINGS if outside is not None else 0):
-            assert outside is not None
-            if abs(inside - self._centre) >= abs(outside - self._centre):
+                outside_value, target_deviance = (
+                    outside_value if outside_value is not None else value,
+                    _LAST_DEVIANCE,
+                )
+            growth = _OVERSHOOT_FACTOR * math.sqrt(target_deviance) / max(root, 1e-3)
+            distance *= min(max(growth, _MIN_DISTANCE_GROWTH), _MAX_DISTANCE_GROWTH)
+        for _ in range(_MAX_LIMIT_REFITS if outside_value is not None else 0):
+            assert outside_value is not None
+            if abs(inside_value - self._minimum_order) >= abs(outside_value - self._minimum_order):
                 break  # there is a barrier between
-            below, above = self._root(inside), self._root(outside)
-            if above - below < _NARROW:
+            inside_root, outside_root = (
+                self._deviance_root(inside_value),
+                self._deviance_root(outside_value),
+            )
+            if outside_root - inside_root < _INTERPOLATION_ROOT_DIFFERENCE:
                 break
-            middle = crossing(inside, outside, below**2, above**2)
-            if self._hold(middle, self._at[inside]) ** 2 < CHI_SQUARE_95:
-                inside = middle
+            trial_value = limit_crossing(
+                inside_value, outside_value, inside_root**2, outside_root**2
+            )
+            if self._refit_at(trial_value, self._refits[inside_value]) ** 2 < CHI_SQUARE_95:
+                inside_value = trial_value
             else:
-                outside = middle
+                outside_value = trial_value
 
-    def _spread(self) -> float:
-        """Return the standard deviation of the order, or a substitute."""
-        (scaled, scale), index = self._first.equations.scaled_hessian(), self._index
-        inverse = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))
+    def _order_std(self) -> float:
+        """Return the standard deviation of the order at the minimum, within 1e-4 to 0.25."""
+        (scaled_hessian, scale), index = self._minimum.equations.scaled_hessian(), self._order_index
+        inverse = np.linalg.inv(scaled_hessian + 1e-12 * np.eye(scale.size))
         variance = inverse[index, index] / scale[index] ** 2
-        std = math.sqrt(variance * self._first.cost / self._values) if variance > 0 else _FIRST_STEP
+        std = (
+            math.sqrt(variance * self._minimum.cost / self._value_count)
+            if variance > 0
+            else _DEFAULT_ORDER_STD
+        )
         return min(max(std, 1e-4), 0.25)
 
-    def _root(self, value: float) -> float:
-        """Return the root of the deviance at a value."""
-        lowest = self.costs[self._centre]
-        return math.sqrt(max(self._values * math.log(self.costs[value] / lowest), 0.0))
+    def _deviance_root(self, value: float) -> float:
+        """Return the square root of the deviance at a computed value of the order."""
+        lowest = self.costs[self._minimum_order]
+        return math.sqrt(max(self._value_count * math.log(self.costs[value] / lowest), 0.0))
 
-    def _hold(self, value: float, near: Refit) -> float:
-        """Fit all other parameters with the order at `value`; return the root of the deviance."""
-        hold, most = (self.order,), self.costs[self._centre] * math.exp(FAR_BEHIND / self._values)
-        found = self._descend(
-            self._tangent(value, near),
+    def _refit_at(self, value: float, nearest_refit: Refit) -> float:
+        """Fit all other parameters at a fixed order. Return the square root of the deviance."""
+        hold, highest_cost = (
+            (self.order,),
+            self.costs[self._minimum_order] * math.exp(FAR_BEHIND / self._value_count),
+        )
+        refit = self._descend(
+            self._tangent(value, nearest_refit),
             _MAX_EVALUATIONS,
             hold=hold,
-            hopeless=(_TRIAL_EVALUATIONS, most),
+            hopeless=(_TRIAL_EVALUATIONS, highest_cost),
         )
-        if found.cost > most:
-            # Near its ends an order turns a loss into inertia or stiffness: the tangent may lead
-            # far astray, where no descent ends. All else stays, the loss at a mode too.
-            found = self._lower(found, near, value, (_TRIAL_EVALUATIONS, most))
-        if found.cost > most:
-            # Without the damping its order says nothing.
-            found = self._lower(found, self._without_damping, value)
-        self._store_lower(value, found)
-        return self._root(value)
+        if refit.cost > highest_cost:
+            # Near 0 and 2 damping acts as stiffness or inertia, and the tangent may lead to a point
+            # from which no descent converges. So all other unknowns keep their values.
+            refit = self._better_refit(
+                refit, nearest_refit, value, (_TRIAL_EVALUATIONS, highest_cost)
+            )
+        if refit.cost > highest_cost:
+            # Without the damping its order has no effect on the cost.
+            refit = self._better_refit(refit, self._without_damping, value)
+        self._store_lower(value, refit)
+        return self._deviance_root(value)
 
-    def _lower(
-        self, found: Refit, other: Refit, value: float, hopeless: tuple[int, float] | None = None
+    def _better_refit(
+        self,
+        first_refit: Refit,
+        start_refit: Refit,
+        value: float,
+        hopeless: tuple[int, float] | None = None,
     ) -> Refit:
-        """Minimize from another fit at a new value of the order; return the better of both fits."""
-        start = other.x.copy()
-        start[self._index] = value
-        again = self._descend(start, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless)
-        return min(found, again, key=lambda refit: refit.cost)
+        """Fit from the unknowns of another refit at a fixed order.
+
+        Return the better of both fits.
+        """
+        start = start_refit.x.copy()
+        start[self._order_index] = value
+        second_refit = self._descend(start, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless)
+        return min(first_refit, second_refit, key=lambda refit: refit.cost)
 
     @cached_property
     def _without_damping(self) -> Refit:
-        """Fit without the damping of this order: the cost at any value of the order."""
+        """Return the fit without the damping of this order, whose cost holds for any order."""
         coefficient = COEFFICIENT_OF[self.order]
-        start = self._first.x.copy()
+        start = self._minimum.x.copy()
         index = self._unknowns.names.index(coefficient)
         start[index] = self._unknowns.bounds[0][index]
         return self._descend(start, _MAX_EVALUATIONS, hold=(self.order, coefficient))
@@ -468,8 +540,8 @@ class Walk:
         hold: tuple[str, ...] = (),
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
-        """Fit from a vector of unknowns, some of them held at their start."""
-        candidate_set = self._field
+        """Minimize the sum of squares from a vector of unknowns, with some unknowns fixed."""
+        candidate_set = self._candidate_set
         return Refit.descend(
             candidate_set.comparison,
             self._unknowns,
@@ -477,20 +549,24 @@ class Walk:
             candidate_set.noise,
             candidate_set.columns,
             max_evaluations=max_evaluations,
-            relative_tolerance=_TOLERANCE,
+            relative_tolerance=_COST_TOLERANCE,
             hold=hold,
             hopeless=hopeless,
         )
 
-    def _tangent(self, value: float, near: Refit) -> NDArray[np.float64]:
-        """Return the first-order estimate of the other unknowns with the order at `value`, (k,)."""
-        x, index = near.x.copy(), self._index
-        scaled, scale = near.equations.scaled_hessian()
+    def _tangent(self, value: float, nearest_refit: Refit) -> NDArray[np.float64]:
+        """Extrapolate the optimal unknowns linearly to another value of the order, shape (k,)."""
+        x, index = nearest_refit.x.copy(), self._order_index
+        scaled_hessian, scale = nearest_refit.equations.scaled_hessian()
         lower, upper = self._unknowns.bounds
-        others = (x > lower) & (x < upper) & (np.arange(x.size) != index)
-        block = scaled[np.ix_(others, others)] + 1e-9 * np.eye(int(others.sum()))
-        slope = -np.linalg.solve(block, scaled[others, index]) / scale[others] * scale[index]
-        x[others] += slope * (value - x[index])
+        is_free = (x > lower) & (x < upper) & (np.arange(x.size) != index)
+        free_hessian = scaled_hessian[np.ix_(is_free, is_free)] + 1e-9 * np.eye(int(is_free.sum()))
+        slope = (
+            -np.linalg.solve(free_hessian, scaled_hessian[is_free, index])
+            / scale[is_free]
+            * scale[index]
+        )
+        x[is_free] += slope * (value - x[index])
         x[index] = value
         return x
 
@@ -500,111 +576,127 @@ class Walk:
 CHI_SQUARE_95: Final = 3.841458820694124
 """Deviance that the true value exceeds once in twenty records (one degree of freedom)."""
 
-MIN_BARRIER: Final = 0.5
-"""Deviance by which a barrier must exceed the higher of two local minima to separate them: far more
-than the tolerance of the refits."""
+MIN_BARRIER_DEVIANCE: Final = 0.5
+"""Deviance by which a barrier must exceed the higher of two local minima to separate them. It is
+far larger than the tolerance of the refits."""
 
 
 def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple[float, ...]:
-    """Return the local minima within the 95 % limit, the lowest first.
-
-    `values`, shape (n,), increase; `deviance`, shape (n,), is above the lowest.
+    """Return the order values at the local minima within the 95 % limit, the lowest first.
 
     Parameters
     ----------
     values : ndarray of float, shape (n,)
-        Values of the order, rising.
+        Values of the order, increasing.
     deviance : ndarray of float, shape (n,)
-        Deviance at each value, above the lowest.
+        Deviance at each value, minus the lowest one.
     """
-    padded = np.concatenate([[np.inf], deviance, [np.inf]])
-    lows = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] < padded[2:]))
-    lows = lows[deviance[lows] < CHI_SQUARE_95]
+    padded_deviance = np.concatenate([[np.inf], deviance, [np.inf]])
+    minimum_indices = np.flatnonzero(
+        (padded_deviance[1:-1] <= padded_deviance[:-2])
+        & (padded_deviance[1:-1] < padded_deviance[2:])
+    )
+    minimum_indices = minimum_indices[deviance[minimum_indices] < CHI_SQUARE_95]
     distinct: list[int] = []
-    for low in lows[np.argsort(deviance[lows], kind="stable")].tolist():
+    for low in minimum_indices[np.argsort(deviance[minimum_indices], kind="stable")].tolist():
         barriers = (deviance[min(low, k) : max(low, k) + 1].max() for k in distinct)
-        if all(barrier > deviance[low] + MIN_BARRIER for barrier in barriers):
+        if all(barrier > deviance[low] + MIN_BARRIER_DEVIANCE for barrier in barriers):
             distinct.append(low)
     return tuple(values[distinct].tolist())
 
 
-def admitted(
+def admitted_interval(
     values: NDArray[np.float64], deviance: NDArray[np.float64]
 ) -> tuple[tuple[float, float], bool, bool]:
-    """Return the interval of all values within the 95 % limit, barriers included.
+    """Return the interval of all order values within the 95 % limit, barriers included.
 
     Parameters
     ----------
     values : ndarray of float, shape (n,)
-        Values of the order, rising.
+        Values of the order, increasing.
     deviance : ndarray of float, shape (n,)
-        Deviance at each value, above the lowest.
+        Deviance at each value, minus the lowest one.
 
     Returns
     -------
     interval : tuple of float
+        Smallest and largest admitted value.
     open_below, open_above : bool
-        Whether the limit is never crossed on that side.
+        Whether the deviance stays within the limit down to the first, and up to the last value.
     """
-    inside = np.flatnonzero(deviance <= CHI_SQUARE_95)
-    first, last = int(inside[0]), int(inside[-1])
-    low = values[0] if first == 0 else _crossing_at(values, deviance, first, first - 1)
-    high = values[-1] if last == values.size - 1 else _crossing_at(values, deviance, last, last + 1)
-    return (float(low), float(high)), first == 0, last == values.size - 1
+    inside_indices = np.flatnonzero(deviance <= CHI_SQUARE_95)
+    first_inside, last_inside = int(inside_indices[0]), int(inside_indices[-1])
+    lower_end = (
+        values[0]
+        if first_inside == 0
+        else _limit_crossing_between(values, deviance, first_inside, first_inside - 1)
+    )
+    upper_end = (
+        values[-1]
+        if last_inside == values.size - 1
+        else _limit_crossing_between(values, deviance, last_inside, last_inside + 1)
+    )
+    return (float(lower_end), float(upper_end)), first_inside == 0, last_inside == values.size - 1
 
 
-def crossing(inside: float, outside: float, below: float, above: float) -> float:
-    """Return the value at which the limit is crossed; the root of a deviance is almost linear.
+def limit_crossing(inside: float, outside: float, below: float, above: float) -> float:
+    """Interpolate the value at which a deviance crosses the 95 % limit.
 
-    `inside` and `outside` are values on either side of the limit, `below` and `above` their
-    deviances.
+    The square root of the deviance is almost linear in the value.
 
     Parameters
     ----------
     inside, outside : float
         Values on either side of the limit.
     below, above : float
-        Their deviances.
+        Deviances at these values.
     """
-    low, high = math.sqrt(max(below, 0.0)), math.sqrt(max(above, 0.0))
-    fraction = (math.sqrt(CHI_SQUARE_95) - low) / (high - low)
+    root_inside, root_outside = math.sqrt(max(below, 0.0)), math.sqrt(max(above, 0.0))
+    fraction = (math.sqrt(CHI_SQUARE_95) - root_inside) / (root_outside - root_inside)
     return inside + fraction * (outside - inside)
 
 
-def gaps(known: list[float], span: tuple[float, float], spacing: float) -> list[float]:
-    """Return equally spaced values within a span that lie outside of all known ones.
+def values_outside_known(
+    known: list[float], span: tuple[float, float], spacing: float
+) -> list[float]:
+    """Return equally spaced values of a span that are outside the range of all known values.
 
     Parameters
     ----------
     known : list of float
         Values at which the profile is known.
     span : tuple of float
-        Ends of the span.
+        First and last value of the span.
     spacing : float
         Distance between neighbouring values.
     """
     grid = np.arange(span[0] + spacing / 2, span[1], spacing).tolist()
-    low, high = min(known), max(known)
-    return [value for value in grid if value < low - spacing / 4 or value > high + spacing / 4]
+    smallest_known, largest_known = min(known), max(known)
+    return [
+        value
+        for value in grid
+        if value < smallest_known - spacing / 4 or value > largest_known + spacing / 4
+    ]
 
 
-def dips(curve: dict[float, float]) -> list[float]:
-    """Return the values on a coarse curve that are lower than both neighbours, ends included."""
+def coarse_minima_values(curve: dict[float, float]) -> list[float]:
+    """Return the values at the local minima of a coarse curve, including its ends."""
     values = sorted(curve)
     heights = [math.inf, *(curve[value] for value in values), math.inf]
     return [
         value
-        for value, (before, here, after) in zip(
+        for value, (left_height, height, right_height) in zip(
             values, zip(heights, heights[1:], heights[2:], strict=False), strict=True
         )
-        if here <= before and here <= after
+        if height <= left_height and height <= right_height
     ]
 
 
-def _crossing_at(
+def _limit_crossing_between(
     values: NDArray[np.float64], deviance: NDArray[np.float64], inside: int, outside: int
 ) -> float:
-    return crossing(
+    """Interpolate the value at the 95 % limit between two indices of a profile."""
+    return limit_crossing(
         float(values[inside]),
         float(values[outside]),
         float(deviance[inside]),

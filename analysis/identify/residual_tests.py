@@ -1,11 +1,11 @@
 """Residual tests: whiteness, coherence with the input, harmonics of the sweep.
 
 Chance is ruled out at one level throughout (`SIGNIFICANT_STD`). The cumulative periodogram of a
-white residual is a straight line but for a Kolmogorov statistic (Bartlett's test). A residual that
-is coherent with the angle is linear dynamics that the model lacks.
+white residual is a straight line, apart from a Kolmogorov statistic (Bartlett's test). A residual
+that is coherent with the angle is linear dynamics that the model lacks.
 
 A linear beam responds at the drive frequency, and rings at frequencies that the sweep has passed. A
-response at twice or three times the drive frequency is nonlinear. This test needs no model.
+response at twice or three times the drive frequency is nonlinear. The test for it needs no model.
 
 References
 ----------
@@ -26,60 +26,68 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-# Chance
+# Level of significance
 
 SIGNIFICANT_STD: Final = 5.0
-"""Standard deviations from which chance is ruled out: 3 in 10 million for all tests together."""
+"""Standard deviations from which chance is ruled out: a probability of 3 in 10 million for all
+tests together."""
 
 
 def largest_of(count: int) -> float:
-    """Return the limit of half the square of a deviate, for the largest of `count` values."""
+    """Return the significance limit of x²/2 for the largest x of `count` normal deviates."""
     return SIGNIFICANT_STD**2 / 2 + math.log(max(count, 1))
 
 
 # Whiteness, and coherence with the input
 
-_LEVEL: Final = 1e-6
-"""Probability of chance: what `SIGNIFICANT_STD` means for the other tests."""
+_NOT_WHITE_PROBABILITY: Final = 1e-6
+"""Probability of chance below which a residual is not white, comparable to `SIGNIFICANT_STD`."""
 
-_DOUBTFUL: Final = 0.01
-"""The same where a false alarm costs only computing time."""
+_DOUBTFUL_PROBABILITY: Final = 0.01
+"""Probability of chance below which a residual is doubtful. A false alarm costs only computing time
+there."""
 
-_WINDOWS: Final = (8, 32)
-_LOUD: Final = 1.4
-"""Power over that of the noise, which is itself known to 10-20 % only."""
+_WINDOW_BINS: Final = (8, 32)
+"""Numbers of bins in which the power of the residual is tested."""
+
+_LOUD_POWER_RATIO: Final = 1.4
+"""Power over that of the noise from which a window is loud. The noise is known to 10-20 % only."""
 
 _COHERENT_BINS: Final = 9
-_DRIVEN: Final = 0.1
-"""Power of the angle relative to what is usual around it, from which a bin counts as driven."""
+"""Number of neighbouring bins over which the coherence is computed."""
 
-_LOUDEST: Final = 4.0
-"""Where the whitened residual is limited: chance exceeds it once in 3000 bins."""
+_DRIVEN_POWER_RATIO: Final = 0.1
+"""Power of the angle, relative to the mean around it, from which a bin counts as driven."""
 
-_LONGEST_LAG_S: Final = 1.0
+_RESIDUAL_LIMIT: Final = 4.0
+"""Magnitude to which the whitened residual is limited. Chance exceeds it once in 3000 bins."""
 
-_NEIGHBOURS: Final = 64
-"""Bins over which the angle's power is averaged: more than lie between two lines of a multisine."""
+_MAX_LAG_S: Final = 1.0
+"""Largest lag of the correlation between residual and angle, in seconds."""
+
+_AVERAGING_BINS: Final = 64
+"""Number of bins over which the angle's power is averaged: more than between two lines of a
+multisine."""
 
 
 @dataclass(frozen=True, slots=True)
 class Whiteness:
-    """Tests of the whitened residual's power (Bartlett's cumulative periodogram).
+    """Whiteness test of a residual by its power (Bartlett's cumulative periodogram).
 
     Attributes
     ----------
     distance : float
         Largest distance of the cumulative periodogram from the straight line.
     band : float
-        Within which it stays in 95 % of the records that hold nothing but noise.
+        Distance that 95 % of the records with nothing but noise do not exceed.
     probability : float
         Probability of such a distance by chance.
     loudest_hz : tuple of float
-        Edges of the window that is loudest for its width.
+        First and last frequency of the window whose power is least likely by chance.
     loudest_ratio : float
-        Its power over that of the noise.
+        Power in this window over that of the noise.
     loud : bool
-        Whether chance is ruled out there.
+        Whether the power in any window rules out chance.
     """
 
     distance: float
@@ -92,35 +100,35 @@ class Whiteness:
     @property
     def white(self) -> bool:
         """Return whether the residual is consistent with noise alone."""
-        return self.probability > _LEVEL and not self.loud
+        return self.probability > _NOT_WHITE_PROBABILITY and not self.loud
 
     @property
     def all_but_white(self) -> bool:
-        """Return whether chance exceeds the residual in one record of 100."""
-        return self.probability > _DOUBTFUL and not self.loud
+        """Return whether noise alone gives such a residual in at least one record of 100."""
+        return self.probability > _DOUBTFUL_PROBABILITY and not self.loud
 
 
 @dataclass(frozen=True, slots=True)
 class InputRelation:
-    """Tests of whether the residual still follows the angle: linear dynamics outside the model.
+    """Test of whether a residual still follows the angle: linear dynamics outside the model.
 
     Attributes
     ----------
     coherence : float
-        Squared coherence of residual and angle over nine neighbouring bins, where it is least
-        likely to be chance.
+        Squared coherence of residual and angle over nine neighbouring bins, at the frequency where
+        it is least likely by chance.
     at_hz : float
-        Where.
+        Frequency of this coherence.
     local : bool
-        Whether chance is ruled out there.
+        Whether this coherence rules out chance.
     deviate : float
         Deviate of the coherence over the whole band, in standard deviations beyond chance.
     correlation : float
         Largest correlation of residual and angle, both whitened, in standard deviations.
     lag_s : float
-        Where; negative: the residual comes before the angle.
+        Lag of the largest correlation, negative if the residual precedes the angle.
     related : bool
-        Whether chance is ruled out by any of the three.
+        Whether any of the three tests rules out chance.
     """
 
     coherence: float
@@ -133,7 +141,7 @@ class InputRelation:
 
 
 def cumulative_periodogram(residual: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return the fraction of the power up to each bin, shape (K,), of a whitened residual.
+    """Return the fraction of the power of a whitened residual up to each bin, shape (K,).
 
     Examples
     --------
@@ -148,37 +156,41 @@ def cumulative_periodogram(residual: NDArray[np.complex128]) -> NDArray[np.float
 
 
 def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64]) -> Whiteness:
-    """Test a whitened residual for whiteness.
+    """Test whether a whitened residual is white.
 
     Parameters
     ----------
     residual : ndarray of complex, shape (K,)
-        Whitened; only bins that are compared.
+        Whitened residual at the compared bins.
     frequency_hz : ndarray, shape (K,)
+        Frequencies of these bins.
     """
     count = residual.size
-    line = np.arange(1, count + 1) / count
-    distance = float(np.abs(cumulative_periodogram(residual) - line).max())
+    straight_line = np.arange(1, count + 1) / count
+    distance = float(np.abs(cumulative_periodogram(residual) - straight_line).max())
     power = residual.real**2 + residual.imag**2
-    sums = np.concatenate([[0.0], np.cumsum(power)])
-    loudest, edges, ratio, loud = -math.inf, (0.0, 0.0), 1.0, False
-    for width in _WINDOWS:
+    cumulative_power = np.concatenate([[0.0], np.cumsum(power)])
+    loudest, edges, loudest_ratio, loud = -math.inf, (0.0, 0.0), 1.0, False
+    for width in _WINDOW_BINS:
         if width >= count:
             continue
-        total = sums[width:] - sums[:-width]
-        i = int(np.argmax(total))
-        deviate = chi_square_deviate(float(total[i]), 2 * width)
+        window_power = cumulative_power[width:] - cumulative_power[:-width]
+        i = int(np.argmax(window_power))
+        deviate = chi_square_deviate(float(window_power[i]), 2 * width)
         if deviate > loudest:
             loudest = deviate
             edges = (float(frequency_hz[i]), float(frequency_hz[i + width - 1]))
-            ratio = float(total[i]) / (2 * width)
-        loud |= deviate > SIGNIFICANT_STD + 0.5 and float(total[i]) / (2 * width) > _LOUD
+            loudest_ratio = float(window_power[i]) / (2 * width)
+        loud |= (
+            deviate > SIGNIFICANT_STD + 0.5
+            and float(window_power[i]) / (2 * width) > _LOUD_POWER_RATIO
+        )
     return Whiteness(
         distance=distance,
         band=KOLMOGOROV_95 / math.sqrt(count),
         probability=kolmogorov_p_value(distance * math.sqrt(count)),
         loudest_hz=edges,
-        loudest_ratio=ratio,
+        loudest_ratio=loudest_ratio,
         loud=loud,
     )
 
@@ -188,88 +200,104 @@ def input_relation(
     angle: NDArray[np.complex128],
     frequency_hz: NDArray[np.float64],
 ) -> InputRelation:
-    """Test a residual for a linear relation to the angle.
+    """Test whether a residual is linearly related to the angle.
 
     Parameters
     ----------
     residual, angle : ndarray of complex, shape (K,)
-        Whitened residual and transform of the angle.
+        Whitened residual, and Fourier transform of the angle.
     frequency_hz : ndarray, shape (K,)
-        Equally spaced.
+        Frequencies of the bins, equally spaced.
     """
-    # Where the motor was not driven, the angle is what the loop makes of the torque's noise: such
-    # bins would say that the residual follows the angle, and count for next to nothing here.
+    # Where the motor was not driven, the angle is the response of the loop to the torque's noise.
+    # Such bins would show a relation of residual and angle, so they have almost no weight here.
     power = np.abs(angle) ** 2
-    neighbours = min(_NEIGHBOURS, power.size)
-    around = np.convolve(power, np.full(neighbours, 1 / neighbours), mode="same")
-    driven = angle / np.sqrt(np.maximum(around, np.finfo(float).tiny))
-    # A hum is not linear dynamics, however large.
-    limited = residual / np.maximum(np.abs(residual) / _LOUDEST, 1.0)
-    cross = limited * driven.conj()
-    blocks = residual.size // _COHERENT_BINS
-    first = np.arange(0, blocks * _COHERENT_BINS, _COHERENT_BINS)
+    neighbours = min(_AVERAGING_BINS, power.size)
+    mean_power = np.convolve(power, np.full(neighbours, 1 / neighbours), mode="same")
+    normalized_angle = angle / np.sqrt(np.maximum(mean_power, np.finfo(float).tiny))
+    # The limit keeps a hum, which is no linear dynamics, from dominating.
+    limited_residual = residual / np.maximum(np.abs(residual) / _RESIDUAL_LIMIT, 1.0)
+    cross_spectrum = limited_residual * normalized_angle.conj()
+    block_count = residual.size // _COHERENT_BINS
+    first_bins = np.arange(0, block_count * _COHERENT_BINS, _COHERENT_BINS)
 
-    def added(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        total: NDArray[np.complex128] = np.add.reduceat(values[: blocks * _COHERENT_BINS], first)
-        return total
+    def block_sums(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return the sum of values over each block of neighbouring bins."""
+        sums: NDArray[np.complex128] = np.add.reduceat(
+            values[: block_count * _COHERENT_BINS], first_bins
+        )
+        return sums
 
-    of_angle = added(driven * driven.conj()).real
-    used = np.flatnonzero(of_angle > _DRIVEN * _COHERENT_BINS)
-    most = added(limited * limited.conj()).real[used] * of_angle[used]
-    coherence = np.abs(added(cross)[used]) ** 2 / np.maximum(most, np.finfo(float).tiny)
+    angle_power = block_sums(normalized_angle * normalized_angle.conj()).real
+    used_blocks = np.flatnonzero(angle_power > _DRIVEN_POWER_RATIO * _COHERENT_BINS)
+    largest_cross_power = (
+        block_sums(limited_residual * limited_residual.conj()).real[used_blocks]
+        * angle_power[used_blocks]
+    )
+    coherence = np.abs(block_sums(cross_spectrum)[used_blocks]) ** 2 / np.maximum(
+        largest_cross_power, np.finfo(float).tiny
+    )
     # Under chance (1 - coherence)^(m - 1) is uniform, whatever the angle.
-    surprise = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
-    worst = int(np.argmax(surprise))
-    local = bool(surprise[worst] > largest_of(used.size))
-    deviate = chi_square_deviate(2 * float(surprise.sum()), 2 * used.size)
+    ln_chance = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
+    least_likely = int(np.argmax(ln_chance))
+    local = bool(ln_chance[least_likely] > largest_of(used_blocks.size))
+    deviate = chi_square_deviate(2 * float(ln_chance.sum()), 2 * used_blocks.size)
 
     spacing_hz = float(frequency_hz[1] - frequency_hz[0])
     length = 4 * residual.size
-    lags = np.fft.ifft(cross, length)
+    lags = np.fft.ifft(cross_spectrum, length)
     at_s = np.fft.fftfreq(length, spacing_hz)  # bins are spaced as the lags' inverse
     carrier = np.exp(2j * np.pi * frequency_hz[0] * at_s)
-    correlation = np.abs((lags * carrier).real) * length / np.linalg.norm(driven)
-    correlation[np.abs(at_s) > _LONGEST_LAG_S] = 0.0
+    correlation = np.abs((lags * carrier).real) * length / np.linalg.norm(normalized_angle)
+    correlation[np.abs(at_s) > _MAX_LAG_S] = 0.0
     at = int(np.argmax(correlation))
-    tried = int(np.count_nonzero(correlation))
+    lag_count = int(np.count_nonzero(correlation))
     return InputRelation(
-        coherence=float(coherence[worst]),
-        at_hz=float(frequency_hz[first[used[worst]] + _COHERENT_BINS // 2]),
+        coherence=float(coherence[least_likely]),
+        at_hz=float(frequency_hz[first_bins[used_blocks[least_likely]] + _COHERENT_BINS // 2]),
         local=local,
         deviate=deviate,
         correlation=float(correlation[at]),
         lag_s=float(at_s[at]),
         related=bool(
-            local or deviate > SIGNIFICANT_STD or correlation[at] ** 2 / 2 > largest_of(tried)
+            local or deviate > SIGNIFICANT_STD or correlation[at] ** 2 / 2 > largest_of(lag_count)
         ),
     )
 
 
 # Harmonics of the sweep
 
-MULTIPLES: Final = (2, 3)
-_BLOCK_S: Final = 1.0
-_LOWEST_HZ: Final = 2.0
-"""Below, a block does not resolve a frequency and its double."""
+TESTED_MULTIPLES: Final = (2, 3)
+"""Multiples of the drive frequency that are tested."""
 
-_STEADY: Final = 0.3
-_FEWEST_BLOCKS: Final = 5
+_BLOCK_S: Final = 1.0
+"""Duration of the blocks in which a harmonic is measured, in seconds."""
+
+_MIN_DRIVE_HZ: Final = 2.0
+"""Drive frequency below which a block does not resolve a frequency and its double."""
+
+_STEADINESS_LIMIT: Final = 0.3
+"""Largest deviation of the phase from a smooth curve in rad, and smallest amplitude relative to the
+median, of a usable block."""
+
+_MIN_BLOCKS: Final = 5
+"""Smallest number of usable blocks for the test of a harmonic."""
 
 
 @dataclass(frozen=True, slots=True)
 class Harmonic:
-    """Residual at one multiple of the sweep's frequency.
+    """Test of a residual at one multiple of the drive frequency of a sweep.
 
     Attributes
     ----------
     multiple : int
-        2 or 3.
+        Multiple of the drive frequency: 2 or 3.
     deviate : float
-        Deviate of its power along the whole sweep, in standard deviations beyond chance.
+        Deviate of the power along the whole sweep, in standard deviations beyond chance.
     drive_hz : float
-        Frequency of the drive at which it is largest.
+        Drive frequency at which the harmonic is largest.
     present : bool
-        Whether chance is ruled out, for the whole or there.
+        Whether chance is ruled out, for the whole sweep or at `drive_hz`.
     """
 
     multiple: int
@@ -284,56 +312,65 @@ def harmonics(
     rate_hz: float,
     band_hz: tuple[float, float],
 ) -> tuple[Harmonic, ...]:
-    """Test along the sweep for harmonics; return nothing if the angle is not a sweep.
+    """Test a residual for harmonics of a sweep. Return no test if the angle is no sweep.
 
     Parameters
     ----------
     angle_rad, residual : ndarray, shape (n,)
         Angle, and whitened residual (variance 1 per sample if white up to half the rate).
     rate_hz : float
+        Sampling rate of both.
     band_hz : tuple of float
-        In which the residual is known.
+        First and last frequency at which the residual is known.
     """
     length = round(_BLOCK_S * rate_hz)
-    blocks = angle_rad.size // length
-    analytic = _analytic(angle_rad)[: blocks * length].reshape(blocks, length)
+    block_count = angle_rad.size // length
+    analytic = _analytic_signal(angle_rad)[: block_count * length].reshape(block_count, length)
     phase = np.unwrap(np.angle(analytic), axis=1)
     drive_hz = (phase[:, -1] - phase[:, 0]) / (2 * np.pi * (length - 1) / rate_hz)
-    size = np.abs(analytic).mean(axis=1)
-    # Of a sweep the frequency of a block hardly varies: its phase is a smooth curve.
+    amplitude = np.abs(analytic).mean(axis=1)
+    # The frequency of a sweep hardly varies within a block, so its phase is a smooth curve.
     time = np.linspace(-1, 1, length)
-    curve = np.polynomial.polynomial.polyfit(time, phase.T, 2)
-    off = np.abs(phase - np.polynomial.polynomial.polyval(time, curve)).mean(axis=1)
-    usable = (off < _STEADY) & (size > _STEADY * np.median(size)) & (drive_hz > _LOWEST_HZ)
+    phase_curve = np.polynomial.polynomial.polyfit(time, phase.T, 2)
+    phase_deviation = np.abs(phase - np.polynomial.polynomial.polyval(time, phase_curve)).mean(
+        axis=1
+    )
+    usable = (
+        (phase_deviation < _STEADINESS_LIMIT)
+        & (amplitude > _STEADINESS_LIMIT * np.median(amplitude))
+        & (drive_hz > _MIN_DRIVE_HZ)
+    )
     window = np.hanning(length)
-    parts = residual[: blocks * length].reshape(blocks, length) * window
-    found = []
-    for multiple in MULTIPLES:
-        inside = (
+    windowed_blocks = residual[: block_count * length].reshape(block_count, length) * window
+    tests = []
+    for multiple in TESTED_MULTIPLES:
+        usable_blocks = (
             usable & (multiple * drive_hz > band_hz[0] + 2) & (multiple * drive_hz < band_hz[1] - 2)
         )
-        if np.count_nonzero(inside) < _FEWEST_BLOCKS:
+        if np.count_nonzero(usable_blocks) < _MIN_BLOCKS:
             continue
-        turned = np.sum(parts[inside] * np.exp(-1j * multiple * phase[inside]), axis=1)
-        chi_square = 2 * np.abs(turned) ** 2 / np.sum(window**2)
+        harmonic_amplitudes = np.sum(
+            windowed_blocks[usable_blocks] * np.exp(-1j * multiple * phase[usable_blocks]), axis=1
+        )
+        chi_square = 2 * np.abs(harmonic_amplitudes) ** 2 / np.sum(window**2)
         deviate = chi_square_deviate(float(chi_square.sum()), 2 * chi_square.size)
         largest = int(np.argmax(chi_square))
-        found.append(
+        tests.append(
             Harmonic(
                 multiple=multiple,
                 deviate=deviate,
-                drive_hz=float(drive_hz[inside][largest]),
+                drive_hz=float(drive_hz[usable_blocks][largest]),
                 present=bool(
                     deviate > SIGNIFICANT_STD
                     or chi_square[largest] / 2 > largest_of(chi_square.size)
                 ),
             )
         )
-    return tuple(found)
+    return tuple(tests)
 
 
-def _analytic(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return the analytic signal (no negative frequencies), shape (n,)."""
+def _analytic_signal(values: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return the analytic signal, which has no negative frequencies, shape (n,)."""
     spectrum = np.fft.fft(values - values.mean())
     n = values.size
     spectrum[(n + 1) // 2 :] = 0

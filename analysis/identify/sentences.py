@@ -1,4 +1,4 @@
-"""Sentences of the verdict on one record, and experiments that would clarify it."""
+"""Sentences of the verdict on one record, and experiments that would clarify the verdict."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from analysis.identify._visible_modes import driven
-from analysis.identify.headline import EXACT_CONDITION, ONE_MODE
+from analysis.identify.headline import EXACT_CONDITION, ONE_MODE_REASON
 from analysis.identify.verdict import ANOTHER_DAMPING, deviance_of_one
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Sentences
 
-_DAMPING: Final = {
+_DAMPING_PHRASES: Final = {
     "I": "Internal damping only",
     "II": "External damping only",
     "III": "Internal and external damping",
@@ -34,19 +34,25 @@ _DAMPING: Final = {
     "VI": "Internal and external damping",
     "VII": "Internal and external damping",
 }
-_SEVERAL: Final = 2
-_OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
+"""Beginning of the sentence on the dampings, by the name of the structure."""
+
+_MIN_MODES_TO_SEPARATE_DAMPINGS: Final = 2
+"""Number of visible modes from which internal and external damping are separable."""
+
+_DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
+"""Damping to which each order belongs, in words."""
+
 LOSSES: Final[Mapping[Order, str]] = {
     "alpha": "internal loss",
     "lambda": "external damping torque",
 }
-"""What an order is the slope of."""
+"""Quantity whose growth with frequency each order describes, in words."""
 
 
-def of_headline(
-    headline: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, alone: bool
+def headline_sentences(
+    headline: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, without_rival: bool
 ) -> list[str]:
-    """Return sentences on the modes, the damping and the conditions of these numbers.
+    """Return the sentences on modes, damping and conditions of the reported numbers.
 
     Parameters
     ----------
@@ -54,33 +60,34 @@ def of_headline(
         Headline of the record.
     orders : tuple of OrderVerdict
         Verdicts on alpha and lambda.
-    alone : bool
-        Whether nothing else explains the record as well.
+    without_rival : bool
+        Whether no other model explains the record as well.
     """
-    if len(headline.visible_modes) < _SEVERAL:
-        sentences = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
+    if len(headline.visible_modes) < _MIN_MODES_TO_SEPARATE_DAMPINGS:
+        sentences = [f"{ONE_MODE_REASON.capitalize()}, nor does it determine their orders."]
     else:
-        sentences = [*uniformity(headline.uniform_beam), *_of_damping(headline, orders)]
+        sentences = [*uniformity(headline.uniform_beam), *_damping_sentences(headline, orders)]
     if headline.tolerant is None:
-        sentences += [order(each) for each in orders]
+        sentences += [order_sentence(each) for each in orders]
     else:
-        sentences += [slope(headline, each) for each in orders]
-        sentences += _if_exact(headline)
+        sentences += [order_slope_sentence(headline, each) for each in orders]
+        sentences += _exact_order_sentences(headline)
     if headline.explained:
         sentences.append(
             "The residual is white: this model suffices for this record."
-            if alone
+            if without_rival
             else "The residual is white, but another model fits the record equally well."
         )
     return sentences
 
 
 def uniformity(test: UniformBeamTest | None) -> list[str]:
-    """Return the sentence on the test of a uniform beam; nothing if it was not tested.
+    """Return the sentence on the uniform-beam test, or no sentence if there was no test.
 
     Parameters
     ----------
     test : UniformBeamTest or None
+        Test on the record. None if no mode is visible.
     """
     if test is None or test.p_value is None:
         return []
@@ -97,25 +104,25 @@ def uniformity(test: UniformBeamTest | None) -> list[str]:
     ]
 
 
-def _of_damping(headline: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -> list[str]:
-    """Return sentences on the damping and the excluded structures."""
+def _damping_sentences(headline: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -> list[str]:
+    """Return the sentences on the dampings and on the excluded structures."""
     if headline.tolerant is not None:
-        excluded = headline.with_status("excluded")
-        return [f"Excluded by the losses: {_types(excluded)}."] if excluded else []
-    free = headline.fit.structure
-    dampings = _DAMPING[free.name]
+        excluded = headline.structures_with_status("excluded")
+        return [f"Excluded by the losses: {_list_structures(excluded)}."] if excluded else []
+    structure = headline.fit.structure
+    dampings = _DAMPING_PHRASES[structure.name]
     if any(each.reason == ANOTHER_DAMPING for each in orders):
         dampings = dampings.replace("only", "alone would do")
     sentences = [f"{dampings}. Numbers are those of type {headline.name}, all orders free."]
-    excluded = headline.with_status("excluded")
+    excluded = headline.structures_with_status("excluded")
     if headline.explained and excluded:
-        sentences.append(f"Excluded: {_types(excluded)}.")
+        sentences.append(f"Excluded: {_list_structures(excluded)}.")
     if headline.simpler is not None and headline.simpler.fixed:
-        sentences.append(_condition(headline.simpler))
+        sentences.append(_conditional_sentence(headline.simpler))
     return sentences
 
 
-def slope(headline: Headline, verdict: OrderVerdict) -> str:
+def order_slope_sentence(headline: Headline, verdict: OrderVerdict) -> str:
     """Return the sentence on one order: the slope of a loss over the visible modes.
 
     Parameters
@@ -127,12 +134,12 @@ def slope(headline: Headline, verdict: OrderVerdict) -> str:
     """
     estimate = headline.tolerant
     assert estimate is not None
-    name, of = verdict.order, _OF[verdict.order]
+    name, damping_name = verdict.order, _DAMPING_OF_ORDER[verdict.order]
     if verdict.value is None or verdict.interval is None:
-        return f"The order {name} of the {of} is not identifiable: {verdict.reason}."
-    shown = [mode.frequency_hz.value for mode in headline.modes if mode.shown]
+        return f"The order {name} of the {damping_name} is not identifiable: {verdict.reason}."
+    shown_hz = [mode.frequency_hz.value for mode in headline.modes if mode.shown]
     return slope_of_loss(
-        name, verdict.value, verdict.interval, shown, estimate, verdict.status, verdict.reason
+        name, verdict.value, verdict.interval, shown_hz, estimate, verdict.status, verdict.reason
     )
 
 
@@ -145,156 +152,170 @@ def slope_of_loss(
     status: Status,
     reason: str | None,
 ) -> str:
-    """Return the sentence on the growth of a loss over the visible modes, with its conditions.
+    """Return the sentence on the growth of a loss over the visible modes, and its conditions.
 
     Parameters
     ----------
     order : str
+        "alpha" or "lambda".
     value : float
+        Estimate of the order.
     interval : (float, float)
-        95 %.
+        95 % interval of the order.
     shown_hz : sequence of float
-        Frequencies of the modes.
+        Frequencies of the visible modes in hertz.
     estimate : TolerantEstimate
         Estimate that contains the order.
     status : str
         "compatible", "fractional" or "open".
     reason : str or None
-        Reason why the order is not established; None if it is.
+        Reason why the order is not established. None if it is established.
     """
     std = (interval[1] - interval[0]) / (2 * NORMAL_95)
-    written, low, high = to_uncertainty((value, *interval), std)
+    value_text, low_text, high_text = to_uncertainty((value, *interval), std)
     condition = "by damping ratios and residue phases alone"
     if estimate.basis == "geometry":
         condition = f"if frequencies are those of a uniform beam to {100 * estimate.uniformity:g} %"
-    sentences = (
+    sentence = (
         f"Between {min(shown_hz):.3g} and {max(shown_hz):.3g} Hz the {LOSSES[order]} grows as "
-        f"f^{written} ({order}; 95 %: {low} to {high}), {condition}"
+        f"f^{value_text} ({order}; 95 %: {low_text} to {high_text}), {condition}"
     )
     if reason is not None:
-        return f"{sentences}; not established, because {reason}."
-    end = {
+        return f"{sentence}; not established, because {reason}."
+    conclusion = {
         "compatible": "consistent with order 1",
         "fractional": "damping ratios and residue phases alone exclude order 1",
     }.get(status, "order 1 is doubtful, but damping ratios and residue phases do not exclude it")
-    return f"{sentences}: {end}."
+    return f"{sentence}: {conclusion}."
 
 
-def _if_exact(headline: Headline) -> list[str]:
-    """Return sentences on the estimates for an exactly uniform beam that predicts the modes."""
-    exact = headline.exact
-    if exact is None:
+def _exact_order_sentences(headline: Headline) -> list[str]:
+    """Return the sentence on the orders if the beam is exactly uniform, or no sentence."""
+    exact_estimates = headline.exact
+    if exact_estimates is None:
         return []
     numbers = [
-        f"{name} = {_with_interval(exact.parameters[name])}"
+        f"{name} = {_value_and_interval_text(exact_estimates.parameters[name])}"
         for name in ("alpha", "lambda")
-        if name in exact.parameters and exact.parameters[name].flag is None
+        if name in exact_estimates.parameters and exact_estimates.parameters[name].flag is None
     ]
     if not numbers:
         return []
     return [f"{EXACT_CONDITION.capitalize()}: {', '.join(numbers)}."]
 
 
-def order(verdict: OrderVerdict) -> str:
-    """Return the sentence on one order on an exactly uniform beam."""
+def order_sentence(verdict: OrderVerdict) -> str:
+    """Return the sentence on one order, estimated on an exactly uniform beam."""
     profile = verdict.profile
-    low, high = profile.interval
-    name, of = verdict.order, _OF[verdict.order]
-    std = (high - low) / (2 * NORMAL_95)
-    estimate, first, last = to_uncertainty((profile.estimate, low, high), std)
-    value = f"{estimate} (95 %: {first} to {last})"
+    lower_end, upper_end = profile.interval
+    name, damping_name = verdict.order, _DAMPING_OF_ORDER[verdict.order]
+    std = (upper_end - lower_end) / (2 * NORMAL_95)
+    estimate_text, first_text, last_text = to_uncertainty(
+        (profile.estimate, lower_end, upper_end), std
+    )
+    value = f"{estimate_text} (95 %: {first_text} to {last_text})"
     if verdict.status == "absent":
-        return f"No {of} was found, so its order {name} has no meaning."
+        return f"No {damping_name} was found, so its order {name} has no meaning."
     if verdict.status == "not identifiable":
-        return f"The order {name} of the {of} is not identifiable: {_why_not(verdict)}."
+        return (
+            f"The order {name} of the {damping_name} is not identifiable: "
+            f"{_unidentifiable_reason(verdict)}."
+        )
     if verdict.reason is not None:
         return (
-            f"The order {name} of the {of} is not established: {value} fits, but {verdict.reason}. "
+            f"The order {name} of the {damping_name} is not established: {value} fits, but "
+            f"{verdict.reason}. "
             "Do not interpret it."
         )
     if verdict.status == "compatible":
-        return f"The order {name} of the {of} is {value}, consistent with 1."
+        return f"The order {name} of the {damping_name} is {value}, consistent with 1."
     if verdict.status == "fractional":
-        return f"The order {name} of the {of} is {value}; 1 is excluded."
+        return f"The order {name} of the {damping_name} is {value}; 1 is excluded."
     return (
-        f"The order {name} of the {of} is {value}: 1 is doubtful, but not excluded (p = "
+        f"The order {name} of the {damping_name} is {value}: 1 is doubtful, but not excluded (p = "
         f"{math.erfc(math.sqrt(deviance_of_one(profile) / 2)):.1g})."
     )
 
 
-def _types(names: tuple[str, ...]) -> str:
-    """Return a list of structures in words."""
+def _list_structures(names: tuple[str, ...]) -> str:
+    """Return "type" or "types" with the sorted names of structures."""
     return f"type{'s' if len(names) > 1 else ''} {listed(sorted(names))}"
 
 
-def _condition(simpler: ConditionalEstimate) -> str:
+def _conditional_sentence(simpler: ConditionalEstimate) -> str:
     """Return the sentence on the conditional estimate of a simpler structure."""
-    taken = " and ".join(f"{name} = {value:g}" for name, value in simpler.fixed.items())
+    assumption = " and ".join(f"{name} = {value:g}" for name, value in simpler.fixed.items())
     numbers = [
-        f"{name} = {_with_interval(simpler.parameters[name])}"
+        f"{name} = {_value_and_interval_text(simpler.parameters[name])}"
         for name in ("zeta", "alpha", "gamma", "lambda")
         if name in simpler.parameters
     ]
     return (
-        f"{taken[0].upper()}{taken[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} not excluded; "
+        f"{assumption[0].upper()}{assumption[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} "
+        "not excluded; "
         f"if true (type {simpler.name}): {', '.join(numbers)}."
     )
 
 
-def _with_interval(quantity: ReportedValue) -> str:
-    """Return a number with its 95 % interval, rounded to significant digits."""
+def _value_and_interval_text(quantity: ReportedValue) -> str:
+    """Return a value with its 95 % interval as text, rounded to significant digits."""
     if quantity.interval_95 is None or not quantity.std:
         return f"{quantity.value:.4g}"
-    low, high = quantity.interval_95
+    lower_end, upper_end = quantity.interval_95
     power = math.floor(math.log10(abs(quantity.value))) if quantity.value else 0
     scale = 10.0**power if power < -2 else 1.0
     digits = decimals(quantity.std / scale)
     exponent = f"e{power}" if power < -2 else ""
     return (
         f"{quantity.value / scale:.{digits}f}{exponent} "
-        f"({low / scale:.{digits}f}{exponent} to {high / scale:.{digits}f}{exponent})"
+        f"({lower_end / scale:.{digits}f}{exponent} to {upper_end / scale:.{digits}f}{exponent})"
     )
 
 
-def _why_not(verdict: OrderVerdict) -> str:
+def _unidentifiable_reason(verdict: OrderVerdict) -> str:
+    """Return, as part of a sentence, why an order is not identifiable."""
     profile = verdict.profile
-    low, high = profile.interval
-    if verdict.reason is not None and (profile.identifiable or not profile.walked):
+    lower_end, upper_end = profile.interval
+    if verdict.reason is not None and (profile.identifiable or not profile.is_computed):
         return verdict.reason
     if len(profile.local_minima) > 1:
-        equal = " and ".join(f"{value:.3f}" for value in sorted(profile.local_minima))
+        minima_text = " and ".join(f"{value:.3f}" for value in sorted(profile.local_minima))
         return (
-            f"{equal} fit the record equally well, each with a different damping (95 %: {low:.3f} "
-            f"to {high:.3f}, with all that lies between)"
+            f"{minima_text} fit the record equally well, each with a different damping (95 %: "
+            f"{lower_end:.3f} "
+            f"to {upper_end:.3f}, with all that lies between)"
         )
     return (
         "any value between 0 and 2 fits"
         if profile.open_below and profile.open_above
-        else f"anything below {high:.2f} fits"
+        else f"anything below {upper_end:.2f} fits"
         if profile.open_below
-        else f"anything above {low:.2f} fits"
+        else f"anything above {lower_end:.2f} fits"
         if profile.open_above
-        else f"anything from {low:.2f} to {high:.2f} fits"
+        else f"anything from {lower_end:.2f} to {upper_end:.2f} fits"
     )
 
 
 # Advice on experiments
 
-_ENOUGH: Final = 2
-_SECOND: Final = 6.267
+_MIN_MODES_FOR_AN_ORDER: Final = 2
+"""Number of visible modes from which a further mode, or a longer sweep, is advised."""
+
+_SECOND_OVER_FIRST_FREQUENCY: Final = 6.267
 """Frequency of the second mode of a uniform beam over that of the first."""
 
-_ORDINALS: Final = {1: "first", 2: "second"}
+_MODE_ORDINALS: Final = {1: "first", 2: "second"}
+"""Ordinals of the first two modes, in words."""
 
 
 def experiments(
     candidate_set: CandidateSet,
     orders: tuple[OrderVerdict, ...],
-    visible: tuple[int, ...],
-    found: tuple[Finding, ...],
-    close: tuple[Candidate, ...],
+    visible_numbers: tuple[int, ...],
+    findings: tuple[Finding, ...],
+    close_rivals: tuple[Candidate, ...],
 ) -> list[str]:
-    """Return experiments that would clarify the verdict, in addition to the findings' remedies.
+    """Return experiments that would clarify the verdict, besides the findings' remedies.
 
     Parameters
     ----------
@@ -302,53 +323,59 @@ def experiments(
         Candidates of the record.
     orders : tuple of OrderVerdict
         Verdicts on alpha and lambda.
-    visible : tuple of int
+    visible_numbers : tuple of int
         Numbers of the visible modes.
-    found : tuple of Finding
+    findings : tuple of Finding
         Findings on the record.
-    close : tuple of Candidate
+    close_rivals : tuple of Candidate
         Candidates that explain the record about as well as the selected one.
     """
     advice = []
-    unknown = [o for o in orders if o.status == "not identifiable"]
-    if unknown:
-        names = " and ".join(o.order for o in unknown)
-        if len(visible) < _ENOUGH:
-            advice.append(f"To determine {names}, {_for_two_modes(candidate_set, visible)}")
+    unidentifiable = [o for o in orders if o.status == "not identifiable"]
+    if unidentifiable:
+        order_names = " and ".join(o.order for o in unidentifiable)
+        if len(visible_numbers) < _MIN_MODES_FOR_AN_ORDER:
+            advice.append(
+                f"To determine {order_names}, "
+                f"{_advice_for_two_modes(candidate_set, visible_numbers)}"
+            )
         else:
             advice.append(
-                f"To determine {names}, run narrow, slow sweeps around the modes, or a wider sweep "
+                f"To determine {order_names}, run narrow, slow sweeps around the modes, or a "
+                "wider sweep "
                 "that reaches one more mode."
             )
-    unexplained = any(finding.kind == "unexplained" for finding in found)
-    if close or (not unexplained and any(o.status == "open" for o in orders)):
+    unexplained = any(finding.kind == "unexplained" for finding in findings)
+    if close_rivals or (not unexplained and any(o.status == "open" for o in orders)):
         advice.append(
             "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
         )
     return advice
 
 
-def _for_two_modes(candidate_set: CandidateSet, visible: tuple[int, ...]) -> str:
-    """Return the experiment that would show both of the first two modes."""
+def _advice_for_two_modes(candidate_set: CandidateSet, visible_numbers: tuple[int, ...]) -> str:
+    """Return the advice, as part of a sentence, how to make both of the first two modes visible."""
     modes = {mode.number: mode.frequency_hz for mode in candidate_set.best.fit.modes}
     first_hz = modes.get(1, 0.0)
-    at_hz = {1: first_hz, 2: modes.get(2, _SECOND * first_hz)}
-    missing = next(number for number in (1, 2) if number not in visible)
-    other = 3 - missing
+    at_hz = {1: first_hz, 2: modes.get(2, _SECOND_OVER_FIRST_FREQUENCY * first_hz)}
+    missing_mode = next(number for number in (1, 2) if number not in visible_numbers)
+    other_mode = 3 - missing_mode
     last_hz = float(candidate_set.comparison.frequency_hz[-1])
-    if at_hz[missing] > last_hz:
+    if at_hz[missing_mode] > last_hz:
         return (
-            f"analyse and excite the {_ORDINALS[missing]} mode as well: band and sweep up to at "
-            f"least {1.3 * at_hz[missing]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
+            f"analyse and excite the {_MODE_ORDINALS[missing_mode]} mode as well: band and sweep "
+            "up to at "
+            f"least {1.3 * at_hz[missing_mode]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
         )
-    if not driven(candidate_set.comparison, at_hz[missing], relative_to_hz=at_hz[other]):
-        return f"excite the {_ORDINALS[missing]} mode as well: sweep " + (
+    if not driven(candidate_set.comparison, at_hz[missing_mode], relative_to_hz=at_hz[other_mode]):
+        return f"excite the {_MODE_ORDINALS[missing_mode]} mode as well: sweep " + (
             f"up to at least {1.3 * at_hz[2]:.0f} Hz."
-            if missing == 2
+            if missing_mode == 2
             else f"from below {0.7 * at_hz[1]:.1f} Hz."
         )
     return (
-        f"raise the {_ORDINALS[missing]} mode above the noise: it was driven at its "
-        f"{at_hz[missing]:.1f} Hz, so increase the amplitude (twice), sweep slower or repeat; a "
+        f"raise the {_MODE_ORDINALS[missing_mode]} mode above the noise: it was driven at its "
+        f"{at_hz[missing_mode]:.1f} Hz, so increase the amplitude (twice), sweep slower or "
+        "repeat; a "
         "wider band does not help."
     )

@@ -1,10 +1,10 @@
 """Test of a uniform beam against the modal constants, and estimate of its parameters.
 
-A plain uniform beam with both dampings predicts frequency, damping ratio and residue of every mode
-from seven parameters. Chi-square of the constants measured against those predicted is the test. No
-antenna is uniform to the precision at which frequencies are measured, so parameters are estimated
-with a stated tolerance: each ln f has that standard deviation, each ln of a residue three times as
-much, in addition to the noise.
+A uniform beam with internal and external damping predicts frequency, damping ratio and residue of
+every mode from seven parameters. The test compares the measured constants with the predicted ones
+by chi-square. No real antenna is as uniform as the frequencies are precise. So the parameters are
+estimated with a stated tolerance: in addition to the measurement noise, each ln frequency has that
+standard deviation, and each ln residue three times as much.
 """
 
 from __future__ import annotations
@@ -44,61 +44,95 @@ PARAMETERS: Final = (
     "bending_stiffness_n_m2",
     "delay_s",
 )
-"""Those of a uniform beam that its modal constants depend on."""
+"""Names of the seven uniform-beam parameters that determine the modal constants."""
 
-_ORDERS: Final = (0.4, 1.0, 1.6)
+_START_ORDERS: Final = (0.4, 1.0, 1.6)
+"""Values of alpha and lambda at which the descents start."""
+
 _ORDER_RANGE: Final = (0.02, 1.98)
-_LN_LOSS_RANGE: Final = (-18.0, 2.0)
-"""Range of the logarithm of what a damping adds to stiffness or inertia at its reference
-frequency."""
+"""Smallest and largest value of alpha and lambda in the search."""
 
-_LN_RANGE: Final = 2.0
-"""Largest distance of ratio and stiffness from the start of the search, in logarithms."""
+_LN_LOSS_RANGE: Final = (-18.0, 2.0)
+"""Range of the logarithm of a damping's loss, relative to stiffness or inertia at its reference
+mode."""
+
+_LN_BEAM_HALF_RANGE: Final = 2.0
+"""Largest change of ln(rho/EI) and of ln(EI) from the start of the search."""
 
 _DELAY_UNIT_S: Final = 0.01
-_LARGEST_DELAY: Final = 1.0
-_RENEWALS: Final = 4
-"""Number of times that the shapes of a loaded or tilted beam are computed, each with the current
+"""Delay in seconds at which the delay unknown is 1."""
+
+_DELAY_UNKNOWN_LIMIT: Final = 1.0
+"""Largest magnitude of the delay unknown, in units of `_DELAY_UNIT_S`."""
+
+_SHAPE_UPDATES: Final = 4
+"""Number of times that the mode shapes of a loaded or tilted beam are recomputed for the fitted
 beam."""
 
-_STEP: Final = 1e-5
-_NEWTON_STEPS: Final = 6
-_EXACT: Final = 1e-13
-_TOLERANCE: Final = 1e-4
-_MANY: Final = 80
+_DIFFERENCE_STEP: Final = 1e-5
+"""Step of the central differences, the same for all unknowns."""
 
-Status = Literal["passed", "refused", "not tested"]
-Basis = Literal["geometry", "losses", "none"]
+_MAX_NEWTON_ITERATIONS: Final = 6
+"""Largest number of Newton iterations for the poles of a beam."""
+
+_POLE_TOLERANCE: Final = 1e-13
+"""Relative change of the poles at which the Newton iterations end."""
+
+_COST_TOLERANCE: Final = 1e-4
+"""Relative tolerance of chi-square at which a descent ends."""
+
+_MAX_EVALUATIONS: Final = 80
+"""Largest number of evaluations of chi-square in one descent."""
+
+TestStatus = Literal["passed", "refused", "not tested"]
+"""Result of the uniform-beam test."""
+
+EstimateBasis = Literal["geometry", "losses", "none"]
+"""Data that an estimate with tolerance uses."""
 
 REFUSED_BELOW: Final = 0.01
-"""p-value below which a beam does not predict the constants."""
+"""p-value below which the test refuses a uniform beam."""
 
-_PLAUSIBLE: Final = 0.3
-"""p-value from which the stated tolerance suffices: a beam that is more uneven reaches a lower one,
-since orders compensate a part of the excess."""
+_PLAUSIBLE_P_VALUE: Final = 0.3
+"""p-value from which the stated tolerance suffices. A beam that is more uneven reaches a lower
+p-value, since orders compensate a part of the excess."""
 
-_PLAUSIBLE_WIDER: Final = 0.1
+_PLAUSIBLE_P_VALUE_WIDER: Final = 0.1
+"""p-value from which the wider tolerance suffices."""
 
-_WIDER: Final = 3e-3
-"""Tolerance that is tested if the stated one does not suffice."""
+_WIDER_TOLERANCE: Final = 3e-3
+"""Relative frequency tolerance that is tried if the stated one does not suffice."""
 
-_LOOSE: Final = 0.05
-"""Tolerance with which frequencies and residues have almost no weight."""
+_LOOSE_TOLERANCE: Final = 0.05
+"""Relative frequency tolerance at which frequencies and residues have almost no weight."""
 
-_FEWEST_MODES: Final = 2
-_NO_EFFECT: Final = 1e-4
-"""Curvature of chi-square by an unknown that does nothing."""
+_MIN_VISIBLE_MODES: Final = 2
+"""Smallest number of visible modes for an estimate with tolerance."""
 
-_COEFFICIENTS: Final = ("zeta", "gamma")
-_PROFILED: Final = ("zeta", "alpha", "gamma", "lambda")
-_PROFILE_STEPS: Final = 8
-_CLOSE: Final = 0.05
-_LONGEST_STEP: Final = 3.0
-_LARGEST_LN: Final = 300.0
+_IDLE_CURVATURE: Final = 1e-4
+"""Second derivative of chi-square below which an unknown counts as without effect."""
+
+_DAMPING_COEFFICIENTS: Final = ("zeta", "gamma")
+"""Damping coefficients that are tested for their absence."""
+
+_PROFILED_PARAMETERS: Final = ("zeta", "alpha", "gamma", "lambda")
+"""Parameters whose intervals come from the profile of chi-square."""
+
+_MAX_PROFILE_STEPS: Final = 8
+"""Largest number of values at which the profile is computed towards one end of an interval."""
+
+_INTERVAL_END_TOLERANCE: Final = 0.05
+"""Distance of the root of the chi-square rise from 1.96 at which an interval end is accepted."""
+
+_MAX_DISTANCE_GROWTH: Final = 3.0
+"""Largest factor by which one profile step increases the distance from the estimate."""
+
+_MAX_EXPONENT: Final = 300.0
+"""Largest exponent of an interval end, which keeps `exp` finite."""
 
 
 class ConstantsProblem:
-    """Deviations of a uniform beam's modal constants from those measured.
+    """Least-squares fit of a uniform beam's parameters to the measured modal constants.
 
     Unknowns are the contribution of internal damping to the stiffness at the highest visible mode
     (``ln zeta omega^alpha``) and external damping to the inertia at the lowest
@@ -108,14 +142,16 @@ class ConstantsProblem:
     Parameters
     ----------
     fit : ModalEstimate
+        Fitted modal model with the covariance of its constants.
     modes : sequence of int
-        Visible modes.
+        Numbers of the visible modes.
     nominal : Plant
-        Rig and specimen as the file states them; with a mass at the tip, if it states one.
+        Rig and specimen as the file states them, with the tip mass if the file states one.
     uniformity : float
         Relative standard deviation of each frequency, in addition to the noise.
     tilt_deg : float, optional
-        Inclination of the plane of motion along the beam at rest as the file states it.
+        Inclination of the plane of motion along the resting beam, as the file states it, in
+        degrees.
     """
 
     def __init__(
@@ -127,63 +163,85 @@ class ConstantsProblem:
         tilt_deg: float | None = None,
     ) -> None:
         rows = fit.rows(modes)
-        count = len(modes)
+        mode_count = len(modes)
         self.modes = tuple(modes)
         self.nominal = nominal
         self.uniformity = uniformity
         self.measured = fit.constants[rows]
-        extra = np.zeros((count, len(CONSTANTS)))
-        extra[:, CONSTANTS.index("ln_frequency")] = uniformity
-        extra[:, CONSTANTS.index("ln_residue")] = 3 * uniformity
-        self.covariance = fit.covariance[np.ix_(rows, rows)] + np.diag(extra.ravel() ** 2)
-        self.compared = count * len(CONSTANTS)
+        tolerance_std = np.zeros((mode_count, len(CONSTANTS)))
+        tolerance_std[:, CONSTANTS.index("ln_frequency")] = uniformity
+        tolerance_std[:, CONSTANTS.index("ln_residue")] = 3 * uniformity
+        self.covariance = fit.covariance[np.ix_(rows, rows)] + np.diag(tolerance_std.ravel() ** 2)
+        self.compared = mode_count * len(CONSTANTS)
         self._whitener = np.linalg.inv(np.linalg.cholesky(self.covariance))
         length = nominal.beam.length_m
         z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
         self.stated = Alteration.stated(nominal, tilt_deg)
         self.terms = mode_terms(self.stated, nominal.beam, self.modes)
         constants = self.measured.reshape(-1, len(CONSTANTS))
-        self._omega = 2 * np.pi * np.exp(constants[:, 0])
-        self._ratios = np.exp(constants[:, 1])
-        self._poles = self._omega * (1j - self._ratios)
-        # Where the search begins: the mean of all modes.
+        self._omega_rad_s = 2 * np.pi * np.exp(constants[:, 0])
+        self._damping_ratios = np.exp(constants[:, 1])
+        self._poles = self._omega_rad_s * (1j - self._damping_ratios)
+        # The search starts at the mean of all modes.
         mass = self.terms.mass + self.terms.lump
-        self._ln_ratio = float(np.mean(np.log((z / length) ** 4 / mass) - 2 * np.log(self._omega)))
-        ln_stiffness = constants[:, 2] - np.log(self._omega) + np.log(length / 2)
+        self._ln_density_over_stiffness = float(
+            np.mean(np.log((z / length) ** 4 / mass) - 2 * np.log(self._omega_rad_s))
+        )
+        ln_stiffness = constants[:, 2] - np.log(self._omega_rad_s) + np.log(length / 2)
         self._ln_stiffness = float(np.mean(ln_stiffness))
-        low, high = _LN_LOSS_RANGE
-        self.lower = np.array([
-            low, _ORDER_RANGE[0], low, _ORDER_RANGE[0],
-            self._ln_ratio - _LN_RANGE, self._ln_stiffness - _LN_RANGE, -_LARGEST_DELAY,
-        ])  # fmt: skip
-        self.upper = np.array([
-            high, _ORDER_RANGE[1], high, _ORDER_RANGE[1],
-            self._ln_ratio + _LN_RANGE, self._ln_stiffness + _LN_RANGE, _LARGEST_DELAY,
-        ])  # fmt: skip
-        # From the unknowns to `PARAMETERS`, those of `LOGARITHMIC` by their logarithms
-        first, last = math.log(self._omega[0]), math.log(self._omega[-1])
+        smallest_ln_loss, largest_ln_loss = _LN_LOSS_RANGE
+        self.lower = np.array(
+            [
+                smallest_ln_loss,
+                _ORDER_RANGE[0],
+                smallest_ln_loss,
+                _ORDER_RANGE[0],
+                self._ln_density_over_stiffness - _LN_BEAM_HALF_RANGE,
+                self._ln_stiffness - _LN_BEAM_HALF_RANGE,
+                -_DELAY_UNKNOWN_LIMIT,
+            ]
+        )
+        self.upper = np.array(
+            [
+                largest_ln_loss,
+                _ORDER_RANGE[1],
+                largest_ln_loss,
+                _ORDER_RANGE[1],
+                self._ln_density_over_stiffness + _LN_BEAM_HALF_RANGE,
+                self._ln_stiffness + _LN_BEAM_HALF_RANGE,
+                _DELAY_UNKNOWN_LIMIT,
+            ]
+        )
+        # Linear map from the unknowns to `PARAMETERS`, with those in `LOGARITHMIC` as logarithms.
+        ln_first_omega, ln_last_omega = (
+            math.log(self._omega_rad_s[0]),
+            math.log(self._omega_rad_s[-1]),
+        )
         self.transform = np.eye(len(PARAMETERS))
-        self.transform[0, 1] = -last
-        self.transform[2, 3] = -first
+        self.transform[0, 1] = -ln_last_omega
+        self.transform[2, 3] = -ln_first_omega
         self.transform[2, 4] = 1.0
         self.transform[6, 6] = _DELAY_UNIT_S
         self._offset = np.zeros(len(PARAMETERS))
-        self._offset[2] = 2 * first
+        self._offset[2] = 2 * ln_first_omega
 
     def parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return `PARAMETERS` for unknowns, shape (..., 7); `LOGARITHMIC` ones as logarithms."""
+        """Convert unknowns, shape (..., 7), to the values of `PARAMETERS`.
+
+        Those in `LOGARITHMIC` are returned as natural logarithms.
+        """
         return x @ self.transform.T + self._offset
 
     def plant(self, x: NDArray[np.float64]) -> Plant:
-        """Return the plant of a vector of unknowns."""
-        zeta, alpha, gamma, lambda_, ratio, stiffness, delay_s = self.parameters(x).tolist()
-        bending = math.exp(stiffness)
+        """Return the rig with the uniform beam and damping that a vector of unknowns describes."""
+        zeta, alpha, gamma, lambda_, ln_ratio, ln_stiffness, delay_s = self.parameters(x).tolist()
+        bending_stiffness = math.exp(ln_stiffness)
         return replace(
             self.nominal,
             beam=Beam(
                 length_m=self.nominal.beam.length_m,
-                density_kg_per_m=math.exp(ratio) * bending,
-                bending_stiffness_n_m2=bending,
+                density_kg_per_m=math.exp(ln_ratio) * bending_stiffness,
+                bending_stiffness_n_m2=bending_stiffness,
             ),
             damping=Damping(
                 zeta=math.exp(zeta), alpha=alpha, gamma=math.exp(gamma), lambda_=lambda_
@@ -194,179 +252,205 @@ class ConstantsProblem:
     def constants(
         self, x: NDArray[np.float64], terms: ModeTerms | None = None
     ) -> NDArray[np.float64]:
-        """Return the modal constants of beams, (m, 4 n), for unknowns of shape (m, 7).
+        """Predict the modal constants of m beams with n modes, shape (m, 4 n).
 
         Parameters
         ----------
-        x : ndarray of float
-            Vector of unknowns.
+        x : ndarray of float, shape (m, 7)
+            One vector of unknowns for each beam.
         terms : ModeTerms, optional
-            Terms of a beam other than the stated one.
+            Modal integrals of another beam than the one the file states.
         """
         terms = self.terms if terms is None else terms
         zeta, alpha, gamma, lambda_, ratio, stiffness, delay = self.parameters(x).T[..., None]
         zeta, gamma = np.exp(zeta), np.exp(gamma)
-        lighter = 1.0
+        density_ratio = 1.0
         if terms.density_kg_per_m is not None:
-            lighter = terms.density_kg_per_m * np.exp(-ratio - stiffness)
+            density_ratio = terms.density_kg_per_m * np.exp(-ratio - stiffness)
         ratio = np.exp(ratio)
-        mass, arm = terms.mass + lighter * terms.lump, terms.mass_arm + lighter * terms.lump_arm
-        rest = terms.stiffness + terms.clamp + ratio * terms.tension
-        strength, time_s = terms.alteration.relaxation
+        mass, lever_arm = (
+            terms.mass + density_ratio * terms.lump,
+            terms.mass_arm + density_ratio * terms.lump_arm,
+        )
+        static_stiffness = terms.stiffness + terms.clamp + ratio * terms.tension
+        relaxation_strength, time_s = terms.alteration.relaxation
         s = np.broadcast_to(self._poles, (len(x), self._poles.size))
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(_MAX_NEWTON_ITERATIONS):
             log_s = np.log(s)
             internal = zeta * np.exp(alpha * log_s) * terms.stiffness
             external = gamma * np.exp(lambda_ * log_s)
             inertia = ratio * s * s
-            slope = (alpha * internal + lambda_ * external) / s + 2 * ratio * s * mass
-            total = rest + internal + inertia * mass + external
-            if strength:
-                relaxed = strength * time_s / (1 + time_s * s) * terms.stiffness
-                total = total + relaxed * s
-                slope = slope + relaxed / (1 + time_s * s)
-            step = total / slope
+            impedance_slope = (alpha * internal + lambda_ * external) / s + 2 * ratio * s * mass
+            impedance = static_stiffness + internal + inertia * mass + external
+            if relaxation_strength:
+                relaxed = relaxation_strength * time_s / (1 + time_s * s) * terms.stiffness
+                impedance = impedance + relaxed * s
+                impedance_slope = impedance_slope + relaxed / (1 + time_s * s)
+            step = impedance / impedance_slope
             s = s - step
-            if np.abs(step).max() < _EXACT * np.abs(s).max():
+            if np.abs(step).max() < _POLE_TOLERANCE * np.abs(s).max():
                 break
         s = np.where((s.imag > 0) & (s.real < 0), s, complex(np.nan, np.nan))
         channel = torque_channel(replace(self.nominal, delay_s=0.0), s) * np.exp(-delay * s)
         channel = channel * terms.alteration.channel(s)
-        turned = external * terms.turn_by_medium
-        turned = turned + internal / terms.stiffness * terms.turn_by_internal
-        pushed = inertia * (arm + turned)
-        pushed = pushed + external * terms.medium_arm + ratio * terms.tension_arm
+        rotation = external * terms.turn_by_medium
+        rotation = rotation + internal / terms.stiffness * terms.turn_by_internal
+        modal_force = inertia * (lever_arm + rotation)
+        modal_force = modal_force + external * terms.medium_arm + ratio * terms.tension_arm
         volume = self.nominal.beam.length_m**3
-        log_residues = np.log(1j * volume * pushed**2 / slope * channel) + stiffness
-        rows = (
+        log_residues = np.log(1j * volume * modal_force**2 / impedance_slope * channel) + stiffness
+        constant_rows = (
             np.log(s.imag / (2 * np.pi)),
             np.log(-s.real / np.abs(s)),
             log_residues.real,
             log_residues.imag,
         )
-        return np.stack(rows, axis=-1).reshape(len(x), -1)
+        return np.stack(constant_rows, axis=-1).reshape(len(x), -1)
 
     def differences(
         self, x: NDArray[np.float64], terms: ModeTerms | None = None
     ) -> NDArray[np.float64]:
-        """Return the differences from the measured constants, (m, 4 n).
+        """Return predicted minus measured modal constants, shape (m, 4 n); phases within ±pi.
 
         Parameters
         ----------
-        x : ndarray of float
-            Vector of unknowns.
+        x : ndarray of float, shape (m, 7)
+            One vector of unknowns for each beam.
         terms : ModeTerms, optional
-            Terms of a beam other than the stated one.
+            Modal integrals of another beam than the one the file states.
         """
         with np.errstate(all="ignore"):  # a mode without a pole gives NaN
-            off = self.constants(x, terms) - self.measured
-        phases = off[:, CONSTANTS.index("residue_phase_rad") :: len(CONSTANTS)]
+            deviations = self.constants(x, terms) - self.measured
+        phases = deviations[:, CONSTANTS.index("residue_phase_rad") :: len(CONSTANTS)]
         phases -= 2 * np.pi * np.round(phases / (2 * np.pi))
-        return off
+        return deviations
 
     def _deviations(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return predicted minus measured constants, whitened by their covariance, (m, 4 n)."""
         return np.nan_to_num(self.differences(x) @ self._whitener.T, nan=1e6)
 
     def equations(self, x: NDArray[np.float64]) -> NormalEquations:
-        """Return chi-square at a point and its derivatives, by central differences."""
-        steps = _STEP * np.eye(x.size)
-        every = self._deviations(np.concatenate([x[None], x + steps, x - steps]))
-        deviation = every[0]
-        jacobian = (every[1 : 1 + x.size] - every[1 + x.size :]) / (2 * _STEP)
+        """Return chi-square at one vector of unknowns with its gradient and Gauss-Newton matrix."""
+        steps = _DIFFERENCE_STEP * np.eye(x.size)
+        deviations = self._deviations(np.concatenate([x[None], x + steps, x - steps]))
+        deviation = deviations[0]
+        jacobian = (deviations[1 : 1 + x.size] - deviations[1 + x.size :]) / (2 * _DIFFERENCE_STEP)
         return NormalEquations(
             float(deviation @ deviation), jacobian @ deviation, jacobian @ jacobian.T
         )
 
     def starts(self) -> list[NDArray[np.float64]]:
-        """Return beams of several orders, with the losses that fit best."""
-        omega, first, last = self._omega, self._omega[0], self._omega[-1]
-        found = []
-        for alpha, lambda_ in itertools.product(_ORDERS, repeat=2):
-            internal = (omega / last) ** alpha * math.sin(alpha * math.pi / 2)
-            external = (omega / first) ** lambda_ * math.sin(lambda_ * math.pi / 2)
-            external *= (first / omega) ** 2
-            columns = np.array([internal, external]).T / (2 * self._ratios)[:, None]
-            sizes, *_ = np.linalg.lstsq(columns, np.ones(omega.size), rcond=None)
-            most = np.min(2 * self._ratios / np.array([internal, external]), axis=1)
-            losses = np.log(np.clip(sizes, 0.02 * most, most))
-            delay = self.nominal.delay_s / _DELAY_UNIT_S
-            found.append(
-                np.array([losses[0], alpha, losses[1], lambda_, self._ln_ratio, self._ln_stiffness,
-                          delay])
-            )  # fmt: skip
-        return found
+        """Return the start vectors of the descents, one for each pair of orders in `_START_ORDERS`.
 
-    def minimum(self, x: NDArray[np.float64]) -> Minimum:
-        """Descend from a point."""
-        return _descend(self.equations, x, self.lower, self.upper)
+        The losses of each are those that best fit the measured damping ratios.
+        """
+        omega, first_omega, last_omega = (
+            self._omega_rad_s,
+            self._omega_rad_s[0],
+            self._omega_rad_s[-1],
+        )
+        start_vectors = []
+        for alpha, lambda_ in itertools.product(_START_ORDERS, repeat=2):
+            internal = (omega / last_omega) ** alpha * math.sin(alpha * math.pi / 2)
+            external = (omega / first_omega) ** lambda_ * math.sin(lambda_ * math.pi / 2)
+            external *= (first_omega / omega) ** 2
+            columns = np.array([internal, external]).T / (2 * self._damping_ratios)[:, None]
+            loss_fractions, *_ = np.linalg.lstsq(columns, np.ones(omega.size), rcond=None)
+            largest_losses = np.min(
+                2 * self._damping_ratios / np.array([internal, external]), axis=1
+            )
+            losses = np.log(np.clip(loss_fractions, 0.02 * largest_losses, largest_losses))
+            delay = self.nominal.delay_s / _DELAY_UNIT_S
+            start_vectors.append(
+                np.array(
+                    [
+                        losses[0],
+                        alpha,
+                        losses[1],
+                        lambda_,
+                        self._ln_density_over_stiffness,
+                        self._ln_stiffness,
+                        delay,
+                    ]
+                )
+            )
+        return start_vectors
+
+    def minimize(self, x: NDArray[np.float64]) -> Minimum:
+        """Minimize chi-square from one start vector, with all unknowns free."""
+        return _minimize_within_bounds(self.equations, x, self.lower, self.upper)
 
     def minima(self) -> list[Minimum]:
-        """Return the minima from all starts, the lowest first."""
-        found = self._minima(self.starts())
-        for _ in range(_RENEWALS if self.stated != Alteration() else 0):
-            self.terms = mode_terms(self.stated, self.plant(found[0].x).beam, self.modes)
-            found = self._minima([each.x for each in found])
-        return found
+        """Minimize chi-square from all start vectors. Return the minima, the lowest first."""
+        minima = self._minimize_from(self.starts())
+        for _ in range(_SHAPE_UPDATES if self.stated != Alteration() else 0):
+            self.terms = mode_terms(self.stated, self.plant(minima[0].x).beam, self.modes)
+            minima = self._minimize_from([each.x for each in minima])
+        return minima
 
-    def _minima(self, starts: Sequence[NDArray[np.float64]]) -> list[Minimum]:
-        return sorted((self.minimum(x) for x in starts), key=lambda each: each.cost)
+    def _minimize_from(self, starts: Sequence[NDArray[np.float64]]) -> list[Minimum]:
+        """Minimize chi-square from each given start. Return the minima, the lowest first."""
+        return sorted((self.minimize(x) for x in starts), key=lambda each: each.cost)
 
-    def held_at_edge(self, index: int, x: NDArray[np.float64]) -> Minimum:
-        """Descend from `x` with a damping at the lower edge of its size, where it has no effect.
+    def minimize_without_damping(self, index: int, x: NDArray[np.float64]) -> Minimum:
+        """Minimize chi-square without one damping, whose loss is fixed at its lower bound.
 
         Parameters
         ----------
         index : int
-            Index of its coefficient among `PARAMETERS`.
-        x : ndarray of float
-            Vector of unknowns.
+            Index of the damping's coefficient in `PARAMETERS`.
+        x : ndarray of float, shape (7,)
+            Vector of unknowns at which the descent starts.
         """
-        high = self.upper.copy()
-        high[index] = self.lower[index]
-        return _descend(self.equations, x, self.lower, high)
+        upper_bounds = self.upper.copy()
+        upper_bounds[index] = self.lower[index]
+        return _minimize_within_bounds(self.equations, x, self.lower, upper_bounds)
 
-    def held(self, index: int, value: float, x: NDArray[np.float64]) -> Minimum:
-        """Descend from `x` with one of `PARAMETERS` held; the result's `x` are the unknowns.
+    def minimize_with_fixed(self, index: int, value: float, x: NDArray[np.float64]) -> Minimum:
+        """Minimize chi-square with one of `PARAMETERS` fixed, and return the minimum.
 
         Parameters
         ----------
         index : int
-            Index among `PARAMETERS`.
+            Index of the fixed parameter in `PARAMETERS`.
         value : float
-            Value at which it is held, as in `parameters`.
-        x : ndarray of float
-            Vector of unknowns to begin with.
+            Fixed value, as `parameters` returns it.
+        x : ndarray of float, shape (7,)
+            Vector of unknowns at which the descent starts.
         """
         # The parameter replaces the unknown that contributes to it with factor 1.
         forward = np.eye(x.size)
         forward[index] = self.transform[index] / self.transform[index, index]
         backward = np.linalg.inv(forward)
-        low, high = self.lower.copy(), self.upper.copy()
-        low[index] = high[index] = (value - self._offset[index]) / self.transform[index, index]
+        lower_bounds, upper_bounds = self.lower.copy(), self.upper.copy()
+        lower_bounds[index] = upper_bounds[index] = (value - self._offset[index]) / self.transform[
+            index, index
+        ]
 
         def equations(y: NDArray[np.float64]) -> NormalEquations:
+            """Return the normal equations in the transformed unknowns."""
             found = self.equations(backward @ y)
             return NormalEquations(
                 found.cost, backward.T @ found.gradient, backward.T @ found.hessian @ backward
             )
 
-        found = _descend(equations, forward @ x, low, high)
+        found = _minimize_within_bounds(equations, forward @ x, lower_bounds, upper_bounds)
         return replace(found, x=backward @ found.x)
 
 
-def _descend(
+def _minimize_within_bounds(
     equations: Callable[[NDArray[np.float64]], NormalEquations],
     x: NDArray[np.float64],
     lower: NDArray[np.float64],
     upper: NDArray[np.float64],
 ) -> Minimum:
-    """Descend between bounds."""
+    """Minimize a sum of squares within bounds by Gauss-Newton descent."""
     return descend(
         equations,
         x,
         Box(lower, upper),
-        relative_tolerance=_TOLERANCE,
-        max_evaluations=_MANY,
+        relative_tolerance=_COST_TOLERANCE,
+        max_evaluations=_MAX_EVALUATIONS,
     )
 
 
@@ -377,18 +461,21 @@ class UniformBeamTest:
     Attributes
     ----------
     status : str
-        "passed", "refused", or "not tested" without degrees of freedom.
+        "passed", "refused", or "not tested" if there are no degrees of freedom.
     chi_square : float
+        Weighted sum of squared differences between measured and predicted constants.
     degrees_of_freedom : int
+        Number of constants minus number of effective beam parameters.
     p_value : float or None
-        Probability of such a chi-square by chance; None without degrees of freedom.
+        Probability of at least this chi-square by chance. None without degrees of freedom.
     modes : tuple of int
-        Modes compared.
+        Numbers of the compared modes.
     measured, predicted, std : ndarray, shape (4 n,)
-        `CONSTANTS` of each mode in turn, and the standard deviation of those measured.
+        Measured and predicted `CONSTANTS`, mode by mode, and the standard deviations of the
+        measured ones.
     """
 
-    status: Status
+    status: TestStatus
     chi_square: float
     degrees_of_freedom: int
     p_value: float | None
@@ -399,11 +486,11 @@ class UniformBeamTest:
 
     @property
     def summary(self) -> BeamUniformity:
-        """Return status and p-value with the sentence."""
+        """Return status and p-value of the uniform-beam test."""
         return BeamUniformity(self.status, self.p_value)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the test as `json.dumps` takes it; numbers may be not finite."""
+        """Return the test as JSON-ready dict, in which numbers may be NaN or infinite."""
         return {
             **self.summary.as_json(),
             "chi_square": self.chi_square,
@@ -430,7 +517,7 @@ class UniformBeamTest:
 
 @dataclass(frozen=True, slots=True)
 class TolerantEstimate:
-    """Parameters of a nearly uniform beam, from the modal constants with a tolerance of geometry.
+    """Beam parameters from the modal constants, with a tolerance for a nearly uniform beam.
 
     Attributes
     ----------
@@ -441,24 +528,27 @@ class TolerantEstimate:
     uniformity : float
         Assumed relative standard deviation of each frequency.
     p_value : float or None
+        Probability of at least the remaining chi-square by chance. None without degrees of
+        freedom.
     plant : Plant
+        Rig and beam with the estimated parameters.
     values, std : mapping of str to float
-        By the names of `PARAMETERS`.
+        Estimates and standard deviations, by the names of `PARAMETERS`.
     interval : mapping of str to (float, float)
-        95 %, by the profile of chi-square; an end is infinite, or the edge of the range, where the
-        modes do not bound it.
+        95 % intervals by the profile of chi-square. An end that the modes do not bound is infinite
+        or the edge of the range.
     covariance : ndarray, shape (7, 7)
-        Covariance of `PARAMETERS`; `LOGARITHMIC` ones by their logarithms.
+        Covariance of `PARAMETERS`, with those in `LOGARITHMIC` as logarithms.
     first_rad_s : float
-        Frequency of the first visible mode.
+        Frequency of the first visible mode, in rad/s.
     deviance_of_one : mapping of str to float
-        Increase of chi-square of damping ratios and residue phases alone with order 1, by order; 0
-        where the interval holds 1.
+        Increase of chi-square if "alpha" or "lambda" is fixed at 1, with damping ratios and residue
+        phases alone. 0 if the interval contains 1.
     deviance_without : mapping of str to float
-        Increase of chi-square without a damping, by its coefficient.
+        Increase of chi-square if the damping with coefficient "zeta" or "gamma" is left out.
     """
 
-    basis: Basis
+    basis: EstimateBasis
     uniformity: float
     p_value: float | None
     plant: Plant
@@ -471,7 +561,7 @@ class TolerantEstimate:
     deviance_without: dict[str, float]
 
     def covariance_json(self) -> dict[str, Any]:
-        """Return the covariance of the parameters as `json.dumps` takes it."""
+        """Return names and covariance matrix of the parameters as a JSON-ready dict."""
         names = [f"ln_{name}" if name in LOGARITHMIC else name for name in PARAMETERS]
         return {"names": names, "matrix": self.covariance.tolist()}
 
@@ -479,35 +569,37 @@ class TolerantEstimate:
 def uniform_beam_test(
     fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
 ) -> UniformBeamTest:
-    """Test whether a uniform beam with both dampings predicts the constants of the visible modes.
+    """Test whether a uniform beam predicts the modal constants of the visible modes.
 
     Parameters
     ----------
     fit : ModalEstimate
+        Fitted modal model with the covariance of its constants.
     nominal : Plant
-        Rig and specimen as the file states them; with a mass at the tip, if it states one.
+        Rig and specimen as the file states them, with the tip mass if the file states one.
     tilt_deg : float, optional
-        Inclination of the plane of motion along the beam at rest as the file states it.
+        Inclination of the plane of motion along the resting beam, as the file states it, in
+        degrees.
     """
     modes = fit.visible
     rows = fit.rows(modes)
     measured, std = fit.constants[rows], np.sqrt(np.diag(fit.covariance)[rows])
-    freedom = len(rows) - len(PARAMETERS)
-    if freedom <= 0:
-        none = np.full(measured.size, np.nan)
-        return UniformBeamTest("not tested", math.nan, 0, None, modes, measured, none, std)
+    degrees_of_freedom = len(rows) - len(PARAMETERS)
+    if degrees_of_freedom <= 0:
+        no_prediction = np.full(measured.size, np.nan)
+        return UniformBeamTest("not tested", math.nan, 0, None, modes, measured, no_prediction, std)
     problem = ConstantsProblem(fit, modes, nominal, tilt_deg=tilt_deg)
-    best = problem.minima()[0]
-    freedom += _idle(problem, best)
-    p_value = float(chi_square_p_value(best.cost, freedom))
+    best_minimum = problem.minima()[0]
+    degrees_of_freedom += _count_idle_unknowns(problem, best_minimum)
+    p_value = float(chi_square_p_value(best_minimum.cost, degrees_of_freedom))
     return UniformBeamTest(
         status="passed" if p_value >= REFUSED_BELOW else "refused",
-        chi_square=best.cost,
-        degrees_of_freedom=freedom,
+        chi_square=best_minimum.cost,
+        degrees_of_freedom=degrees_of_freedom,
         p_value=p_value,
         modes=modes,
         measured=measured,
-        predicted=problem.constants(best.x[None])[0],
+        predicted=problem.constants(best_minimum.x[None])[0],
         std=std,
     )
 
@@ -515,100 +607,119 @@ def uniform_beam_test(
 def tolerant_estimate(
     fit: ModalEstimate, nominal: Plant, uniformity: float, tilt_deg: float | None = None
 ) -> TolerantEstimate | None:
-    """Estimate damping and beam with a tolerance of the geometry.
+    """Estimate damping and beam parameters from the modal constants, with a tolerance.
 
     If a uniform beam with the stated tolerance does not predict the constants, a wider tolerance is
-    used; if that fails too, losses and phases alone.
+    used. If that fails, too, only damping ratios and residue phases are used.
 
     Parameters
     ----------
     fit : ModalEstimate
+        Fitted modal model with the covariance of its constants.
     nominal : Plant
         Rig and specimen as the file states them.
     uniformity : float
         Stated relative standard deviation of each frequency.
     tilt_deg : float, optional
-        Inclination of the plane of motion along the beam at rest as the file states it.
+        Inclination of the plane of motion along the resting beam, as the file states it, in
+        degrees.
 
     Returns
     -------
     TolerantEstimate or None
-        None with fewer than two visible modes.
+        None if fewer than two modes are visible.
     """
     modes = fit.visible
-    if len(modes) < _FEWEST_MODES:
+    if len(modes) < _MIN_VISIBLE_MODES:
         return None
-    wider = max(_WIDER, uniformity)
-    attempts: tuple[tuple[Basis, float, float], ...] = (
-        ("geometry", uniformity, _PLAUSIBLE),
-        ("geometry", wider, _PLAUSIBLE_WIDER),
-        ("losses", _LOOSE, REFUSED_BELOW),
+    wider_tolerance = max(_WIDER_TOLERANCE, uniformity)
+    attempts: tuple[tuple[EstimateBasis, float, float], ...] = (
+        ("geometry", uniformity, _PLAUSIBLE_P_VALUE),
+        ("geometry", wider_tolerance, _PLAUSIBLE_P_VALUE_WIDER),
+        ("losses", _LOOSE_TOLERANCE, REFUSED_BELOW),
     )
-    for basis, tolerance, least in attempts:
+    for basis, tolerance, least_p_value in attempts:
         problem = ConstantsProblem(fit, modes, nominal, tolerance, tilt_deg)
         minima = problem.minima()
-        # With a loose geometry frequencies and residues count as compared no longer.
-        compared = problem.compared // (2 if basis == "losses" else 1)
-        freedom = compared - (len(PARAMETERS) if basis == "geometry" else len(PARAMETERS) - 2)
-        freedom += _idle(problem, minima[0])
-        p_value = float(chi_square_p_value(minima[0].cost, freedom)) if freedom > 0 else None
-        if p_value is None or p_value >= least:
+        # With the loose tolerance frequencies and residues do not count as data.
+        constant_count = problem.compared // (2 if basis == "losses" else 1)
+        degrees_of_freedom = constant_count - (
+            len(PARAMETERS) if basis == "geometry" else len(PARAMETERS) - 2
+        )
+        degrees_of_freedom += _count_idle_unknowns(problem, minima[0])
+        p_value = (
+            float(chi_square_p_value(minima[0].cost, degrees_of_freedom))
+            if degrees_of_freedom > 0
+            else None
+        )
+        if p_value is None or p_value >= least_p_value:
             break
     else:
         basis = "none"
-    found = _estimate(problem, minima, basis, p_value)
-    away = [
+    estimate = _estimate_at_minimum(problem, minima, basis, p_value)
+    orders_without_one = [
         order for order in ("alpha", "lambda")
-        if not found.interval[order][0] <= 1 <= found.interval[order][1]
+        if not estimate.interval[order][0] <= 1 <= estimate.interval[order][1]
     ]  # fmt: skip
-    if not away:
-        return found
+    if not orders_without_one:
+        return estimate
     if basis == "geometry":
-        problem = ConstantsProblem(fit, modes, nominal, _LOOSE, tilt_deg)
+        problem = ConstantsProblem(fit, modes, nominal, _LOOSE_TOLERANCE, tilt_deg)
         minima = problem.minima()
-    best = minima[0]
-    rises = {
-        order: problem.held(PARAMETERS.index(order), 1.0, best.x).cost - best.cost for order in away
+    best_minimum = minima[0]
+    deviances = {
+        order: problem.minimize_with_fixed(PARAMETERS.index(order), 1.0, best_minimum.x).cost
+        - best_minimum.cost
+        for order in orders_without_one
     }
-    return replace(found, deviance_of_one=found.deviance_of_one | rises)
+    return replace(estimate, deviance_of_one=estimate.deviance_of_one | deviances)
 
 
-def _idle(problem: ConstantsProblem, best: Minimum) -> int:
-    """Count the unknowns without effect at a minimum: those of an absent damping."""
-    spread = np.diag(best.equations.hessian)
-    held = best.equations.held(best.x, problem.lower, problem.upper)
-    return int(np.count_nonzero(held | (spread < _NO_EFFECT)))
+def _count_idle_unknowns(problem: ConstantsProblem, minimum: Minimum) -> int:
+    """Count the unknowns that do not affect chi-square at a minimum.
+
+    Absent damping has such unknowns.
+    """
+    curvature = np.diag(minimum.equations.hessian)
+    at_bound = minimum.equations.held(minimum.x, problem.lower, problem.upper)
+    return int(np.count_nonzero(at_bound | (curvature < _IDLE_CURVATURE)))
 
 
-def _estimate(
-    problem: ConstantsProblem, minima: Sequence[Minimum], basis: Basis, p_value: float | None
+def _estimate_at_minimum(
+    problem: ConstantsProblem,
+    minima: Sequence[Minimum],
+    basis: EstimateBasis,
+    p_value: float | None,
 ) -> TolerantEstimate:
-    """Return values, deviations and intervals at a minimum."""
-    best = minima[0]
-    plant = problem.plant(best.x)
-    hessian = best.equations.hessian + np.diag(1 / (problem.upper - problem.lower) ** 2)
+    """Return beam parameters with standard deviations and 95 % intervals at the lowest minimum."""
+    best_minimum = minima[0]
+    plant = problem.plant(best_minimum.x)
+    hessian = best_minimum.equations.hessian + np.diag(1 / (problem.upper - problem.lower) ** 2)
     covariance = problem.transform @ np.linalg.inv(hessian) @ problem.transform.T
-    values = problem.parameters(best.x)
+    values = problem.parameters(best_minimum.x)
     spreads = np.sqrt(np.diag(covariance))
-    without = {
-        name: problem.held_at_edge(PARAMETERS.index(name), best.x).cost - best.cost
-        for name in _COEFFICIENTS
+    deviance_without = {
+        name: problem.minimize_without_damping(PARAMETERS.index(name), best_minimum.x).cost
+        - best_minimum.cost
+        for name in _DAMPING_COEFFICIENTS
     }
-    near = [each for each in minima if each.cost - best.cost < NORMAL_95**2]
-    ends: dict[str, tuple[float, float]] = {}
+    near_minima = [each for each in minima if each.cost - best_minimum.cost < NORMAL_95**2]
+    intervals: dict[str, tuple[float, float]] = {}
     std: dict[str, float] = {}
     for index, name in enumerate(PARAMETERS):
         value, spread = float(values[index]), float(spreads[index])
-        if name in _PROFILED:
-            low, high = (_end(problem, index, best, side * spread) for side in (-1.0, 1.0))
-            others = [float(problem.parameters(each.x)[index]) for each in near]
-            low, high = min(low, *others), max(high, *others)
+        if name in _PROFILED_PARAMETERS:
+            lower_end, upper_end = (
+                _interval_end(problem, index, best_minimum, side * spread) for side in (-1.0, 1.0)
+            )
+            other_values = [float(problem.parameters(each.x)[index]) for each in near_minima]
+            lower_end, upper_end = min(lower_end, *other_values), max(upper_end, *other_values)
         else:
-            low, high = value - NORMAL_95 * spread, value + NORMAL_95 * spread
+            lower_end, upper_end = value - NORMAL_95 * spread, value + NORMAL_95 * spread
         if name in LOGARITHMIC:
             value, spread = math.exp(value), math.exp(value) * spread
-            low, high = math.exp(low), math.exp(min(high, _LARGEST_LN))
-        ends[name], std[name] = (low, high), spread
+            lower_end, upper_end = math.exp(lower_end), math.exp(min(upper_end, _MAX_EXPONENT))
+        intervals[name], std[name] = (lower_end, upper_end), spread
     return TolerantEstimate(
         basis=basis,
         uniformity=problem.uniformity,
@@ -616,42 +727,48 @@ def _estimate(
         plant=plant,
         values=plant.parameters,
         std=std,
-        interval=ends,
+        interval=intervals,
         covariance=covariance,
         first_rad_s=float(2 * np.pi * np.exp(problem.measured[0])),
         deviance_of_one={"alpha": 0.0, "lambda": 0.0},
-        deviance_without=without,
+        deviance_without=deviance_without,
     )
 
 
-def _end(problem: ConstantsProblem, index: int, best: Minimum, spread: float) -> float:
-    """Return the end of a 95 % interval, where the profile of chi-square has risen by 3.84.
+def _interval_end(
+    problem: ConstantsProblem, index: int, best_minimum: Minimum, spread: float
+) -> float:
+    """Return one end of the 95 % interval of a parameter, where chi-square has risen by 3.84.
 
-    It is the edge of the range of an order if chi-square does not rise so far. `index` and `spread`
-    are the parameter and its standard deviation with the side as sign.
+    Return the edge of the range if chi-square does not rise so far. `index` is the position of the
+    parameter in `PARAMETERS`. `spread` is its standard deviation, negative for the lower end.
     """
-    centre = float(problem.parameters(best.x)[index])
-    edge = math.copysign(math.inf, spread)
+    estimate = float(problem.parameters(best_minimum.x)[index])
+    range_edge = math.copysign(math.inf, spread)
     if PARAMETERS[index] in ("alpha", "lambda"):
-        edge = _ORDER_RANGE[0 if spread < 0 else 1]
-    inside, rise, x = centre, 0.0, best.x
-    trial = centre + NORMAL_95 * spread
-    outside: float | None = None
-    for _ in range(_PROFILE_STEPS):
-        trial = max(trial, edge) if spread < 0 else min(trial, edge)
-        found = problem.held(index, trial, x)
-        root = math.sqrt(max(found.cost - best.cost, 0.0))
-        if abs(root - NORMAL_95) < _CLOSE:
-            return trial
+        range_edge = _ORDER_RANGE[0 if spread < 0 else 1]
+    inside_value, inside_root, x = estimate, 0.0, best_minimum.x
+    trial_value = estimate + NORMAL_95 * spread
+    outside_value: float | None = None
+    for _ in range(_MAX_PROFILE_STEPS):
+        trial_value = max(trial_value, range_edge) if spread < 0 else min(trial_value, range_edge)
+        trial_minimum = problem.minimize_with_fixed(index, trial_value, x)
+        root = math.sqrt(max(trial_minimum.cost - best_minimum.cost, 0.0))
+        if abs(root - NORMAL_95) < _INTERVAL_END_TOLERANCE:
+            return trial_value
         if root < NORMAL_95:
-            inside, rise, x = trial, root, found.x
-            if trial == edge:
-                return edge
+            inside_value, inside_root, x = trial_value, root, trial_minimum.x
+            if trial_value == range_edge:
+                return range_edge
         else:
-            outside, above = trial, root
-        if outside is None:
-            step = (inside - centre) * min(NORMAL_95 / max(rise, 0.2), _LONGEST_STEP)
-            trial = centre + step
+            outside_value, outside_root = trial_value, root
+        if outside_value is None:
+            distance = (inside_value - estimate) * min(
+                NORMAL_95 / max(inside_root, 0.2), _MAX_DISTANCE_GROWTH
+            )
+            trial_value = estimate + distance
         else:
-            trial = inside + (outside - inside) * (NORMAL_95 - rise) / (above - rise)
-    return trial if outside is not None else edge
+            trial_value = inside_value + (outside_value - inside_value) * (
+                NORMAL_95 - inside_root
+            ) / (outside_root - inside_root)
+    return trial_value if outside_value is not None else range_edge

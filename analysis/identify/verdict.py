@@ -1,4 +1,4 @@
-"""Verdict on one record: structure, orders, limits of the data, and clarifying experiments."""
+"""Verdict on one record: structure, damping orders, limits of the data, clarifying experiments."""
 
 from __future__ import annotations
 
@@ -21,32 +21,39 @@ if TYPE_CHECKING:
     from analysis.models import Structure
 
 Status = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
+"""Status of a damping order."""
 
 BIC_DECISIVE: Final = 10.0
 """Difference of BIC from which the worse structure may be dismissed (Kass and Raftery, J. American
-Statistical Association 90 (1995) 773-795); below `BIC_TIE` the data do not distinguish the two."""
+Statistical Association 90 (1995) 773-795)."""
 
 BIC_TIE: Final = 6.0
+"""Difference of BIC below which the data do not distinguish two structures."""
 
 EXCLUDED: Final = (10.828, 13.816, 16.266, 18.467)
-"""Deviance above the freest structure's from which a simpler one is excluded, by the number of
-parameters that it lacks: chi-square's 0.1 %. A true one is excluded once in a thousand records."""
+"""Deviance above that of the freest structure from which a simpler one is excluded, by the number
+of missing parameters (1 to 4): the 0.1 % limit of chi-square. A true structure is excluded once in
+a thousand records."""
 
 NOT_DETERMINED: Final = "the record does not determine the order"
+"""Reason against an order whose profile is too wide or has several minima."""
 
-WITH_DRAG: Final = "air drag contributes to it, and its law is known to a few per cent only"
-"""Why external damping with drag is not a property of the beam: of two records
-of one rig, one had lambda four standard deviations off, with a drag that fell with the speed."""
+WITH_DRAG_REASON: Final = "air drag contributes to it, and its law is known to a few per cent only"
+"""Reason against external damping if the record shows air drag: of two records of one rig, one had
+lambda four standard deviations off, with a drag that fell with the speed."""
 
 
-# One order of the damping
+# Verdict on one damping order
 
-_MODES_FOR_AN_ORDER: Final = 2
-_MODES_FOR_ONE_DAMPING: Final = 3
-"""Number of modes that shows whether there is a second damping: two loss factors are explained by
-coefficient and order of one damping as well as by two dampings."""
+_MIN_MODES_FOR_AN_ORDER: Final = 2
+"""Number of visible modes from which an order can be determined."""
+
+_MIN_MODES_FOR_A_SINGLE_DAMPING: Final = 3
+"""Number of visible modes that show whether there is a second damping: two loss factors are
+explained by coefficient and order of one damping as well as by two dampings."""
 
 ANOTHER_DAMPING: Final = "from two modes it cannot be told whether there is another damping as well"
+"""Reason against the order of a single damping if the record shows two modes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,17 +65,18 @@ class OrderVerdict:
     order : str
         "alpha" (internal damping, of the material) or "lambda" (external, of the surroundings).
     status : str
-        "compatible": the 95 % interval holds 1; "fractional": the record excludes 1; "open": 1 is
-        doubtful but not excluded, or something else explains as much; "not identifiable": it could
-        be almost any value; "absent": such damping is insignificant, though three modes would show
-        it.
+        "compatible": the 95 % interval contains 1. "fractional": the record excludes 1. "open": 1
+        is doubtful but not excluded, or another effect explains the record as well. "not
+        identifiable": almost any value fits. "absent": the damping is insignificant, although three
+        modes would show it.
     value : float or None
-        Estimate with the order free, if it is identifiable.
+        Estimate with the order free. None if it is not identifiable or absent.
     interval : tuple of float or None
-        Its 95 % interval, by the likelihood ratio.
+        95 % interval of the order by the likelihood ratio. None as for `value`.
     reason : str or None
-        Reason why the number is not a property of the beam; None if it is one.
-    profile : Profile
+        Reason why the order is not a property of the beam. None if it is one.
+    profile : LikelihoodProfile
+        Deviance over the values of the order.
     """
 
     order: Order
@@ -82,11 +90,11 @@ class OrderVerdict:
 def order_verdict(
     candidate_set: CandidateSet,
     profile: LikelihoodProfile,
-    visible: tuple[int, ...],
+    visible_numbers: tuple[int, ...],
     *,
     doubt: str | None,
 ) -> OrderVerdict:
-    """Assess one order in the freest structure.
+    """Return the verdict on one damping order from its profile in the freest structure.
 
     Parameters
     ----------
@@ -94,74 +102,78 @@ def order_verdict(
         Candidates of the record.
     profile : LikelihoodProfile
         Profile of the order on the selected beam.
-    visible : tuple of int
+    visible_numbers : tuple of int
         Numbers of the visible modes.
     doubt : str or None
-        Reason against the structure; None if it is valid.
+        Reason against the structure. None if it is valid.
     """
-    status, reason = _status(candidate_set, profile, visible, doubt=doubt)
-    known = status not in ("not identifiable", "absent")
+    status, reason = _order_status(candidate_set, profile, visible_numbers, doubt=doubt)
+    is_reported = status not in ("not identifiable", "absent")
     return OrderVerdict(
         order=profile.order,
         status=status,
-        value=profile.estimate if known else None,
-        interval=profile.interval if known else None,
+        value=profile.estimate if is_reported else None,
+        interval=profile.interval if is_reported else None,
         reason=reason,
         profile=profile,
     )
 
 
-def not_reported_reason(candidate_set: CandidateSet, visible: tuple[int, ...]) -> str | None:
-    """Return why a record determines no order, whatever its likelihood; None if it may.
+def not_reported_reason(
+    candidate_set: CandidateSet, visible_numbers: tuple[int, ...]
+) -> str | None:
+    """Return why a record cannot determine any order, or None if it may.
 
     Parameters
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    visible : tuple of int
+    visible_numbers : tuple of int
         Numbers of the visible modes.
     """
-    return too_few_modes(candidate_set.freest.structure, len(visible))
+    return too_few_modes(candidate_set.freest.structure, len(visible_numbers))
 
 
-def too_few_modes(structure: Structure, modes: int) -> str | None:
-    """Return why so many modes determine no order, whatever the likelihood; None if they may.
+def too_few_modes(structure: Structure, mode_count: int) -> str | None:
+    """Return why a number of visible modes cannot determine an order, or None if it can.
 
     Parameters
     ----------
     structure : Structure
-        The freest that the data support.
-    modes : int
+        Freest structure that the data support.
+    mode_count : int
         Number of visible modes.
     """
-    # The loss at one frequency is all that one mode shows; what may narrow an order then is how
-    # exactly the beam is uniform.
-    if modes < _MODES_FOR_AN_ORDER:
+    # One mode shows the loss at one frequency only. Its order could follow only from the assumption
+    # that the beam is exactly uniform.
+    if mode_count < _MIN_MODES_FOR_AN_ORDER:
         return "a single mode determines the amount of damping, not its order"
-    if structure.internal != structure.external and modes < _MODES_FOR_ONE_DAMPING:
+    if structure.internal != structure.external and mode_count < _MIN_MODES_FOR_A_SINGLE_DAMPING:
         return ANOTHER_DAMPING
     return None
 
 
 def deviance_of_one(profile: LikelihoodProfile) -> float:
-    """Return the deviance of order 1 above the lowest; infinite beyond the end of the walk.
+    """Return the deviance of order 1 above the lowest, or infinity outside of the profile.
 
     Parameters
     ----------
-    profile : Profile
+    profile : LikelihoodProfile
+        Deviance over the values of the order.
     """
     return float(np.interp(1.0, profile.values, profile.deviance, left=np.inf, right=np.inf))
 
 
-def _status(
+def _order_status(
     candidate_set: CandidateSet,
     profile: LikelihoodProfile,
-    visible: tuple[int, ...],
+    visible_numbers: tuple[int, ...],
     *,
     doubt: str | None,
 ) -> tuple[Status, str | None]:
+    """Return the status of an order, and the reason against it or None."""
     freest, order = candidate_set.freest, profile.order
-    reason = not_reported_reason(candidate_set, visible)
+    reason = not_reported_reason(candidate_set, visible_numbers)
     if reason is not None:
         return "not identifiable", reason
     if not freest.structure.has(order):
@@ -171,7 +183,7 @@ def _status(
     if doubt is not None:
         return "open", doubt
     if order == "lambda" and candidate_set.drag is not None:
-        return "open", WITH_DRAG
+        return "open", WITH_DRAG_REASON
     if profile.admits_one:
         return "compatible", None
     return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
@@ -182,17 +194,18 @@ def _status(
 
 @dataclass(frozen=True, slots=True)
 class CandidateRow:
-    """Row of the table of candidates.
+    """Row of the table of candidate structures.
 
     Attributes
     ----------
     structure : str
-        "I" to "VII".
+        Name of the structure: "I" to "VII".
     parameters : int
+        Number of free parameters.
     cost : float
         Sum of squares of the whitened residual.
     delta_bic, delta_aic : float
-        Above the lowest of all.
+        BIC and AIC minus the lowest ones of all candidates.
     """
 
     structure: str
@@ -209,31 +222,35 @@ class Verdict:
     Attributes
     ----------
     name : str
-        The file.
+        Name of the file.
     structure : str
-        Structure of the lowest BIC: "I" to "VII".
+        Structure with the lowest BIC: "I" to "VII".
     rivals : tuple of str
-        Structures that the data do not distinguish from it.
+        Structures that the data do not distinguish from this structure.
     parameters : mapping of str to float
-        Parameters of the freest structure without a flag, as `RecordFit` names them.
+        Parameters of the freest structure without a flag, by the names of `RecordFit`.
     adequate : bool
-        Whether the residual of that structure is noise.
+        Whether the residual of the freest structure is noise.
     alpha, lambda_ : OrderVerdict
+        Verdicts on the orders of internal and external damping.
     visible_modes : tuple of int
-        Modes significantly above the noise.
+        Numbers of the modes significantly above the noise.
     findings : tuple of Finding
         Other effects in the record.
     table : tuple of CandidateRow
-        All candidates, the lowest BIC first.
+        All candidates, the one with the lowest BIC first.
     whiteness : Whiteness
+        Whiteness test of the residual.
     input_relation : InputRelation
+        Test of whether the residual still follows the angle.
     harmonics : tuple of Harmonic
+        Tests for the second and third harmonic of a sweep.
     sentences : tuple of str
-        The verdict in words, the most important first.
+        Sentences of the verdict, the most important first.
     experiments : tuple of str
         Experiments that would clarify the verdict.
     damping_with_amplitude : tuple of DampingAt
-        Damping in free vibration with air drag; else empty.
+        Damping in free vibration by amplitude, if the record shows air drag. Empty otherwise.
     """
 
     name: str
@@ -254,34 +271,35 @@ class Verdict:
     damping_with_amplitude: tuple[DampingAt, ...] = ()
 
     def as_json(self) -> dict[str, object]:
-        """Return the verdict as `json.dumps` accepts it; non-finite numbers become null."""
-        plain = _plain(dataclasses.asdict(self))
-        assert isinstance(plain, dict)
+        """Return the verdict as a JSON-ready dict, in which non-finite numbers are None."""
+        document = _json_ready(dataclasses.asdict(self))
+        assert isinstance(document, dict)
         for order in ("alpha", "lambda"):
-            profile = plain[order]["profile"]
+            profile = document[order]["profile"]
             profile["valleys"] = profile.pop("local_minima")  # the key of the document
-        return plain
+        return document
 
 
-def rivals(candidate_set: CandidateSet, within: float) -> tuple[Candidate, ...]:
-    """Return the candidates whose BIC is within a limit above that of the first.
+def rivals(candidate_set: CandidateSet, max_bic_difference: float) -> tuple[Candidate, ...]:
+    """Return the candidates whose BIC exceeds the lowest one by less than a limit.
 
     Parameters
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    within : float
-        Largest difference of BIC.
+    max_bic_difference : float
+        Limit of the difference of BIC.
     """
-    limit = candidate_set.best.bic + within
+    limit = candidate_set.best.bic + max_bic_difference
     return tuple(c for c in candidate_set.candidates[1:] if c.bic < limit)
 
 
-def _plain(value: object) -> object:
+def _json_ready(value: object) -> object:
+    """Convert a value for JSON: tuples to lists, non-finite numbers to None."""
     if isinstance(value, dict):
-        return {str(key).rstrip("_"): _plain(item) for key, item in value.items()}
+        return {str(key).rstrip("_"): _json_ready(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_json_ready(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -1,7 +1,7 @@
 """Transfer functions from motor angle to coupling torque that are to be realised.
 
-A beam of the exact model and a modal model are described alike: the response, the poles of its
-modes, the channel of the torque.
+A beam of the exact model and a modal model have the same description: the response, the poles of
+the modes, and the channel of the torque.
 """
 
 from __future__ import annotations
@@ -24,35 +24,44 @@ if TYPE_CHECKING:
     from analysis.identify import ModalModel, Plant
 
 Response = Callable[[NDArray[np.complex128]], NDArray[np.complex128]]
+"""Function from s in rad/s to a frequency response."""
 
 BEAM_BAND_HZ: Final = (0.05, 100.0)
-"""Band in which a beam is realised."""
+"""Band in which a beam is realised, in hertz."""
 
-_BEYOND: Final = 4
-"""Modes beyond the band that may be realised with those in it."""
-_MOST_MODES: Final = 40
-_OSCILLATING: Final = 0.8
-"""Damping ratio above which a mode beyond the band is left to real poles."""
-_RESIDUAL_FREQUENCIES: Final = (1.5, 2.2, 3.3, 5.0)
-_RESIDUAL_DAMPING: Final = 0.5
-_BUTTERWORTH: Final = 2**0.5
+_MODES_BEYOND_BAND: Final = 4
+"""Number of modes beyond the band that may be realised in addition to those within it."""
+_MAX_BEAM_MODES: Final = 40
+"""Largest number of modes of an exported beam."""
+
+_MAX_OSCILLATING_DAMPING_RATIO: Final = 0.8
+"""Damping ratio from which a mode beyond the band is represented by real poles."""
+_RESIDUAL_FREQUENCY_RATIOS: Final = (1.5, 2.2, 3.3, 5.0)
+"""Frequencies of the pole pairs that represent the background of a modal model, relative to the end
+of the band."""
+
+_RESIDUAL_DAMPING_RATIO: Final = 0.5
+"""Damping ratio of the pole pairs that represent the background of a modal model."""
+
+_BUTTERWORTH_COEFFICIENT: Final = 2**0.5
+"""Coefficient of s in the denominator of a second-order Butterworth filter."""
 
 
 class LinearModelError(UserError, ValueError):
-    """The model cannot be realised; the message names the cause and the remedy."""
+    """The model cannot be exported. The message names the cause and the remedy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dynamics:
-    """Response from motor angle to coupling torque, with its poles, to be realised.
+    """Response from motor angle to coupling torque, with the poles for its realisation.
 
     Attributes
     ----------
     response : callable
-        From s (rad/s, not 0) to N·m/rad, without filters and delay of the torque's channel.
+        Function from s (rad/s, not 0) to N·m/rad, without filters and delay of the torque channel.
     pairs : ndarray of complex
-        Upper poles of conjugate pairs that a realisation may have, in the order in which they
-        are added.
+        Upper poles of the conjugate pairs that a realisation may have, in the order in which they
+        are added, in rad/s.
     names : tuple of str
         Name of each pair.
     in_band : int
@@ -60,15 +69,16 @@ class Dynamics:
     band_hz : tuple of float
         Band in which the realisation has to be accurate.
     real_poles : tuple of float
-        Poles of over-damped modes within it, which every realisation has.
+        Poles of over-damped modes within the band in rad/s, which every realisation has.
     tool_inertia_kg_m2 : float
         Inertia between sensor and beam, part of the response.
     motor_inertia_kg_m2 : float or None
-        Inertia of a motor that the realisation must not make unstable; None: of any.
+        Inertia of a motor that the realisation must not make unstable. None if this is not
+        required.
     filters : tuple of (float, int)
-        Time constant (s) and order of low-pass filters in the torque's channel.
+        Time constant (s) and order of each low-pass filter in the torque channel.
     delay_s : float
-        By how much the torque is older than the angle.
+        Delay of the torque relative to the angle.
     """
 
     response: Response
@@ -83,53 +93,58 @@ class Dynamics:
     delay_s: float = 0.0
 
     def filtered(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the response with the filters, still without the delay.
+        """Return the response with the filters of the torque channel, without the delay.
 
         Parameters
         ----------
         s : ndarray of complex
-            In rad/s.
+            Points in rad/s.
         """
-        through = self.response(s)
+        filtered_response = self.response(s)
         for constant_s, order in self.filters:
             x = constant_s * s
-            through = through / (1 + x if order == 1 else 1 + _BUTTERWORTH * x + x * x)
-        return through
+            filtered_response = filtered_response / (
+                1 + x if order == 1 else 1 + _BUTTERWORTH_COEFFICIENT * x + x * x
+            )
+        return filtered_response
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Uncertain:
-    """Dynamics as a function of parameters with known values and covariance.
+class UncertainDynamics:
+    """Dynamics as a function of parameters with estimated values and covariance.
 
     Attributes
     ----------
-    at : callable
-        From parameters, by the names below, to dynamics.
+    dynamics_of : callable
+        Function from parameters by name to dynamics.
     names : tuple of str
-        Names of the uncertain parameters; one with ``ln_`` is a natural logarithm.
+        Names of the uncertain parameters. A name with ``ln_`` denotes a natural logarithm.
     values : ndarray, shape (k,)
+        Estimates of the parameters.
     covariance : ndarray, shape (k, k)
-    allowed : callable
-        Whether parameters are possible.
+        Covariance of the estimates.
+    is_possible : callable
+        Function that returns whether parameters are physically possible.
     """
 
-    at: Callable[[Mapping[str, float]], Dynamics]
+    dynamics_of: Callable[[Mapping[str, float]], Dynamics]
     names: tuple[str, ...] = ()
     values: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
-    allowed: Callable[[Mapping[str, float]], bool] = lambda _parameters: True
+    is_possible: Callable[[Mapping[str, float]], bool] = lambda _parameters: True
 
     @property
     def nominal(self) -> Dynamics:
-        """Dynamics at the values."""
-        return self.at(self.named(self.values))
+        """Dynamics for the estimated values of the parameters."""
+        return self.dynamics_of(self.by_name(self.values))
 
-    def named(self, values: NDArray[np.float64]) -> dict[str, float]:
-        """Return values by name, shape (k,).
+    def by_name(self, values: NDArray[np.float64]) -> dict[str, float]:
+        """Return parameter values as a dict by name.
 
         Parameters
         ----------
         values : ndarray, shape (k,)
+            Values in the order of `names`.
         """
         return dict(zip(self.names, values.tolist(), strict=True))
 
@@ -138,16 +153,17 @@ class Uncertain:
 
 
 def beam_dynamics(plant: Plant) -> Dynamics:
-    """Describe a beam with its ends and channels.
+    """Return the dynamics of a beam with its ends and channels.
 
     Parameters
     ----------
     plant : Plant
+        Rig and beam.
 
     Raises
     ------
     LinearModelError
-        If its modes are too many, or their poles are not found.
+        If the beam has too many modes in the band, or their poles are not found.
     """
     pairs, numbers, real_poles = _beam_poles(plant)
     hz = np.abs(pairs) / (2 * np.pi)
@@ -175,18 +191,21 @@ def beam_dynamics(plant: Plant) -> Dynamics:
 def _beam_poles(
     plant: Plant,
 ) -> tuple[NDArray[np.complex128], NDArray[np.intp], tuple[float, ...]]:
-    """Return upper poles up to some modes beyond the band, their modes, and real poles in it."""
+    """Return the upper poles of the modes of a beam, their mode numbers, and the real poles.
+
+    The upper poles include a few modes beyond the band. The real poles are those within the band.
+    """
     if plant.tip_mass_kg and any(plant.stiffness_offsets):
         raise LinearModelError(
             "The model has a tip mass and modes of their own stiffness, which together are not "
             "defined; export the modal model, without --beam."
         )
-    reach = (2 * np.pi * BEAM_BAND_HZ[1]) ** 2 * plant.beam.density_over_stiffness
-    in_band = int(reach**0.25 * plant.beam.length_m / np.pi) + 1
-    if in_band > _MOST_MODES:
+    ratio_at_band_end = (2 * np.pi * BEAM_BAND_HZ[1]) ** 2 * plant.beam.density_over_stiffness
+    in_band = int(ratio_at_band_end**0.25 * plant.beam.length_m / np.pi) + 1
+    if in_band > _MAX_BEAM_MODES:
         raise LinearModelError(
             f"{plant.beam} has some {in_band} modes below {BEAM_BAND_HZ[1]:g} Hz, and a model of "
-            f"at most {_MOST_MODES} is exported; check length and stiffness."
+            f"at most {_MAX_BEAM_MODES} is exported; check length and stiffness."
         )
     loaded = LoadedBeam(
         plant.beam,
@@ -195,20 +214,26 @@ def _beam_poles(
         plant.root_compliance_rad_per_nm,
         plant.stiffness_offsets,
     )
-    poles = loaded.poles(clamped_free_eigenvalues(in_band + _BEYOND + 1))
-    lost = np.flatnonzero(np.isnan(poles[:, 0]))
-    poles = poles[: lost[0] if lost.size else None]
-    upper, edge = poles[:, 0], 2 * np.pi * BEAM_BAND_HZ[1]
-    beyond = np.flatnonzero(np.abs(upper) >= edge)
-    if lost.size and not beyond.size:
+    poles = loaded.poles(clamped_free_eigenvalues(in_band + _MODES_BEYOND_BAND + 1))
+    missing = np.flatnonzero(np.isnan(poles[:, 0]))
+    poles = poles[: missing[0] if missing.size else None]
+    upper_poles, band_end_rad_s = poles[:, 0], 2 * np.pi * BEAM_BAND_HZ[1]
+    beyond_band = np.flatnonzero(np.abs(upper_poles) >= band_end_rad_s)
+    if missing.size and not beyond_band.size:
         raise LinearModelError(f"The poles of {loaded} were not found; check its parameters.")
-    oscillates = upper.imag > 0
-    light = (np.abs(upper) < edge) | (-upper.real < _OSCILLATING * np.abs(upper))
-    if beyond.size:
-        light[beyond[0] + _BEYOND :] = False
-    numbers = np.flatnonzero(oscillates & light)
-    real = poles[~oscillates].real.ravel()
-    return upper[numbers], numbers + 1, tuple(real[np.abs(real) < edge].tolist())
+    oscillates = upper_poles.imag > 0
+    is_realised = (np.abs(upper_poles) < band_end_rad_s) | (
+        -upper_poles.real < _MAX_OSCILLATING_DAMPING_RATIO * np.abs(upper_poles)
+    )
+    if beyond_band.size:
+        is_realised[beyond_band[0] + _MODES_BEYOND_BAND :] = False
+    numbers = np.flatnonzero(oscillates & is_realised)
+    real_poles = poles[~oscillates].real.ravel()
+    return (
+        upper_poles[numbers],
+        numbers + 1,
+        tuple(real_poles[np.abs(real_poles) < band_end_rad_s].tolist()),
+    )
 
 
 # Modal model
@@ -217,30 +242,32 @@ def _beam_poles(
 def modal_dynamics(
     modal: ModalModel, band_hz: tuple[float, float], numbers: Sequence[int]
 ) -> Dynamics:
-    """Describe a modal model within the band of its record.
+    """Return the dynamics of a modal model within the band of its record.
 
-    The background is a polynomial in s and thus no state space: the two powers beyond the
-    acceleration are realised by well-damped pairs of poles above the band.
+    The background is a polynomial in s, which no state space realises: the two powers beyond the
+    acceleration are approximated by well-damped pairs of poles above the band.
 
     Parameters
     ----------
     modal : ModalModel
+        Fitted modal model.
     band_hz : tuple of float
+        First and last frequency of the band.
     numbers : sequence of int
-        Number of each mode; 0 for a resonance of something else.
+        Mode number of each pole, 0 for a resonance that is not of the beam.
     """
     modes = np.array(modal.poles_rad_s, dtype=np.complex128)
-    angle = complex(-_RESIDUAL_DAMPING, math.sqrt(1 - _RESIDUAL_DAMPING**2))
-    residual = 2 * np.pi * band_hz[1] * angle * np.array(_RESIDUAL_FREQUENCIES)
+    unit_pole = complex(-_RESIDUAL_DAMPING_RATIO, math.sqrt(1 - _RESIDUAL_DAMPING_RATIO**2))
+    residual_poles = 2 * np.pi * band_hz[1] * unit_pole * np.array(_RESIDUAL_FREQUENCY_RATIOS)
     return Dynamics(
         response=modal.response,
-        pairs=np.concatenate([modes, residual]),
+        pairs=np.concatenate([modes, residual_poles]),
         names=(
             *(
                 f"mode_{number}" if number else f"resonance_{index}"
                 for index, number in enumerate(numbers, start=1)
             ),
-            *(f"residual_{number}" for number in range(1, residual.size + 1)),
+            *(f"residual_{number}" for number in range(1, residual_poles.size + 1)),
         ),
         in_band=modes.size,
         band_hz=band_hz,

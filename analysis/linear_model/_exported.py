@@ -1,4 +1,4 @@
-"""An identified model as matrices for other programs, with its error and its uncertainty."""
+"""Identified model as state-space matrices for other programs, with its error and uncertainty."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from analysis.linear_model._dynamics import LinearModelError
-from analysis.linear_model._identified import PASSED
-from analysis.linear_model._order import realised
+from analysis.linear_model._identified import PASSED_STATUS
+from analysis.linear_model._order import realise_response
 from analysis.linear_model._pole_fit import PoleFit, angle_response, imaginary_axis
 
 if TYPE_CHECKING:
@@ -17,37 +17,43 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.linear_model._dynamics import Dynamics, Uncertain
+    from analysis.linear_model._dynamics import Dynamics, UncertainDynamics
     from analysis.linear_model._identified import IdentifiedModel
     from analysis.linear_model._pole_fit import Input, PoleStructure
     from analysis.linear_model._state_space import StateSpace
 
 SAMPLES: Final = 50
-"""Samples of the posterior by default."""
+"""Default number of samples of the posterior distribution of the parameters."""
 
-_SEED: Final = 0
-_TRIES_PER_SAMPLE: Final = 10
+_RANDOM_SEED: Final = 0
+"""Seed of the random samples, so that an export is reproducible."""
+
+_MAX_DRAWS_PER_SAMPLE: Final = 10
+"""Largest number of random draws for each accepted sample."""
+
 _TABLE_POINTS: Final = 400
+"""Number of frequencies of the exported response, besides those of poles and zeros."""
+
 _STEP_STD: Final = 1e-3
-"""Step of the derivatives, in standard deviations."""
+"""Step of the numerical derivatives, in standard deviations of the parameters."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModelOptions:
-    """How a model is exported.
+    """Options of the export of a linear model.
 
     Attributes
     ----------
     beam : bool
-        Export the beam's model even if a uniform beam does not predict the modes.
+        Whether to export the beam's model even if a uniform beam does not predict the modes.
     given : str
         Input: "acceleration", or "angle" for angle, velocity and acceleration.
     order : int or None
-        Number of states; None: as few as the accuracy needs.
+        Number of states. None for as few as the accuracy needs.
     rate_hz : float or None
-        Rate at which the input is held; None: continuous time.
+        Sampling rate of the model, whose input is held between samples. None for continuous time.
     samples : int
-        Number of samples of the posterior.
+        Number of samples of the posterior distribution.
     """
 
     beam: bool = False
@@ -59,12 +65,14 @@ class ModelOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosteriorSamples:
-    """Samples of the parameters, and the state space of each with the same states.
+    """Random samples of the parameters, and the state space of each sample.
 
     Attributes
     ----------
     parameters : ndarray, shape (samples, k)
+        Sampled parameters.
     systems : tuple of StateSpace
+        State space of each sample. All have the same states.
     """
 
     parameters: NDArray[np.float64]
@@ -73,23 +81,24 @@ class PosteriorSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Accuracy:
-    """Error of a realisation and standard deviation of the response over a band.
+    """Error of a realisation, and standard deviation of the response, over a band.
 
-    Both are relative to the exact response, and of continuous time.
+    Both are relative to the exact response in continuous time.
 
     Attributes
     ----------
     band_hz : tuple of float
         Band for which the model is made.
     frequency_hz : ndarray, shape (m,)
-        Evenly spaced in the logarithm, with the poles and zeros of the response.
+        Logarithmically spaced frequencies, and those of the poles and zeros of the response.
     response : ndarray of complex, shape (m,)
         Exact response with filters and delay, coupling torque over motor angle in N·m/rad.
     error : ndarray, shape (m,)
+        Relative error of the realisation.
     std : ndarray, shape (m,)
-        NaN if no covariance is stated.
+        Relative standard deviation of the response. NaN if no covariance is stated.
     error_max : float
-        Largest on a grid that is several times denser than `frequency_hz`.
+        Largest relative error at frequencies several times denser than `frequency_hz`.
     """
 
     band_hz: tuple[float, float]
@@ -101,42 +110,47 @@ class Accuracy:
 
     @property
     def error_median(self) -> float:
-        """Median of the error."""
+        """Median relative error of the realisation over the frequencies."""
         return float(np.median(self.error))
 
     @property
     def std_max(self) -> float:
-        """Largest standard deviation, NaN if it is not known."""
+        """Largest relative standard deviation of the response, NaN if it is not known."""
         return float(self.std.max())
 
     @property
     def std_median(self) -> float:
-        """Median of the standard deviation, NaN if it is not known."""
+        """Median of the relative standard deviation of the response, NaN if it is not known."""
         return float(np.median(self.std))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearModel:
-    """An exported model.
+    """Exported linear model, with its source, error and uncertainty.
 
     Attributes
     ----------
     identified : IdentifiedModel
+        Models of the analysis.
     kind : str
         Realised model: "beam" or "modal".
-    uncertain : Uncertain
-        Its parameters.
+    uncertain : UncertainDynamics
+        Dynamics of this model as a function of its parameters.
     options : ModelOptions
+        Options of the export.
     system : StateSpace
+        State-space matrices.
     structure : PoleStructure
-        Its states.
+        Poles and integrators of `system`.
     accuracy : Accuracy
+        Error of the realisation, and uncertainty of the response.
     posterior : PosteriorSamples
+        Random samples of the parameters with their state spaces.
     """
 
     identified: IdentifiedModel
     kind: Literal["beam", "modal"]
-    uncertain: Uncertain
+    uncertain: UncertainDynamics
     options: ModelOptions
     system: StateSpace
     structure: PoleStructure
@@ -145,22 +159,29 @@ class LinearModel:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return remarks for users of the model."""
+        """Return remarks for users of the model: doubts, and effects that it leaves out."""
         if self.kind == "modal":
             return self.identified.modal_notes
         status, _ = self.identified.gate
-        doubt = "" if status == PASSED else f"whether a uniform beam predicts the modes: {status}"
+        doubt = (
+            ""
+            if status == PASSED_STATUS
+            else f"whether a uniform beam predicts the modes: {status}"
+        )
         return (*filter(None, [doubt]), *self.identified.beam_notes)
 
     def variables(self) -> dict[str, Any]:
-        """Return the content of a file: strings, numbers, lists of strings and arrays by name."""
+        """Return the variables of an exported file, by name.
+
+        Values are strings, numbers, lists of strings or arrays.
+        """
         system, accuracy, posterior = self.system, self.accuracy, self.posterior
         modal = self.identified.modal
-        of_modal = self.identified.modal_covariance()
-        modal_names, modal_covariance = of_modal or ((), np.zeros((0, 0)))
+        modal_names_and_covariance = self.identified.modal_covariance()
+        modal_names, modal_covariance = modal_names_and_covariance or ((), np.zeros((0, 0)))
         status, p_value = self.identified.gate
         n, (p, m) = system.order, system.d.shape
-        stacked = {
+        stacked_matrices = {
             name: np.array([getattr(each, name.lower()) for each in posterior.systems]).reshape(
                 -1, *shape
             )
@@ -200,7 +221,7 @@ class LinearModel:
             "parameter_values": self.uncertain.values,
             "parameter_covariance": self.uncertain.covariance,
             "parameter_samples": posterior.parameters,
-            **{f"{name}_samples": values for name, values in stacked.items()},
+            **{f"{name}_samples": values for name, values in stacked_matrices.items()},
             "delay_samples_s": np.array([each.delay_s for each in posterior.systems]),
             "poles_rad_s": np.array([] if modal is None else modal.poles_rad_s, complex),
             "residues_nm_per_s": np.array([] if modal is None else modal.residues, complex),
@@ -215,44 +236,47 @@ def linear_model(
     options: ModelOptions,
     on_step: Callable[[str], None] = lambda _step: None,
 ) -> LinearModel:
-    """Realise the beam where it predicts the modes or is requested, else the modal model.
+    """Realise an identified model: the beam if it predicts the modes, else the modal model.
 
     Parameters
     ----------
     identified : IdentifiedModel
+        Models of the analysis.
     options : ModelOptions
+        Options of the export.
     on_step : callable, optional
-        Called with a few words before each step.
+        Function that is called with the name of each step before it begins.
 
     Raises
     ------
     LinearModelError, rigd.identified_beam.IdentifiedBeamError
-        If the model cannot be realised, or samples are requested of one without covariance.
+        If the model cannot be realised, or samples are requested without a stated covariance.
     """
-    as_beam = options.beam or identified.gate[0] == PASSED
-    uncertain = identified.beam() if as_beam else identified.modes()
+    export_beam = options.beam or identified.gate[0] == PASSED_STATUS
+    uncertain = identified.beam() if export_beam else identified.modes()
     if options.samples and not uncertain.names:
-        key = "covariance" if as_beam else "modal_model.covariance"
+        key = "covariance" if export_beam else "modal_model.covariance"
         raise LinearModelError(
-            f"{identified.where} has no {key}, as of an older version or of a campaign, so no "
+            f"{identified.headline_name} has no {key}, as of an older version or of a campaign, "
+            "so no "
             "samples can be drawn; analyze a session again, or add --samples 0."
         )
     on_step("order")
     nominal = uncertain.nominal
     fit = PoleFit(nominal)
-    structure, system = realised(fit, options.order, options.given)
+    structure, system = realise_response(fit, options.order, options.given)
     on_step("accuracy")
     accuracy = _accuracy(uncertain, fit, system)
     on_step("samples")
-    posterior = _posterior(uncertain, fit, structure, options)
+    posterior = _draw_posterior(uncertain, fit, structure, options)
     if options.rate_hz is not None:
         rate_hz = options.rate_hz
-        system = system.held(rate_hz)
-        held = tuple(each.held(rate_hz) for each in posterior.systems)
-        posterior = replace(posterior, systems=held)
+        system = system.sampled(rate_hz)
+        sampled_systems = tuple(each.sampled(rate_hz) for each in posterior.systems)
+        posterior = replace(posterior, systems=sampled_systems)
     return LinearModel(
         identified,
-        "beam" if as_beam else "modal",
+        "beam" if export_beam else "modal",
         uncertain,
         options,
         system,
@@ -262,82 +286,95 @@ def linear_model(
     )
 
 
-def _accuracy(uncertain: Uncertain, fit: PoleFit, system: StateSpace) -> Accuracy:
-    low, high = fit.dynamics.band_hz
-    marks = np.concatenate([fit.dynamics.pairs, fit.zeros]).imag / (2 * np.pi)
-    inner = marks[(marks > low) & (marks < high)]
-    frequency_hz = np.sort(np.concatenate([np.geomspace(low, high, _TABLE_POINTS), inner]))
+def _accuracy(uncertain: UncertainDynamics, fit: PoleFit, system: StateSpace) -> Accuracy:
+    """Return error and uncertainty of a realisation over its band."""
+    low_hz, high_hz = fit.dynamics.band_hz
+    pole_and_zero_hz = np.concatenate([fit.dynamics.pairs, fit.zeros]).imag / (2 * np.pi)
+    inner_hz = pole_and_zero_hz[(pole_and_zero_hz > low_hz) & (pole_and_zero_hz < high_hz)]
+    frequency_hz = np.sort(np.concatenate([np.geomspace(low_hz, high_hz, _TABLE_POINTS), inner_hz]))
     s = imaginary_axis(frequency_hz)
-    exact = fit.dynamics.filtered(s)
+    exact_response = fit.dynamics.filtered(s)
     return Accuracy(
         fit.dynamics.band_hz,
         frequency_hz,
-        exact * np.exp(-fit.dynamics.delay_s * s),
-        np.abs(angle_response(system, s) / exact - 1),
+        exact_response * np.exp(-fit.dynamics.delay_s * s),
+        np.abs(angle_response(system, s) / exact_response - 1),
         _relative_std(uncertain, s),
         float(fit.error(system).max()),
     )
 
 
-def _relative_std(uncertain: Uncertain, s: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return the relative standard deviation of the response with its delay (delta method)."""
+def _relative_std(uncertain: UncertainDynamics, s: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Return the relative standard deviation of the response with delay (delta method)."""
     if not uncertain.names:
         return np.full(s.size, np.nan)
 
     def response(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        dynamics = uncertain.at(uncertain.named(values))
+        """Return the exact response with filters and delay for given parameters."""
+        dynamics = uncertain.dynamics_of(uncertain.by_name(values))
         return dynamics.filtered(s) * np.exp(-dynamics.delay_s * s)
 
     variances, directions = np.linalg.eigh(uncertain.covariance)
-    total = np.zeros(s.size)
+    total_variance = np.zeros(s.size)
     for variance, direction in zip(variances, directions.T, strict=True):
         if variance > 0:
-            change = np.sqrt(variance) * _STEP_STD * direction
-            above, below = response(uncertain.values + change), response(uncertain.values - change)
-            total += np.abs((above - below) / (2 * _STEP_STD)) ** 2
-    std: NDArray[np.float64] = np.sqrt(total) / np.abs(response(uncertain.values))
+            value_step = np.sqrt(variance) * _STEP_STD * direction
+            above, below = (
+                response(uncertain.values + value_step),
+                response(uncertain.values - value_step),
+            )
+            total_variance += np.abs((above - below) / (2 * _STEP_STD)) ** 2
+    std: NDArray[np.float64] = np.sqrt(total_variance) / np.abs(response(uncertain.values))
     return std
 
 
-def _posterior(
-    uncertain: Uncertain, fit: PoleFit, structure: PoleStructure, options: ModelOptions
+def _draw_posterior(
+    uncertain: UncertainDynamics, fit: PoleFit, structure: PoleStructure, options: ModelOptions
 ) -> PosteriorSamples:
-    """Draw parameters from a normal distribution, and realise each with the same states."""
+    """Draw parameters from a normal distribution, and realise each sample with the same states."""
     count = options.samples
-    drawn: list[NDArray[np.float64]] = []
+    accepted_values: list[NDArray[np.float64]] = []
     systems: list[StateSpace] = []
-    generator = np.random.default_rng(_SEED)
-    for _ in range(count * _TRIES_PER_SAMPLE):
-        if len(drawn) == count:
+    generator = np.random.default_rng(_RANDOM_SEED)
+    for _ in range(count * _MAX_DRAWS_PER_SAMPLE):
+        if len(accepted_values) == count:
             break
         values = generator.multivariate_normal(
             uncertain.values, uncertain.covariance, method="eigh", check_valid="ignore"
         )
-        dynamics = _sampled(uncertain, values, fit.dynamics, structure)
+        dynamics = _dynamics_of_sample(uncertain, values, fit.dynamics, structure)
         if dynamics is None:
             continue
-        sampled = PoleFit(dynamics, near=fit)
-        coefficients, _ = sampled.solve(structure)
-        if sampled.stable_on_motor(structure, coefficients):
-            drawn.append(values)
-            systems.append(sampled.system(structure, coefficients, options.given))
-    if len(drawn) < count:
+        sampled_fit = PoleFit(dynamics, near=fit)
+        coefficients, _ = sampled_fit.solve(structure)
+        if sampled_fit.is_stable_on_motor(structure, coefficients):
+            accepted_values.append(values)
+            systems.append(sampled_fit.system(structure, coefficients, options.given))
+    if len(accepted_values) < count:
         raise LinearModelError(
-            f"Only {len(drawn)} of {count} samples of the posterior have the states of the model: "
-            "its parameters are too uncertain; record more, or add --samples 0."
+            f"Only {len(accepted_values)} of {count} samples of the posterior have the states of "
+            "the model: its parameters are too uncertain; record more, or add --samples 0."
         )
-    return PosteriorSamples(np.array(drawn).reshape(count, uncertain.values.size), tuple(systems))
+    return PosteriorSamples(
+        np.array(accepted_values).reshape(count, uncertain.values.size), tuple(systems)
+    )
 
 
-def _sampled(
-    uncertain: Uncertain, values: NDArray[np.float64], nominal: Dynamics, structure: PoleStructure
+def _dynamics_of_sample(
+    uncertain: UncertainDynamics,
+    values: NDArray[np.float64],
+    nominal: Dynamics,
+    structure: PoleStructure,
 ) -> Dynamics | None:
-    """Return the dynamics of a sample; None if it is impossible or has not the same states."""
-    parameters = uncertain.named(values)
-    if not uncertain.allowed(parameters):
+    """Return the dynamics of sampled parameters.
+
+    Return None if they are impossible or need other states.
+    """
+    parameters = uncertain.by_name(values)
+    if not uncertain.is_possible(parameters):
         return None
     try:
-        dynamics = uncertain.at(parameters)
+        dynamics = uncertain.dynamics_of(parameters)
     except LinearModelError:
         return None
     same_modes = dynamics.names[: structure.pairs] == nominal.names[: structure.pairs] and len(

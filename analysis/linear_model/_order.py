@@ -1,4 +1,4 @@
-"""Choice of the states of a realisation: the fewest for an accuracy, or the best of a number."""
+"""Choice of the states of a realisation: the fewest for an accuracy, or a given number."""
 
 from __future__ import annotations
 
@@ -20,55 +20,77 @@ if TYPE_CHECKING:
     from analysis.linear_model._state_space import StateSpace
 
 MAX_RELATIVE_ERROR: Final = 1e-3
-"""Accuracy over the band at which `auto` stops."""
+"""Relative error over the band at which the number of states suffices (`--order auto`)."""
 
-_LADDERS_RAD_S: Final = ((0.1, 1e3), (0.3, 3e3), (0.03, 1e4), (0.03, 3e2), (30.0, 1e4))
-"""First and last of the real poles, which are spaced evenly in the logarithm."""
-_MOST_REAL: Final = 12
-_MOST_INTEGRATORS: Final = 2
+_REAL_POLE_RANGES_RAD_S: Final = ((0.1, 1e3), (0.3, 3e3), (0.03, 1e4), (0.03, 3e2), (30.0, 1e4))
+"""First and last of the real poles, which are logarithmically spaced, in rad/s."""
+_MAX_REAL_POLES: Final = 12
+"""Largest number of added real poles."""
+
+_MAX_INTEGRATORS: Final = 2
+"""Largest number of integrals of the acceleration: velocity and angle."""
 
 
-def realised(fit: PoleFit, order: int | None, given: Input) -> tuple[PoleStructure, StateSpace]:
-    """Realise a response with a number of states.
+def realise_response(
+    fit: PoleFit, order: int | None, input_kind: Input
+) -> tuple[PoleStructure, StateSpace]:
+    """Realise a response by a state space with a given number of states, or the fewest.
 
     Parameters
     ----------
     fit : PoleFit
+        Fit of the response.
     order : int or None
-        Number of states, those of filters included; None: as few as suffice for an error of
+        Number of states, including those of filters. None for as few as suffice for an error of
         `MAX_RELATIVE_ERROR`.
-    given : str
-        Input.
+    input_kind : str
+        Input: "acceleration", or "angle" for angle, velocity and acceleration.
 
     Raises
     ------
     LinearModelError
-        If no number suffices, or a realisation has not as many states or is not stable.
+        If no number of states suffices, or no stable realisation has the given number.
     """
     dynamics = fit.dynamics
     if order is not None:
-        fixed = len(dynamics.real_poles) + sum(each for _, each in dynamics.filters)
-        most = fixed + 2 * len(dynamics.pairs) + _MOST_REAL
-        every = dict.fromkeys(range(len(dynamics.pairs) + 1), 0)
-        best = _best(fit, order - fixed, given, every, np.inf)
-        if best is not None:
-            return best
-        raise LinearModelError(
-            f"A stable model with {order} states was not found: the model may have {fixed} to "
-            f"{most} states, 2 for each of the {dynamics.in_band} modes in its band; state another "
-            "number, or --order auto."
+        fixed_states = len(dynamics.real_poles) + sum(each for _, each in dynamics.filters)
+        most_states = fixed_states + 2 * len(dynamics.pairs) + _MAX_REAL_POLES
+        no_real_poles = dict.fromkeys(range(len(dynamics.pairs) + 1), 0)
+        realisation = _best_realisation(
+            fit, order - fixed_states, input_kind, no_real_poles, np.inf
         )
-    least = {
-        pairs: bisect_left(range(_MOST_REAL + 1), True, key=partial(_suffice, fit, pairs))
+        if realisation is not None:
+            return realisation
+        raise LinearModelError(
+            f"A stable model with {order} states was not found: the model may have "
+            f"{fixed_states} to {most_states} states, 2 for each of the {dynamics.in_band} modes "
+            "in its band; state another number, or --order auto."
+        )
+    least_real_poles = {
+        pairs: bisect_left(
+            range(_MAX_REAL_POLES + 1), True, key=partial(_real_poles_suffice, fit, pairs)
+        )
         for pairs in range(dynamics.in_band, len(dynamics.pairs) + 1)
     }
-    least = {pairs: real for pairs, real in least.items() if real <= _MOST_REAL}
-    first = min((2 * pairs + real for pairs, real in least.items()), default=0)
-    last = max((2 * pairs for pairs in least), default=-1) + _MOST_REAL + _MOST_INTEGRATORS
-    for states in range(first, last + 1):
-        best = _best(fit, states, given, least, MAX_RELATIVE_ERROR)
-        if best is not None:
-            return best
+    least_real_poles = {
+        pairs: real_poles
+        for pairs, real_poles in least_real_poles.items()
+        if real_poles <= _MAX_REAL_POLES
+    }
+    first_states = min(
+        (2 * pairs + real_poles for pairs, real_poles in least_real_poles.items()), default=0
+    )
+    last_states = (
+        max((2 * pairs for pairs in least_real_poles), default=-1)
+        + _MAX_REAL_POLES
+        + _MAX_INTEGRATORS
+    )
+    for states in range(first_states, last_states + 1):
+        realisation = _best_realisation(
+            fit, states, input_kind, least_real_poles, MAX_RELATIVE_ERROR
+        )
+        if realisation is not None:
+            return realisation
     raise LinearModelError(
         f"The model was not realised with a relative error of {MAX_RELATIVE_ERROR:g} from "
         f"{dynamics.band_hz[0]:g} to {dynamics.band_hz[1]:g} Hz; state a number of states "
@@ -76,49 +98,64 @@ def realised(fit: PoleFit, order: int | None, given: Input) -> tuple[PoleStructu
     )
 
 
-def _suffice(fit: PoleFit, pairs: int, real: int) -> bool:
-    """Return whether a number of real poles suffices, with both integrators."""
-    ladders = _ladders(pairs, real, _MOST_INTEGRATORS)
-    return any(fit.solve(structure)[1] <= MAX_RELATIVE_ERROR for structure in ladders)
+def _real_poles_suffice(fit: PoleFit, pairs: int, real_poles: int) -> bool:
+    """Return whether a number of real poles suffices for the accuracy, with both integrators."""
+    structures = _structures_with_real_poles(pairs, real_poles, _MAX_INTEGRATORS)
+    return any(fit.solve(structure)[1] <= MAX_RELATIVE_ERROR for structure in structures)
 
 
-def _structures(pairs: int, states: int, given: Input) -> Iterator[PoleStructure]:
-    """Return the structures of a number of pairs and of states beyond those of all structures."""
-    if given == "angle":  # which has the velocity and the acceleration as inputs
-        yield from _ladders(pairs, states - 2 * pairs, _MOST_INTEGRATORS)
+def _structures_with_states(pairs: int, states: int, input_kind: Input) -> Iterator[PoleStructure]:
+    """Yield the structures with a number of pairs and a total number of states.
+
+    `states` does not count the states that all structures have.
+    """
+    if input_kind == "angle":  # which has the velocity and the acceleration as inputs
+        yield from _structures_with_real_poles(pairs, states - 2 * pairs, _MAX_INTEGRATORS)
         return
-    for integrators in range(_MOST_INTEGRATORS + 1):
-        yield from _ladders(pairs, states - 2 * pairs - integrators, integrators)
+    for integrators in range(_MAX_INTEGRATORS + 1):
+        yield from _structures_with_real_poles(pairs, states - 2 * pairs - integrators, integrators)
 
 
-def _ladders(pairs: int, real: int, integrators: int) -> Iterator[PoleStructure]:
-    if not 0 <= real <= _MOST_REAL:
+def _structures_with_real_poles(
+    pairs: int, real_poles: int, integrators: int
+) -> Iterator[PoleStructure]:
+    """Yield the structures with a number of pairs, of added real poles and of integrators."""
+    if not 0 <= real_poles <= _MAX_REAL_POLES:
         return
-    for low, high in _LADDERS_RAD_S[: None if real else 1]:
-        poles = np.geomspace(low, high, real) if real > 1 else np.full(real, (low * high) ** 0.5)
+    for first_pole, last_pole in _REAL_POLE_RANGES_RAD_S[: None if real_poles else 1]:
+        poles = (
+            np.geomspace(first_pole, last_pole, real_poles)
+            if real_poles > 1
+            else np.full(real_poles, (first_pole * last_pole) ** 0.5)
+        )
         yield PoleStructure(pairs, tuple((-poles).tolist()), integrators)
 
 
-def _best(
-    fit: PoleFit, states: int, given: Input, least: Mapping[int, int], tolerance: float
+def _best_realisation(
+    fit: PoleFit,
+    states: int,
+    input_kind: Input,
+    least_real_poles: Mapping[int, int],
+    tolerance: float,
 ) -> tuple[PoleStructure, StateSpace] | None:
-    """Return the most accurate stable realisation within a tolerance, None if there is none.
+    """Return the most accurate stable realisation within a tolerance, or None if there is none.
 
-    It has the given number of pairs and at least the given number of real poles.
+    `least_real_poles` gives the admissible numbers of pairs and, for each, the smallest number of
+    real poles.
     """
-    found: list[tuple[float, int, PoleStructure, NDArray[np.float64]]] = []
+    accurate_fits: list[tuple[float, int, PoleStructure, NDArray[np.float64]]] = []
     for structure in (
         each
-        for pairs, real in least.items()
-        for each in _structures(pairs, states, given)
-        if len(each.ladder_rad_s) >= real
+        for pairs, real_poles in least_real_poles.items()
+        for each in _structures_with_states(pairs, states, input_kind)
+        if len(each.added_real_poles_rad_s) >= real_poles
     ):
         coefficients, error = fit.solve(structure)
         if error <= tolerance:
-            found.append((error, len(found), structure, coefficients))
-    for _, _, structure, coefficients in sorted(found, key=lambda each: each[:2]):
-        system = fit.system(structure, coefficients, given)
+            accurate_fits.append((error, len(accurate_fits), structure, coefficients))
+    for _, _, structure, coefficients in sorted(accurate_fits, key=lambda each: each[:2]):
+        system = fit.system(structure, coefficients, input_kind)
         accurate = tolerance == np.inf or fit.error(system).max() <= tolerance
-        if accurate and fit.stable_on_motor(structure, coefficients):
+        if accurate and fit.is_stable_on_motor(structure, coefficients):
             return structure, system
     return None

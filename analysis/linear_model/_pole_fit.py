@@ -5,9 +5,10 @@ The coupling torque per angular acceleration is approximated by a sum over poles
     H(s) / s² ≈ sum_k c_k(s) + D + V / s + K / s²
 
 with a pair of poles for each mode, some real poles for the branch cut of fractional orders, the
-inertia D, and the integrals of the acceleration (velocity and angle) with V and K. The residual is
-relative. Poles are where the exact ones are, or negative and real, so every fit is stable; D, V and
-K of a beam are not negative, and a motor with the realised beam is not unstable.
+inertia D, and the integrals of the acceleration (velocity and angle) with V and K. The residual of
+the least squares is relative. Poles are at the exact positions, or negative and real, so every fit
+is stable. D, V and K of a beam are not negative, and a motor with the realised beam is not
+unstable.
 """
 
 from __future__ import annotations
@@ -28,95 +29,119 @@ if TYPE_CHECKING:
     Real = NDArray[np.float64]
 
 Input = Literal["acceleration", "angle"]
-INPUTS: Final[tuple[Input, ...]] = ("acceleration", "angle")
+"""Input of an exported model."""
 
-_MOTION: Final = SignalNames(
+INPUTS: Final[tuple[Input, ...]] = ("acceleration", "angle")
+"""Possible inputs of an exported model."""
+
+_INPUT_SIGNALS: Final = SignalNames(
     ("motor_angle", "motor_velocity", "motor_acceleration"), ("rad", "rad/s", "rad/s^2")
 )
-_TORQUE: Final = SignalNames(("coupling_torque",), ("N.m",))
+"""Names and units of the inputs."""
+
+_OUTPUT_SIGNAL: Final = SignalNames(("coupling_torque",), ("N.m",))
+"""Name and unit of the output."""
 
 _FIT_POINTS: Final = (200, 10)
+"""Number of frequencies over the band, and at each pole and zero, to which the response is
+fitted."""
+
 _CHECK_POINTS: Final = (1200, 34)
-"""Points over the band, and at each pole and zero, of a fit and of its check."""
-_BEYOND_BAND: Final = 1.1
-_TAIL: Final = (500.0, 10.0)
-"""How far the tails go below and above the band, as factors."""
+"""Number of frequencies over the band, and at each pole and zero, at which the error of a fit is
+checked."""
+_BAND_MARGIN_FACTOR: Final = 1.1
+"""Factor by which the fitted frequencies exceed the band on either side."""
+
+_TAIL_FACTORS: Final = (500.0, 10.0)
+"""Factors by which the frequencies with little weight extend below and above the band."""
 _TAIL_POINTS: Final = 25
+"""Number of frequencies with little weight on either side of the band."""
+
 _TAIL_WEIGHT: Final = 1e-5
-_CLOSEST: Final = 3e-7
+"""Weight of the relative error at frequencies outside of the band."""
+
+_MIN_RELATIVE_DISTANCE: Final = 3e-7
 """Relative distance from a pole or zero below which a relative error has no meaning."""
 _SCAN_POINTS: Final = 4000
-_NEWTON_STEPS: Final = 30
-_RCOND: Final = 1e-10
-_NEAR: Final = 0.3
-"""How far Newton's method may move a zero, relatively."""
+"""Number of frequencies at which minima of the response are searched for."""
+
+_MAX_NEWTON_ITERATIONS: Final = 30
+"""Largest number of Newton iterations for the zeros."""
+
+_SINGULAR_VALUE_LIMIT: Final = 1e-10
+"""Relative limit of the singular values in the least squares."""
+
+_MAX_RELATIVE_ZERO_CHANGE: Final = 0.3
+"""Largest relative change of a zero by Newton's method."""
 _MAX_GROWTH_PER_S: Final = 1e-2
+"""Largest growth rate of the motor with the realised beam that counts as stable, in 1/s."""
 
 
 @dataclass(frozen=True, slots=True)
 class PoleStructure:
-    """States of a realisation, whatever the parameters.
+    """Numbers and real poles that define the states of a realisation, without its coefficients.
 
     Attributes
     ----------
     pairs : int
-        Number of pairs of poles.
-    ladder_rad_s : tuple of float
-        Negative real poles in addition to those of over-damped modes.
+        Number of conjugate pairs of poles.
+    added_real_poles_rad_s : tuple of float
+        Negative real poles, besides those of over-damped modes.
     integrators : int
-        0; 1: the velocity; 2: velocity and angle.
+        Number of integrals of the acceleration: 0, 1 (velocity) or 2 (velocity and angle).
     """
 
     pairs: int
-    ladder_rad_s: tuple[float, ...]
+    added_real_poles_rad_s: tuple[float, ...]
     integrators: int
 
 
 class PoleFit:
-    """Fits of one response by any structure.
+    """Least-squares fits of one response by state spaces of any pole structure.
 
     Parameters
     ----------
     dynamics : Dynamics
+        Response and poles to be realised.
     near : PoleFit, optional
-        Fit of dynamics that differ little, whose zeros lie near.
+        Fit of almost the same dynamics, from whose zeros the search for zeros starts.
     """
 
     def __init__(self, dynamics: Dynamics, near: PoleFit | None = None) -> None:
         self.dynamics = dynamics
-        low, high = dynamics.band_hz
-        starts = self._minima() if near is None else near.zeros
-        self.zeros: NDArray[np.complex128] = self._roots(starts)
-        wide = (low / _BEYOND_BAND, high * _BEYOND_BAND)
-        band = self._crowded(wide, _FIT_POINTS)
-        tails = np.concatenate(
+        low_hz, high_hz = dynamics.band_hz
+        start_zeros = self._response_minima() if near is None else near.zeros
+        self.zeros: NDArray[np.complex128] = self._find_zeros(start_zeros)
+        wide_band_hz = (low_hz / _BAND_MARGIN_FACTOR, high_hz * _BAND_MARGIN_FACTOR)
+        band = self._dense_frequencies(wide_band_hz, _FIT_POINTS)
+        tail_hz = np.concatenate(
             [
-                np.geomspace(low / _TAIL[0], wide[0], _TAIL_POINTS),
-                np.geomspace(wide[1], high * _TAIL[1], _TAIL_POINTS),
+                np.geomspace(low_hz / _TAIL_FACTORS[0], wide_band_hz[0], _TAIL_POINTS),
+                np.geomspace(wide_band_hz[1], high_hz * _TAIL_FACTORS[1], _TAIL_POINTS),
             ]
         )
         if dynamics.motor_inertia_kg_m2 is None:  # a modal model is meant for its band alone
-            tails = tails[:0]
-        frequency_hz = np.concatenate([band, tails])
-        apart = self._apart(frequency_hz)
-        self._s = imaginary_axis(frequency_hz[apart])
-        self._in_band = (np.arange(frequency_hz.size) < band.size)[apart]
+            tail_hz = tail_hz[:0]
+        frequency_hz = np.concatenate([band, tail_hz])
+        is_usable = self._is_apart_from_poles_and_zeros(frequency_hz)
+        self._s = imaginary_axis(frequency_hz[is_usable])
+        self._in_band = (np.arange(frequency_hz.size) < band.size)[is_usable]
         weight = np.where(self._in_band, 1.0, _TAIL_WEIGHT)
         per_acceleration = dynamics.response(self._s) / self._s**2
         self._scale = weight / np.abs(per_acceleration)
         self._target = (per_acceleration - dynamics.tool_inertia_kg_m2) * self._scale
-        self._of_pairs = [self._pair_columns(pole) for pole in dynamics.pairs]
+        self._pair_basis = [self._pair_basis_functions(pole) for pole in dynamics.pairs]
 
     @cached_property
-    def check_s(self) -> NDArray[np.complex128]:
-        """Return the points of the band for the error, in rad/s."""
-        frequency_hz = self._crowded(self.dynamics.band_hz, _CHECK_POINTS)
-        return imaginary_axis(frequency_hz[self._apart(frequency_hz)])
+    def check_points_s(self) -> NDArray[np.complex128]:
+        """Return the points s in rad/s at which the error of a realisation is checked."""
+        frequency_hz = self._dense_frequencies(self.dynamics.band_hz, _CHECK_POINTS)
+        return imaginary_axis(frequency_hz[self._is_apart_from_poles_and_zeros(frequency_hz)])
 
     @cached_property
     def exact(self) -> NDArray[np.complex128]:
-        """Return the response there with filters, without delay, in N·m/rad."""
-        return self.dynamics.filtered(self.check_s)
+        """Return the exact response at `check_points_s`, without delay, in N·m/rad."""
+        return self.dynamics.filtered(self.check_points_s)
 
     def real_poles(self, structure: PoleStructure) -> tuple[float, ...]:
         """Return all real poles of a realisation, in rad/s.
@@ -124,101 +149,113 @@ class PoleFit:
         Parameters
         ----------
         structure : PoleStructure
+            States of the realisation.
         """
-        return (*self.dynamics.real_poles, *structure.ladder_rad_s)
+        return (*self.dynamics.real_poles, *structure.added_real_poles_rad_s)
 
     def solve(self, structure: PoleStructure) -> tuple[NDArray[np.float64], float]:
-        """Fit a structure.
+        """Fit the coefficients of a pole structure to the response.
 
         Parameters
         ----------
         structure : PoleStructure
+            States of the realisation.
 
         Returns
         -------
         coefficients : ndarray
-            Residues, then those of D, V and K that the structure has.
+            Residues, then D, and V and K if the structure has these integrators.
         error : float
-            Largest relative error in the band, on the points of the fit.
+            Largest relative error in the band, at the points of the fit.
         """
-        real = self.real_poles(structure)
-        direct = 1 + structure.integrators
-        columns = np.concatenate(
+        real_poles = self.real_poles(structure)
+        direct_terms = 1 + structure.integrators
+        basis = np.concatenate(
             [
-                *self._of_pairs[: structure.pairs],
-                [1 / (self._s - pole) for pole in real] or np.empty((0, self._s.size)),
-                [self._s**-power for power in range(direct)],
+                *self._pair_basis[: structure.pairs],
+                [1 / (self._s - pole) for pole in real_poles] or np.empty((0, self._s.size)),
+                [self._s**-power for power in range(direct_terms)],
             ]
         )
-        columns = columns * self._scale
-        bounded = direct if self.dynamics.motor_inertia_kg_m2 is not None else 0
-        coefficients = _least_squares(columns, self._target, bounded)
-        residual = coefficients @ columns - self._target
+        basis = basis * self._scale
+        bounded_count = direct_terms if self.dynamics.motor_inertia_kg_m2 is not None else 0
+        coefficients = _least_squares(basis, self._target, bounded_count)
+        residual = coefficients @ basis - self._target
         return coefficients, float(np.abs(residual[self._in_band]).max())
 
     def system(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64], given: Input
+        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: Input
     ) -> StateSpace:
         """Return the state space of a fit, with tool inertia, filters and delay.
 
         Parameters
         ----------
         structure : PoleStructure
+            States of the realisation.
         coefficients : ndarray
-            As `solve` returned them.
-        given : str
+            Coefficients that `solve` returned.
+        input_kind : str
             Input: "acceleration", or "angle" for angle, velocity and acceleration.
         """
-        system = self._unfiltered(structure, coefficients, given)
+        system = self._system_without_filters(structure, coefficients, input_kind)
         for constant_s, order in self.dynamics.filters:
             system = with_filter(system, constant_s, order)
         return replace(system, delay_s=self.dynamics.delay_s)
 
     def error(self, system: StateSpace) -> NDArray[np.float64]:
-        """Return the relative error of a state space in continuous time at `check_s`.
+        """Return the relative error of a state space at each point of `check_points_s`.
 
         Parameters
         ----------
         system : StateSpace
+            Realisation of the response in continuous time.
         """
-        return np.abs(angle_response(system, self.check_s) / self.exact - 1)
+        return np.abs(angle_response(system, self.check_points_s) / self.exact - 1)
 
-    def stable_on_motor(self, structure: PoleStructure, coefficients: NDArray[np.float64]) -> bool:
-        """Return whether a motor without friction, as heavy as the beam, is stable with it.
+    def is_stable_on_motor(
+        self, structure: PoleStructure, coefficients: NDArray[np.float64]
+    ) -> bool:
+        """Return whether a frictionless motor with the beam's inertia is stable with the model.
 
         Parameters
         ----------
         structure : PoleStructure
+            States of the realisation.
         coefficients : ndarray
-            As `solve` returned them.
+            Coefficients that `solve` returned.
         """
         inertia = self.dynamics.motor_inertia_kg_m2
         if inertia is None:
             return True
-        system = self._unfiltered(structure, coefficients, "acceleration")
+        system = self._system_without_filters(structure, coefficients, "acceleration")
         coupled = system.a - system.b @ system.c / (inertia + system.d.item())
         return bool(np.linalg.eigvals(coupled).real.max(initial=0.0) <= _MAX_GROWTH_PER_S)
 
-    def _unfiltered(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64], given: Input
+    def _system_without_filters(
+        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: Input
     ) -> StateSpace:
-        upper, real = self.dynamics.pairs[: structure.pairs], self.real_poles(structure)
-        poles = 2 * upper.size + len(real)
+        """Return the state space of a fit with tool inertia, without filters and delay."""
+        upper_poles, real_poles = self.dynamics.pairs[: structure.pairs], self.real_poles(structure)
+        poles = 2 * upper_poles.size + len(real_poles)
         a = np.zeros((poles, poles))
-        even = np.arange(0, 2 * upper.size, 2)
-        a[even, even] = a[even + 1, even + 1] = upper.real
-        a[even, even + 1] = upper.imag
-        a[even + 1, even] = -upper.imag
-        others = np.arange(2 * upper.size, poles)
-        a[others, others] = real
+        pair_rows = np.arange(0, 2 * upper_poles.size, 2)
+        a[pair_rows, pair_rows] = a[pair_rows + 1, pair_rows + 1] = upper_poles.real
+        a[pair_rows, pair_rows + 1] = upper_poles.imag
+        a[pair_rows + 1, pair_rows] = -upper_poles.imag
+        real_rows = np.arange(2 * upper_poles.size, poles)
+        a[real_rows, real_rows] = real_poles
         b = np.ones((poles, 1))
-        b[even + 1] = 0.0
+        b[pair_rows + 1] = 0.0
         c = coefficients[None, :poles]
         inertia, viscosity, stiffness = np.append(coefficients[poles:], np.zeros(2))[:3].tolist()
         inertia += self.dynamics.tool_inertia_kg_m2
-        names = [f"{name}_{part}" for name in self.dynamics.names[: upper.size] for part in "ab"]
-        names += [f"relaxation_{number}" for number in range(1, len(real) + 1)]
-        if given == "angle":
+        names = [
+            f"{name}_{suffix}"
+            for name in self.dynamics.names[: upper_poles.size]
+            for suffix in "ab"
+        ]
+        names += [f"relaxation_{number}" for number in range(1, len(real_poles) + 1)]
+        if input_kind == "angle":
             # s² / (s - p) = s + p + p² / (s - p)
             stiffness += (c @ a @ b).item()
             viscosity += (c @ b).item()
@@ -227,11 +264,11 @@ class PoleFit:
                 np.pad(b, ((0, 0), (0, 2))),
                 c @ a @ a,
                 np.array([[stiffness, viscosity, inertia]]),
-                _MOTION,
-                _TORQUE,
+                _INPUT_SIGNALS,
+                _OUTPUT_SIGNAL,
                 SignalNames(tuple(names), ("rad.s",) * poles),
             )
-        # The velocity and the angle are integrals of the input: v' = u, q' = v.
+        # Velocity v and angle q are integrals of the input u: v' = u, q' = v.
         k = structure.integrators
         a = np.pad(a, (0, k))
         if k == 2:
@@ -242,16 +279,16 @@ class PoleFit:
             b,
             np.append(c, np.array([[viscosity, stiffness]])[:, :k], axis=1),
             np.array([[inertia]]),
-            SignalNames(_MOTION.names[2:], _MOTION.units[2:]),
-            _TORQUE,
+            SignalNames(_INPUT_SIGNALS.names[2:], _INPUT_SIGNALS.units[2:]),
+            _OUTPUT_SIGNAL,
             SignalNames(
                 (*names, *("motor_velocity", "motor_angle")[:k]),
                 (*("rad/s",) * poles, *("rad/s", "rad")[:k]),
             ),
         )
 
-    def _pair_columns(self, pole: complex) -> NDArray[np.complex128]:
-        """Return both columns of a conjugate pair, shape (2, points)."""
+    def _pair_basis_functions(self, pole: complex) -> NDArray[np.complex128]:
+        """Return both basis functions of a conjugate pair at the fit points, shape (2, points)."""
         shifted = self._s - pole.real
         return np.array([shifted, np.full_like(shifted, -pole.imag)]) / (
             shifted * shifted + pole.imag**2
@@ -259,90 +296,111 @@ class PoleFit:
 
     # Points
 
-    def _landmarks(self) -> NDArray[np.complex128]:
+    def _poles_and_zeros(self) -> NDArray[np.complex128]:
+        """Return the poles and zeros of the response, in rad/s."""
         return np.concatenate([self.dynamics.pairs, self.zeros])
 
-    def _crowded(self, band_hz: tuple[float, float], points: tuple[int, int]) -> Real:
-        """Return frequencies over a band, crowded within three half-widths of poles and zeros."""
-        marks = self._landmarks()
-        half_width = np.maximum(np.abs(marks.real), 1e-4 * np.abs(marks))
+    def _dense_frequencies(self, band_hz: tuple[float, float], points: tuple[int, int]) -> Real:
+        """Return frequencies of a band in hertz.
+
+        They are dense within three half widths of poles and zeros.
+        """
+        poles_and_zeros = self._poles_and_zeros()
+        half_width = np.maximum(np.abs(poles_and_zeros.real), 1e-4 * np.abs(poles_and_zeros))
         offsets = np.linspace(-3, 3, points[1])
-        near = (marks.imag[:, None] + half_width[:, None] * offsets).ravel() / (2 * np.pi)
-        found = np.concatenate([np.geomspace(*band_hz, points[0]), near])
-        return np.sort(found[(found >= band_hz[0]) & (found <= band_hz[1])])
+        near_hz = (poles_and_zeros.imag[:, None] + half_width[:, None] * offsets).ravel() / (
+            2 * np.pi
+        )
+        frequencies_hz = np.concatenate([np.geomspace(*band_hz, points[0]), near_hz])
+        return np.sort(
+            frequencies_hz[(frequencies_hz >= band_hz[0]) & (frequencies_hz <= band_hz[1])]
+        )
 
-    def _apart(self, frequency_hz: Real) -> NDArray[np.bool_]:
-        """Return which frequencies are not practically at a pole or zero."""
+    def _is_apart_from_poles_and_zeros(self, frequency_hz: Real) -> NDArray[np.bool_]:
+        """Return which frequencies are far enough from poles and zeros for a relative error."""
         omega = 2 * np.pi * frequency_hz
-        distance = np.abs(1j * omega[:, None] - self._landmarks()).min(axis=1, initial=np.inf)
-        apart: NDArray[np.bool_] = distance > _CLOSEST * omega
-        return apart
+        distance = np.abs(1j * omega[:, None] - self._poles_and_zeros()).min(axis=1, initial=np.inf)
+        is_apart: NDArray[np.bool_] = distance > _MIN_RELATIVE_DISTANCE * omega
+        return is_apart
 
-    def _minima(self) -> NDArray[np.complex128]:
-        """Return where the response per acceleration is smaller than on both sides."""
-        low, high = self.dynamics.band_hz
-        s = imaginary_axis(np.geomspace(low / 2, high * 2, _SCAN_POINTS))
-        size = np.abs(self.dynamics.response(s) / s**2)
-        inner = np.flatnonzero((size[1:-1] < size[:-2]) & (size[1:-1] < size[2:])) + 1
-        return s[inner]
+    def _response_minima(self) -> NDArray[np.complex128]:
+        """Return the points s = j omega of local minima of the response per acceleration."""
+        low_hz, high_hz = self.dynamics.band_hz
+        s = imaginary_axis(np.geomspace(low_hz / 2, high_hz * 2, _SCAN_POINTS))
+        magnitude = np.abs(self.dynamics.response(s) / s**2)
+        minimum_indices = (
+            np.flatnonzero((magnitude[1:-1] < magnitude[:-2]) & (magnitude[1:-1] < magnitude[2:]))
+            + 1
+        )
+        return s[minimum_indices]
 
-    def _roots(self, starts: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the zeros of the response that Newton's method finds near by."""
+    def _find_zeros(self, starts: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return the zeros of the response that Newton's method finds near the start points."""
         s, response = starts.copy(), self.dynamics.response
         if not s.size:
             return s
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(_MAX_NEWTON_ITERATIONS):
             step = 1e-6 * np.abs(s)
-            above, below = response(np.concatenate([s + step, s - step])).reshape(2, -1)
-            change = step * (above + below) / np.where(above == below, 1.0, above - below)
+            response_above, response_below = response(np.concatenate([s + step, s - step])).reshape(
+                2, -1
+            )
+            change = (
+                step
+                * (response_above + response_below)
+                / np.where(response_above == response_below, 1.0, response_above - response_below)
+            )
             s = s - change
-            lost = np.abs(s / starts - 1) > _NEAR
-            s[lost] = starts[lost]
-            if (np.abs(change)[~lost] < 1e-9 * np.abs(s)[~lost]).all():
+            has_left = np.abs(s / starts - 1) > _MAX_RELATIVE_ZERO_CHANGE
+            s[has_left] = starts[has_left]
+            if (np.abs(change)[~has_left] < 1e-9 * np.abs(s)[~has_left]).all():
                 break
         return s
 
 
 def imaginary_axis(frequency_hz: Real) -> NDArray[np.complex128]:
-    """Return s in rad/s at frequencies, of their shape.
+    """Return s = j omega in rad/s for given frequencies, of the same shape.
 
     Parameters
     ----------
     frequency_hz : ndarray
+        Frequencies in hertz.
     """
     return np.asarray(2j * np.pi * frequency_hz, dtype=np.complex128)
 
 
 def angle_response(system: StateSpace, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return the response of a state space to the motor angle, without its delay.
+    """Return the response of a state space to the motor angle, without its delay, in N·m/rad.
 
     Parameters
     ----------
     system : StateSpace
-        In continuous time; its inputs are the acceleration, or angle, velocity and acceleration.
+        System in continuous time, whose inputs are the acceleration, or angle, velocity and
+        acceleration.
     s : ndarray of complex
-        In rad/s.
+        Points in rad/s.
     """
     motion = np.array([np.ones_like(s), s, s * s])[-system.d.shape[1] :]
-    total: NDArray[np.complex128] = np.einsum("km,mk->k", system.response(s)[:, 0], motion)
-    return total
+    response: NDArray[np.complex128] = np.einsum("km,mk->k", system.response(s)[:, 0], motion)
+    return response
 
 
 def _least_squares(
-    columns: NDArray[np.complex128], target: NDArray[np.complex128], bounded: int
+    columns: NDArray[np.complex128], target: NDArray[np.complex128], bounded_count: int
 ) -> NDArray[np.float64]:
-    """Solve for real coefficients, the last ones of them not negative."""
+    """Return the real coefficients of a least-squares fit. The last ones are not negative."""
     matrix = np.concatenate([columns.real, columns.imag], axis=1).T
-    wanted = np.concatenate([target.real, target.imag])
+    target_parts = np.concatenate([target.real, target.imag])
     scale = np.linalg.norm(matrix, axis=0)
     matrix = matrix / scale
-    used = np.arange(scale.size)
-    first_bounded = scale.size - bounded
+    used_columns = np.arange(scale.size)
+    first_bounded = scale.size - bounded_count
     while True:
         solution = np.zeros(scale.size)
-        solution[used] = np.linalg.lstsq(matrix[:, used], wanted, rcond=_RCOND)[0]
-        last = solution[first_bounded:]
-        if not (last < 0).any():
-            found: NDArray[np.float64] = solution / scale
-            return found
-        used = used[used != first_bounded + np.argmin(last)]
+        solution[used_columns] = np.linalg.lstsq(
+            matrix[:, used_columns], target_parts, rcond=_SINGULAR_VALUE_LIMIT
+        )[0]
+        bounded_values = solution[first_bounded:]
+        if not (bounded_values < 0).any():
+            coefficients: NDArray[np.float64] = solution / scale
+            return coefficients
+        used_columns = used_columns[used_columns != first_bounded + np.argmin(bounded_values)]

@@ -1,7 +1,7 @@
 """Linear state space with named inputs, outputs and states, and a delay of its outputs.
 
-In continuous time ``x' = A x + B u``, ``y(t) = C x(t - delay) + D u(t - delay)``; at a rate
-``x[k+1] = A x[k] + B u[k]``, the same with the input held between the samples.
+In continuous time ``x' = A x + B u``, ``y(t) = C x(t - delay) + D u(t - delay)``. At a sampling
+rate ``x[k+1] = A x[k] + B u[k]``, with the input held between the samples.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_BLOCK: Final = 256
-"""Frequencies that are solved for together."""
+_POINTS_PER_BLOCK: Final = 256
+"""Number of frequencies whose equations are solved together."""
 
 
 @dataclass(frozen=True, slots=True)
 class SignalNames:
-    """Names and units of the components of a vector, in ASCII."""
+    """Names and units of the components of an input, output or state vector, in ASCII."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -30,17 +30,19 @@ class SignalNames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateSpace:
-    """Matrices of a linear system, without its delay.
+    """Matrices of a linear system, and the delay of its outputs.
 
     Attributes
     ----------
     a, b, c, d : ndarray, shapes (n, n), (n, m), (p, n), (p, m)
+        Matrices of the system.
     inputs, outputs, states : SignalNames
+        Names and units of the vectors u, y and x.
     delay_s : float
-        By how much the outputs come later than the matrices say; negative: the inputs are older
-        than the outputs.
+        Delay of the outputs in addition to the matrices. Negative if the inputs are older than the
+        outputs.
     period_s : float
-        Time between the samples; 0 in continuous time.
+        Time between the samples, 0 in continuous time.
     """
 
     a: NDArray[np.float64]
@@ -59,26 +61,27 @@ class StateSpace:
         return len(self.a)
 
     def response(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the response in continuous time without the delay, shape (len(s), p, m).
+        """Return the frequency response in continuous time without delay, shape (len(s), p, m).
 
         Parameters
         ----------
         s : ndarray of complex
-            In rad/s, none of them a pole.
+            Points in rad/s, none of them a pole.
         """
-        found = np.empty((s.size, *self.d.shape), dtype=np.complex128)
-        for first in range(0, s.size, _BLOCK):
-            block = s[first : first + _BLOCK, None, None]
+        response = np.empty((s.size, *self.d.shape), dtype=np.complex128)
+        for first_point in range(0, s.size, _POINTS_PER_BLOCK):
+            block = s[first_point : first_point + _POINTS_PER_BLOCK, None, None]
             resolvent = np.linalg.solve(block * np.eye(self.order) - self.a, self.b[None] + 0j)
-            found[first : first + _BLOCK] = self.c @ resolvent + self.d
-        return found
+            response[first_point : first_point + _POINTS_PER_BLOCK] = self.c @ resolvent + self.d
+        return response
 
-    def held(self, rate_hz: float) -> StateSpace:
-        """Return the system at a rate, exact for inputs that are constant between the samples.
+    def sampled(self, rate_hz: float) -> StateSpace:
+        """Convert the system to a sampling rate, exactly for inputs held between the samples.
 
         Parameters
         ----------
         rate_hz : float
+            Sampling rate.
         """
         from scipy.signal import cont2discrete
 
@@ -89,28 +92,29 @@ class StateSpace:
 
 
 def with_filter(system: StateSpace, time_constant_s: float, order: int) -> StateSpace:
-    """Return the system with a low-pass filter of order 1 or 2 (Butterworth) at its only output.
+    """Return the system with a low-pass filter (order 1, or Butterworth of order 2) at its output.
 
     Parameters
     ----------
     system : StateSpace
-        In continuous time.
+        System in continuous time with one output.
     time_constant_s : float
-        Reciprocal corner frequency, s/rad.
+        Reciprocal of the corner frequency, in s/rad.
     order : int
+        Order of the filter: 1 or 2.
     """
     n, m = system.b.shape
     omega = 1.0 / time_constant_s
     a = np.zeros((n + order, n + order))
     b = np.zeros((n + order, m))
     a[:n, :n], b[:n] = system.a, system.b
-    first, last = n, n + order - 1
+    first_state, last_state = n, n + order - 1
     # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
-    a[last, :n], b[last] = omega * system.c[0], omega * system.d[0]
-    a[last, first] = -omega
+    a[last_state, :n], b[last_state] = omega * system.c[0], omega * system.d[0]
+    a[last_state, first_state] = -omega
     if order == 2:
-        a[first, last] = omega
-        a[last, last] = -np.sqrt(2) * omega
+        a[first_state, last_state] = omega
+        a[last_state, last_state] = -np.sqrt(2) * omega
     unit = system.outputs.units[0]
     names = ("filter_output", "filter_slope")[:order]
     return replace(
@@ -119,13 +123,13 @@ def with_filter(system: StateSpace, time_constant_s: float, order: int) -> State
         b=b,
         c=np.eye(1, n + order, n),
         d=np.zeros_like(system.d),
-        states=joined((system.states, SignalNames(names, (unit,) * order))),
+        states=concatenate_names((system.states, SignalNames(names, (unit,) * order))),
     )
 
 
-def joined(parts: Sequence[SignalNames]) -> SignalNames:
-    """Return the components of several vectors one after the other."""
+def concatenate_names(vectors: Sequence[SignalNames]) -> SignalNames:
+    """Return the names and units of several vectors one after the other."""
     return SignalNames(
-        tuple(name for each in parts for name in each.names),
-        tuple(unit for each in parts for unit in each.units),
+        tuple(name for each in vectors for name in each.names),
+        tuple(unit for each in vectors for unit in each.units),
     )

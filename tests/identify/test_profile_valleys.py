@@ -6,11 +6,11 @@ import pytest
 from analysis.identify.profile_likelihood import (
     CHI_SQUARE_95,
     LikelihoodProfile,
-    admitted,
-    crossing,
-    dips,
-    gaps,
+    admitted_interval,
+    coarse_minima_values,
+    limit_crossing,
     local_minima,
+    values_outside_known,
 )
 
 VALUES = np.linspace(0.1, 1.9, 361)
@@ -24,7 +24,7 @@ def double(depth):
 
 def profile_of(values, deviance):
     bottoms = local_minima(values, deviance)
-    interval, below, above = admitted(values, deviance)
+    interval, below, above = admitted_interval(values, deviance)
     return LikelihoodProfile(
         "lambda", "VII", tuple(values), tuple(deviance), bottoms[0], bottoms, interval, below,
         above, 0.0,
@@ -64,19 +64,19 @@ def test_ripples_part_no_valley():
 
 
 def test_a_curve_that_never_reaches_the_limit_is_open():
-    interval, below, above = admitted(VALUES, (VALUES - 1) ** 2)
+    interval, below, above = admitted_interval(VALUES, (VALUES - 1) ** 2)
     assert (interval, below, above) == ((0.1, 1.9), True, True)
 
 
 def test_the_crossing_of_a_parabola_is_exact():
-    assert crossing(1.0, 3.0, 1.0, 9.0) == pytest.approx(CHI_SQUARE_95**0.5)
+    assert limit_crossing(1.0, 3.0, 1.0, 9.0) == pytest.approx(CHI_SQUARE_95**0.5)
 
 
 def test_places_to_look_at_lie_outside_of_what_is_known():
-    places = gaps([0.5, 0.9], (0.0, 2.0), 0.2)
+    places = values_outside_known([0.5, 0.9], (0.0, 2.0), 0.2)
     assert all(place < 0.5 or place > 0.9 for place in places)
     assert (min(places), max(places)) == pytest.approx((0.1, 1.9))
 
 
 def test_dips_of_a_coarse_curve():
-    assert dips({0.1: 1.0, 0.3: 2.0, 0.5: 1.5, 0.7: 3.0}) == [0.1, 0.5]
+    assert coarse_minima_values({0.1: 1.0, 0.3: 2.0, 0.5: 1.5, 0.7: 3.0}) == [0.1, 0.5]

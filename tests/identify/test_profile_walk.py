@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify.profile_likelihood import Walk, admitted, local_minima
+from analysis.identify.profile_likelihood import OrderProfiler, admitted_interval, local_minima
 from analysis.models import STRUCTURES
 from analysis.optimizer import NormalEquations
 
@@ -23,13 +23,13 @@ def cost(order):
     return COUNT * math.exp(deviance(order) / COUNT)
 
 
-class DoubleWell(Walk):
+class DoubleWell(OrderProfiler):
     """A walk on a deviance that is known, begun in one of its valleys."""
 
     def __init__(self, start):
         self.order, self.structure = "lambda", None
-        self._values, self._index = COUNT, 0
-        self.costs, self._at = {}, {}
+        self._value_count, self._order_index = COUNT, 0
+        self.costs, self._refits = {}, {}
         self._start_at(self._descend(np.array([start]), 1))
 
     def _descend(self, start, max_evaluations, *, hold=(), hopeless=None):
@@ -46,12 +46,12 @@ class DoubleWell(Walk):
 @pytest.mark.parametrize("start", BOTTOMS)
 def test_both_valleys_are_found_from_either(start):
     walk = DoubleWell(start)
-    walk.both_ways()
+    walk.extend_both_ways()
     assert len(local_minima(*walk.curve())) == 1
-    walk.elsewhere()
+    walk.extend_from_other_minima()
     values, found = walk.curve()
     assert local_minima(values, found) == pytest.approx((0.6, 1.4))
-    (low, high), *is_open = admitted(values, found)
+    (low, high), *is_open = admitted_interval(values, found)
     limit = 3.841458820694124
     assert low == pytest.approx(0.6 - WIDTH * limit**0.5, abs=3e-3)
     assert high == pytest.approx(1.4 + WIDTH * (limit - 1) ** 0.5, abs=3e-3)
@@ -69,9 +69,9 @@ def test_a_special_case_that_is_as_good_begins_a_walk(behind, found):
         cost=COUNT * math.exp(behind / COUNT), parameters={"lambda": at}, plant=at
     )
     special = SimpleNamespace(kind="a rig", structure=STRUCTURES["III"], fit=fit)
-    walk._field = SimpleNamespace(candidates=[special])
-    walk.both_ways()
-    walk.from_candidates()
+    walk._candidate_set = SimpleNamespace(candidates=[special])
+    walk.extend_both_ways()
+    walk.extend_from_candidates()
     assert (len(local_minima(*walk.curve())) == 2) == found
 
 
@@ -94,8 +94,8 @@ class Astray(DoubleWell):
 
 def test_an_order_is_not_excluded_because_a_descent_went_astray():
     walk = Astray(1.4)
-    near = walk._at[1.4]
-    assert walk._hold(1.95, near) == pytest.approx((deviance(1.95) - deviance(1.4)) ** 0.5)
+    near = walk._refits[1.4]
+    assert walk._refit_at(1.95, near) == pytest.approx((deviance(1.95) - deviance(1.4)) ** 0.5)
 
 
 class TangentAstray(DoubleWell):
@@ -111,5 +111,5 @@ class TangentAstray(DoubleWell):
 
 def test_the_damping_stays_where_only_the_tangent_went_astray():
     walk = TangentAstray(1.4)
-    near = walk._at[1.4]
-    assert walk._hold(1.45, near) == pytest.approx((deviance(1.45) - deviance(1.4)) ** 0.5)
+    near = walk._refits[1.4]
+    assert walk._refit_at(1.45, near) == pytest.approx((deviance(1.45) - deviance(1.4)) ** 0.5)

@@ -3,8 +3,8 @@
 import pytest
 
 from analysis.identify import select
-from analysis.identify.profile_likelihood import LikelihoodProfile, profiled
-from analysis.identify.sentences import order as order_sentence
+from analysis.identify.profile_likelihood import LikelihoodProfile, profile_both_orders
+from analysis.identify.sentences import order_sentence
 from analysis.identify.verdict import order_verdict
 
 pytestmark = pytest.mark.fit
@@ -28,7 +28,7 @@ def test_a_delay_that_is_there_is_named_in_a_step(steps):
 
 
 def test_a_profile_looks_for_no_valley_where_there_is_none(without_delay):
-    field, alpha, _ = profiled(without_delay)
+    field, alpha, _ = profile_both_orders(without_delay)
     assert len(alpha.local_minima) == 1
     assert alpha.estimate == pytest.approx(field.best.fit.parameters["alpha"], abs=1e-4)
 
