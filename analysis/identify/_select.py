@@ -186,7 +186,7 @@ def select(
 
 
 _ResultT = TypeVar("_ResultT")
-"""Result of an assessment."""
+"""Type of the result of an assessment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -666,7 +666,7 @@ def _wrong_model_reason(kinds: Collection[str], *, explained: bool) -> str | Non
 
 
 def _doubt_reason(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> str | None:
-    """Return the reason why no parameter is valid although the record is explained, or None.
+    """Return why changes along the record make every parameter doubtful, or None if they do not.
 
     With a change along the record, the mode parameters are those at the time when the sweep passed
     each mode.
