@@ -1,8 +1,8 @@
-"""Set-up of the drive, in pre-operational, before the cycle starts.
+"""Verification and configuration of the drive, in pre-operational, before the loop starts.
 
 The requirements are in :mod:`rigd.devices.cia402.requirements`. An object that holds the required
-value is not written, because it may be read-only; its row there decides what follows if it is
-absent or cannot be changed.
+value is not written, because it may be read-only. If an object is absent or cannot be changed, its
+requirement decides whether the drive is refused.
 """
 
 from dataclasses import dataclass
@@ -27,10 +27,11 @@ from rigd.devices.cia402.requirements import (
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters, ServoDrive
 
-_READ_ONLY = 0x0601_0002
-_ABORTS = {
+_READ_ONLY_ABORT = 0x0601_0002
+"""SDO abort code for writing a read-only object."""
+_ABORT_MEANINGS = {
     0x0601_0000: "unsupported access",
-    _READ_ONLY: "read-only",
+    _READ_ONLY_ABORT: "read-only",
     0x0602_0000: "no such object",
     0x0604_0041: "it cannot be mapped",
     0x0604_0042: "the PDO gets too long",
@@ -41,13 +42,17 @@ _ABORTS = {
     0x0800_0000: "general error",
     0x0800_0022: "not in this state of the device",
 }
-"""SDO abort codes in short."""
+"""Short meanings of SDO abort codes, for messages."""
 
-_MODE_PATIENCE_S = 0.3
+_MODE_TIMEOUT_S = 0.3
+"""Time in seconds to wait until the drive shows the commanded mode of operation."""
 _RATED_TORQUE_TOLERANCE = 0.02
+"""Largest difference, relative, between the rated torques of the drive and of the profile."""
 _SCALE_TOLERANCE = 0.02
-_DUPLICATE_WATCHES = 127
-"""Most entries that 1016 can have."""
+"""Largest difference, relative, between gear ratio or encoder step of the drive and of the
+profile."""
+_MOST_HEARTBEAT_CONSUMERS = 127
+"""Largest number of heartbeat consumer entries in object 1016."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +64,10 @@ class DriveCapabilities:
     identity
         Identity that the drive reports.
     watchdog, watchdog_s
-        What takes the torque off when this computer falls silent, and after how long; infinite
-        where nothing does.
+        Watchdog that removes the torque if this computer stops communicating, and its timeout in
+        seconds, which is infinite if there is no watchdog.
     lacks
-        Rows of the objects that are absent or not usable.
+        Requirements on objects that the drive lacks or that are not usable.
     assigned
         Manufacturer-specific objects that the profile has set.
     """
@@ -74,7 +79,7 @@ class DriveCapabilities:
     assigned: tuple[str, ...]
 
     def has(self, index: int, sub: int = 0) -> bool:
-        """Whether the drive has an object of the table.
+        """Return whether the drive has a usable object of the table of requirements.
 
         Parameters
         ----------
@@ -85,7 +90,7 @@ class DriveCapabilities:
 
     @property
     def accepted(self) -> tuple[str, ...]:
-        """Names under which the profile accepted that something is missing, where it is."""
+        """Names in ``cia402.accept_without`` of functions that this drive indeed lacks."""
         names = [each.accept for each in self.lacks if each.accept and each.accept != WATCHDOG]
         if self.watchdog is Watchdog.NONE:
             names.insert(0, WATCHDOG)
@@ -93,7 +98,7 @@ class DriveCapabilities:
 
 
 def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
-    """Verify and configure the drive; it stays pre-operational and disabled.
+    """Verify and configure the drive by SDO; the drive stays pre-operational and disabled.
 
     Parameters
     ----------
@@ -112,14 +117,14 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
     Raises
     ------
     DeviceError
-        If it does not answer, is not the drive of the profile, is in fault, lacks a required
+        If the drive does not answer, is not the one of the profile, is in fault, lacks a required
         object, or rejects the configuration.
     """
     settings = rig.cia402
     assert settings is not None
     wanted = wanted_values(rig)
     with SdoAccess(port, settings.node_id, name) as sdo:
-        # First of all, before its identity is known: a killed session may have left it turning.
+        # First, before the identity is known: a killed session may have left the motor turning.
         command_off(sdo)
         sdo.to_pre_operational()
         command_off(sdo)
@@ -130,19 +135,19 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
         except DeviceError as error:
             raise DeviceError(f"{error}{still_on(sdo)}") from None
         require_off(sdo, rig, name)
-        work = _SetUp(sdo, settings, name, wanted)
-        work.assign()
-        work.check_torque(identity, rig)
-        work.check_scales(identity, rig)
-        work.configure_torque()
-        work.configure_speed()
-        work.configure_sync()
-        active = work.configure_guards()
-        work.configure_pdos(active)
-        work.check_other_objects(identity)
-        work.settle(requirement(objects.MODE))
+        configuration = _DriveConfiguration(sdo, settings, name, wanted)
+        configuration.assign()
+        configuration.check_rated_torque(identity, rig)
+        configuration.check_gear_and_encoder(identity, rig)
+        configuration.configure_torque()
+        configuration.configure_speed()
+        configuration.configure_sync()
+        active = configuration.configure_watchdog()
+        configuration.configure_pdos(active)
+        configuration.read_stop_options(identity)
+        configuration.set_object(requirement(objects.MODE))
         # Some drives show the mode only when enabled: it is checked again then.
-        wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_PATIENCE_S)
+        wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_TIMEOUT_S)
     return DriveCapabilities(
         identity,
         active,
@@ -150,12 +155,13 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
             Watchdog.OWN: settings.own_watchdog_s,
             Watchdog.NONE: float("inf"),
         }.get(active, settings.heartbeat_timeout_s),
-        tuple(work.lacks),
+        tuple(configuration.lacks),
         settings.set_objects,
     )
 
 
 def _read_identity(sdo: SdoAccess) -> dict[str, object]:
+    """Read the drive's identity by SDO; objects that the drive lacks give None or an empty text."""
     identity: dict[str, object] = {}
     for sub, key in enumerate(("vendor_id", "product_code", "revision", "serial_number"), 1):
         identity[key] = sdo.read_if_there(objects.IDENTITY, sub)
@@ -168,6 +174,7 @@ def _read_identity(sdo: SdoAccess) -> dict[str, object]:
 def _check_identity(
     identity: dict[str, object], settings: ServoDrive, name: str, eds_identity: tuple[int, int]
 ) -> None:
+    """Raise if the drive differs from the profile or its EDS file, or has no cyclic torque mode."""
     vendor, product = eds_identity
     for key, where, wanted in (
         ("vendor_id", "cia402.vendor_id", settings.vendor_id),
@@ -190,19 +197,19 @@ def _check_identity(
         )
 
 
-class _SetUp:
-    """Set-up of one drive that is disabled; collects the objects that it lacks.
+class _DriveConfiguration:
+    """Configuration of one disabled drive, which collects the objects that the drive lacks.
 
     Parameters
     ----------
     sdo
-        The way to it.
+        SDO access to the drive.
     settings
-        Settings of the profile.
+        Settings of the drive in the profile.
     name
         Name of the drive, for messages.
     wanted
-        Values that its objects are to hold, by index and sub-index.
+        Required values of the drive's objects, by index and sub-index.
     """
 
     def __init__(
@@ -214,17 +221,17 @@ class _SetUp:
         self._wanted = wanted
         self.lacks: list[Requirement] = []
 
-    def settle(self, row: Requirement, wanted: int | None = None) -> bool:
-        """Set an object to a value, and return whether the drive has the object.
+    def set_object(self, row: Requirement, wanted: int | None = None) -> bool:
+        """Set an object to a value, unless it has that value; return whether the object exists.
 
-        A write-only one is written and not read back, where that may be.
+        A write-only object is written and not read back, if `MAY_BE_WRITE_ONLY` lists it.
 
         Parameters
         ----------
         row
-            Row of the object in the table of requirements.
+            Requirement on the object.
         wanted
-            The value; the one of the table of values if it is not given.
+            Value to set; None: the required value that the constructor was given.
 
         Raises
         ------
@@ -246,37 +253,40 @@ class _SetUp:
             self._sdo.configure(row.index, row.sub, wanted)
         except ValueNotStored as not_stored:
             found = not_stored.got
-            why: DeviceError = not_stored
+            error: DeviceError = not_stored
         except SdoRefusal as refusal:
             if found is None and refusal.is_absent:
-                self._do_without(row)
+                self._record_missing_object(row)
                 return False
             if found is None:
                 raise
-            why = DeviceError(
+            error = DeviceError(
                 f"{self._name}: object {row.address} ({row.name}) is {show_value(found)}, needed "
                 f"is {show_value(wanted)}, and it refuses to change it (abort code "
-                f"0x{refusal.code:08X}: {_words(refusal)}). {row.sentence}"
+                f"0x{refusal.code:08X}: {_abort_meaning(refusal)}). {row.sentence}"
             )
         else:
             return True
         if row.fit.allows(found, wanted):
             return True
         if row.accept == TORQUE_LIMIT and found >= wanted and self._accepts(row):
-            self._do_without(row)
+            self._record_missing_object(row)
             return False
-        raise why
+        raise error
 
     def assign(self) -> None:
-        """Set the manufacturer-specific objects that the profile names."""
+        """Write the manufacturer-specific objects that ``cia402.set_objects`` names."""
         for text in self._settings.set_objects:
             try:
                 self._sdo.assign(parse_assignment(text))
             except (DeviceError, ValueError) as error:
                 raise DeviceError(f'{error} (cia402.set_objects: "{text}")') from None
 
-    def check_torque(self, identity: dict[str, object], rig: RigParameters) -> None:
-        """Compare the rated torque of the drive with that of the profile."""
+    def check_rated_torque(self, identity: dict[str, object], rig: RigParameters) -> None:
+        """Raise if the drive's rated torque differs from that of the profile by more than 2 %.
+
+        The rated torque is added to `identity`.
+        """
         settings = self._settings
         counts = self._sdo.read_if_there(objects.RATED_TORQUE)
         identity["rated_torque_counts"] = counts
@@ -299,98 +309,109 @@ class _SetUp:
                 "torque would be wrong by that ratio. Correct the profile or the drive."
             )
 
-    def check_scales(self, identity: dict[str, object], rig: RigParameters) -> None:
-        """Compare gear and encoder step with the profile's, as far as the drive states them.
+    def check_gear_and_encoder(self, identity: dict[str, object], rig: RigParameters) -> None:
+        """Raise if the drive's gear ratio or encoder step differs from the profile's by over 2 %.
+
+        Only values that the drive states are compared. Both are added to `identity`.
 
         Raises
         ------
         DeviceError
             If they differ by more than 2 %.
         """
-        gear = self._ratio(objects.GEAR_RATIO)
-        increments = self._ratio(objects.ENCODER_RESOLUTION)
-        units = self._ratio(objects.FEED_CONSTANT)
+        gear = self._read_ratio(objects.GEAR_RATIO)
+        increments = self._read_ratio(objects.ENCODER_RESOLUTION)
+        feed = self._read_ratio(objects.FEED_CONSTANT)
         stated_gear = self._settings.gear_ratio
         identity["gear_ratio"] = gear
-        if gear is not None and not _is_near(gear, stated_gear):
+        if gear is not None and not _is_ratio_equal(gear, stated_gear):
             raise DeviceError(
                 f"{self._name}: its gear (object 6091) is {gear:.5g} turns of the motor in one of "
                 f"the output shaft, cia402.gear_ratio says {stated_gear:.5g}. Correct the profile "
                 "or the drive."
             )
-        # Units of the position in a turn of the output shaft: increments, unless the drive has a
-        # feed constant that makes them others.
+        # Position units per revolution of the output shaft: encoder increments, unless the drive
+        # has a feed constant that defines other units.
         increments_a_turn = None if increments is None else increments * (gear or stated_gear)
-        turns = [turn for turn in (units, increments_a_turn) if turn is not None]
-        identity["encoder_step_rad"] = tau / turns[0] if turns else None
+        turn_units = [units for units in (feed, increments_a_turn) if units is not None]
+        identity["encoder_step_rad"] = tau / turn_units[0] if turn_units else None
         step_rad = rig.encoder.resolution_rad
-        if not turns or any(_is_near(tau / turn, step_rad) for turn in turns):
+        if not turn_units or any(_is_ratio_equal(tau / units, step_rad) for units in turn_units):
             return
-        gear_objects = "6092" if units is not None else "608F" if gear is None else "608F and 6091"
+        gear_objects = "6092" if feed is not None else "608F" if gear is None else "608F and 6091"
         raise DeviceError(
-            f"{self._name}: its encoder step (object {gear_objects}) is {tau / turns[0]:.4g} rad "
-            f"at the output shaft ({turns[0]:.6g} steps a turn), encoder.resolution_rad says "
-            f"{step_rad:.4g} rad; every angle, speed and limit would be wrong by the ratio "
-            f"{tau / turns[0] / step_rad:.3g}. Correct the profile or the drive."
+            f"{self._name}: its encoder step (object {gear_objects}) is {tau / turn_units[0]:.4g} "
+            f"rad at the output shaft ({turn_units[0]:.6g} steps a turn), encoder.resolution_rad "
+            f"says {step_rad:.4g} rad; every angle, speed and limit would be wrong by the ratio "
+            f"{tau / turn_units[0] / step_rad:.3g}. Correct the profile or the drive."
         )
 
-    def _ratio(self, index: int) -> float | None:
-        """Return the ratio of an object's two numbers; None where it states none.
+    def _read_ratio(self, index: int) -> float | None:
+        """Return an object's sub-index 1 divided by its sub-index 2, or None if not stated.
+
+        A ratio of 1 to 1 counts as not stated, since drives that were never configured have that
+        value.
 
         Drives that were never set up for it have it as 1 to 1.
         """
         try:
-            above = self._sdo.read_if_there(index, 1)
-            below = self._sdo.read_if_there(index, 2)
+            numerator = self._sdo.read_if_there(index, 1)
+            denominator = self._sdo.read_if_there(index, 2)
         except SdoRefusal:
             return None
-        if above is None or below is None or above <= 0 or below <= 0 or above == below == 1:
+        if (
+            numerator is None
+            or denominator is None
+            or numerator <= 0
+            or denominator <= 0
+            or numerator == denominator == 1
+        ):
             return None
-        return above / below
+        return numerator / denominator
 
     def configure_torque(self) -> None:
-        """Configure the torque limit, and clear offsets that add to the target torque."""
-        self.settle(requirement(objects.MAX_TORQUE))
+        """Set the torque limits, and clear the torque offset and the polarity."""
+        self.set_object(requirement(objects.MAX_TORQUE))
         for index in objects.TORQUE_LIMITS:
             if self._sdo.read_if_there(index) is not None:
-                self.settle(requirement(index))
-        self._clear(requirement(objects.TORQUE_OFFSET))
-        self._clear(requirement(objects.POLARITY))
+                self.set_object(requirement(index))
+        self._clear_object(requirement(objects.TORQUE_OFFSET))
+        self._clear_object(requirement(objects.POLARITY))
 
     def configure_speed(self) -> None:
-        """Configure the speed limit, which bounds the effect of a constant torque."""
+        """Set the drive's speed limit, which bounds the effect of a constant torque."""
         if self._settings.max_speed_rad_s == 0:
             return
         row = requirement(objects.MAX_SPEED_RPM)
-        if not self.settle(row):
+        if not self.set_object(row):
             raise DeviceError(
                 f"{self._name}: it has no object {row.address} ({row.name}). {row.sentence}"
             )
 
     def configure_sync(self) -> None:
-        """Configure SYNC: its period, no window, no counter."""
+        """Set the SYNC period, and clear the SYNC window and counter."""
         sdo = self._sdo
         cob_id = sdo.read_if_there(objects.SYNC_COB_ID)
         row = requirement(objects.SYNC_COB_ID)
         if cob_id is not None and cob_id & ~objects.PDO_DISABLED != self._wanted[row.index, 0]:
-            self.settle(row)
+            self.set_object(row)
         if sdo.read_if_there(objects.SYNC_OVERFLOW):
             # It may be changed only while the period is 0 (CiA 301).
             if sdo.read_if_there(objects.SYNC_PERIOD_US):
-                self.settle(requirement(objects.SYNC_PERIOD_US), 0)
-            self._clear(requirement(objects.SYNC_OVERFLOW))
-        self._clear(requirement(objects.SYNC_WINDOW_US))
-        self.settle(requirement(objects.SYNC_PERIOD_US))
+                self.set_object(requirement(objects.SYNC_PERIOD_US), 0)
+            self._clear_object(requirement(objects.SYNC_OVERFLOW))
+        self._clear_object(requirement(objects.SYNC_WINDOW_US))
+        self.set_object(requirement(objects.SYNC_PERIOD_US))
         for sub in (1, 2):
-            self.settle(requirement(objects.INTERPOLATION_TIME, sub))
+            self.set_object(requirement(objects.INTERPOLATION_TIME, sub))
 
-    def configure_guards(self) -> Watchdog:
-        """Set the drive's reaction to this computer's silence, and its own heartbeat.
+    def configure_watchdog(self) -> Watchdog:
+        """Set up the drive's watchdog over this computer, and the drive's own heartbeat.
 
         Returns
         -------
         Watchdog
-            Watchdog that is active.
+            Kind of watchdog that is active.
         """
         settings, sdo = self._settings, self._sdo
         deadline = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
@@ -406,28 +427,28 @@ class _SetUp:
             raise DeviceError(f"{self._name}: {row.missing()}")
         if active in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
             # The drive's own watchdog acts as its manufacturer defines, whatever is set here.
-            self.settle(requirement(objects.ABORT_OPTION))
+            self.set_object(requirement(objects.ABORT_OPTION))
         row = requirement(objects.COMMUNICATION_ERROR, 1)
-        if not self.settle(row) and settings.communication_error_option:
+        if not self.set_object(row) and settings.communication_error_option:
             raise DeviceError(
                 f"{self._name}: it has no object {row.address} ({row.name}), so that it goes "
                 "pre-operational on a lost connection; set cia402.communication_error_option = 0."
             )
-        self.settle(requirement(objects.HEARTBEAT_PRODUCER_MS))
+        self.set_object(requirement(objects.HEARTBEAT_PRODUCER_MS))
         row = requirement(objects.EMERGENCY_COB_ID)
         if sdo.read_if_there(row.index) not in (None, self._wanted[row.index, 0]):
-            self.settle(row)
+            self.set_object(row)
         return active
 
     def configure_pdos(self, active: Watchdog) -> None:
-        """Map one PDO each way and switch all others off."""
+        """Map one RPDO and one TPDO, and disable all other PDOs."""
         settings, sdo = self._settings, self._sdo
         for communication in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
-            _disable_others(sdo, communication)
+            _disable_unused_pdos(sdo, communication)
         entries: tuple[int, ...] = objects.TPDO_ENTRIES
         row = requirement(objects.ACTUAL_TORQUE)
         if sdo.read_if_there(objects.ACTUAL_TORQUE) is None and self._accepts(row):
-            self._do_without(row)
+            self._record_missing_object(row)
             entries = entries[:-1]
         self._configure_pdo(
             objects.TPDO_COMMUNICATION,
@@ -443,8 +464,8 @@ class _SetUp:
             {objects.EVENT_TIMER: deadline_ms} if active is Watchdog.RPDO_DEADLINE else {},
         )
 
-    def check_other_objects(self, identity: dict[str, object]) -> None:
-        """Check the objects that are only read."""
+    def read_stop_options(self, identity: dict[str, object]) -> None:
+        """Read the options for quick stop and fault reaction, and add them to `identity`."""
         for key, index in (
             ("quick_stop_option", objects.QUICK_STOP_OPTION),
             ("fault_reaction_option", objects.FAULT_REACTION_OPTION),
@@ -454,28 +475,29 @@ class _SetUp:
                 identity[key] = value
 
     def _accepts(self, row: Requirement) -> bool:
+        """Return whether the profile accepts a drive without an object."""
         return row.accept in self._settings.accept_without
 
-    def _do_without(self, row: Requirement) -> None:
-        """Record a missing object if it is dispensable.
+    def _record_missing_object(self, row: Requirement) -> None:
+        """Record that the drive lacks an object, or raise if the object is indispensable.
 
         Raises
         ------
         DeviceError
-            If it is indispensable.
+            If the object is indispensable.
         """
         reason = row.missing(self._settings.accept_without)
         if reason:
             raise DeviceError(f"{self._name}: {reason}")
         self.lacks.append(row)
 
-    def _clear(self, row: Requirement) -> None:
-        """Set an object to 0 if the drive has it; raise if rigd does not set it."""
+    def _clear_object(self, row: Requirement) -> None:
+        """Set an object to 0 if the drive has it; raise if rigd may not write to it."""
         found = self._sdo.read_if_there(row.index, row.sub)
         if not found:
             return
         if ObjectAccess.WRITE in row.access:
-            self.settle(row, 0)
+            self.set_object(row, 0)
             return
         raise DeviceError(
             f"{self._name}: object {row.address} ({row.name}) is 0x{found:02X}, not 0. "
@@ -483,21 +505,21 @@ class _SetUp:
         )
 
     def _configure_heartbeat_consumer(self) -> bool:
-        """Configure the monitoring of this computer's heartbeat; return whether there is one."""
+        """Make the drive monitor this computer's heartbeat; return whether it can do that."""
         settings, sdo = self._settings, self._sdo
         index, host = objects.HEARTBEAT_CONSUMER, settings.host_node_id
         wanted = host << 16 | round(settings.heartbeat_timeout_s * 1000)
         found = sdo.read_if_there(index, 1)
         if found != wanted:
-            # One node twice is refused (0x06040043): what was stored before goes first.
-            for sub in range(2, min(sdo.read_if_there(index) or 0, _DUPLICATE_WATCHES) + 1):
+            # A second entry for one node is refused (0x06040043): clear stored entries first.
+            for sub in range(2, min(sdo.read_if_there(index) or 0, _MOST_HEARTBEAT_CONSUMERS) + 1):
                 stored = sdo.read_if_there(index, sub)
                 if stored is not None and stored >> 16 & 0x7F == host:
                     sdo.configure(index, sub, 0)
             try:
                 sdo.configure(index, 1, wanted)
             except SdoRefusal as refusal:
-                if refusal.is_absent or refusal.code == _READ_ONLY:
+                if refusal.is_absent or refusal.code == _READ_ONLY_ABORT:
                     return False
                 raise
         return True
@@ -509,45 +531,46 @@ class _SetUp:
         entries: tuple[int, ...],
         parameters: dict[int, int],
     ) -> None:
-        """Map entries into a PDO; one that has them already is not written.
+        """Map objects into a PDO and enable it; nothing is written if the PDO already is as needed.
 
         Parameters
         ----------
         communication
-            Index of its communication parameters; those of its mapping are 0x200 further.
+            Index of the PDO's communication parameters; the index of its mapping is 0x200 higher.
         flags
-            Further bits of its COB-ID.
+            Additional bits of the PDO's COB-ID.
         entries
-            Objects that it carries, as mapping entries.
+            Mapping entries of the objects that the PDO carries.
         parameters
-            Further sub-indices of the communication parameters, and what they are to hold where
-            the drive has them and they are not 0, or are wanted.
+            Required values of further communication parameters by sub-index; a parameter that the
+            drive does not have is skipped.
         """
         sdo, mapping = self._sdo, communication + 0x200
         can_id = self._wanted[communication, 1] | flags
         transmission = self._wanted[communication, 2]
         cob_id_bits = EVERY_BIT & ~objects.NO_REMOTE_REQUEST
-        mapped = self._reads(mapping, (len(entries), *entries))
-        typed = sdo.read_if_there(communication, 2) == transmission
-        identified = sdo.read_if_there(communication, 1)
-        others = {
+        is_mapped = self._holds_values(mapping, (len(entries), *entries))
+        has_transmission_type = sdo.read_if_there(communication, 2) == transmission
+        cob_id_found = sdo.read_if_there(communication, 1)
+        other_parameters = {
             sub: value
             for sub, value in parameters.items()
             if sdo.read_if_there(communication, sub) not in (None, value)
         }
-        right = identified is not None and not (identified ^ can_id) & cob_id_bits
-        if right and mapped and typed and not others:
+        has_cob_id = cob_id_found is not None and not (cob_id_found ^ can_id) & cob_id_bits
+        if has_cob_id and is_mapped and has_transmission_type and not other_parameters:
             return
         sdo.configure(communication, 1, can_id | objects.PDO_DISABLED, cob_id_bits)
-        if not mapped:
-            self._map(communication, mapping, entries)
-        if not typed:
+        if not is_mapped:
+            self._write_mapping(communication, mapping, entries)
+        if not has_transmission_type:
             sdo.configure(communication, 2, transmission)
-        for sub, value in others.items():
-            self.settle(requirement(communication, sub), value)
+        for sub, value in other_parameters.items():
+            self.set_object(requirement(communication, sub), value)
         sdo.configure(communication, 1, can_id, cob_id_bits)
 
-    def _map(self, communication: int, mapping: int, entries: tuple[int, ...]) -> None:
+    def _write_mapping(self, communication: int, mapping: int, entries: tuple[int, ...]) -> None:
+        """Write the mapping entries of a disabled PDO."""
         sdo = self._sdo
         what = "RPDO1" if communication == objects.RPDO_COMMUNICATION else "TPDO1"
         try:
@@ -563,30 +586,32 @@ class _SetUp:
                     raise DeviceError(f"{self._name}: {row.missing()}") from None
                 raise DeviceError(
                     f"{self._name}: it does not take object {row.address} ({row.name}) into {what} "
-                    f"(abort code 0x{refusal.code:08X}: {_words(refusal)}). {row.sentence}"
+                    f"(abort code 0x{refusal.code:08X}: {_abort_meaning(refusal)}). {row.sentence}"
                 ) from None
         sdo.configure(mapping, 0, len(entries))
 
-    def _reads(self, index: int, values: tuple[int, ...]) -> bool:
-        """Whether sub-indices 0 and on of an object read as given."""
+    def _holds_values(self, index: int, values: tuple[int, ...]) -> bool:
+        """Return whether sub-indices 0, 1, 2, … of an object hold the given values."""
         return all(self._sdo.read_if_there(index, sub) == value for sub, value in enumerate(values))
 
 
-def _is_near(stated: float, wanted: float) -> bool:
+def _is_ratio_equal(stated: float, wanted: float) -> bool:
+    """Return whether a ratio that the drive states agrees with the profile's within 2 %."""
     return abs(stated - wanted) <= _SCALE_TOLERANCE * wanted
 
 
-def _disable_others(sdo: SdoAccess, communication: int) -> None:
-    """Disable the PDOs that the rig does not use, as many as the drive has."""
-    for later in range(1, objects.PDO_COUNT_AT_MOST):
-        cob_id = sdo.read_if_there(communication + later, 1)
+def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:
+    """Disable all PDOs of the drive except the first, which the rig uses."""
+    for pdo_offset in range(1, objects.PDO_COUNT_AT_MOST):
+        cob_id = sdo.read_if_there(communication + pdo_offset, 1)
         if cob_id is None:
-            # Beyond those that CiA 301 sets beforehand there are no gaps.
-            if later >= objects.PDO_COUNT:
+            # Above the PDOs that CiA 301 predefines, indices are used without gaps.
+            if pdo_offset >= objects.PDO_COUNT:
                 return
         elif not cob_id & objects.PDO_DISABLED:
-            sdo.configure(communication + later, 1, cob_id | objects.PDO_DISABLED)
+            sdo.configure(communication + pdo_offset, 1, cob_id | objects.PDO_DISABLED)
 
 
-def _words(refusal: SdoRefusal) -> str:
-    return _ABORTS.get(refusal.code, "see CiA 301")
+def _abort_meaning(refusal: SdoRefusal) -> str:
+    """Return the short meaning of the abort code of a refusal."""
+    return _ABORT_MEANINGS.get(refusal.code, "see CiA 301")
