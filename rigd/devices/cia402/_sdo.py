@@ -235,7 +235,7 @@ class SdoAccess:
         """
         value = self._transfer(index, sub, None)
         if not isinstance(value, int):
-            raise DeviceError(f"{self._name}: {self._object_title(index, sub)} is not a number.")
+            raise DeviceError(f"{self._name}: {self._object_name(index, sub)} is not a number.")
         return value
 
     def read_if_there(self, index: int, sub: int = 0) -> int | None:
@@ -283,7 +283,7 @@ class SdoAccess:
         got = self.read(index, sub)
         if (got ^ value) & mask:
             raise ValueNotStored(
-                f"{self._name}: {self._object_title(index, sub)} was set to {show_value(value)} "
+                f"{self._name}: {self._object_name(index, sub)} was set to {show_value(value)} "
                 f"and reads {show_value(got)}; check with the drive's own tool why it does not "
                 "keep it.",
                 got,
@@ -317,17 +317,19 @@ class SdoAccess:
                 else ""
             )
             raise SdoRefusal(
-                f"{self._name}: it refuses {what} {self._object_title(index, sub)}: {error}.{remedy}",
+                f"{self._name}: it refuses {what} {self._object_name(index, sub)}: {error}."
+                f"{remedy}",
                 error.code,
             ) from None
         except (canopen.SdoCommunicationError, can.CanError, OSError):
             raise DeviceError(
                 f"{self._name}: no answer on CAN bus {self._bus_name} to {what} "
-                f"{self._object_title(index, sub)}."
+                f"{self._object_name(index, sub)}."
             ) from None
         except (ObjectDictionaryError, ValueError) as error:
             raise DeviceError(
-                f"{self._name}: unusable answer to {what} {self._object_title(index, sub)} ({error})."
+                f"{self._name}: unusable answer to {what} {self._object_name(index, sub)} "
+                f"({error})."
             ) from None
 
     def _variable(self, index: int, sub: int) -> ODVariable:
@@ -346,7 +348,7 @@ class SdoAccess:
         record.add_member(variable)
         return variable
 
-    def _object_title(self, index: int, sub: int) -> str:
+    def _object_name(self, index: int, sub: int) -> str:
         """Return index, sub-index and name of an object as messages show them."""
         name = self._variable(index, sub).name
         address = f"{index:04X}:{sub}" if sub else f"{index:04X}"

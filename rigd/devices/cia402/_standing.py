@@ -14,12 +14,12 @@ from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
     FAULT_BIT,
     FAULT_RESET,
-    OFF,
     SHUTDOWN,
+    TORQUE_FREE_STATES,
     VOLTAGE_ENABLED,
     DriveState,
     describe_error,
-    state_of,
+    drive_state,
 )
 from rigd.devices.cia402._sdo import SdoAccess, SdoRefusal
 from rigd.devices.contracts import DeviceError
@@ -99,9 +99,9 @@ def require_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
     settings = rig.cia402
     assert settings is not None
     end_states = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
-    wait_for(lambda: _state(sdo) in end_states, settings.enable_timeout_s)
+    wait_for(lambda: _read_state(sdo) in end_states, settings.enable_timeout_s)
     statusword = sdo.read(objects.STATUSWORD)
-    state = state_of(statusword)
+    state = drive_state(statusword)
     if state is DriveState.SWITCH_ON_DISABLED:
         return
     if statusword & FAULT_BIT:
@@ -109,7 +109,7 @@ def require_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
             f"{name}: it is in fault: {_describe_fault(sdo)}. Remove the cause, then: rigd reset "
             f"--profile {rig.name}"
         )
-    remedy = "switch it off and on" if state in OFF else _PRESS_STO_ADVICE
+    remedy = "switch it off and on" if state in TORQUE_FREE_STATES else _PRESS_STO_ADVICE
     raise DeviceError(
         f'{name}: expected in the state "{DriveState.SWITCH_ON_DISABLED.value}", it is in '
         f'"{state.value}" (statusword 0x{statusword:04X}); {remedy}.'
@@ -125,8 +125,8 @@ def still_on(sdo: SdoAccess) -> str:
         statusword = sdo.read(objects.STATUSWORD)
     except DeviceError:
         return ""
-    state = state_of(statusword)
-    if state in OFF:
+    state = drive_state(statusword)
+    if state in TORQUE_FREE_STATES:
         return ""
     return f' It is in "{state.value}" (statusword 0x{statusword:04X}): {_PRESS_STO_ADVICE}.'
 
@@ -162,7 +162,7 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
                     requested = True
             with suppress(Exception):
                 statusword = sdo.read(objects.STATUSWORD)
-                if state_of(statusword) in OFF:
+                if drive_state(statusword) in TORQUE_FREE_STATES:
                     return
             patience_s = _FIRST_ANSWER_TIMEOUT_S if statusword is None else _SWITCH_OFF_TIMEOUT_S
             if time.monotonic() - began > patience_s:
@@ -179,12 +179,13 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
                 f"{cause} It has not shown that it is off: keep clear of the beam, and press the "
                 "wired stop (STO) if anything moves."
             ) from None
-        if state_of(statusword) in OFF:
+        if drive_state(statusword) in TORQUE_FREE_STATES:
             return
     raise DeviceError(
-        f"{name}: it was commanded to switch off and has not done so within {_SWITCH_OFF_TIMEOUT_S:g} s: it is in "
-        f'"{state_of(statusword).value}" (statusword 0x{statusword:04X}); {_PRESS_STO_ADVICE}. Its watch '
-        "over the heartbeat (object 1016) was left as it was."
+        f"{name}: it was commanded to switch off and has not done so within "
+        f'{_SWITCH_OFF_TIMEOUT_S:g} s: it is in "{drive_state(statusword).value}" (statusword '
+        f"0x{statusword:04X}); {_PRESS_STO_ADVICE}. Its watch over the heartbeat (object 1016) was "
+        "left as it was."
     )
 
 
@@ -193,12 +194,12 @@ def _reset_reported_fault(sdo: SdoAccess, name: str, patience_s: float) -> str:
     fault = _describe_fault(sdo)
     for controlword in (DISABLE_VOLTAGE, FAULT_RESET):
         sdo.write(objects.CONTROLWORD, 0, controlword)
-    is_reset = wait_for(lambda: _state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
+    is_reset = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
     sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
     if not is_reset:
         raise DeviceError(
             f"{name}: the fault cannot be reset: {_describe_fault(sdo)}. It is in the state "
-            f'"{_state(sdo).value}"; remove the cause, or switch the drive off and on.'
+            f'"{_read_state(sdo).value}"; remove the cause, or switch the drive off and on.'
         )
     return fault
 
@@ -215,17 +216,17 @@ def _confirm_ready(
     """
     with suppress(SdoRefusal):
         sdo.write(objects.CONTROLWORD, 0, SHUTDOWN)
-    ready = wait_for(lambda: _state(sdo) is DriveState.READY, patience_s)
+    ready = wait_for(lambda: _read_state(sdo) is DriveState.READY, patience_s)
     statusword = sdo.read(objects.STATUSWORD)
     sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
-    disabled = wait_for(lambda: _state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
+    disabled = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
     if ready and disabled:
         return
     done = f"its fault is reset ({fault})" if fault else "it is not in fault"
-    state = state_of(statusword)
+    state = drive_state(statusword)
     if ready:
         raise DeviceError(
-            f'{name}: {done}; it got ready and is now in "{_state(sdo).value}", not in '
+            f'{name}: {done}; it got ready and is now in "{_read_state(sdo).value}", not in '
             f'"{DriveState.SWITCH_ON_DISABLED.value}"; switch it off and on.'
         )
     if statusword & FAULT_BIT:
@@ -246,9 +247,9 @@ def _in_fault(sdo: SdoAccess) -> bool:
     return bool(sdo.read(objects.STATUSWORD) & FAULT_BIT)
 
 
-def _state(sdo: SdoAccess) -> DriveState:
+def _read_state(sdo: SdoAccess) -> DriveState:
     """Read the drive's statusword by SDO and return the state that it shows."""
-    return state_of(sdo.read(objects.STATUSWORD))
+    return drive_state(sdo.read(objects.STATUSWORD))
 
 
 def _describe_fault(sdo: SdoAccess) -> str:
