@@ -177,11 +177,11 @@ class AtiCanSensor:
             polls.wait(time.monotonic_ns() + self._deadline_ns)
         polls.drain()
         if not self._waits:
-            self._previous, self._previous_ns = polls.settle(), polls.sent_ns
+            self._previous, self._previous_ns = polls.process_replies(), polls.sent_ns
         elif self._given_up:
-            self.late_replies += polls.settle() is not None
+            self.late_replies += polls.process_replies() is not None
         if self._in_doubt and not self._is_the_same():
-            polls.pause()
+            polls.register_pause()
         else:
             polls.send_or_pause()
         self._give_up_ns = polls.sent_ns + self._deadline_ns

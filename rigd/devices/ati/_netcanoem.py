@@ -119,7 +119,7 @@ class GaugePolls:
     Attributes
     ----------
     answer : tuple of bytes, or None
-        Answer to the last poll, as of the last `settle`.
+        Answer to the last poll, as of the last `process_replies`.
     sent_ns, turnaround_ns : int
         Time of the last poll (``time.monotonic_ns``), and time from a poll to its answer.
     """
@@ -188,8 +188,8 @@ class GaugePolls:
 
     def send(self) -> None:
         """Poll the sensor."""
-        self._firsts.ask()
-        self._seconds.ask()
+        self._firsts.register_request()
+        self._seconds.register_request()
         self.answer = None
         self.sent_ns = time.monotonic_ns()
         self.exchange.send(self._frame)
@@ -197,15 +197,17 @@ class GaugePolls:
     def send_or_pause(self) -> None:
         """Poll, or leave the poll out for one tick to restore the pairing of replies."""
         firsts, seconds = self._firsts, self._seconds
-        if (firsts.owed or seconds.owed) and firsts.wants_pause() | seconds.wants_pause():
-            self.pause()
+        if (
+            firsts.outstanding or seconds.outstanding
+        ) and firsts.needs_pause() | seconds.needs_pause():
+            self.register_pause()
         else:
             self.send()
 
-    def pause(self) -> None:
+    def register_pause(self) -> None:
         """Leave a tick without a poll."""
-        self._firsts.pause()
-        self._seconds.pause()
+        self._firsts.register_pause()
+        self._seconds.register_pause()
         self.answer = None
         self.sent_ns = time.monotonic_ns()
 
@@ -213,11 +215,11 @@ class GaugePolls:
         """Return the answer to the last poll as soon as it has come, or None at the deadline."""
         if self.answer is None:
             self.exchange.wait_until(self._have_caught_up, deadline_ns)
-        return self.settle()
+        return self.process_replies()
 
-    def settle(self) -> Answer | None:
+    def process_replies(self) -> Answer | None:
         """Return the answer to the last poll if it has been delivered, else None."""
-        if self._firsts.settle() & self._seconds.settle():
+        if self._firsts.process_replies() & self._seconds.process_replies():
             first, second = self._first.data, self._second.data
             if first and second:
                 self.answer = (first, second)
@@ -231,4 +233,4 @@ class GaugePolls:
         self.answer = None
 
     def _have_caught_up(self) -> bool:
-        return self._firsts.has_caught_up() and self._seconds.has_caught_up()
+        return self._firsts.is_up_to_date() and self._seconds.is_up_to_date()

@@ -53,7 +53,7 @@ class Cia402Drive:
     rig
         Parameters with the sections ``cia402`` and ``acquisition``.
     link
-        CAN bus of the drive, which the sensor may share.
+        CAN bus of the drive, which the sensor may use, too.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class Cia402Drive:
         self.angle_rad = 0.0
         self.angle_stale = False
         self.angle_time_ns = node.sync_ns
-        node.pairing.settle()  # that reply is of no tick
+        node.pairing.process_replies()  # that reply is of no tick
         self._awaits_reply = False
         node.resume()
 
@@ -275,7 +275,7 @@ class Cia402Drive:
         if self._awaits_reply:
             self._awaits_reply = False
             if self._replies_in_same_tick:
-                caught_up = node.pairing.has_caught_up
+                caught_up = node.pairing.is_up_to_date
                 node.exchange.wait_until(caught_up, node.sync_ns + node.deadline_ns)
                 self._store_reply(node)
             node.send_heartbeat()
@@ -327,23 +327,24 @@ class Cia402Drive:
             return LineHealth()
         exchange = self._node.exchange
         pairing = self._node.pairing
-        unproven = pairing.unproven
-        angle_doubt = lost_count_text = ""
-        if unproven:
+        lost_without_proof = pairing.lost_without_proof
+        doubt = lost_count_text = ""
+        if lost_without_proof:
             reason = "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
-            angle_doubt = (
+            doubt = (
                 f"{self._name}: a TPDO did not arrive, or all have been delayed by a period since, "
                 f"which is unknown {reason}: angles may be older than the file states."
             )
             lost_count_text = (
-                f"{self._name}: TPDOs that did not arrive since it was connected: {unproven}."
+                f"{self._name}: TPDOs that did not arrive since it was connected: "
+                f"{lost_without_proof}."
             )
         errors = exchange.error_frames + pairing.lost + self._inbox.malformed_frames
         return LineHealth(
             exchange.bits,
             self._bit_rate_bit_s,
             errors,
-            angle_doubt=angle_doubt,
+            doubt=doubt,
             doubt_count=lost_count_text,
         )
 
@@ -444,15 +445,15 @@ class Cia402Drive:
 
     def _store_previous_reply(self, node: Node) -> None:
         """Process the reply to the previous tick's SYNC, which should have arrived."""
-        if node.lock_step and node.pairing.owed:
-            node.exchange.wait_until(node.pairing.has_caught_up, node.sync_ns + node.deadline_ns)
+        if node.lock_step and node.pairing.outstanding:
+            node.exchange.wait_until(node.pairing.is_up_to_date, node.sync_ns + node.deadline_ns)
         else:
             node.exchange.drain()
         self._store_reply(node)
 
     def _store_reply(self, node: Node) -> None:
         """Store angle and torque if the last TPDO answers the last SYNC, else mark them stale."""
-        is_fresh = node.pairing.settle() and self._inbox.is_last_tpdo_valid
+        is_fresh = node.pairing.process_replies() and self._inbox.is_last_tpdo_valid
         self.angle_stale = not is_fresh
         if self._enabled and is_fresh:
             self._torque_check.compare(self._inbox.torque)

@@ -219,7 +219,7 @@ class Node:
     Attributes
     ----------
     pairing : ReplyPairing
-        Pairing of TPDOs with SYNCs: tells a late TPDO from the answer to the last SYNC.
+        Pairing of TPDOs with SYNCs: distinguishes a late TPDO from the reply to the last SYNC.
     lock_step : bool
         Whether the drive is simulated and its time advances with each SYNC. The driver then waits
         for every reply, and does not wait for the clock.
@@ -244,8 +244,8 @@ class Node:
         self.period_ns = round(1e9 / rig.rate_hz)
         self.deadline_ns = round(rig.acquisition.deadline_us * 1000)
         self.lock_step = self.deadline_ns > self.period_ns
-        pauses = self.settings.sync_gaps and not self.lock_step
-        self.pairing = ReplyPairing(inbox, pauses=pauses)
+        may_pause = self.settings.sync_gaps and not self.lock_step
+        self.pairing = ReplyPairing(inbox, may_pause=may_pause)
         self.sync_ns = 0
         self.now_ns = 0
         self._reset_command = f"rigd reset --profile {rig.name}"
@@ -325,16 +325,16 @@ class Node:
     def send_sync(self) -> None:
         """Send SYNC; frames that have arrived before do not count as its reply."""
         self.exchange.drain()
-        self.pairing.ask()
+        self.pairing.register_request()
         self.sync_ns = time.monotonic_ns()
         self.exchange.send(self.frames.sync)
 
     def send_sync_or_pause(self) -> None:
         """Send SYNC, or omit it in this tick to find out if a missing reply is late or lost."""
-        if self.pairing.owed:
+        if self.pairing.outstanding:
             self.exchange.drain()
-            if self.pairing.wants_pause():
-                self.pairing.pause()
+            if self.pairing.needs_pause():
+                self.pairing.register_pause()
                 return
         self.send_sync()
 
@@ -364,9 +364,9 @@ class Node:
 
     def sync_if_possible(self) -> bool:
         """Send SYNC despite bus errors, and return whether it was answered; never raises."""
-        with self.exchange.regardless():
+        with self.exchange.ignore_errors():
             self.exchange.drain()  # frames that have already arrived are no reply to this SYNC
-            self.pairing.ask()
+            self.pairing.register_request()
             self.sync_ns = time.monotonic_ns()
             return self.send_if_possible(self.frames.sync) and self.await_reply()
 
@@ -438,7 +438,7 @@ class Node:
 
     def _request_if_possible(self, request: bytes, answered: Callable[[], bool]) -> bool:
         """Send an SDO request despite bus errors; return whether the reply came in time."""
-        with self.exchange.regardless():
+        with self.exchange.ignore_errors():
             return self.send_if_possible(request) and self.exchange.wait_until(
                 answered, time.monotonic_ns() + _SDO_REPLY_TIMEOUT_NS
             )
