@@ -1,7 +1,7 @@
 """Address of a running ``rigd simulate``: one small file for each simulated rig.
 
 A simulated rig replaces the hardware of one profile. Code that opens the devices of a profile first
-looks for a simulated rig, so that a motor never moves when a simulation was intended.
+checks whether a simulated rig runs, so that a motor never moves when a simulation was intended.
 """
 
 import json
