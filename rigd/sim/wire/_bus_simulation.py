@@ -489,7 +489,7 @@ class BusSimulation:
 
         if fault.kind in DISTURBANCES:
             try:
-                self._simulated.check(disturbance_of(fault, 0.0))
+                self._simulated.check_disturbance(disturbance_of(fault, 0.0))
             except (ObstacleError, RealisationError) as error:
                 raise FaultError(f"Fault '{fault}': {error}") from None
 
@@ -529,7 +529,7 @@ class BusSimulation:
         elif fault.kind in DISTURBANCES:
             now_s = self._simulated.plant.elapsed_s + (0.0 if self._lock_step else _READY_IN_S)
             disturbance = disturbance_of(fault, now_s)
-            self._simulated.meet(disturbance, wait=self._lock_step)
+            self._simulated.add_disturbance(disturbance, wait=self._lock_step)
             if isinstance(disturbance, Obstacle):
                 self._obstacles.append((fault, disturbance))
         elif fault.kind == "end":
@@ -583,7 +583,7 @@ class BusSimulation:
         if kind in (None, "obstacle"):
             obstacles, self._obstacles = self._obstacles, []
             for fault, obstacle in obstacles:
-                self._simulated.end(obstacle)
+                self._simulated.remove_obstacle(obstacle)
                 self._log("simulator", "fault over", fault=str(fault))
         if kind in (None, "cut"):
             cut, self._cut_lines = self._cut_lines, {}
