@@ -24,7 +24,7 @@ from rigd.beam.realisation import (
     with_filter,
 )
 from rigd.devices.parameters import RigParameters, Simulation
-from rigd.sim._stiffness_drift import in_displacements
+from rigd.sim._stiffness_drift import with_modal_displacements
 
 Real = NDArray[np.float64]
 """Array of real numbers."""
@@ -162,7 +162,7 @@ def drifted_step_arrays(
             f"{stiffness_ratio:.4g} times its stiffness, which it drifts to; leave the drift out. "
             f"{error}"
         ) from error
-    free, locked = (in_displacements(model, beam, at_start) for model in models)
+    free, locked = (with_modal_displacements(model, beam, at_start) for model in models)
     step, locked_step, friction = free_and_locked_steps(free, locked, period_s, instants)
     per_torque = np.array([free.sensor_torque_per_torque, free.shear_per_torque])
     return step, locked_step, friction[free.b.size :], per_torque

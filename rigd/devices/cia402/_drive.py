@@ -137,7 +137,7 @@ class Cia402Drive:
         self._subscribe(exchange)
         exchange.start()
         node = self._node = Node(self._rig, exchange, self._frames, self._inbox)
-        node.go_operational(beats=self._has_heartbeat)
+        node.go_operational(has_heartbeat=self._has_heartbeat)
         node.await_first_reply()
         self._position, self._relative_counts = self._inbox.position, 0
         self.angle_rad = 0.0

@@ -257,7 +257,7 @@ class Node:
 
         Parameters
         ----------
-        beats
+        has_heartbeat
             Whether the drive sends a heartbeat; if not, its first TPDO has to confirm the start.
 
         Raises

@@ -155,7 +155,7 @@ class DriveNode:
     the plant is still at tick k.
 
     Before the owner calls `tick`, it has to pass the frames that arrived before that time.
-    Otherwise a pause of the owner would look like a silent host.
+    Otherwise a pause of the owner would have the same effect as a silent host.
     """
 
     def __init__(

@@ -184,7 +184,7 @@ def virtual():
     theirs.setblocking(False)
     bus = links.VirtualCan.__new__(links.VirtualCan)
     handlers, heard = {}, []
-    bus._serve(ours, handlers, lambda frames, origin: heard.append((frames, origin)))
+    bus._use_socket(ours, handlers, lambda frames, origin: heard.append((frames, origin)))
     yield bus, theirs, handlers, heard
     bus.close()
     theirs.close()
