@@ -38,7 +38,7 @@ _NOISE_BLOCK_READINGS = 128
 Thousands would take a whole period."""
 
 
-class Stuck:
+class StuckReadings:
     """Replacement for the readings of a failed device, which repeats earlier readings.
 
     Parameters
@@ -123,7 +123,7 @@ class SimulatedRig:
         self.plant = SimulatedPlant(rig)
         self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, rig.rate_hz, weights)
         self._resolution_rad = rig.encoder.resolution_rad
-        self.stuck_encoder: Stuck | None = None
+        self.stuck_encoder: StuckReadings | None = None
 
     def begin_session(self, seed: int) -> None:
         """Restart the noise, and use the beam of this session if beams differ between sessions.
@@ -145,11 +145,11 @@ class SimulatedRig:
             self._poll_preparation()
         if self.records_per_period == 1:
             self.plant.advance(n_periods)
-            self.sensor.elapse(n_periods)
+            self.sensor.advance_hum(n_periods)
             return
         for _ in range(n_periods * self.records_per_period):
             self.plant.advance(1)
-            self.sensor.elapse(1)
+            self.sensor.advance_hum(1)
             self.sensor.sample()
 
     def check_disturbance(self, disturbance: Disturbance) -> None:
@@ -262,12 +262,12 @@ class SimulatedDrive:
         self.off_doubt = ""
 
     @property
-    def stuck_encoder(self) -> Stuck | None:
+    def stuck_encoder(self) -> StuckReadings | None:
         """Replacement for the readings of a failed encoder; None if it works. It can be set."""
         return self._rig.stuck_encoder
 
     @stuck_encoder.setter
-    def stuck_encoder(self, stuck: Stuck | None) -> None:
+    def stuck_encoder(self, stuck: StuckReadings | None) -> None:
         self._rig.stuck_encoder = stuck
 
     def connect(self) -> None:
@@ -367,7 +367,7 @@ class SimulatedSensor:
         self._hum_nm = simulation.hum_nm
         self._hum_cycles_per_reading = simulation.hum_hz / rate_hz
         self._hum_cycles = 0.0
-        self.stuck: Stuck | None = None
+        self.stuck: StuckReadings | None = None
         self._saturated = False  # whether a reading since the last value read was saturated
         self.wrench_stale = False
         self.wrench_time_ns = 0
@@ -415,7 +415,7 @@ class SimulatedSensor:
         self.records.append(self.measure())
         self._saturated |= self.wrench_saturated
 
-    def elapse(self, readings: int) -> None:
+    def advance_hum(self, readings: int) -> None:
         """Advance the phase of the hum by a number of reading periods."""
         if self._hum_nm:
             # Whole cycles are dropped to keep the phase exact.

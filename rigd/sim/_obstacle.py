@@ -88,9 +88,10 @@ class AttachedObstacles:
         self._period_s = period_s
         self.substeps = _substeps(beam, bodies, period_s)
         self._step_s = period_s / self.substeps
-        at_m = np.array([body.x_m for body in bodies])
+        positions_m = np.array([body.x_m for body in bodies])
         force_realisations = [
-            realise_force(beam, damping, x, at_m, 1 / self._step_s) for x in at_m.tolist()
+            realise_force(beam, damping, x, positions_m, 1 / self._step_s)
+            for x in positions_m.tolist()
         ]
         # Rows: displacement at each body, torque, shear. Columns of `_force_state_rows`: states of
         # each force; columns of `_direct_rows`: forces.
@@ -105,10 +106,10 @@ class AttachedObstacles:
                 inertial=False,
                 small=_SMALL_DISPLACEMENT_RATIO * x,
             )
-            for x in at_m.tolist()
+            for x in positions_m.tolist()
         ]
         self._rigid_rows = np.array([[t.per_angle, t.per_velocity, *t.c] for t in angle_outputs])
-        self._at_m = at_m
+        self._positions_m = positions_m
         self._obstacles = [
             (index, body, min(body.stiffness_n_per_m, _RIGID_N_PER_M))
             for index, body in enumerate(bodies)
@@ -139,7 +140,7 @@ class AttachedObstacles:
         of_force
             Contribution of each force (1 N) to the derivative of the state, shape (n, bodies).
         """
-        bodies, own_states = self._at_m.size, self._b.size
+        bodies, own_states = self._positions_m.size, self._b.size
         n, more = model.b.size, bodies * own_states
         torque, shear = self._force_state_rows[-2], self._force_state_rows[-1]
         a = np.zeros((n + more, n + more))
@@ -187,7 +188,7 @@ class AttachedObstacles:
         friction
             Effect of the previous period's friction (1 N·m) on the state, shape (n,).
         """
-        steps, step_s, bodies = self.substeps, self._step_s, self._at_m.size
+        steps, step_s, bodies = self.substeps, self._step_s, self._positions_m.size
         n = model.b.size
         phi, step_response = propagator(model, step_s)
         displacement_rows = self.displacement_rows
@@ -231,16 +232,16 @@ class AttachedObstacles:
 
         at_sensor = (1 - model.sensor_torque_per_torque) * self._direct_rows[-2]
         shear = self._direct_rows[-1] - model.shear_per_torque * self._direct_rows[-2]
-        none, period_s = np.zeros(bodies), self._period_s
+        zero_row, period_s = np.zeros(bodies), self._period_s
         effect = np.vstack(
             [
                 decayed_states[::-1].transpose(1, 0, 2).reshape(n, -1),
-                effect_on(model.angle, none, period_s),
-                effect_on(model.velocity, none, period_s),
+                effect_on(model.angle, zero_row, period_s),
+                effect_on(model.velocity, zero_row, period_s),
                 effect_on(model.sensor_torque, at_sensor, period_s),
                 effect_on(holding_torque, self._direct_rows[-2], period_s),
                 effect_on(model.shear, shear, period_s),
-                effect_on(model.angle, none, angle_instant_s),
+                effect_on(model.angle, zero_row, angle_instant_s),
                 effect_on(model.sensor_torque, at_sensor, torque_instant_s),
                 effect_on(model.shear, shear, torque_instant_s),
             ]
@@ -275,10 +276,10 @@ class AttachedObstacles:
                 if self._penetration_m[index] > 0:
                     return False
                 old, new = before_m.item(index), displacement_m.item(index)
-                moves = 2 * abs(new - old) + body.x_m * abs(body.rate_rad_s) * self._period_s
-                if body.side * (new - _surface(body, end_s)) > -(moves + _CONTACT_MARGIN_M):
+                motion_m = 2 * abs(new - old) + body.x_m * abs(body.rate_rad_s) * self._period_s
+                if body.side * (new - _surface(body, end_s)) > -(motion_m + _CONTACT_MARGIN_M):
                     return False
-        self._penetration_m = dict.fromkeys(range(self._at_m.size), -inf)
+        self._penetration_m = dict.fromkeys(range(self._positions_m.size), -inf)
         self.forces_n = self._zero_forces
         return True
 
@@ -338,7 +339,7 @@ class AttachedObstacles:
             )
         if obstacles:
             self._compute_obstacle_forces(substep_matrices, obstacles)
-        self._ends_m = dict.fromkeys(range(self._at_m.size), -inf)
+        self._ends_m = dict.fromkeys(range(self._positions_m.size), -inf)
         for obstacle in obstacles:
             self._ends_m[obstacle.index] = obstacle.start_m
             forces[:, obstacle.index] = -obstacle.side * obstacle.force_n
@@ -353,13 +354,15 @@ class AttachedObstacles:
         """
         steps = self.substeps
         # By how much each force moves the beam out of an obstacle until the end of each substep.
-        relief = [
+        displacement_kernels = [
             [(one.side * other.side * substep_matrices.history[one.index, other.index],
               other.force_n) for other in obstacles]
             for one in obstacles
         ]  # fmt: skip
-        rows = [[(list(matrix), force_n) for matrix, force_n in pairs] for pairs in relief]
-        tasks = list(zip(obstacles, rows, strict=True))
+        rows = [
+            [(list(matrix), force_n) for matrix, force_n in pairs] for pairs in displacement_kernels
+        ]
+        obstacles_with_rows = list(zip(obstacles, rows, strict=True))
         iterations = _CONTACT_ITERATIONS if len(obstacles) > 1 else 1
         j = 0
         while j < steps:
@@ -368,7 +371,7 @@ class AttachedObstacles:
                 first = steps
                 free_penetrations_m = [
                     obstacle.free_m - sum(matrix @ force_n for matrix, force_n in pairs)
-                    for obstacle, pairs in zip(obstacles, relief, strict=True)
+                    for obstacle, pairs in zip(obstacles, displacement_kernels, strict=True)
                 ]
                 for free_penetration_m in free_penetrations_m:
                     is_touching = free_penetration_m[j:first] > 0
@@ -383,12 +386,12 @@ class AttachedObstacles:
                 if j == steps:
                     return
             for _ in range(iterations):
-                for obstacle, pairs_of_rows in tasks:
+                for obstacle, pairs_of_rows in obstacles_with_rows:
                     obstacle.force_n[j] = 0.0
-                    without = obstacle.free_m.item(j)
+                    free_penetration = obstacle.free_m.item(j)
                     for matrix_rows, force_n in pairs_of_rows:
-                        without -= matrix_rows[j].dot(force_n)
-                    force, obstacle.end_m = obstacle.force_and_penetration(without)
+                        free_penetration -= matrix_rows[j].dot(force_n)
+                    force, obstacle.end_m = obstacle.force_and_penetration(free_penetration)
                     obstacle.force_n[j] = force
             for obstacle in obstacles:
                 obstacle.start_m = obstacle.end_m
@@ -413,19 +416,19 @@ class AttachedObstacles:
         """
         size = self._b.size
         old_size = 0 if other is None else other._b.size
-        old_bodies = 0 if other is None else other._at_m.size
+        old_bodies = 0 if other is None else other._positions_m.size
         n = state.size - old_size * old_bodies
-        new_state = np.zeros(n + size * self._at_m.size)
+        new_state = np.zeros(n + size * self._positions_m.size)
         new_state[:n] = state[:n]
         if other is not None:
-            modal = min(self._oscillating, other._oscillating)
-            real = min(size - self._oscillating, old_size - other._oscillating)
+            modal_states = min(self._oscillating, other._oscillating)
+            real_states = min(size - self._oscillating, old_size - other._oscillating)
             for index in range(old_bodies):
                 new = new_state[n + index * size :]
                 old = state[n + index * old_size :]
-                new[:modal] = old[:modal]
-                new[self._oscillating : self._oscillating + real] = old[
-                    other._oscillating : other._oscillating + real
+                new[:modal_states] = old[:modal_states]
+                new[self._oscillating : self._oscillating + real_states] = old[
+                    other._oscillating : other._oscillating + real_states
                 ]
             self._penetration_m.update(other._penetration_m)
         self._displacement_m = self.displacement_rows @ new_state

@@ -340,24 +340,33 @@ class SimulatedPlant:
             if self._drift is not None and self._drift.refresh_if_due(self._periods):
                 self._use_stiffness(self._drift)
             torques.append(self._torque_nm)
-            before, after = torques[0], torques[1]
+            torque_before, torque_after = torques[0], torques[1]
             (vector, input_, _), (output, _, results) = self._vectors
-            vector[n] = before
-            vector[n + 1] = after
+            vector[n] = torque_before
+            vector[n + 1] = torque_after
             vector[n + 2] = self._friction_nm
             self._vectors = self._vectors[1], self._vectors[0]
             if self._air is not None:
                 self._air.write_held_force(input_[n + 3 :])
 
             fraction = self._fraction_before_switch
-            load = fraction * before + (1 - fraction) * after - self._holding_beam_nm
-            if self._is_stuck and abs(load) <= self._coulomb_nm:
+            shaft_load_nm = (
+                fraction * torque_before + (1 - fraction) * torque_after - self._holding_beam_nm
+            )
+            if self._is_stuck and abs(shaft_load_nm) <= self._coulomb_nm:
                 self._locked_step(input_, output)
                 if self._contact is not None:
                     self._add_contact_effect(self._locked_march, input_, output, is_turning=False)
-                angle, _, torque, holding, shear, sensed_angle, sensed_torque, sensed_shear = (
-                    results.tolist()
-                )
+                (
+                    angle,
+                    _,
+                    torque,
+                    holding_torque,
+                    shear,
+                    sensed_angle,
+                    sensed_torque,
+                    sensed_shear,
+                ) = results.tolist()
                 self._friction_nm = velocity = 0.0
                 free = False
             else:
@@ -366,39 +375,39 @@ class SimulatedPlant:
                 if self._contact is not None:
                     self._add_contact_effect(self._free_march, input_, output, is_turning=True)
                 (
-                    angle, velocity, torque, holding, shear,
+                    angle, velocity, torque, holding_torque, shear,
                     sensed_angle, sensed_torque, sensed_shear,
                 ) = results.tolist()  # fmt: skip
                 if self._jump_gain:
-                    jump = torques[2] - after
-                    torque += self._jump_gain * jump
-                    shear += self._shear_jump_gain * jump
-                    sensed_torque += self._sensed_jump_gain * jump
-                    sensed_shear += self._sensed_shear_jump_gain * jump
+                    torque_jump = torques[2] - torque_after
+                    torque += self._jump_gain * torque_jump
+                    shear += self._shear_jump_gain * torque_jump
+                    sensed_torque += self._sensed_jump_gain * torque_jump
+                    sensed_shear += self._sensed_shear_jump_gain * torque_jump
                 if self._coulomb_nm:
-                    effects = self._friction_effects
-                    friction = -velocity / effects[1]
+                    friction_effects = self._friction_effects
+                    friction = -velocity / friction_effects[1]
                     self._is_stuck = abs(friction) <= self._coulomb_nm
                     if self._is_stuck:
                         velocity = 0.0
                     else:
                         friction = self._coulomb_nm if friction > 0 else -self._coulomb_nm
-                        velocity += effects[1] * friction
+                        velocity += friction_effects[1] * friction
                     self._friction_nm = friction
-                    angle += effects[0] * friction
-                    torque += effects[2] * friction
-                    holding += effects[3] * friction
-                    shear += effects[4] * friction
-                    sensed_angle += effects[5] * friction
-                    sensed_torque += effects[6] * friction
-                    sensed_shear += effects[7] * friction
+                    angle += friction_effects[0] * friction
+                    torque += friction_effects[2] * friction
+                    holding_torque += friction_effects[3] * friction
+                    shear += friction_effects[4] * friction
+                    sensed_angle += friction_effects[5] * friction
+                    sensed_torque += friction_effects[6] * friction
+                    sensed_shear += friction_effects[7] * friction
             if self._air is not None:
-                torque, holding, shear, sensed_torque, sensed_shear = self._with_drag_effect(
-                    output, free, torque, holding, shear, sensed_torque, sensed_shear
+                torque, holding_torque, shear, sensed_torque, sensed_shear = self._with_drag_effect(
+                    output, free, torque, holding_torque, shear, sensed_torque, sensed_shear
                 )
             if self._periods >= 0:
                 self._periods += 1
-            self._holding_beam_nm = holding
+            self._holding_beam_nm = holding_torque
             self._sensed_angles.append(sensed_angle)
             self._sensed_torques.append(sensed_torque)
             self._sensed_shears.append(sensed_shear)
@@ -461,7 +470,7 @@ class SimulatedPlant:
         output: Real,
         free: bool,
         torque: float,
-        holding: float,
+        holding_torque: float,
         shear: float,
         sensed_torque: float,
         sensed_shear: float,
@@ -481,7 +490,7 @@ class SimulatedPlant:
         at = self._torque_instant_fraction
         return (
             torque + fraction * now_nm,
-            holding + now_nm,
+            holding_torque + now_nm,
             shear + now_n,
             sensed_torque + fraction * (before_nm + at * (now_nm - before_nm)),
             sensed_shear + before_n + at * (now_n - before_n),

@@ -58,7 +58,7 @@ def drive_identifiers(drive: ServoDrive) -> dict[int, str]:
 
     The PDOs that are not configured count too: a drive may have them on from the factory.
     """
-    own_services = {base + drive.node_id: what for base, what in _NODE_SERVICES.items()}
+    own_services = {base + drive.node_id: name for base, name in _NODE_SERVICES.items()}
     return _BROADCAST_SERVICES | own_services
 
 
@@ -87,12 +87,12 @@ def _collisions(rig: RigParameters) -> Iterator[str]:
     used_identifiers = drive_identifiers(drive) | {0x700 + drive.host_node_id: "host's heartbeat"}
     own_identifiers = sensor_identifiers(sensor)
     collisions = {
-        can_id: what
-        for can_id, what in sorted(used_identifiers.items())
+        can_id: name
+        for can_id, name in sorted(used_identifiers.items())
         if can_id in own_identifiers
     }
     if collisions:
-        collision_list = ", ".join(f"{can_id:#05x} ({what})" for can_id, what in collisions.items())
+        collision_list = ", ".join(f"{can_id:#05x} ({name})" for can_id, name in collisions.items())
         yield (
             f"ati_can.base_id = {sensor.base_id:#04x} takes the identifiers "
             f"{own_identifiers[0]:#05x} to {own_identifiers[-1]:#05x}, of which the drive's bus "
@@ -134,7 +134,7 @@ Above it a frame may miss its period."""
 
 
 @dataclass(frozen=True, slots=True)
-class Traffic:
+class CyclicFrame:
     """Frame that is sent cyclically on the bus."""
 
     what: str
@@ -151,7 +151,7 @@ class Traffic:
 class BusLoad:
     """Cyclic frames of a CAN bus, and the bus load that they cause."""
 
-    traffic: tuple[Traffic, ...]
+    traffic: tuple[CyclicFrame, ...]
     """Cyclic frames of the bus."""
     plain: float
     """Fraction of time in which the bus is busy without stuff bits; above 1 if overloaded."""
@@ -181,7 +181,7 @@ def worst_frame_bits(length: int) -> int:
     return frame_bits(length) + (_STUFFABLE_BITS + 8 * length - 1) // 4
 
 
-def load_of_frames(traffic: tuple[Traffic, ...], bitrate_bit_s: float) -> BusLoad:
+def load_of_frames(traffic: tuple[CyclicFrame, ...], bitrate_bit_s: float) -> BusLoad:
     """Return the load that cyclic frames cause on a bus of the given bit rate."""
     return BusLoad(
         traffic=traffic,
@@ -214,23 +214,23 @@ def bus_load(rig: RigParameters) -> BusLoad:
     """
     if rig.can is None:
         raise ValueError("The rig has no CAN bus.")
-    traffic: list[Traffic] = []
+    traffic: list[CyclicFrame] = []
     if (drive := rig.cia402) is not None:
         host_heartbeat_hz = min(rig.rate_hz, 1.0 / drive.heartbeat_period_s)
         drive_heartbeat_hz = 1.0 / drive.drive_heartbeat_period_s
         node, host = drive.node_id, drive.host_node_id
         traffic += [
-            Traffic("SYNC", 0x80, SYNC_LENGTH, rig.rate_hz),
-            Traffic("drive's TPDO1", 0x180 + node, TPDO_LENGTH, rig.rate_hz),
-            Traffic("drive's RPDO1", 0x200 + node, RPDO_LENGTH, rig.rate_hz),
-            Traffic("drive's heartbeat", 0x700 + node, HEARTBEAT_LENGTH, drive_heartbeat_hz),
-            Traffic("host's heartbeat", 0x700 + host, HEARTBEAT_LENGTH, host_heartbeat_hz),
+            CyclicFrame("SYNC", 0x80, SYNC_LENGTH, rig.rate_hz),
+            CyclicFrame("drive's TPDO1", 0x180 + node, TPDO_LENGTH, rig.rate_hz),
+            CyclicFrame("drive's RPDO1", 0x200 + node, RPDO_LENGTH, rig.rate_hz),
+            CyclicFrame("drive's heartbeat", 0x700 + node, HEARTBEAT_LENGTH, drive_heartbeat_hz),
+            CyclicFrame("host's heartbeat", 0x700 + host, HEARTBEAT_LENGTH, host_heartbeat_hz),
         ]
     if (sensor := rig.ati_can) is not None:
         first = sensor.base_id << 4
-        traffic.append(Traffic("sensor's request", first, REQUEST_LENGTH, rig.rate_hz))
+        traffic.append(CyclicFrame("sensor's request", first, REQUEST_LENGTH, rig.rate_hz))
         traffic += [
-            Traffic(f"sensor's reply {part + 1}", first + part, length, rig.rate_hz)
+            CyclicFrame(f"sensor's reply {part + 1}", first + part, length, rig.rate_hz)
             for part, length in enumerate(REPLY_LENGTHS)
         ]
     return load_of_frames(tuple(traffic), rig.can.bitrate_bit_s)

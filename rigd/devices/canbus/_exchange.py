@@ -38,7 +38,7 @@ _STEADY_PERIODS = 3
 The rule applies only if no tick may be run without a request."""
 
 
-class Counter(Protocol):
+class ReplyCounter(Protocol):
     """Object that counts received replies, in its attribute `replies`."""
 
     replies: int
@@ -72,14 +72,14 @@ class ReplyPairing:
         "_inbox",
         "_is_only_request",
         "_may_pause",
-        "_received",
+        "_replies_in_period",
         "_steady_periods",
         "lost",
         "lost_without_proof",
         "outstanding",
     )
 
-    def __init__(self, inbox: Counter, *, may_pause: bool = True) -> None:
+    def __init__(self, inbox: ReplyCounter, *, may_pause: bool = True) -> None:
         self._inbox = inbox
         self._may_pause = may_pause
         self.lost = 0
@@ -90,7 +90,7 @@ class ReplyPairing:
         """Reset the pairing: no reply is outstanding."""
         self._inbox.replies = 0
         self._has_request = self._is_only_request = True
-        self._received = 0
+        self._replies_in_period = 0
         self._steady_periods = 0
         self.outstanding = 0
 
@@ -104,7 +104,7 @@ class ReplyPairing:
         self._count_replies()
         # A pause with a reply continues until all replies have arrived, or none does.
         return self.outstanding > 0 and (
-            self._received == 1 if self._has_request else self._received > 0
+            self._replies_in_period == 1 if self._has_request else self._replies_in_period > 0
         )
 
     def register_request(self) -> None:
@@ -139,23 +139,25 @@ class ReplyPairing:
         self._count_replies()
         if self.outstanding:
             if not self._has_request:
-                if not self._received:
+                if not self._replies_in_period:
                     self.lost += self.outstanding
                     self.outstanding = 0
             elif not self._may_pause:
-                self._steady_periods = self._steady_periods + 1 if self._received == 1 else 0
+                self._steady_periods = (
+                    self._steady_periods + 1 if self._replies_in_period == 1 else 0
+                )
                 if self._steady_periods >= _STEADY_PERIODS:
                     self.lost += self.outstanding
                     self.lost_without_proof += self.outstanding
                     self.outstanding = self._steady_periods = 0
         else:
             self._steady_periods = 0
-        self._received = 0
+        self._replies_in_period = 0
 
     def _count_replies(self) -> int:
         """Move newly received replies from the inbox into the counts; return their number."""
         replies, self._inbox.replies = self._inbox.replies, 0
-        self._received += replies
+        self._replies_in_period += replies
         self.outstanding = max(0, self.outstanding - replies)
         return replies
 

@@ -11,7 +11,7 @@ from typing import Final
 
 from rigd.devices.cia402.requirements import REQUIREMENTS, ObjectAccess
 
-KINDS: Final = {
+INTEGER_RANGES: Final = {
     "u8": (0, 0xFF),
     "u16": (0, 0xFFFF),
     "u32": (0, 0xFFFF_FFFF),
@@ -45,8 +45,8 @@ class Assignment:
     """Index of the object."""
     sub: int
     """Sub-index of the object."""
-    kind: str
-    """Integer type of the value, one of :data:`KINDS`."""
+    integer_type: str
+    """Integer type of the value, one of :data:`INTEGER_RANGES`."""
     value: int
     """Value to write."""
 
@@ -72,24 +72,26 @@ def parse_assignment(text: str) -> Assignment:
     Examples
     --------
     >>> parse_assignment("3001:2 u32 2500")
-    Assignment(index=12289, sub=2, kind='u32', value=2500)
+    Assignment(index=12289, sub=2, integer_type='u32', value=2500)
     """
     match = _ASSIGNMENT_PATTERN.fullmatch(text.strip())
     if match is None:
         raise ValueError('must be index:sub, type and value, such as "3001:2 u32 2500"')
     index, sub = int(match[1], 16), int(match[2] or "0", 16)
-    kind = match[3]
-    if kind not in KINDS:
-        raise ValueError(f"has the unknown type {kind!r}; choose {', '.join(KINDS)}")
+    integer_type = match[3]
+    if integer_type not in INTEGER_RANGES:
+        raise ValueError(
+            f"has the unknown type {integer_type!r}; choose {', '.join(INTEGER_RANGES)}"
+        )
     try:
         value = int(match[4], 0)
     except ValueError:
         raise ValueError(
             f"has a value that is not a whole number ({match[4]}); write 2500, -3 or 0x9C4"
         ) from None
-    low, high = KINDS[kind]
+    low, high = INTEGER_RANGES[integer_type]
     if not low <= value <= high:
-        raise ValueError(f"has a value that {kind} does not hold ({low} to {high})")
+        raise ValueError(f"has a value that {integer_type} does not hold ({low} to {high})")
     if (index, sub) in _SET_BY_RIGD or index in _PDO_INDICES:
         raise ValueError("is an object that rigd sets itself; remove it")
     if index in _STORAGE_INDICES:
@@ -97,4 +99,4 @@ def parse_assignment(text: str) -> Assignment:
             "would have the drive store or restore its memory at every start; do that once with "
             "the drive's own tool"
         )
-    return Assignment(index, sub, kind, value)
+    return Assignment(index, sub, integer_type, value)

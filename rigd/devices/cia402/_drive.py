@@ -21,7 +21,7 @@ from rigd.devices.cia402._protocol import (
     NodeFrames,
     drive_state,
 )
-from rigd.devices.cia402._setup import DriveCapabilities, set_up
+from rigd.devices.cia402._setup import DriveCapabilities, set_up_drive
 from rigd.devices.cia402._standing import reset_fault
 from rigd.devices.cia402._transitions import (
     StopRequestedError,
@@ -127,7 +127,7 @@ class Cia402Drive:
         self._enabled = self._may_be_on = False
         self._inbox.clear()
         self._inbox.require_status(FAULT_BIT, 0)
-        capabilities = self._capabilities = set_up(exchange.port, self._rig, self._name)
+        capabilities = self._capabilities = set_up_drive(exchange.port, self._rig, self._name)
         has_torque = capabilities.has(ACTUAL_TORQUE)
         self._inbox.tpdo_has_torque = has_torque
         self._torque_check.is_active = has_torque
@@ -280,8 +280,8 @@ class Cia402Drive:
                 self._store_reply(node)
             node.send_heartbeat()
         inbox = self._inbox
-        if inbox.received or not self._has_heartbeat:
-            inbox.received = False
+        if inbox.heartbeat_received or not self._has_heartbeat:
+            inbox.heartbeat_received = False
             self._last_received_ns = node.now_ns
         if (
             inbox.alarm

@@ -57,16 +57,16 @@ class ReceivedFrames:
         Whether the last TPDO had the right length.
     nmt_state : int or None
         NMT state in the last heartbeat; None if none has been received.
-    received : bool
+    heartbeat_received : bool
         Whether a heartbeat has arrived since this was last set to False.
     must_stay_operational : bool
         Whether leaving the NMT state operational raises an alarm.
     alarm : str
         Reason to end the session, as a sentence for the operator: an emergency message, a restart,
         or a drive that has left operational. The first reason is retained; empty if there is none.
-    emergency : bool
+    emergency_received : bool
         Whether an emergency message has been received.
-    reply : bytes
+    sdo_reply : bytes
         Data of the last SDO reply.
     malformed_frames : int
         Number of received frames of the wrong length.
@@ -78,16 +78,16 @@ class ReceivedFrames:
         "_required_mask",
         "_required_value",
         "alarm",
-        "emergency",
+        "emergency_received",
+        "heartbeat_received",
         "is_last_tpdo_valid",
         "malformed_frames",
         "must_stay_operational",
         "name",
         "nmt_state",
         "position",
-        "received",
         "replies",
-        "reply",
+        "sdo_reply",
         "statusword",
         "sto_error_code",
         "torque",
@@ -111,11 +111,11 @@ class ReceivedFrames:
         self.replies = 0
         self.is_last_tpdo_valid = False
         self.nmt_state: int | None = None
-        self.received = False
+        self.heartbeat_received = False
         self.must_stay_operational = False
         self.alarm = ""
-        self.emergency = False
-        self.reply = b""
+        self.emergency_received = False
+        self.sdo_reply = b""
 
     def require_status(self, mask: int, value: int) -> None:
         """Require that every statusword from now on has `value` in the bits of `mask`."""
@@ -151,7 +151,7 @@ class ReceivedFrames:
         code, _, vendor = message
         if code >> 8 == 0:
             return
-        self.emergency = True
+        self.emergency_received = True
         if self.alarm:
             return
         if code == self.sto_error_code:
@@ -168,7 +168,7 @@ class ReceivedFrames:
             return
         state = data[0] & ~_TOGGLE_BIT
         self.nmt_state = state
-        self.received = True
+        self.heartbeat_received = True
         if self.must_stay_operational and state != OPERATIONAL and not self.alarm:
             if state == BOOT_UP:
                 what = "it has restarted by itself; check its supply"
@@ -182,7 +182,7 @@ class ReceivedFrames:
 
     def store_sdo_reply(self, data: bytes) -> None:
         """Store the data of a received SDO reply."""
-        self.reply = data
+        self.sdo_reply = data
 
 
 # The node
@@ -347,7 +347,7 @@ class Node:
     def resume(self) -> None:
         """Restart the timing of both heartbeats after a time without ticks."""
         self._next_heartbeat_ns = _BEFORE_ANY_TIME_NS
-        self.inbox.received = True
+        self.inbox.heartbeat_received = True
 
     def await_reply(self, patience_ns: int = 0) -> bool:
         """Wait for a TPDO for the given time or one period; return whether one has arrived.
@@ -380,17 +380,18 @@ class Node:
     def write(self, request: bytes, index: int, sub: int) -> bool:
         """Send an SDO write request, and return whether the drive confirmed it in time."""
         inbox = self.inbox
-        inbox.reply = b""
-        return self._request_if_possible(request, lambda: is_written(inbox.reply, index, sub))
+        inbox.sdo_reply = b""
+        return self._request_if_possible(request, lambda: is_written(inbox.sdo_reply, index, sub))
 
     def is_off(self) -> bool:
         """Read the statusword by SDO, and return whether it shows that the drive has no torque."""
         inbox = self.inbox
-        inbox.reply = b""
+        inbox.sdo_reply = b""
         self._request_if_possible(
-            self.frames.read_statusword_request, lambda: read_statusword(inbox.reply) is not None
+            self.frames.read_statusword_request,
+            lambda: read_statusword(inbox.sdo_reply) is not None,
         )
-        statusword = read_statusword(inbox.reply)
+        statusword = read_statusword(inbox.sdo_reply)
         return statusword is not None and drive_state(statusword) in TORQUE_FREE_STATES
 
     def send_if_possible(self, frame: bytes) -> bool:
@@ -429,7 +430,7 @@ class Node:
         )
         if in_fault:
             reason += f" Remove the cause, then: {self._reset_command}"
-        elif inbox.emergency:
+        elif inbox.emergency_received:
             # The message may be from a drive that was off; one that was on reports its state later.
             reason += (
                 f" Remove the cause; if drive or daemon are in fault then: {self._reset_command}"

@@ -156,7 +156,7 @@ class SdoAccess:
 
     def __exit__(
         self,
-        kind: type[BaseException] | None,
+        error_type: type[BaseException] | None,
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
@@ -164,7 +164,7 @@ class SdoAccess:
         with suppress(Exception):
             self._network.disconnect()
 
-    def to_pre_operational(self) -> None:
+    def enter_pre_operational(self) -> None:
         """Command the drive to the NMT state pre-operational, and check that it answers.
 
         Raises
@@ -184,7 +184,7 @@ class SdoAccess:
                 f"{error} Check its supply, its node id (cia402.node_id) and bit rate{received}."
             ) from None
 
-    def use_eds(self, path: str) -> tuple[int, int]:
+    def load_eds(self, path: str) -> tuple[int, int]:
         """Load the data types of the objects from the drive's EDS file, and return its identity.
 
         Returns
@@ -215,15 +215,15 @@ class SdoAccess:
             ) from None
 
     @contextmanager
-    def hurried(self) -> Iterator[None]:
-        """Allow each SDO transfer one attempt of 50 ms, to switch the torque off quickly."""
+    def short_timeouts(self) -> Iterator[None]:
+        """Allow each SDO transfer in this context one attempt of 50 ms, to switch off quickly."""
         client = self._node.sdo
-        before = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
+        previous_settings = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
         client.RESPONSE_TIMEOUT, client.MAX_RETRIES = _HURRIED_TIMEOUT_S, 1
         try:
             yield
         finally:
-            client.RESPONSE_TIMEOUT, client.MAX_RETRIES = before
+            client.RESPONSE_TIMEOUT, client.MAX_RETRIES = previous_settings
 
     def read(self, index: int, sub: int = 0) -> int:
         """Read an object by SDO and return its integer value.
@@ -238,7 +238,7 @@ class SdoAccess:
             raise DeviceError(f"{self._name}: {self._object_name(index, sub)} is not a number.")
         return value
 
-    def read_if_there(self, index: int, sub: int = 0) -> int | None:
+    def read_or_none(self, index: int, sub: int = 0) -> int | None:
         """Read an object by SDO and return its value, or None if the drive has no such object.
 
         Raises
@@ -296,7 +296,7 @@ class SdoAccess:
         """
         index, sub = assignment.index, assignment.sub
         variable = self._variable(index, sub)
-        variable.data_type = _DATA_TYPES[assignment.kind]
+        variable.data_type = _DATA_TYPES[assignment.integer_type]
         self.configure(index, sub, assignment.value)
 
     def last_emergency(self) -> int:
@@ -307,7 +307,7 @@ class SdoAccess:
     def _transfer(self, index: int, sub: int, value: int | None) -> object:
         """Write `value` to an object, or read the object if `value` is None; return the value."""
         variable = SdoVariable(self._node.sdo, self._variable(index, sub))
-        what = "reading" if value is None else f"writing {show_value(value)} to"
+        action_text = "reading" if value is None else f"writing {show_value(value)} to"
         try:
             return _transfer_skipping_late_replies(self._node.sdo, variable, value)
         except canopen.SdoAbortedError as error:
@@ -317,18 +317,18 @@ class SdoAccess:
                 else ""
             )
             raise SdoRefusal(
-                f"{self._name}: it refuses {what} {self._object_name(index, sub)}: {error}."
+                f"{self._name}: it refuses {action_text} {self._object_name(index, sub)}: {error}."
                 f"{remedy}",
                 error.code,
             ) from None
         except (canopen.SdoCommunicationError, can.CanError, OSError):
             raise DeviceError(
-                f"{self._name}: no answer on CAN bus {self._bus_name} to {what} "
+                f"{self._name}: no answer on CAN bus {self._bus_name} to {action_text} "
                 f"{self._object_name(index, sub)}."
             ) from None
         except (ObjectDictionaryError, ValueError) as error:
             raise DeviceError(
-                f"{self._name}: unusable answer to {what} {self._object_name(index, sub)} "
+                f"{self._name}: unusable answer to {action_text} {self._object_name(index, sub)} "
                 f"({error})."
             ) from None
 

@@ -12,7 +12,12 @@ from rigd.devices.canbus.port import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402._assignments import parse_assignment
 from rigd.devices.cia402._sdo import EVERY_BIT, SdoAccess, SdoRefusal, ValueNotStored, show_value
-from rigd.devices.cia402._standing import command_off, require_off, still_on, wait_for
+from rigd.devices.cia402._standing import (
+    command_off,
+    describe_remaining_torque,
+    wait_for,
+    wait_until_disabled,
+)
 from rigd.devices.cia402.requirements import (
     MAY_BE_WRITE_ONLY,
     TORQUE_LIMIT,
@@ -20,8 +25,8 @@ from rigd.devices.cia402.requirements import (
     ObjectAccess,
     Requirement,
     Watchdog,
+    required_values,
     requirement,
-    wanted_values,
     watchdog,
 )
 from rigd.devices.contracts import DeviceError
@@ -97,7 +102,7 @@ class DriveCapabilities:
         return tuple(names)
 
 
-def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
+def set_up_drive(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
     """Verify and configure the drive by SDO; the drive stays pre-operational and disabled.
 
     Parameters
@@ -122,20 +127,20 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
     """
     settings = rig.cia402
     assert settings is not None
-    wanted = wanted_values(rig)
+    required = required_values(rig)
     with SdoAccess(port, settings.node_id, name) as sdo:
         # First, before the identity is known: a killed session may have left the motor turning.
         command_off(sdo)
-        sdo.to_pre_operational()
+        sdo.enter_pre_operational()
         command_off(sdo)
         identity = _read_identity(sdo)
         try:
-            eds_identity = sdo.use_eds(settings.eds) if settings.eds else (0, 0)
+            eds_identity = sdo.load_eds(settings.eds) if settings.eds else (0, 0)
             _check_identity(identity, settings, name, eds_identity)
         except DeviceError as error:
-            raise DeviceError(f"{error}{still_on(sdo)}") from None
-        require_off(sdo, rig, name)
-        configuration = _DriveConfiguration(sdo, settings, name, wanted)
+            raise DeviceError(f"{error}{describe_remaining_torque(sdo)}") from None
+        wait_until_disabled(sdo, rig, name)
+        configuration = _DriveConfiguration(sdo, settings, name, required)
         configuration.assign()
         configuration.check_rated_torque(identity, rig)
         configuration.check_gear_and_encoder(identity, rig)
@@ -164,10 +169,10 @@ def _read_identity(sdo: SdoAccess) -> dict[str, object]:
     """Read the drive's identity by SDO; objects that the drive lacks give None or an empty text."""
     identity: dict[str, object] = {}
     for sub, key in enumerate(("vendor_id", "product_code", "revision", "serial_number"), 1):
-        identity[key] = sdo.read_if_there(objects.IDENTITY, sub)
+        identity[key] = sdo.read_or_none(objects.IDENTITY, sub)
     identity["device_name"] = sdo.read_text(objects.DEVICE_NAME)
     identity["software_version"] = sdo.read_text(objects.SOFTWARE_VERSION)
-    identity["supported_modes"] = sdo.read_if_there(objects.SUPPORTED_MODES)
+    identity["supported_modes"] = sdo.read_or_none(objects.SUPPORTED_MODES)
     return identity
 
 
@@ -176,17 +181,17 @@ def _check_identity(
 ) -> None:
     """Raise if the drive differs from the profile or its EDS file, or has no cyclic torque mode."""
     vendor, product = eds_identity
-    for key, where, wanted in (
+    for key, source, required in (
         ("vendor_id", "cia402.vendor_id", settings.vendor_id),
         ("product_code", "cia402.product_code", settings.product_code),
         ("vendor_id", f"VendorNumber in {settings.eds}", vendor),
         ("product_code", f"ProductNumber in {settings.eds}", product),
     ):
-        got = identity[key]
-        if wanted and got != wanted:
-            got_text = "nothing" if got is None else f"0x{got:08X}"
+        reported = identity[key]
+        if required and reported != required:
+            got_text = "nothing" if reported is None else f"0x{reported:08X}"
             raise DeviceError(
-                f"{name}: it is another drive: {where} is 0x{wanted:08X}, it says {got_text}. "
+                f"{name}: it is another drive: {source} is 0x{required:08X}, it says {got_text}. "
                 "Check cia402.node_id, or write into the profile what is really there."
             )
     modes = identity["supported_modes"]
@@ -208,20 +213,20 @@ class _DriveConfiguration:
         Settings of the drive in the profile.
     name
         Name of the drive, for messages.
-    wanted
+    required
         Required values of the drive's objects, by index and sub-index.
     """
 
     def __init__(
-        self, sdo: SdoAccess, settings: ServoDrive, name: str, wanted: dict[tuple[int, int], int]
+        self, sdo: SdoAccess, settings: ServoDrive, name: str, required: dict[tuple[int, int], int]
     ) -> None:
         self._sdo = sdo
         self._settings = settings
         self._name = name
-        self._wanted = wanted
+        self._wanted = required
         self.lacks: list[Requirement] = []
 
-    def set_object(self, row: Requirement, wanted: int | None = None) -> bool:
+    def set_object(self, row: Requirement, required: int | None = None) -> bool:
         """Set an object to a value, unless it has that value; return whether the object exists.
 
         A write-only object is written and not read back, if `MAY_BE_WRITE_ONLY` lists it.
@@ -230,7 +235,7 @@ class _DriveConfiguration:
         ----------
         row
             Requirement on the object.
-        wanted
+        required
             Value to set; None: the required value that the constructor was given.
 
         Raises
@@ -238,38 +243,38 @@ class _DriveConfiguration:
         DeviceError
             If the object is indispensable, or the drive stores a value that is not acceptable.
         """
-        if wanted is None:
-            wanted = self._wanted[row.index, row.sub]
+        if required is None:
+            required = self._wanted[row.index, row.sub]
         try:
-            found = self._sdo.read_if_there(row.index, row.sub)
+            present_value = self._sdo.read_or_none(row.index, row.sub)
         except SdoRefusal as refusal:
             if not (refusal.is_write_only and row.index in MAY_BE_WRITE_ONLY):
                 raise
-            self._sdo.write(row.index, row.sub, wanted)
+            self._sdo.write(row.index, row.sub, required)
             return True
-        if found == wanted:
+        if present_value == required:
             return True
         try:
-            self._sdo.configure(row.index, row.sub, wanted)
+            self._sdo.configure(row.index, row.sub, required)
         except ValueNotStored as not_stored:
-            found = not_stored.got
+            present_value = not_stored.got
             error: DeviceError = not_stored
         except SdoRefusal as refusal:
-            if found is None and refusal.is_absent:
+            if present_value is None and refusal.is_absent:
                 self._record_missing_object(row)
                 return False
-            if found is None:
+            if present_value is None:
                 raise
             error = DeviceError(
-                f"{self._name}: object {row.address} ({row.name}) is {show_value(found)}, needed "
-                f"is {show_value(wanted)}, and it refuses to change it (abort code "
+                f"{self._name}: object {row.address} ({row.name}) is {show_value(present_value)}, "
+                f"needed is {show_value(required)}, and it refuses to change it (abort code "
                 f"0x{refusal.code:08X}: {_abort_meaning(refusal)}). {row.sentence}"
             )
         else:
             return True
-        if row.fit.allows(found, wanted):
+        if row.value_rule.allows(present_value, required):
             return True
-        if row.accept == TORQUE_LIMIT and found >= wanted and self._accepts(row):
+        if row.accept == TORQUE_LIMIT and present_value >= required and self._accepts(row):
             self._record_missing_object(row)
             return False
         raise error
@@ -288,7 +293,7 @@ class _DriveConfiguration:
         The rated torque is added to `identity`.
         """
         settings = self._settings
-        counts = self._sdo.read_if_there(objects.RATED_TORQUE)
+        counts = self._sdo.read_or_none(objects.RATED_TORQUE)
         identity["rated_torque_counts"] = counts
         row = requirement(objects.RATED_TORQUE)
         if counts is None:
@@ -355,8 +360,8 @@ class _DriveConfiguration:
         Drives that were never set up for it have it as 1 to 1.
         """
         try:
-            numerator = self._sdo.read_if_there(index, 1)
-            denominator = self._sdo.read_if_there(index, 2)
+            numerator = self._sdo.read_or_none(index, 1)
+            denominator = self._sdo.read_or_none(index, 2)
         except SdoRefusal:
             return None
         if (
@@ -373,7 +378,7 @@ class _DriveConfiguration:
         """Set the torque limits, and clear the torque offset and the polarity."""
         self.set_object(requirement(objects.MAX_TORQUE))
         for index in objects.TORQUE_LIMITS:
-            if self._sdo.read_if_there(index) is not None:
+            if self._sdo.read_or_none(index) is not None:
                 self.set_object(requirement(index))
         self._clear_object(requirement(objects.TORQUE_OFFSET))
         self._clear_object(requirement(objects.POLARITY))
@@ -391,13 +396,13 @@ class _DriveConfiguration:
     def configure_sync(self) -> None:
         """Set the SYNC period, and clear the SYNC window and counter."""
         sdo = self._sdo
-        cob_id = sdo.read_if_there(objects.SYNC_COB_ID)
+        cob_id = sdo.read_or_none(objects.SYNC_COB_ID)
         row = requirement(objects.SYNC_COB_ID)
         if cob_id is not None and cob_id & ~objects.PDO_DISABLED != self._wanted[row.index, 0]:
             self.set_object(row)
-        if sdo.read_if_there(objects.SYNC_OVERFLOW):
+        if sdo.read_or_none(objects.SYNC_OVERFLOW):
             # It may be changed only while the period is 0 (CiA 301).
-            if sdo.read_if_there(objects.SYNC_PERIOD_US):
+            if sdo.read_or_none(objects.SYNC_PERIOD_US):
                 self.set_object(requirement(objects.SYNC_PERIOD_US), 0)
             self._clear_object(requirement(objects.SYNC_OVERFLOW))
         self._clear_object(requirement(objects.SYNC_WINDOW_US))
@@ -416,7 +421,7 @@ class _DriveConfiguration:
         settings, sdo = self._settings, self._sdo
         deadline = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         heartbeat = self._configure_heartbeat_consumer()
-        has_deadline = sdo.read_if_there(deadline.index, deadline.sub) is not None
+        has_deadline = sdo.read_or_none(deadline.index, deadline.sub) is not None
         active = watchdog(
             heartbeat=heartbeat, rpdo_deadline=has_deadline, own=settings.own_watchdog_s > 0
         )
@@ -424,7 +429,7 @@ class _DriveConfiguration:
         if not heartbeat:
             self.lacks.append(row)
         if active is Watchdog.NONE and not self._accepts(row):
-            raise DeviceError(f"{self._name}: {row.missing()}")
+            raise DeviceError(f"{self._name}: {row.refusal_reason()}")
         if active in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
             # The drive's own watchdog acts as its manufacturer defines, whatever is set here.
             self.set_object(requirement(objects.ABORT_OPTION))
@@ -436,7 +441,7 @@ class _DriveConfiguration:
             )
         self.set_object(requirement(objects.HEARTBEAT_PRODUCER_MS))
         row = requirement(objects.EMERGENCY_COB_ID)
-        if sdo.read_if_there(row.index) not in (None, self._wanted[row.index, 0]):
+        if sdo.read_or_none(row.index) not in (None, self._wanted[row.index, 0]):
             self.set_object(row)
         return active
 
@@ -447,7 +452,7 @@ class _DriveConfiguration:
             _disable_unused_pdos(sdo, communication)
         entries: tuple[int, ...] = objects.TPDO_ENTRIES
         row = requirement(objects.ACTUAL_TORQUE)
-        if sdo.read_if_there(objects.ACTUAL_TORQUE) is None and self._accepts(row):
+        if sdo.read_or_none(objects.ACTUAL_TORQUE) is None and self._accepts(row):
             self._record_missing_object(row)
             entries = entries[:-1]
         self._configure_pdo(
@@ -470,12 +475,12 @@ class _DriveConfiguration:
             ("quick_stop_option", objects.QUICK_STOP_OPTION),
             ("fault_reaction_option", objects.FAULT_REACTION_OPTION),
         ):
-            value = self._sdo.read_if_there(index)
+            value = self._sdo.read_or_none(index)
             if value is not None:
                 identity[key] = value
 
     def _accepts(self, row: Requirement) -> bool:
-        """Return whether the profile accepts a drive without an object."""
+        """Return whether the profile accepts a drive that lacks an object."""
         return row.accept in self._settings.accept_without
 
     def _record_missing_object(self, row: Requirement) -> None:
@@ -486,21 +491,21 @@ class _DriveConfiguration:
         DeviceError
             If the object is indispensable.
         """
-        reason = row.missing(self._settings.accept_without)
+        reason = row.refusal_reason(self._settings.accept_without)
         if reason:
             raise DeviceError(f"{self._name}: {reason}")
         self.lacks.append(row)
 
     def _clear_object(self, row: Requirement) -> None:
         """Set an object to 0 if the drive has it; raise if rigd may not write to it."""
-        found = self._sdo.read_if_there(row.index, row.sub)
-        if not found:
+        present_value = self._sdo.read_or_none(row.index, row.sub)
+        if not present_value:
             return
         if ObjectAccess.WRITE in row.access:
             self.set_object(row, 0)
             return
         raise DeviceError(
-            f"{self._name}: object {row.address} ({row.name}) is 0x{found:02X}, not 0. "
+            f"{self._name}: object {row.address} ({row.name}) is 0x{present_value:02X}, not 0. "
             f"{row.sentence}"
         )
 
@@ -508,16 +513,16 @@ class _DriveConfiguration:
         """Make the drive monitor this computer's heartbeat; return whether it can do that."""
         settings, sdo = self._settings, self._sdo
         index, host = objects.HEARTBEAT_CONSUMER, settings.host_node_id
-        wanted = host << 16 | round(settings.heartbeat_timeout_s * 1000)
-        found = sdo.read_if_there(index, 1)
-        if found != wanted:
+        required = host << 16 | round(settings.heartbeat_timeout_s * 1000)
+        present_value = sdo.read_or_none(index, 1)
+        if present_value != required:
             # A second entry for one node is refused (0x06040043): clear stored entries first.
-            for sub in range(2, min(sdo.read_if_there(index) or 0, _MOST_HEARTBEAT_CONSUMERS) + 1):
-                stored = sdo.read_if_there(index, sub)
+            for sub in range(2, min(sdo.read_or_none(index) or 0, _MOST_HEARTBEAT_CONSUMERS) + 1):
+                stored = sdo.read_or_none(index, sub)
                 if stored is not None and stored >> 16 & 0x7F == host:
                     sdo.configure(index, sub, 0)
             try:
-                sdo.configure(index, 1, wanted)
+                sdo.configure(index, 1, required)
             except SdoRefusal as refusal:
                 if refusal.is_absent or refusal.code == _READ_ONLY_ABORT:
                     return False
@@ -550,12 +555,12 @@ class _DriveConfiguration:
         transmission = self._wanted[communication, 2]
         cob_id_bits = EVERY_BIT & ~objects.NO_REMOTE_REQUEST
         is_mapped = self._holds_values(mapping, (len(entries), *entries))
-        has_transmission_type = sdo.read_if_there(communication, 2) == transmission
-        cob_id_found = sdo.read_if_there(communication, 1)
+        has_transmission_type = sdo.read_or_none(communication, 2) == transmission
+        cob_id_found = sdo.read_or_none(communication, 1)
         other_parameters = {
             sub: value
             for sub, value in parameters.items()
-            if sdo.read_if_there(communication, sub) not in (None, value)
+            if sdo.read_or_none(communication, sub) not in (None, value)
         }
         has_cob_id = cob_id_found is not None and not (cob_id_found ^ can_id) & cob_id_bits
         if has_cob_id and is_mapped and has_transmission_type and not other_parameters:
@@ -572,7 +577,7 @@ class _DriveConfiguration:
     def _write_mapping(self, communication: int, mapping: int, entries: tuple[int, ...]) -> None:
         """Write the mapping entries of a disabled PDO."""
         sdo = self._sdo
-        what = "RPDO1" if communication == objects.RPDO_COMMUNICATION else "TPDO1"
+        pdo_name = "RPDO1" if communication == objects.RPDO_COMMUNICATION else "TPDO1"
         try:
             sdo.configure(mapping, 0, 0)
         except SdoRefusal as refusal:
@@ -583,27 +588,28 @@ class _DriveConfiguration:
             except SdoRefusal as refusal:
                 row = requirement(entry >> 16)
                 if refusal.is_absent:
-                    raise DeviceError(f"{self._name}: {row.missing()}") from None
+                    raise DeviceError(f"{self._name}: {row.refusal_reason()}") from None
                 raise DeviceError(
-                    f"{self._name}: it does not take object {row.address} ({row.name}) into {what} "
-                    f"(abort code 0x{refusal.code:08X}: {_abort_meaning(refusal)}). {row.sentence}"
+                    f"{self._name}: it does not take object {row.address} ({row.name}) into "
+                    f"{pdo_name} (abort code 0x{refusal.code:08X}: {_abort_meaning(refusal)}). "
+                    f"{row.sentence}"
                 ) from None
         sdo.configure(mapping, 0, len(entries))
 
     def _holds_values(self, index: int, values: tuple[int, ...]) -> bool:
         """Return whether sub-indices 0, 1, 2, … of an object hold the given values."""
-        return all(self._sdo.read_if_there(index, sub) == value for sub, value in enumerate(values))
+        return all(self._sdo.read_or_none(index, sub) == value for sub, value in enumerate(values))
 
 
-def _is_ratio_equal(stated: float, wanted: float) -> bool:
+def _is_ratio_equal(stated: float, required: float) -> bool:
     """Return whether a ratio that the drive states agrees with the profile's within 2 %."""
-    return abs(stated - wanted) <= _SCALE_TOLERANCE * wanted
+    return abs(stated - required) <= _SCALE_TOLERANCE * required
 
 
 def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:
     """Disable all PDOs of the drive except the first, which the rig uses."""
     for pdo_offset in range(1, objects.PDO_COUNT_AT_MOST):
-        cob_id = sdo.read_if_there(communication + pdo_offset, 1)
+        cob_id = sdo.read_or_none(communication + pdo_offset, 1)
         if cob_id is None:
             # Above the PDOs that CiA 301 predefines, indices are used without gaps.
             if pdo_offset >= objects.PDO_COUNT:

@@ -71,7 +71,7 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     assert settings is not None
     with SdoAccess(port, settings.node_id, name) as sdo:
         _confirm_off(sdo, name)
-        sdo.to_pre_operational()
+        sdo.enter_pre_operational()
         with suppress(SdoRefusal):
             # No heartbeat is sent now, whose absence would be the next fault.
             sdo.write(objects.HEARTBEAT_CONSUMER, 1, 0)
@@ -84,11 +84,11 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
 def command_off(sdo: SdoAccess) -> None:
     """Command the drive to switch off (controlword 0) and ignore its answer; never raises."""
     # An adapter's library may raise anything, and this is the way off.
-    with suppress(Exception), sdo.hurried():
+    with suppress(Exception), sdo.short_timeouts():
         sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
 
 
-def require_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
+def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
     """Wait until a drive that was commanded off is disabled, or raise.
 
     Raises
@@ -116,7 +116,7 @@ def require_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
     )
 
 
-def still_on(sdo: SdoAccess) -> str:
+def describe_remaining_torque(sdo: SdoAccess) -> str:
     """Return a warning that a drive that was commanded off still has torque, or an empty text.
 
     The text is empty if the drive reports that it is off, or does not answer.
@@ -152,7 +152,7 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
     began = time.monotonic()
     statusword: int | None = None
     requested = False
-    with sdo.hurried():
+    with sdo.short_timeouts():
         while True:
             command_off(sdo)
             if not requested:
@@ -170,7 +170,7 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
             time.sleep(_STATE_POLL_S)
     if statusword is None:
         try:
-            sdo.to_pre_operational()  # patiently, and it names what else is on the bus
+            sdo.enter_pre_operational()  # patiently, and it names what else is on the bus
             sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
             statusword = sdo.read(objects.STATUSWORD)
         except Exception as error:

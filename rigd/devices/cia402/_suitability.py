@@ -18,9 +18,9 @@ from rigd.devices.cia402.requirements import (
     ObjectAccess,
     Requirement,
     Watchdog,
-    fixed_values,
+    profile_independent_values,
+    required_values,
     requirement,
-    wanted_values,
     watchdog,
 )
 from rigd.devices.eds import Eds, EdsEntry
@@ -120,7 +120,9 @@ class _SuitabilityCheck:
         self._eds = eds
         self._rig = rig if rig is not None and rig.cia402 is not None else None
         self._settings: ServoDrive | None = self._rig.cia402 if self._rig else None
-        self._wanted = wanted_values(self._rig) if self._rig else fixed_values(eds.node_id)
+        self._wanted = (
+            required_values(self._rig) if self._rig else profile_independent_values(eds.node_id)
+        )
 
     def findings(self) -> Iterator[SuitabilityFinding]:
         """Yield the findings on identity, bit rate, torque mode, watchdog and all other objects."""
@@ -230,7 +232,7 @@ class _SuitabilityCheck:
         what = f"{needed.address} {needed.name}"
         if needed.core:
             return SuitabilityFinding(
-                what, "absent", "core", Grade.REFUSED, _capitalise(needed.missing())
+                what, "absent", "core", Grade.REFUSED, _capitalise(needed.refusal_reason())
             )
         if needed.index == objects.ABORT_OPTION and self._expected_watchdog() in _NOT_SET_BY_RIGD:
             found = "absent; in its place: the manufacturer's own watchdog"
@@ -252,7 +254,7 @@ class _SuitabilityCheck:
             found = f"{found}, accepted by the profile"
             sentence = f"{what}: {found}.{stand_in}"
             return SuitabilityFinding(what, found, wanted, Grade.ACCEPTED, sentence, needed.accept)
-        sentence = _capitalise(needed.missing()) + stand_in
+        sentence = _capitalise(needed.refusal_reason()) + stand_in
         # Without a profile there was no chance to accept it.
         grade = Grade.DOUBT if self._settings is None else Grade.REFUSED
         return SuitabilityFinding(what, found, wanted, grade, sentence, needed.accept)
@@ -308,7 +310,7 @@ class _SuitabilityCheck:
     ) -> SuitabilityFinding:
         """Return the finding on a read-only object, whose fixed value may be acceptable."""
         what = f"{needed.address} {needed.name}"
-        if needed.fit is AllowedValue.AT_LEAST:
+        if needed.value_rule is AllowedValue.AT_LEAST:
             wanted_text = f"at least {wanted or 'motor.peak_torque_nm'}"
         else:
             wanted_text = "" if wanted is None else _format_value(needed, wanted)
@@ -336,7 +338,7 @@ class _SuitabilityCheck:
                     what, found, wanted_text, Grade.REFUSED, _capitalise(sentence)
                 )
         else:
-            is_acceptable = needed.fit.allows(entry.default, wanted)
+            is_acceptable = needed.value_rule.allows(entry.default, wanted)
         if is_acceptable:
             return SuitabilityFinding(what, f"{found}: it does", wanted_text, Grade.FITS)
         if is_acceptable is None and needed.index != objects.CONTROLWORD:

@@ -248,15 +248,15 @@ def _check_mode(node: Node, grid_ns: int, stop: Callable[[], bool]) -> None:
 
     def in_cyclic_torque() -> bool:
         nonlocal mode
-        mode_read = read_mode(inbox.reply)
+        mode_read = read_mode(inbox.sdo_reply)
         if mode_read is None:
             return False
-        mode, inbox.reply = mode_read, b""
+        mode, inbox.sdo_reply = mode_read, b""
         if mode != CYCLIC_TORQUE:
             send(frames.read_mode_request)
         return mode == CYCLIC_TORQUE
 
-    inbox.reply = b""
+    inbox.sdo_reply = b""
     send(frames.read_mode_request)
     _send_controlword_until(
         node,

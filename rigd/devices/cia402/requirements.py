@@ -86,17 +86,17 @@ class AllowedValue(Enum):
     ANY = "any"
     """Every value is accepted, because the object is only read."""
 
-    def allows(self, found: int, wanted: int) -> bool:
+    def allows(self, value: int, required_value: int) -> bool:
         """Return whether this rule accepts the value that an object holds.
 
         Parameters
         ----------
-        found, wanted
+        value, required_value
             Value that the object holds, and value that is required.
         """
         if self in (AllowedValue.EQUAL, AllowedValue.EQUAL_OR_UNUSED):
-            return found == wanted or (self is AllowedValue.EQUAL_OR_UNUSED and found == 0)
-        return self is AllowedValue.ANY or found >= wanted
+            return value == required_value or (self is AllowedValue.EQUAL_OR_UNUSED and value == 0)
+        return self is AllowedValue.ANY or value >= required_value
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,12 +117,12 @@ class Requirement:
         What replaces the object if it is absent; empty if nothing does.
     sentence
         Consequence and remedy if the object is absent or unusable, for the operator.
-    fit
+    value_rule
         Rule for the value of the object if it is read-only.
     accept
         Name in ``cia402.accept_without`` that permits a drive without the object; empty if no
         permission is needed. (For 1016:1 only if no other :class:`Watchdog` is active.)
-    zero
+    must_be_zero
         Whether the object has to read 0 if the drive has it, since the drive may have stored
         another value in earlier use.
     """
@@ -134,16 +134,16 @@ class Requirement:
     access: ObjectAccess
     stand_in: str = ""
     sentence: str = ""
-    fit: AllowedValue = AllowedValue.EQUAL
+    value_rule: AllowedValue = AllowedValue.EQUAL
     accept: str = ""
-    zero: bool = False
+    must_be_zero: bool = False
 
     @property
     def address(self) -> str:
         """Index and sub-index of the object as messages show them: ``6072`` or ``1016:1``."""
         return f"{self.index:04X}:{self.sub}" if self.sub else f"{self.index:04X}"
 
-    def missing(self, accepted: Collection[str] = ()) -> str:
+    def refusal_reason(self, accepted: Collection[str] = ()) -> str:
         """Return the reason to refuse a drive without this object; empty if it is accepted.
 
         Parameters
@@ -159,7 +159,7 @@ class Requirement:
         return f"it has no object {self.address} ({self.name}). {self.sentence}{remedy}"
 
 
-_R, _W = ObjectAccess.READ, ObjectAccess.WRITE
+_READ_ACCESS, _WRITE_ACCESS = ObjectAccess.READ, ObjectAccess.WRITE
 _DRIVE_NOT_USABLE: Final = (
     "Without it the drive cannot be used: check whether its firmware offers it."
 )
@@ -169,13 +169,13 @@ _PDO_MAPPING_NEEDED: Final = (
 )
 _CLEAR_STORED_VALUE: Final = "Set it to 0 with the drive's own tool, and store that."
 
-CORE: Final = (
+CORE_REQUIREMENTS: Final = (
     Requirement(
         objects.CONTROLWORD,
         0,
         "Controlword",
         True,
-        _W | ObjectAccess.RECEIVED,
+        _WRITE_ACCESS | ObjectAccess.RECEIVED,
         sentence=_DRIVE_NOT_USABLE,
     ),
     Requirement(
@@ -183,7 +183,7 @@ CORE: Final = (
         0,
         "Statusword",
         True,
-        _R | ObjectAccess.SENT,
+        _READ_ACCESS | ObjectAccess.SENT,
         sentence=_DRIVE_NOT_USABLE,
     ),
     Requirement(
@@ -191,18 +191,23 @@ CORE: Final = (
         0,
         "Modes of operation",
         True,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         sentence="It must accept 10, cyclic synchronous torque mode.",
     ),
     Requirement(
-        objects.MODE_DISPLAY, 0, "Modes of operation display", True, _R, sentence=_DRIVE_NOT_USABLE
+        objects.MODE_DISPLAY,
+        0,
+        "Modes of operation display",
+        True,
+        _READ_ACCESS,
+        sentence=_DRIVE_NOT_USABLE,
     ),
     Requirement(
         objects.POSITION,
         0,
         "Position actual value",
         True,
-        _R | ObjectAccess.SENT,
+        _READ_ACCESS | ObjectAccess.SENT,
         sentence="The loop runs on it.",
     ),
     Requirement(
@@ -218,7 +223,7 @@ CORE: Final = (
         0,
         "Supported drive modes",
         True,
-        _R,
+        _READ_ACCESS,
         sentence="Its bit 9 must say that the drive has cyclic synchronous torque mode.",
     ),
     Requirement(
@@ -226,7 +231,7 @@ CORE: Final = (
         1,
         "COB-ID of RPDO1",
         True,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         sentence=_PDO_MAPPING_NEEDED,
     ),
     Requirement(
@@ -234,18 +239,23 @@ CORE: Final = (
         2,
         "Transmission type of RPDO1",
         True,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         sentence="It must be 1 (at_sync) or 255 (on_arrival), as cia402.torque_delivery says.",
     ),
     Requirement(
-        objects.RPDO_MAPPING, 0, "Mapping of RPDO1", True, _R | _W, sentence=_PDO_MAPPING_NEEDED
+        objects.RPDO_MAPPING,
+        0,
+        "Mapping of RPDO1",
+        True,
+        _READ_ACCESS | _WRITE_ACCESS,
+        sentence=_PDO_MAPPING_NEEDED,
     ),
     Requirement(
         objects.TPDO_COMMUNICATION,
         1,
         "COB-ID of TPDO1",
         True,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         sentence=_PDO_MAPPING_NEEDED,
     ),
     Requirement(
@@ -253,11 +263,16 @@ CORE: Final = (
         2,
         "Transmission type of TPDO1",
         True,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         sentence="It must be 1: an angle at every SYNC.",
     ),
     Requirement(
-        objects.TPDO_MAPPING, 0, "Mapping of TPDO1", True, _R | _W, sentence=_PDO_MAPPING_NEEDED
+        objects.TPDO_MAPPING,
+        0,
+        "Mapping of TPDO1",
+        True,
+        _READ_ACCESS | _WRITE_ACCESS,
+        sentence=_PDO_MAPPING_NEEDED,
     ),
 )
 """Requirements on objects without which no session is possible.
@@ -265,35 +280,43 @@ CORE: Final = (
 Rows for sub-index 0 of the mappings 1600 and 1A00 stand for the entries from sub-index 1 on,
 too."""
 
-OPTIONAL: Final = (
+OPTIONAL_REQUIREMENTS: Final = (
     # Identity and texts: reported, and compared only if the profile states them.
     Requirement(
         objects.IDENTITY,
         1,
         "Vendor-ID",
         False,
-        _R,
+        _READ_ACCESS,
         "nothing: cia402.vendor_id = 0",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
     ),
     Requirement(
         objects.IDENTITY,
         2,
         "Product code",
         False,
-        _R,
+        _READ_ACCESS,
         "nothing: cia402.product_code = 0",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
     ),
-    Requirement(objects.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=AllowedValue.ANY),
+    Requirement(
+        objects.DEVICE_NAME,
+        0,
+        "Device name",
+        False,
+        _READ_ACCESS,
+        "no name",
+        value_rule=AllowedValue.ANY,
+    ),
     Requirement(
         objects.ERROR_CODE,
         0,
         "Error code",
         False,
-        _R,
+        _READ_ACCESS,
         "the emergency message",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
     ),
     # SYNC.
     Requirement(
@@ -301,7 +324,7 @@ OPTIONAL: Final = (
         0,
         "COB-ID SYNC",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "0x080, the default of CiA 301",
     ),
     Requirement(
@@ -309,7 +332,7 @@ OPTIONAL: Final = (
         0,
         "Communication cycle period",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "transmission type 1: the drive goes by the SYNCs that come",
         "It must be the period of rig.rate_hz in microseconds, or 0.",
         AllowedValue.EQUAL_OR_UNUSED,
@@ -319,27 +342,27 @@ OPTIONAL: Final = (
         0,
         "Synchronous window length",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "no window",
         f"A torque that comes later than it is dropped. {_CLEAR_STORED_VALUE}",
-        zero=True,
+        must_be_zero=True,
     ),
     Requirement(
         objects.SYNC_OVERFLOW,
         0,
         "Synchronous counter overflow value",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "a SYNC without counter",
         f"rigd sends SYNC without a counter. {_CLEAR_STORED_VALUE}",
-        zero=True,
+        must_be_zero=True,
     ),
     Requirement(
         objects.INTERPOLATION_TIME,
         1,
         "Interpolation time period value",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the SYNC: each torque holds until the next",
         "With 60C2:2 it has to be the period of rig.rate_hz.",
     ),
@@ -348,7 +371,7 @@ OPTIONAL: Final = (
         2,
         "Interpolation time index",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the SYNC: each torque holds until the next",
         "With 60C2:1 it has to be the period of rig.rate_hz.",
     ),
@@ -358,7 +381,7 @@ OPTIONAL: Final = (
         1,
         "Consumer heartbeat time",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the deadline of the RPDO (1400:5), or the drive's own watchdog (cia402.own_watchdog_s)",
         "Nothing in the drive would remove the torque if this computer stops communicating. If the "
         "drive has its own watchdog, set that up and state its time: cia402.own_watchdog_s.",
@@ -369,7 +392,7 @@ OPTIONAL: Final = (
         objects.EVENT_TIMER,
         "Event timer of RPDO1",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the heartbeat consumer (1016:1), which comes first",
     ),
     Requirement(
@@ -377,7 +400,7 @@ OPTIONAL: Final = (
         0,
         "Abort connection option code",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "",
         "The drive's reaction to the loss of this computer is then manufacturer-specific: see its "
         "manual, and test it at a low torque by pulling the cable. If it has a suitable value, "
@@ -389,7 +412,7 @@ OPTIONAL: Final = (
         1,
         "Error behaviour on communication error",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the default of CiA 301: to pre-operational",
         "It must be cia402.communication_error_option.",
     ),
@@ -398,7 +421,7 @@ OPTIONAL: Final = (
         0,
         "Producer heartbeat time",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the TPDO of every SYNC, and limits.stale_ticks_in_a_row",
         "It must be cia402.drive_heartbeat_period_s in milliseconds.",
     ),
@@ -407,7 +430,7 @@ OPTIONAL: Final = (
         0,
         "COB-ID EMCY",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "0x080 + node id, the default of CiA 301",
         "Its emergency messages would not be received.",
     ),
@@ -417,7 +440,7 @@ OPTIONAL: Final = (
         0,
         "Max torque",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "a manufacturer-specific limit, set by cia402.set_objects (maxon EPOS4: 3001:2), the speed "
         "limit 6080, and the cut to motor.peak_torque_nm in this program",
         "The drive then has no limit of its own for the torque that rigd could set. Set the one "
@@ -430,7 +453,7 @@ OPTIONAL: Final = (
             0,
             name,
             False,
-            _R | _W,
+            _READ_ACCESS | _WRITE_ACCESS,
             "Max torque (6072)",
             "It cuts torques that the profile allows: raise it with the drive's own tool, or lower "
             "motor.peak_torque_nm.",
@@ -447,21 +470,21 @@ OPTIONAL: Final = (
         0,
         "Torque offset",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "none is added",
         f"The drive adds it to every torque. {_CLEAR_STORED_VALUE}",
-        zero=True,
+        must_be_zero=True,
     ),
     Requirement(
         objects.RATED_TORQUE,
         0,
         "Motor rated torque",
         False,
-        _R,
+        _READ_ACCESS,
         "motor.rated_torque_nm alone: cia402.rated_torque_unit_nm = 0",
         "What 1000 thousandths of torque are cannot be compared with the profile: set "
         "cia402.rated_torque_unit_nm = 0, and measure it (rigd identify motor).",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
     ),
     *(
         Requirement(
@@ -469,9 +492,9 @@ OPTIONAL: Final = (
             sub,
             name,
             False,
-            _R,
+            _READ_ACCESS,
             "the probing move before the first session (docs/safety.md)",
-            fit=AllowedValue.ANY,
+            value_rule=AllowedValue.ANY,
         )
         for index, sub, name in (
             (objects.ENCODER_RESOLUTION, 1, "Encoder increments"),
@@ -487,10 +510,10 @@ OPTIONAL: Final = (
         0,
         "Torque actual value",
         False,
-        _R | ObjectAccess.SENT,
+        _READ_ACCESS | ObjectAccess.SENT,
         "",
         "Torque commands that are lost, or cut by the drive, would not be noticed.",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
         accept=TORQUE_FEEDBACK,
     ),
     Requirement(
@@ -498,7 +521,7 @@ OPTIONAL: Final = (
         0,
         "Max motor speed",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "nothing: cia402.max_speed_rad_s = 0, and a longer worst travel in rigd check",
         "The drive has no limit of its own for the speed: set cia402.max_speed_rad_s = 0, and see "
         "what rigd check then says of the worst travel.",
@@ -509,38 +532,44 @@ OPTIONAL: Final = (
         objects.INHIBIT_TIME,
         "Inhibit time of TPDO1",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "no inhibit time",
         f"It keeps back angles that SYNC asks for. {_CLEAR_STORED_VALUE}",
-        zero=True,
+        must_be_zero=True,
     ),
     Requirement(
         objects.POLARITY,
         0,
         "Polarity",
         False,
-        _R,
+        _READ_ACCESS,
         "no polarity",
         "It turns the position, the speed or the torque round: turned alone, one of them makes the "
         f"loop run away. {_CLEAR_STORED_VALUE} The direction of the axis is cia402.direction.",
-        zero=True,
+        must_be_zero=True,
     ),
     Requirement(
-        objects.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=AllowedValue.ANY
+        objects.QUICK_STOP_OPTION,
+        0,
+        "Quick stop option code",
+        False,
+        _READ_ACCESS,
+        "–",
+        value_rule=AllowedValue.ANY,
     ),
     Requirement(
         objects.FAULT_REACTION_OPTION,
         0,
         "Fault reaction option code",
         False,
-        _R,
+        _READ_ACCESS,
         "–",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
     ),
 )
 """Requirements on objects that something else can replace."""
 
-REQUIREMENTS: Final = CORE + OPTIONAL
+REQUIREMENTS: Final = CORE_REQUIREMENTS + OPTIONAL_REQUIREMENTS
 """All requirements on the drive's object dictionary."""
 
 MAY_BE_WRITE_ONLY: Final = (
@@ -581,7 +610,7 @@ _ROUNDING_TOLERANCE = 1e-9
 """Tolerance for rounding errors of floating-point numbers, relative."""
 
 
-def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
+def profile_independent_values(node_id: int) -> dict[tuple[int, int], int]:
     """Return the required object values that do not depend on the profile, by index and sub-index.
 
     Parameters
@@ -591,7 +620,7 @@ def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
         of SYNC.
     """
     return {
-        **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.zero},
+        **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.must_be_zero},
         (objects.MODE, 0): objects.CYCLIC_TORQUE,
         (objects.SYNC_COB_ID, 0): objects.SYNC_ID,
         (objects.EMERGENCY_COB_ID, 0): 0x080 + node_id,
@@ -601,7 +630,7 @@ def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
     }
 
 
-def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
+def required_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     """Return the values that the set-up writes to the drive's objects, by index and sub-index.
 
     Values that depend on what the drive reports, such as its kind of watchdog, are not included,
@@ -623,7 +652,7 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     period_us = sync_period_us(rig.rate_hz)
     value, exponent = interpolation_time(rig.rate_hz)
     unknown = unknown_values(rig)
-    wanted = fixed_values(settings.node_id) | {
+    required_value = profile_independent_values(settings.node_id) | {
         (objects.RPDO_COMMUNICATION, 2): objects.AT_EVERY_SYNC if at_sync else objects.ON_ARRIVAL,
         (objects.SYNC_PERIOD_US, 0): period_us,
         (objects.INTERPOLATION_TIME, 1): value,
@@ -635,10 +664,10 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     if not {"motor.peak_torque_nm", "motor.rated_torque_nm"}.intersection(unknown):
         limit_per_mille = torque_limit_per_mille(rig)
         limit_indices = (objects.MAX_TORQUE, *objects.TORQUE_LIMITS)
-        wanted |= {(index, 0): limit_per_mille for index in limit_indices}
+        required_value |= {(index, 0): limit_per_mille for index in limit_indices}
     if settings.max_speed_rad_s > 0 and "cia402.gear_ratio" not in unknown:
-        wanted[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
-    return wanted
+        required_value[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
+    return required_value
 
 
 def sync_period_us(rate_hz: float) -> int:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rigd.devices.contracts import Wrench
 from rigd.devices.parameters import WrenchSensorSettings
-from rigd.sim import Stuck
+from rigd.sim import StuckReadings
 
 COUNTS_PER_UNIT = (1_000_000, 1_000_000)
 """Counts per N and per N·m, as documented for two sensors of this family."""
@@ -81,7 +81,7 @@ class AtiGauges:
         self.quantisation: NDArray[np.float64] = 0.5 * np.abs(matrix).sum(axis=1) / counts
         # For wrenches in rows.
         self._counts_per_wrench = np.ascontiguousarray((np.linalg.inv(matrix) * counts).T)
-        self.stuck: tuple[int, Stuck] | None = None
+        self.stuck: tuple[int, StuckReadings] | None = None
         self._bias = np.array(_BIAS_COUNTS, dtype=np.float64)
 
     def read(self, wrenches: Sequence[Wrench], saturated: int | None = None) -> NDArray[np.int16]:

@@ -15,7 +15,7 @@ from rigd.beam.realisation import RealisationError
 from rigd.devices.canbus.port import BUS_OFF_FRAME, pack_frame, unpack_frame
 from rigd.devices.obstacles import Obstacle, ObstacleError
 from rigd.devices.parameters import RigParameters
-from rigd.sim import SimulatedRig, Stuck
+from rigd.sim import SimulatedRig, StuckReadings
 from rigd.sim.wire._faults import (
     DISTURBANCE_KINDS,
     LINE_KINDS,
@@ -283,12 +283,12 @@ class BusSimulation:
         self._serial: SerialDevice | None = None
         self._advance_is_due = False
         self._lines = {
-            "host": FaultyLine("host", self._from_host, self._schedule_delivery, log),
+            "host": FaultyLine("host", self._deliver_from_host, self._schedule_delivery, log),
             "drive": FaultyLine(
-                "drive", partial(self._from_node, "drive"), self._schedule_delivery, log
+                "drive", partial(self._deliver_from_node, "drive"), self._schedule_delivery, log
             ),
             "sensor": FaultyLine(
-                "sensor", partial(self._from_node, "sensor"), self._schedule_delivery, log
+                "sensor", partial(self._deliver_from_node, "sensor"), self._schedule_delivery, log
             ),
         }
         self._undelivered_frames: deque[tuple[str, int, bytes]] = deque()
@@ -323,15 +323,15 @@ class BusSimulation:
         """Names of the senders whose next frames a fault may affect."""
         return [sender for sender, line in self._lines.items() if line.disturbed]
 
-    def can_port(self, sender: str) -> Callable[[int, bytes], None]:
+    def can_sender(self, sender: str) -> Callable[[int, bytes], None]:
         """Return the function by which a node sends frames on the CAN bus."""
         return self._lines[sender].send
 
-    def serial_port(self) -> Callable[[bytes], None]:
+    def serial_writer(self) -> Callable[[bytes], None]:
         """Return the function by which a sensor writes to the serial line."""
         return self._write_serial
 
-    def join(self, name: str, node: SimulatedNode) -> None:
+    def add_node(self, name: str, node: SimulatedNode) -> None:
         """Connect a node to the CAN bus."""
         self._nodes[name] = node
 
@@ -339,11 +339,11 @@ class BusSimulation:
         """Connect the sensor to the serial line."""
         self._serial = device
         self._lines["sensor"] = FaultyLine(
-            "sensor", self._to_serial, self._schedule_delivery, self._log
+            "sensor", self._deliver_to_serial_host, self._schedule_delivery, self._log
         )
 
     def step(self) -> None:
-        """Advance the rig to the tick of a SYNC; the drive calls this at each received SYNC."""
+        """Advance the rig by the period of a SYNC, which the drive reports as received."""
         if self._advance_is_due:
             self._advance_is_due = False
             self._advance_rig()
@@ -393,13 +393,13 @@ class BusSimulation:
         FaultError
             If the fault is not possible on this rig.
         """
-        self._check(fault)
+        self._check_fault(fault)
         if fault.after_s is None:
-            self._begin(fault)
+            self._begin_fault(fault)
         elif self._enabled_s is None:
             self._faults_after_enabling.append(fault)
         else:
-            self._schedule(self._enabled_s + fault.after_s, partial(self._begin, fault))
+            self._schedule(self._enabled_s + fault.after_s, partial(self._begin_fault, fault))
 
     def _sync(self, data: bytes, origin: object, now_ns: float) -> None:
         """Process a SYNC: advance clock, rig and nodes, and deliver the SYNC."""
@@ -453,7 +453,7 @@ class BusSimulation:
 
     # Delivery of frames and bytes.
 
-    def _from_host(self, can_id: int, data: bytes, origin: object) -> None:
+    def _deliver_from_host(self, can_id: int, data: bytes, origin: object) -> None:
         """Deliver a frame of a host to the other hosts and to the nodes."""
         if self.bus_off:
             return
@@ -462,7 +462,7 @@ class BusSimulation:
             node.receive(can_id, data)
         self._deliver_to_nodes()
 
-    def _from_node(self, sender: str, can_id: int, data: bytes, _: object) -> None:
+    def _deliver_from_node(self, sender: str, can_id: int, data: bytes, _: object) -> None:
         """Deliver a frame of a node to the hosts, and queue it for the other nodes."""
         if not self.bus_off:
             self._send(pack_frame(can_id, data), None)
@@ -485,13 +485,13 @@ class BusSimulation:
         else:
             line.send(SERIAL, data)
 
-    def _to_serial(self, _: int, data: bytes, __: object) -> None:
+    def _deliver_to_serial_host(self, _: int, data: bytes, __: object) -> None:
         """Pass bytes that got through the faulty line to the host."""
         self._write(data)
 
     # Faults.
 
-    def _check(self, fault: Fault) -> None:
+    def _check_fault(self, fault: Fault) -> None:
         """Raise if a fault is not possible on this rig."""
         values = fault.values
         device = values.get("device", values.get("from", "drive"))
@@ -527,7 +527,7 @@ class BusSimulation:
             except (ObstacleError, RealisationError) as error:
                 raise FaultError(f"Fault '{fault}': {error}") from None
 
-    def _begin(self, fault: Fault) -> None:
+    def _begin_fault(self, fault: Fault) -> None:
         """Begin a fault now."""
         self._log("simulator", "fault", fault=str(fault))
         values: dict[str, Any] = dict(fault.values)
@@ -555,7 +555,7 @@ class BusSimulation:
         elif fault.kind == "jump":
             drive.angle_offset_counts += values["counts"]
         elif fault.kind == "object":
-            drive.state_object(values["index"], values["sub"], values.get("value"))
+            drive.override_object(values["index"], values["sub"], values.get("value"))
         elif fault.kind in ("restart", "power_cycle"):
             device = drive if values["device"] == "drive" else sensor
             (device.reset if fault.kind == "restart" else device.power_cycle)()
@@ -580,7 +580,7 @@ class BusSimulation:
 
     def _begin_stuck_readings(self, fault: Fault, sensor: Any) -> None:  # noqa: ANN401
         """Make the encoder, the sensor or one gauge repeat its readings."""
-        stuck = Stuck(int(fault.values.get("every", 0)))
+        stuck = StuckReadings(int(fault.values.get("every", 0)))
         what = fault.values["what"]
         if what == "encoder":
             self._override_attribute(fault, self._simulated, "stuck_encoder", stuck)

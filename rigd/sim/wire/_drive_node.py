@@ -300,7 +300,7 @@ class DriveNode:
         """Restart the drive as after a loss of power; it equals `reset` here."""
         self.reset()
 
-    def state_object(self, index: int, sub: int, value: int | None) -> None:
+    def override_object(self, index: int, sub: int, value: int | None) -> None:
         """Set an object to another value, or make it absent if `value` is None."""
         self._objects.override_entry(index, sub, value)
 
@@ -384,12 +384,12 @@ class DriveNode:
 
     def _on_sync(self, data: bytes) -> None:
         """Process a SYNC: apply pending RPDOs, advance the rig, send TPDOs."""
-        operational = self._nmt is Nmt.OPERATIONAL and not self.frozen
+        is_operational = self._nmt is Nmt.OPERATIONAL and not self.frozen
         if len(data) != self._sync_length:
-            if operational:
+            if is_operational:
                 self._report(_SYNC_LENGTH_CODE, _COMMUNICATION_ERROR_BIT, bytes([len(data)]))
             return
-        if operational:
+        if is_operational:
             if self._emergencies.active:
                 self._clear(_SYNC_LENGTH_CODE)
             self._last_sync_s = self._now_s
@@ -404,7 +404,7 @@ class DriveNode:
         self._advance()
         if self.torque_lag_s:
             self._measure_torque()
-        if operational:
+        if is_operational:
             limit_rad_s = self._entries.max_speed_rpm.value * self._rad_s_per_rpm
             too_fast = not -limit_rad_s <= self._plant.velocity_rad_s <= limit_rad_s
             if too_fast or self._is_too_fast:
@@ -583,10 +583,13 @@ class DriveNode:
 
     def _on_controlword(self) -> None:
         """Process a changed controlword."""
-        word = self._entries.controlword.value
+        controlword = self._entries.controlword.value
         mask, unchanged_value = _UNCHANGED_OPERATION
-        if self._machine.state is not PdsState.OPERATION_ENABLED or word & mask != unchanged_value:
-            self._machine.control(word)
+        if (
+            self._machine.state is not PdsState.OPERATION_ENABLED
+            or controlword & mask != unchanged_value
+        ):
+            self._machine.control(controlword)
         self._refresh_torque()
 
     def _on_mode(self) -> None:
@@ -596,10 +599,10 @@ class DriveNode:
             self._log("mode", mode=self._mode)
             self._refresh_torque()
 
-    def _on_state_change(self, left: PdsState) -> None:
+    def _on_state_change(self, previous_state: PdsState) -> None:
         """Process a change of the drive's state: switch the plant on or off, and log it."""
         state = self._machine.state
-        if left is PdsState.OPERATION_ENABLED:
+        if previous_state is PdsState.OPERATION_ENABLED:
             self._plant.disable()
             self._per_mille = 0
             self._is_limited = self._follows_target = False
@@ -609,7 +612,7 @@ class DriveNode:
             self._plant.enable()
             self._log("torque", torque_nm=0.0, enabled=True)
             self._refresh_torque()
-        elif left is PdsState.FAULT:
+        elif previous_state is PdsState.FAULT:
             self._entries.error_code.value = 0
             remaining = (
                 {_HEARTBEAT_LOST_CODE} if any(watch.lost for watch in self._watches) else set()
@@ -627,16 +630,22 @@ class DriveNode:
             and not entries.controlword.value & _HALT_BIT
             and (not self._target_pdos or any(pdo.applied for pdo in self._target_pdos))
         )
-        wanted = (
+        target_per_mille = (
             entries.target_torque.value + entries.torque_offset.value if self._follows_target else 0
         )
-        limit = min(entries.max_torque.value, self._peak_per_mille)
-        high = min(limit, abs(entries.positive_limit.value))
-        low = -min(limit, abs(entries.negative_limit.value))  # some drives state a negative limit
-        per_mille = low if wanted < low else min(wanted, high)
+        limit_per_mille = min(entries.max_torque.value, self._peak_per_mille)
+        highest_per_mille = min(limit_per_mille, abs(entries.positive_limit.value))
+        lowest_per_mille = -min(
+            limit_per_mille, abs(entries.negative_limit.value)
+        )  # some drives state a negative limit
+        per_mille = (
+            lowest_per_mille
+            if target_per_mille < lowest_per_mille
+            else min(target_per_mille, highest_per_mille)
+        )
         if self._is_too_fast and per_mille * self._direction * self._plant.velocity_rad_s > 0:
             per_mille = 0
-        self._is_limited = per_mille != wanted
+        self._is_limited = per_mille != target_per_mille
         if per_mille != self._per_mille:
             self._per_mille = per_mille
             torque_nm = per_mille * self._nm_per_mille
@@ -687,7 +696,7 @@ class DriveNode:
 
 
 def _pdo_parameters(
-    communication: int, cob_id: int, word: int, file: "DeviceFile | None"
+    communication: int, cob_id: int, first_mapped_index: int, file: "DeviceFile | None"
 ) -> Iterator[tuple[int, int, int, tuple[int, ...], int]]:
     """Yield index of parameters and mapping, COB-ID, mapping and number of slots of each PDO.
 
@@ -701,7 +710,7 @@ def _pdo_parameters(
         mapping = communication + 0x200 + number
         slots = MAX_MAPPING_ENTRIES if file is None else file.sub_index_count(mapping)
         default_cob_id = cob_id + 0x100 * number if number < _DEFAULT_PDO_COUNT else 0
-        default_mapping = () if number else (word << 16 | 16,)
+        default_mapping = () if number else (first_mapped_index << 16 | 16,)
         yield (
             communication + number,
             mapping,

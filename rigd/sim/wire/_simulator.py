@@ -453,23 +453,23 @@ class _SimulatorProcess:
             rig,
             simulated,
             bus_simulation.step,
-            bus_simulation.can_port("drive"),
+            bus_simulation.can_sender("drive"),
             self._log,
             sync_timeout_s=self._sync_timeout_s(),
             file=self._file,
         )
-        bus_simulation.join("drive", drive)
+        bus_simulation.add_node("drive", drive)
         if rig.ati_serial is not None:
             from rigd.sim.wire._ati_serial_device import AtiSerialDevice
 
             bus_simulation.add_serial_device(
-                AtiSerialDevice(rig, simulated, bus_simulation.serial_port(), self._log)
+                AtiSerialDevice(rig, simulated, bus_simulation.serial_writer(), self._log)
             )
         elif rig.ati_can is not None:
             from rigd.sim.wire._ati_can_node import AtiCanNode
 
-            bus_simulation.join(
-                "sensor", AtiCanNode(rig, simulated, bus_simulation.can_port("sensor"), self._log)
+            bus_simulation.add_node(
+                "sensor", AtiCanNode(rig, simulated, bus_simulation.can_sender("sensor"), self._log)
             )
         return bus_simulation
 

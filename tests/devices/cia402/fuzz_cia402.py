@@ -106,7 +106,7 @@ def fuzz(rig, frames, seed=1):
             assert not drive._enabled
             # As after the operator's reset.
             drive._inbox.clear()
-            drive._inbox.must_stay_operational = drive._inbox.received = True
+            drive._inbox.must_stay_operational = drive._inbox.heartbeat_received = True
             drive._may_be_on = False
     drive.disable()
     return ends

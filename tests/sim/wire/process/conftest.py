@@ -132,15 +132,15 @@ class Recording:
             mend=self.mended.append,
             log=log,
         )
-        self.drive = Drive(self.world.step, self.world.can_port("drive"))
+        self.drive = Drive(self.world.step, self.world.can_sender("drive"))
         self.drive.rig_periods = lambda: self.world.rig_periods
-        self.world.join("drive", self.drive)
+        self.world.add_node("drive", self.drive)
         if serial:
-            self.sensor = SerialSensor(self.world.serial_port(), simulated.records_per_period)
+            self.sensor = SerialSensor(self.world.serial_writer(), simulated.records_per_period)
             self.world.add_serial_device(self.sensor)
         else:
-            self.sensor = Sensor(self.world.can_port("sensor"))
-            self.world.join("sensor", self.sensor)
+            self.sensor = Sensor(self.world.can_sender("sensor"))
+            self.world.add_node("sensor", self.sensor)
 
     def _write(self, data):
         self.written += data
