@@ -9,7 +9,7 @@ _SEED_BITS: Final = 53
 
 
 def fresh_seed() -> int:
-    """Return a random seed."""
+    """Return a random seed for the noise of a simulated rig."""
     return secrets.randbits(_SEED_BITS)
 
 

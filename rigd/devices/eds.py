@@ -101,7 +101,7 @@ class EdsEntry:
 
     @property
     def bits(self) -> int | None:
-        """Length of the value in bits; None for a text or block, or if no type is stated."""
+        """Length of the object's value in bits; None for a text or block, or if untyped."""
         return _TYPE_LENGTHS_BIT.get(self.data_type)
 
 

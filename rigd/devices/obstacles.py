@@ -205,7 +205,7 @@ def check_obstacles(
         Obstacles and impacts.
     beam
         Beam, within whose length every obstacle and impact has to be.
-    simulated
+    simulated_effects
         Values of the other simulated effects by the keys in `INCOMPATIBLE_WITH_OBSTACLES`; 0 or
         None if the effect is not simulated.
 

@@ -271,7 +271,7 @@ class SimulatedDrive:
         self._rig.stuck_encoder = stuck
 
     def connect(self) -> None:
-        """Do nothing: there is no line."""
+        """Do nothing: a drive simulated in this process has no line to open."""
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:  # noqa: ARG002
         """Switch the simulated drive on, or raise if the wired stop is dropped."""
@@ -294,7 +294,7 @@ class SimulatedDrive:
         return LineHealth()
 
     def disable(self) -> None:
-        """Zero the torque, and ignore further commands until the drive is enabled."""
+        """Zero the simulated drive's torque, and ignore further commands until it is enabled."""
         self._plant.disable()
         self.read_angle = self._rig.read_angle
 
@@ -315,7 +315,7 @@ class SimulatedDrive:
         raise wired_stop_dropped(_DRIVE_NAME)
 
     def close(self) -> None:
-        """Disable the drive."""
+        """Disable the simulated drive."""
         self.disable()
 
 
@@ -374,7 +374,7 @@ class SimulatedSensor:
         self.wrench_saturated = False
 
     def connect(self) -> None:
-        """Do nothing: there is no line."""
+        """Do nothing: a sensor simulated in this process has no line to open."""
 
     def calibration(self) -> dict[str, object]:
         """Return the calibration as a real sensor would report it."""
@@ -406,12 +406,12 @@ class SimulatedSensor:
         return LineHealth(status=0)
 
     def renew_noise(self, seed: int) -> None:
-        """Restart the noise from a seed."""
+        """Restart the simulated sensor's noise from a seed."""
         self._noise_rows = chain.from_iterable(self._noise(seed))
         self.records.clear()
 
     def sample(self) -> None:
-        """Take a reading and add it to the decimating filter."""
+        """Take a reading of the simulated sensor and add it to the decimating filter."""
         self.records.append(self.measure())
         self._saturated |= self.wrench_saturated
 
@@ -441,7 +441,7 @@ class SimulatedSensor:
         return wrench if self.stuck is None else self.stuck(wrench)
 
     def close(self) -> None:
-        """Do nothing: there is no line to release."""
+        """Do nothing: a sensor simulated in this process has no line to release."""
 
     def _noise(self, seed: int | None) -> Iterator[list[list[float]]]:
         """Yield blocks of unloaded wrenches with noise and offset; without a seed, random ones."""

@@ -86,7 +86,7 @@ class AttachedObstacles:
     ) -> None:
         self.bodies = bodies
         self._period_s = period_s
-        self.substeps = _substeps(beam, bodies, period_s)
+        self.substeps = _substeps_per_period(beam, bodies, period_s)
         self._step_s = period_s / self.substeps
         positions_m = np.array([body.x_m for body in bodies])
         force_realisations = [
@@ -102,7 +102,7 @@ class AttachedObstacles:
         angle_outputs = [
             state_output(
                 realisation,
-                partial(_displacement, beam, damping, x),
+                partial(_displacement_per_angle, beam, damping, x),
                 inertial=False,
                 small=_SMALL_DISPLACEMENT_RATIO * x,
             )
@@ -250,7 +250,7 @@ class AttachedObstacles:
             free=np.asfortranarray(free).dot,
             friction=-torques.sum(axis=2),
             kernel=kernel,
-            history=_history(kernel),
+            history=_history_matrices(kernel),
             effect=np.asfortranarray(effect).dot,
             velocity_row=n + 1,
         )
@@ -277,7 +277,9 @@ class AttachedObstacles:
                     return False
                 old, new = before_m.item(index), displacement_m.item(index)
                 motion_m = 2 * abs(new - old) + body.x_m * abs(body.rate_rad_s) * self._period_s
-                if body.side * (new - _surface(body, end_s)) > -(motion_m + _CONTACT_MARGIN_M):
+                if body.side * (new - _surface_displacement_m(body, end_s)) > -(
+                    motion_m + _CONTACT_MARGIN_M
+                ):
                     return False
         self._penetration_m = dict.fromkeys(range(self._positions_m.size), -inf)
         self.forces_n = self._zero_forces
@@ -321,10 +323,12 @@ class AttachedObstacles:
             is_present = (ends_s > body.from_s) & (ends_s <= body.until_s)
             if not is_present.any():
                 continue
-            surface_m = _surface(body, ends_s)
+            surface_m = _surface_displacement_m(body, ends_s)
             start_m = self._penetration_m[index]
             if start_m == -inf and body.from_s <= time_s:
-                start_m = body.side * (self._start_m.item(index) - _surface(body, time_s))
+                start_m = body.side * (
+                    self._start_m.item(index) - _surface_displacement_m(body, time_s)
+                )
             obstacles.append(
                 _ActiveObstacle(
                     index=index,
@@ -435,7 +439,7 @@ class AttachedObstacles:
         return new_state
 
     def remove(self, body: Disturbance, time_s: float) -> None:
-        """Remove an obstacle at a time in seconds."""
+        """Remove an obstacle from the simulation at a time in seconds."""
         self._obstacles = [
             (index, replace(each, until_s=min(each.until_s, time_s)) if each == body else each, k)
             for index, each, k in self._obstacles
@@ -525,20 +529,20 @@ class SubstepMatrices:
     """Row of the velocity in [next state, outputs]."""
 
 
-def _history(kernel: Real) -> Real:
-    """Return the lower triangular matrices of a kernel (substeps, m, m), over past substeps."""
+def _history_matrices(kernel: Real) -> Real:
+    """Return lower triangular matrices (m, m, substeps, substeps) of a kernel (substeps, m, m)."""
     steps = len(kernel)
     lag = np.subtract.outer(np.arange(steps), np.arange(steps))
     history: Real = np.where(lag >= 0, kernel.transpose(1, 2, 0)[:, :, np.maximum(lag, 0)], 0.0)
     return history
 
 
-def _surface(body: Obstacle, time_s: Any) -> Any:  # noqa: ANN401 - one time or several
+def _surface_displacement_m(body: Obstacle, time_s: Any) -> Any:  # noqa: ANN401 - one time or several
     """Return the displacement in m of the beam, at given times, at which it touches an obstacle."""
     return body.x_m * (body.angle_rad + body.rate_rad_s * (time_s - body.from_s))
 
 
-def _substeps(beam: Beam, bodies: tuple[Disturbance, ...], period_s: float) -> int:
+def _substeps_per_period(beam: Beam, bodies: tuple[Disturbance, ...], period_s: float) -> int:
     """Return the number of substeps per period, which resolves the contacts of all obstacles."""
     # A force that grows like k t moves a beam without ends by k t^(3/2) / unit.
     unit = 2 * sqrt(2) * beam.density_kg_per_m**0.75 * beam.bending_stiffness_n_m2**0.25
@@ -555,6 +559,6 @@ def _substeps(beam: Beam, bodies: tuple[Disturbance, ...], period_s: float) -> i
     return max(_FEWEST_SUBSTEPS, ceil(max(required_rates_per_s) * period_s))
 
 
-def _displacement(beam: Beam, damping: Damping, x_m: float, s: Complex) -> Complex:
+def _displacement_per_angle(beam: Beam, damping: Damping, x_m: float, s: Complex) -> Complex:
     """Return the transfer function from motor angle to displacement of the beam at a position."""
     return PointForceGrid(s, beam, damping).per_angle(x_m)

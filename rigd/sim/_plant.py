@@ -98,10 +98,10 @@ class SimulatedPlant:
         "_air",
         "_contact",
         "_coulomb_nm",
-        "_direct_fraction",
-        "_direct_nm",
-        "_direct_shear_fraction",
-        "_direct_shear_n",
+        "_drag_shear_fraction",
+        "_drag_shear_n",
+        "_drag_torque_fraction",
+        "_drag_torque_nm",
         "_drift",
         "_fraction_before_switch",
         "_free_march",
@@ -111,7 +111,6 @@ class SimulatedPlant:
         "_friction_speed",
         "_holding_beam_nm",
         "_is_stuck",
-        "_jump_gain",
         "_jump_is_sensed",
         "_locked_march",
         "_locked_step",
@@ -119,15 +118,16 @@ class SimulatedPlant:
         "_peak_nm",
         "_period_s",
         "_periods",
-        "_rest_per_angle",
+        "_rest_state_per_angle",
         "_sensed_angles",
-        "_sensed_jump_gain",
         "_sensed_shear_jump_gain",
         "_sensed_shears",
+        "_sensed_torque_jump_gain",
         "_sensed_torques",
         "_shear_jump_gain",
         "_states",
         "_torque_instant_fraction",
+        "_torque_jump_gain",
         "_torque_nm",
         "_torques",
         "_vectors",
@@ -165,8 +165,8 @@ class SimulatedPlant:
         if self._contact is not None:
             (free, on_free), (locked, on_locked) = map(self._contact.extended_model, (free, locked))
         n = free.b.size
-        self._rest_per_angle = np.eye(1, n)[0]
-        self._rest_per_angle[2:] = -np.linalg.solve(locked.a[2:, 2:], locked.a[2:, 0])
+        self._rest_state_per_angle = np.eye(1, n)[0]
+        self._rest_state_per_angle[2:] = -np.linalg.solve(locked.a[2:, 2:], locked.a[2:, 0])
         step, locked_step, friction = free_and_locked_steps(free, locked, period, instants)
         self._friction_effects: list[float] = friction[n:].tolist()
         points = 0
@@ -185,9 +185,9 @@ class SimulatedPlant:
                 for parts in ((step, held_effect), (locked_step, locked_held_effect))
             )
             self._friction_speed = self._air.speed @ friction[:n]
-            self._direct_nm = self._direct_shear_n = 0.0
-            self._direct_fraction = 1 - free.sensor_torque_per_torque
-            self._direct_shear_fraction = -free.shear_per_torque
+            self._drag_torque_nm = self._drag_shear_n = 0.0
+            self._drag_torque_fraction = 1 - free.sensor_torque_per_torque
+            self._drag_shear_fraction = -free.shear_per_torque
             self._torque_instant_fraction = 1 - torque_age / period
         if self._contact is not None:
             points = len(self._contact.displacement_rows)
@@ -289,7 +289,7 @@ class SimulatedPlant:
         for name in self.__slots__:
             if hasattr(other, name):  # some attributes exist only with drag or obstacles
                 setattr(self, name, getattr(other, name))
-        self._vectors[0][0][: self._states] = self._rest_per_angle * angle_rad
+        self._vectors[0][0][: self._states] = self._rest_state_per_angle * angle_rad
         self._sensed_angles.extend([angle_rad] * len(self._sensed_angles))
         self.angle_rad = self.sensed_angle_rad = angle_rad
 
@@ -311,7 +311,7 @@ class SimulatedPlant:
         self._vectors[0][0][: state.size] = state
 
     def remove_obstacle(self, obstacle: Disturbance) -> None:
-        """Remove an obstacle, if the plant has an equal one."""
+        """Remove an obstacle, if one equal to the given one is simulated."""
         if self._contact is not None:
             self._contact.remove(obstacle, self.elapsed_s)
 
@@ -378,11 +378,11 @@ class SimulatedPlant:
                     angle, velocity, torque, holding_torque, shear,
                     sensed_angle, sensed_torque, sensed_shear,
                 ) = results.tolist()  # fmt: skip
-                if self._jump_gain:
+                if self._torque_jump_gain:
                     torque_jump = torques[2] - torque_after
-                    torque += self._jump_gain * torque_jump
+                    torque += self._torque_jump_gain * torque_jump
                     shear += self._shear_jump_gain * torque_jump
-                    sensed_torque += self._sensed_jump_gain * torque_jump
+                    sensed_torque += self._sensed_torque_jump_gain * torque_jump
                     sensed_shear += self._sensed_shear_jump_gain * torque_jump
                 if self._coulomb_nm:
                     friction_effects = self._friction_effects
@@ -422,9 +422,9 @@ class SimulatedPlant:
 
     def _set_jump_gains(self, torque_per_torque: float, shear_per_torque: float) -> None:
         """Set the effect of half a jump of the motor's torque on the outputs at a tick."""
-        self._jump_gain = 0.5 * torque_per_torque if self._next_is_known else 0.0
+        self._torque_jump_gain = 0.5 * torque_per_torque if self._next_is_known else 0.0
         self._shear_jump_gain = 0.5 * shear_per_torque if self._next_is_known else 0.0
-        self._sensed_jump_gain = self._jump_gain if self._jump_is_sensed else 0.0
+        self._sensed_torque_jump_gain = self._torque_jump_gain if self._jump_is_sensed else 0.0
         self._sensed_shear_jump_gain = self._shear_jump_gain if self._jump_is_sensed else 0.0
 
     def _use_stiffness(self, drift: StiffnessDrift) -> None:
@@ -480,13 +480,13 @@ class SimulatedPlant:
         speed_m_s = output[self._states + OUTPUTS :]
         if free and self._friction_nm:
             speed_m_s += self._friction_nm * self._friction_speed
-        before_nm, before_n = self._direct_nm, self._direct_shear_n
+        before_nm, before_n = self._drag_torque_nm, self._drag_shear_n
         now_nm, now_n = self._air.update_force(speed_m_s)
         fraction, shear_fraction = (
-            (self._direct_fraction, self._direct_shear_fraction) if free else (1.0, 0.0)
+            (self._drag_torque_fraction, self._drag_shear_fraction) if free else (1.0, 0.0)
         )
         now_n += shear_fraction * now_nm
-        self._direct_nm, self._direct_shear_n = now_nm, now_n
+        self._drag_torque_nm, self._drag_shear_n = now_nm, now_n
         at = self._torque_instant_fraction
         return (
             torque + fraction * now_nm,
@@ -550,7 +550,7 @@ class GrowingDelayLine:
         self._readings = [0.0] * (periods + _INTERPOLATION_POINTS)
 
     def append(self, value: float) -> None:
-        """Append the reading of the next tick, and increase the delay."""
+        """Append the reading of the next tick to the delay line, and increase the delay."""
         self._age += self._growth
         readings = self._readings
         readings.append(value)
@@ -558,7 +558,7 @@ class GrowingDelayLine:
             del readings[0]
 
     def __getitem__(self, index: int) -> float:
-        """Return the interpolated reading at the present delay; `index` must be 0."""
+        """Return the interpolated reading at the present delay of the line; `index` must be 0."""
         assert index == 0
         readings = self._readings
         position = len(readings) - 1 - self._age

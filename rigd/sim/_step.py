@@ -99,7 +99,7 @@ def free_and_locked_steps(
     free, locked
         Models of motor and beam.
     period_s, instants
-        As for `_step`.
+        As for `_step_matrix`.
 
     Returns
     -------
@@ -107,8 +107,8 @@ def free_and_locked_steps(
     friction : (n + 8,)
     """
     n = free.b.size
-    step = _step(free, locked.sensor_torque, period_s, *instants)
-    locked_step = _step(locked, locked.sensor_torque, period_s, *instants)
+    step = _step_matrix(free, locked.sensor_torque, period_s, *instants)
+    locked_step = _step_matrix(locked, locked.sensor_torque, period_s, *instants)
     friction = -(step[:, n] + step[:, n + 1])
     step = np.column_stack([step, step[:, :n] @ friction[:n]])
     locked_step = np.column_stack([locked_step, locked_step[:, :n] @ friction[:n]])
@@ -134,7 +134,7 @@ def drifted_step_arrays(
     at_start
         Realisation of the beam at the start of the drift.
     period_s, instants
-        As for `_step`.
+        As for `_step_matrix`.
 
     Returns
     -------
@@ -181,7 +181,7 @@ def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
     return periods, remainder_s if remainder_s > _SAME_INSTANT_PERIODS * period_s else 0.0
 
 
-def _step(
+def _step_matrix(
     model: CoupledModel,
     holding_torque: Real,
     period_s: float,
@@ -275,7 +275,7 @@ def constant_force_effect(
         Contribution of the force per metre at the points to the derivative of the state, shape (n,
         points).
     holding_torque, period_s, angle_instant_s, torque_instant_s
-        As for `_step`.
+        As for `_step_matrix`.
 
     Returns
     -------

@@ -172,7 +172,7 @@ class Calibration:
         )
 
     def wrench_per_wire_count(self) -> MatrixRows:
-        """Return the 6x6 matrix that converts gauge counts in wire order to N and N·m."""
+        """Return the 6x6 matrix that converts gauge counts in wire order to a wrench in N, N·m."""
         return tuple(tuple(row[gauge] for gauge in WIRE_ORDER) for row in self.wrench_per_count())
 
     def as_dict(self) -> dict[str, object]:
@@ -346,21 +346,21 @@ CRITICAL_SERIAL_STATUS_BITS = 0x3EBE
 They are the bits that are critical on NETCANOEM, and the bits that only Digital F/T has."""
 
 
-def describe_can_status(word: int) -> list[str]:
+def describe_can_status(status_word: int) -> list[str]:
     """Describe the status word of a NETCANOEM box, one clause per set bit."""
     # Bit 15 summarises the others.
-    return _meanings_of_set_bits(word & 0x7FFF, _CAN_STATUS_BITS)
+    return _meanings_of_set_bits(status_word & 0x7FFF, _CAN_STATUS_BITS)
 
 
-def describe_serial_status(word: int) -> list[str]:
+def describe_serial_status(status_word: int) -> list[str]:
     """Describe the status word of a Digital F/T sensor, one clause per set bit."""
-    return _meanings_of_set_bits(word, _SERIAL_STATUS_BITS)
+    return _meanings_of_set_bits(status_word, _SERIAL_STATUS_BITS)
 
 
-def _meanings_of_set_bits(word: int, table: dict[int, str]) -> list[str]:
+def _meanings_of_set_bits(status_word: int, table: dict[int, str]) -> list[str]:
     """Return the meanings of the set bits of a status word."""
     return [
         table.get(bit, f"status bit {bit}, which has no known meaning, is set")
         for bit in range(16)
-        if word >> bit & 1
+        if status_word >> bit & 1
     ]

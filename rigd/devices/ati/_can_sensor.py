@@ -405,7 +405,7 @@ class AtiCanSensor:
         )
 
     def _read_serial_number(self) -> str:
-        """Read the serial number and compare it with the profile; return the serial number."""
+        """Read the sensor's serial number, compare it with the profile, and return it."""
         found = netcanoem.serial_number(
             self._request_reply("its serial number", netcanoem.SERIAL_NUMBER)
         )

@@ -72,12 +72,12 @@ def request(base: int, opcode: int, *arguments: int) -> bytes:
 
 
 def matrix_row(replies: bytes) -> tuple[float, ...]:
-    """Unpack the six entries of a matrix row from three concatenated replies."""
+    """Unpack the six entries of a calibration matrix row from three concatenated replies."""
     return unpack(">6f", replies)
 
 
 def serial_number(reply: bytes) -> str:
-    """Decode the serial number in a reply to text."""
+    """Decode the sensor's serial number in a reply to text."""
     return printable_text(reply)
 
 
@@ -88,7 +88,7 @@ def counts_per_unit(reply: bytes) -> tuple[int, int]:
 
 
 def firmware(reply: bytes) -> tuple[int, int, int]:
-    """Unpack major, minor and build number of the firmware from a reply."""
+    """Unpack major, minor and build number of the sensor's firmware from a reply."""
     major, minor, build = unpack(">BBH", reply)
     return major, minor, build
 

@@ -425,13 +425,13 @@ class AtiSerialSensor:
 
     def _check_status(self, setup: SerialSetup) -> None:
         """Read the status word, and raise if it has a critical bit."""
-        word = self._status_word = setup.read_status()
-        self.status = describe_serial_status(word)
-        if word & CRITICAL_SERIAL_STATUS_BITS:
+        status_word = self._status_word = setup.read_status()
+        self.status = describe_serial_status(status_word)
+        if status_word & CRITICAL_SERIAL_STATUS_BITS:
             raise DeviceError(
-                f"{self._name}: its status word {word:#06x} says that "
-                f"{'; '.join(describe_serial_status(word & CRITICAL_SERIAL_STATUS_BITS))}. It does "
-                "not measure properly: check sensor, cable and supply."
+                f"{self._name}: its status word {status_word:#06x} says that "
+                f"{'; '.join(describe_serial_status(status_word & CRITICAL_SERIAL_STATUS_BITS))}. "
+                "It does not measure properly: check sensor, cable and supply."
             )
 
     def _start_streaming(self, setup: SerialSetup) -> None:

@@ -101,7 +101,7 @@ class SerialLine:
             self.low_latency = True
 
     def read(self) -> bytes:
-        """Return all bytes that have arrived; empty if there are none.
+        """Return all bytes that have arrived on the serial line; empty if there are none.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class SerialLine:
             raise self._failure_error(error.strerror) from None
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until bytes may have arrived, at most for the timeout.
+        """Wait until bytes may have arrived on the serial line, at most for the timeout.
 
         Raises
         ------
@@ -163,7 +163,7 @@ class SerialLine:
         return reply
 
     def drain(self, quiet_s: float, limit_s: float) -> bool:
-        """Discard received bytes until the line has been silent for a while.
+        """Discard received bytes until the line has been silent for `quiet_s`; return success.
 
         Returns
         -------
@@ -182,7 +182,7 @@ class SerialLine:
         return False
 
     def close(self) -> None:
-        """Close the port; harmless when repeated."""
+        """Close the serial port; harmless when repeated."""
         with suppress(OSError, termios.error):
             self._serial.close()
 
@@ -274,7 +274,7 @@ class SerialSetup:
         )
 
     def read_status(self) -> int:
-        """Read and return the sensor's status word."""
+        """Read the status word of the Digital F/T sensor by Modbus, and return it."""
         return self._read_register_values(modbus.STATUS_WORD, 1, "report its status")[0]
 
     def read_block(self) -> CalibrationBlock:

@@ -243,7 +243,7 @@ class CanExchange:
         self._handlers[can_id] = handler
 
     def start(self) -> None:
-        """Discard queued frames, and let the port accept only subscribed identifiers."""
+        """Discard queued frames, and accept only frames with subscribed identifiers."""
         self.port.accept(self._handlers)
         while self._receive() is not None:
             pass
@@ -416,7 +416,7 @@ class CanLink:
 
     @property
     def exchange(self) -> CanExchange:
-        """Cyclic exchange on the open bus.
+        """Cyclic exchange of frames on the open CAN bus.
 
         Raises
         ------

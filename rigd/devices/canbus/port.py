@@ -161,7 +161,7 @@ class CanPort(Protocol):
         """Return a python-can bus on this port, for set-up; closing the bus keeps the port open."""
 
     def close(self) -> None:
-        """Close the port; harmless when repeated."""
+        """Close the port to the CAN bus; harmless when repeated."""
 
 
 class SocketPort:
@@ -234,7 +234,7 @@ class SocketPort:
         return SetupBus(self)
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the port's socket."""
         with suppress(OSError):
             self._link.close()
 
@@ -311,7 +311,7 @@ class PythonCanPort:
         return SetupBus(self)
 
     def close(self) -> None:
-        """Shut the adapter down."""
+        """Shut down the adapter of python-can; errors are ignored."""
         with suppress(Exception):
             self._bus.shutdown()
 

@@ -103,7 +103,7 @@ class ReceivedFrames:
         self.clear()
 
     def clear(self) -> None:
-        """Reset all contents to their initial values, except the number of malformed frames."""
+        """Reset the contents of all received frames, except the number of malformed frames."""
         self.statusword = 0
         self.require_status(0, 0)
         self.position = 0
@@ -253,7 +253,7 @@ class Node:
         self._next_heartbeat_ns = _BEFORE_ANY_TIME_NS
 
     def go_operational(self, *, has_heartbeat: bool = True) -> None:
-        """Start the node and wait for the heartbeat that confirms it.
+        """Start the drive's CANopen node and wait for the heartbeat that confirms it.
 
         Parameters
         ----------

@@ -349,7 +349,7 @@ class SdoAccess:
         return variable
 
     def _object_name(self, index: int, sub: int) -> str:
-        """Return index, sub-index and name of an object as messages show them."""
+        """Return index, sub-index and name of an object for messages."""
         name = self._variable(index, sub).name
         address = f"{index:04X}:{sub}" if sub else f"{index:04X}"
         return f"object {address}" + (f" ({name})" if name else "")

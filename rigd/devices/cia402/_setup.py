@@ -608,11 +608,11 @@ def _is_ratio_equal(stated: float, required: float) -> bool:
 
 def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:
     """Disable all PDOs of the drive except the first, which the rig uses."""
-    for pdo_offset in range(1, objects.PDO_COUNT_AT_MOST):
+    for pdo_offset in range(1, objects.MOST_PDO_COUNT):
         cob_id = sdo.read_or_none(communication + pdo_offset, 1)
         if cob_id is None:
             # Above the PDOs that CiA 301 predefines, indices are used without gaps.
-            if pdo_offset >= objects.PDO_COUNT:
+            if pdo_offset >= objects.PREDEFINED_PDO_COUNT:
                 return
         elif not cob_id & objects.PDO_DISABLED:
             sdo.configure(communication + pdo_offset, 1, cob_id | objects.PDO_DISABLED)

@@ -93,7 +93,7 @@ _COB_ID_ADDRESSES: Final = (
     (objects.RPDO_COMMUNICATION, 1),
 )
 """Index and sub-index of the objects that hold a CAN identifier."""
-_NOT_SET_BY_RIGD: Final = (Watchdog.OWN, Watchdog.NONE)
+_UNCONFIGURED_WATCHDOGS: Final = (Watchdog.OWN, Watchdog.NONE)
 """Kinds of watchdog that rigd does not configure in the drive."""
 _REPORTED_ELSEWHERE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
 """Indices of objects that findings other than those of the table report."""
@@ -130,15 +130,11 @@ class _SuitabilityCheck:
         yield from self._bit_rate_findings()
         yield self._torque_mode_finding()
         yield self._watchdog_finding()
-        for needed in REQUIREMENTS:
-            if needed.index in _REPORTED_ELSEWHERE or needed.accept == WATCHDOG:
+        for row in REQUIREMENTS:
+            if row.index in _REPORTED_ELSEWHERE or row.accept == WATCHDOG:
                 continue
-            entry = self._eds.get(needed.index, needed.sub)
-            yield (
-                self._absent_object(needed)
-                if entry is None
-                else self._present_object(needed, entry)
-            )
+            entry = self._eds.get(row.index, row.sub)
+            yield (self._absent_object(row) if entry is None else self._present_object(row, entry))
 
     def _identity_findings(self) -> Iterator[SuitabilityFinding]:
         """Yield the findings on vendor and product code."""
@@ -227,39 +223,42 @@ class _SuitabilityCheck:
             own=self._settings is not None and self._settings.own_watchdog_s > 0,
         )
 
-    def _absent_object(self, needed: Requirement) -> SuitabilityFinding:
+    def _absent_object(self, row: Requirement) -> SuitabilityFinding:
         """Return the finding on a required object that the file does not contain."""
-        what = f"{needed.address} {needed.name}"
-        if needed.core:
+        what = f"{row.address} {row.name}"
+        if row.core:
             return SuitabilityFinding(
-                what, "absent", "core", Grade.REFUSED, _capitalise(needed.refusal_reason())
+                what, "absent", "core", Grade.REFUSED, _capitalise(row.refusal_reason())
             )
-        if needed.index == objects.ABORT_OPTION and self._expected_watchdog() in _NOT_SET_BY_RIGD:
+        if (
+            row.index == objects.ABORT_OPTION
+            and self._expected_watchdog() in _UNCONFIGURED_WATCHDOGS
+        ):
             found = "absent; in its place: the manufacturer's own watchdog"
             return SuitabilityFinding(what, found, "", Grade.SUBSTITUTED)
-        if needed.accept:
-            return self._missing_unless_accepted(needed, what, "absent", "")
-        if self._is_set_by_profile(needed):
-            sentence = f"it has no object {needed.address} ({needed.name}). {needed.sentence}"
+        if row.accept:
+            return self._missing_unless_accepted(row, what, "absent", "")
+        if self._is_set_by_profile(row):
+            sentence = f"it has no object {row.address} ({row.name}). {row.sentence}"
             return SuitabilityFinding(what, "absent", "", Grade.REFUSED, _capitalise(sentence))
-        stand_in = f"; in its place: {needed.stand_in}" if needed.stand_in.strip("–") else ""
+        stand_in = f"; in its place: {row.stand_in}" if row.stand_in.strip("–") else ""
         return SuitabilityFinding(what, f"absent{stand_in}", "", Grade.SUBSTITUTED)
 
     def _missing_unless_accepted(
-        self, needed: Requirement, what: str, found: str, wanted: str
+        self, row: Requirement, what: str, found: str, wanted: str
     ) -> SuitabilityFinding:
         """Return the finding on a missing object that the profile may accept by name."""
-        stand_in = f" In its place: {needed.stand_in}." if needed.stand_in else ""
-        if self._settings is not None and needed.accept in self._settings.accept_without:
+        stand_in = f" In its place: {row.stand_in}." if row.stand_in else ""
+        if self._settings is not None and row.accept in self._settings.accept_without:
             found = f"{found}, accepted by the profile"
             sentence = f"{what}: {found}.{stand_in}"
-            return SuitabilityFinding(what, found, wanted, Grade.ACCEPTED, sentence, needed.accept)
-        sentence = _capitalise(needed.refusal_reason()) + stand_in
+            return SuitabilityFinding(what, found, wanted, Grade.ACCEPTED, sentence, row.accept)
+        sentence = _capitalise(row.refusal_reason()) + stand_in
         # Without a profile there was no chance to accept it.
         grade = Grade.DOUBT if self._settings is None else Grade.REFUSED
-        return SuitabilityFinding(what, found, wanted, grade, sentence, needed.accept)
+        return SuitabilityFinding(what, found, wanted, grade, sentence, row.accept)
 
-    def _is_set_by_profile(self, needed: Requirement) -> bool:
+    def _is_set_by_profile(self, row: Requirement) -> bool:
         """Return whether the profile needs this object, because nothing else can do its work."""
         settings = self._settings
         if settings is None:
@@ -268,86 +267,86 @@ class _SuitabilityCheck:
             (objects.MAX_SPEED_RPM, 0): settings.max_speed_rad_s > 0,
             (objects.RATED_TORQUE, 0): settings.rated_torque_unit_nm > 0,
             (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option > 0,
-        }.get((needed.index, needed.sub), False)
+        }.get((row.index, row.sub), False)
 
-    def _present_object(self, needed: Requirement, entry: EdsEntry) -> SuitabilityFinding:
+    def _present_object(self, row: Requirement, entry: EdsEntry) -> SuitabilityFinding:
         """Return the finding on a required object that the file contains."""
-        what = f"{needed.address} {needed.name}"
-        wanted = self._wanted.get((needed.index, needed.sub))
-        wanted_text = "" if wanted is None else _format_value(needed, wanted)
-        default = "" if entry.default is None else f", {_format_value(needed, entry.default)}"
+        what = f"{row.address} {row.name}"
+        wanted = self._wanted.get((row.index, row.sub))
+        wanted_text = "" if wanted is None else _format_value(row, wanted)
+        default = "" if entry.default is None else f", {_format_value(row, entry.default)}"
         found = f"{entry.access}{default}"
 
         def objection(text: str, *, doubt: bool = False) -> SuitabilityFinding:
-            sentence = _capitalise(f"its object {needed.address} ({needed.name}) {text}")
+            sentence = _capitalise(f"its object {row.address} ({row.name}) {text}")
             grade = Grade.DOUBT if doubt else Grade.REFUSED
             return SuitabilityFinding(what, found, wanted_text, grade, sentence)
 
-        if needed.access & (ObjectAccess.SENT | ObjectAccess.RECEIVED):
+        if row.access & (ObjectAccess.SENT | ObjectAccess.RECEIVED):
             mapping_obstacle = self._describe_mapping_obstacle(entry)
-            if mapping_obstacle and needed.accept:
+            if mapping_obstacle and row.accept:
                 return self._missing_unless_accepted(
-                    needed, what, f"{found}, {mapping_obstacle}", wanted_text
+                    row, what, f"{found}, {mapping_obstacle}", wanted_text
                 )
             if mapping_obstacle:
-                return objection(f"{mapping_obstacle}. {needed.sentence}")
-        if ObjectAccess.WRITE in needed.access and not entry.writable:
-            return self._read_only_object(needed, entry, found, wanted)
-        if ObjectAccess.READ in needed.access and entry.access == "wo":
+                return objection(f"{mapping_obstacle}. {row.sentence}")
+        if ObjectAccess.WRITE in row.access and not entry.writable:
+            return self._read_only_object(row, entry, found, wanted)
+        if ObjectAccess.READ in row.access and entry.access == "wo":
             return objection(
-                f"is write-only: what it holds cannot be checked. {needed.sentence}".rstrip(),
-                doubt=needed.index in MAY_BE_WRITE_ONLY,
+                f"is write-only: what it holds cannot be checked. {row.sentence}".rstrip(),
+                doubt=row.index in MAY_BE_WRITE_ONLY,
             )
         if wanted is not None and not _is_within_limits(entry, wanted):
-            limits = f"{_format_limit(needed, entry.low)} to {_format_limit(needed, entry.high)}"
+            limits = f"{_format_limit(row, entry.low)} to {_format_limit(row, entry.high)}"
             return objection(
-                f"takes {limits}, not {wanted_text}. {needed.sentence}", doubt=not needed.core
+                f"takes {limits}, not {wanted_text}. {row.sentence}", doubt=not row.core
             )
         return SuitabilityFinding(what, found, wanted_text, Grade.FITS)
 
     def _read_only_object(
-        self, needed: Requirement, entry: EdsEntry, found: str, wanted: int | None
+        self, row: Requirement, entry: EdsEntry, found: str, wanted: int | None
     ) -> SuitabilityFinding:
         """Return the finding on a read-only object, whose fixed value may be acceptable."""
-        what = f"{needed.address} {needed.name}"
-        if needed.value_rule is AllowedValue.AT_LEAST:
+        what = f"{row.address} {row.name}"
+        if row.value_rule is AllowedValue.AT_LEAST:
             wanted_text = f"at least {wanted or 'motor.peak_torque_nm'}"
         else:
-            wanted_text = "" if wanted is None else _format_value(needed, wanted)
-        if needed.index in _PDO_ENTRIES:
-            default_entries = self._default_mapping(needed.index)
+            wanted_text = "" if wanted is None else _format_value(row, wanted)
+        if row.index in _PDO_ENTRIES:
+            default_entries = self._default_mapping(row.index)
             is_acceptable = (
-                None if None in default_entries else default_entries == _PDO_ENTRIES[needed.index]
+                None if None in default_entries else default_entries == _PDO_ENTRIES[row.index]
             )
         elif wanted is None or entry.default is None:
             is_acceptable = None
-        elif (needed.index, needed.sub) in _COB_ID_ADDRESSES:
+        elif (row.index, row.sub) in _COB_ID_ADDRESSES:
             # Drives are free to set the bit that forbids remote requests.
             is_acceptable = (entry.default ^ wanted) & ~objects.NO_REMOTE_REQUEST == 0
-            mapping = needed.index + 0x200
+            mapping = row.index + 0x200
             if (
                 is_acceptable
                 and mapping in _PDO_ENTRIES
                 and self._default_mapping(mapping) != _PDO_ENTRIES[mapping]
             ):
                 sentence = (
-                    f"its object {needed.address} ({needed.name}) is read-only, so that the PDO "
-                    f"cannot be switched off to be remapped. {needed.sentence}"
+                    f"its object {row.address} ({row.name}) is read-only, so that the PDO "
+                    f"cannot be switched off to be remapped. {row.sentence}"
                 )
                 return SuitabilityFinding(
                     what, found, wanted_text, Grade.REFUSED, _capitalise(sentence)
                 )
         else:
-            is_acceptable = needed.value_rule.allows(entry.default, wanted)
+            is_acceptable = row.value_rule.allows(entry.default, wanted)
         if is_acceptable:
             return SuitabilityFinding(what, f"{found}: it does", wanted_text, Grade.FITS)
-        if is_acceptable is None and needed.index != objects.CONTROLWORD:
+        if is_acceptable is None and row.index != objects.CONTROLWORD:
             return SuitabilityFinding(
                 what, f"{found}: the drive will be asked", wanted_text, Grade.ASK
             )
         sentence = (
-            f"its object {needed.address} ({needed.name}) is read-only and does not hold what is "
-            f"needed{f' ({wanted_text})' if wanted_text else ''}. {needed.sentence}"
+            f"its object {row.address} ({row.name}) is read-only and does not hold what is "
+            f"needed{f' ({wanted_text})' if wanted_text else ''}. {row.sentence}"
         )
         return SuitabilityFinding(what, found, wanted_text, Grade.REFUSED, _capitalise(sentence))
 
@@ -392,15 +391,15 @@ def _is_within_limits(entry: EdsEntry, value: int) -> bool:
     return (low is None or low <= value) and (high is None or value <= high)
 
 
-def _format_value(needed: Requirement, value: int) -> str:
+def _format_value(row: Requirement, value: int) -> str:
     """Format a value for messages: CAN identifiers and large values in hexadecimal."""
-    in_hex = value > 0xFFFF or (needed.index, needed.sub) in _COB_ID_ADDRESSES
+    in_hex = value > 0xFFFF or (row.index, row.sub) in _COB_ID_ADDRESSES
     return f"0x{value:X}" if in_hex and value >= 0 else str(value)
 
 
-def _format_limit(needed: Requirement, value: int | None) -> str:
+def _format_limit(row: Requirement, value: int | None) -> str:
     """Format a limit of an object's value for messages."""
-    return "anything" if value is None else _format_value(needed, value)
+    return "anything" if value is None else _format_value(row, value)
 
 
 def _capitalise(text: str) -> str:

@@ -109,7 +109,7 @@ class TorqueFollowingCheck:
         self.start()
 
     def start(self) -> None:
-        """Restart the check for a drive whose commanded torque is zero."""
+        """Restart the check of the torque, for a drive whose commanded torque is zero."""
         self._commanded_per_mille = 0
         self._last_per_mille = 0.0
         self._previous_per_mille = 0.0

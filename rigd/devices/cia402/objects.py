@@ -103,9 +103,9 @@ NO_REMOTE_REQUEST: Final = 0x4000_0000
 """Bit in the COB-ID of a TPDO that forbids remote requests; drives may set it by themselves."""
 SYNC_ID: Final = 0x080
 """CAN identifier of SYNC."""
-PDO_COUNT: Final = 4
+PREDEFINED_PDO_COUNT: Final = 4
 """Number of RPDOs, and of TPDOs, whose CAN identifiers CiA 301 predefines."""
-PDO_COUNT_AT_MOST: Final = 512
+MOST_PDO_COUNT: Final = 512
 """Largest number of RPDOs, and of TPDOs, that a drive can have."""
 
 AT_EVERY_SYNC: Final = 1

@@ -591,7 +591,7 @@ _BY_ADDRESS: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
 
 
 def requirement(index: int, sub: int = 0) -> Requirement:
-    """Return the requirement on an object.
+    """Return the requirement on the drive's object at an index and sub-index.
 
     Parameters
     ----------

@@ -73,7 +73,7 @@ class AtiCanNode:
     rig
         Parameters of the rig with a section ``ati_can``: base, serial number (FT12345 if empty) and
         calibration.
-    simulated
+    simulated_rig
         Simulated rig, whose sensor takes one reading per request.
     send
         Function that sends a reply with identifier and data.
@@ -109,7 +109,7 @@ class AtiCanNode:
     def __init__(
         self,
         rig: RigParameters,
-        simulated: SimulatedRig,
+        simulated_rig: SimulatedRig,
         send: Callable[[int, bytes], None],
         log: Callable[..., None],
         *,
@@ -128,7 +128,7 @@ class AtiCanNode:
         self.frozen = False
         self.saturate: int | None = None
         self.status_bits = 0
-        self._measure = simulated.sensor.measure
+        self._measure = simulated_rig.sensor.measure
         self._send = send
         self._log = log
         self._firmware = firmware
@@ -157,7 +157,7 @@ class AtiCanNode:
             self._requests[0x9] = (1, self._read_diagnostic)
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Process a received frame: answer a valid request."""
+        """Process a received CAN frame: answer a valid request."""
         if can_id >> 4 != self._base or self.frozen:
             return
         request = self._requests.get(can_id & 0xF)
@@ -181,7 +181,7 @@ class AtiCanNode:
         self._log("sensor", "power-up", base_id=self._base)
 
     def _reply(self, opcode: int, data: bytes) -> None:
-        """Send a reply with an opcode."""
+        """Send the reply to a request, with an opcode."""
         self._send(self._base << 4 | opcode, data)
 
     def _read_gauges(self, _: bytes) -> None:
@@ -212,7 +212,7 @@ class AtiCanNode:
         self._reply(0x5, self._serial_number)
 
     def _set_calibration(self, data: bytes) -> None:
-        """Select a calibration and confirm it."""
+        """Select a calibration by its index, and confirm it."""
         index = data[0]
         if index > 15:
             return
@@ -221,15 +221,15 @@ class AtiCanNode:
         self._reply(0x6, data)
 
     def _read_counts_per_unit(self, _: bytes) -> None:
-        """Answer a request for the counts per unit."""
+        """Answer a request for the counts per unit of force and torque."""
         self._reply(0x7, _pack_counts_per_unit(*self.gauges.counts_per_unit))
 
     def _read_units(self, _: bytes) -> None:
-        """Answer a request for the unit codes."""
+        """Answer a request for the unit codes of force and torque."""
         self._reply(0x8, bytes((UNIT_NEWTON, UNIT_NEWTON_METRE)))
 
     def _read_diagnostic(self, data: bytes) -> None:
-        """Answer a request for a diagnostic channel."""
+        """Answer a request for the raw value of a diagnostic channel."""
         if data[0] < len(_DIAGNOSTIC_VALUES):
             self._reply(0x9, _pack_word(_DIAGNOSTIC_VALUES[data[0]]))
 
@@ -238,7 +238,7 @@ class AtiCanNode:
         self.reset()
 
     def _set_base(self, data: bytes) -> None:
-        """Store a new base for the next power-up, and confirm it."""
+        """Store a new identifier base for the next power-up, and confirm it."""
         if data[0] > 0x7F:
             return
         self._reply(0xD, b"")

@@ -109,7 +109,7 @@ class AtiSerialDevice:
         Parameters of the rig with a section ``ati_serial``: serial number (FT12345 if empty),
         number of the filled calibration block (the fifteen others read 0xFFFF), and the baud
         register after power-up.
-    simulated
+    simulated_rig
         Simulated rig, whose sensor measures. The stream sends the newest readings that the sensor
         has taken in a period, without new ones.
     write
@@ -140,7 +140,7 @@ class AtiSerialDevice:
     def __init__(
         self,
         rig: RigParameters,
-        simulated: SimulatedRig,
+        simulated_rig: SimulatedRig,
         write: Callable[[bytes], None],
         log: Callable[..., None],
     ) -> None:
@@ -155,8 +155,8 @@ class AtiSerialDevice:
         self.frozen = False
         self.saturate: int | None = None
         self.status_bits = 0
-        self._sensor = simulated.sensor
-        self._records_per_period = simulated.records_per_period
+        self._sensor = simulated_rig.sensor
+        self._records_per_period = simulated_rig.records_per_period
         self._write = write
         self._log = log
         self._unlocked = False
@@ -271,7 +271,7 @@ class AtiSerialDevice:
         return _answer_with_registers(inputs, body)
 
     def _write_registers(self, body: bytes) -> bytes | int:
-        """Write registers; return the answer or an exception code."""
+        """Write registers; return the content of the answer, or an exception code."""
         first, count = _unpack_register_range(body[:4])
         data = body[5:]
         if not 1 <= count <= _MOST_REGISTERS_WRITTEN or len(data) != 2 * count:
@@ -298,7 +298,7 @@ class AtiSerialDevice:
         return body[:4]
 
     def _start_stream(self, body: bytes) -> bytes | int:
-        """Start the stream; return the answer."""
+        """Start the stream of records; return the content of the answer."""
         if body[0] != _START_STREAM_PARAMETER:
             return b"\x00"
         self.streaming = True
@@ -309,7 +309,7 @@ class AtiSerialDevice:
         return b"\x01"
 
     def _set_lock(self, body: bytes) -> bytes | int:
-        """Lock or unlock the storage; return the answer."""
+        """Lock or unlock the sensor's storage; return the content of the answer."""
         if body[0] not in (_UNLOCK_PARAMETER, _LOCK_PARAMETER):
             return b"\x00"
         self._unlocked = body[0] == _UNLOCK_PARAMETER

@@ -82,7 +82,7 @@ class WallClock:
         return self._averaged_syncs == 0 or self.tick - self._last_sync > _NEW_PHASE_PERIODS
 
     def sync(self, now_ns: float) -> int:
-        """Process a SYNC received at a time; return the number of periods that pass, normally 1."""
+        """Process a SYNC received at `now_ns`; return the number of elapsed periods, normally 1."""
         elapsed = (now_ns - self._origin_ns) / self._period_ns
         nearest = round(elapsed)
         if nearest - self._last_sync > _NEW_PHASE_PERIODS:
@@ -93,11 +93,11 @@ class WallClock:
         return self._advance_to(nearest)
 
     def elapse(self, now_ns: int) -> int:
-        """Return the number of periods that have passed without a SYNC in time."""
+        """Return the number of periods that have elapsed until `now_ns` without a SYNC in time."""
         return self._advance_to(int((now_ns - self._origin_ns) / self._period_ns - 0.5))
 
     def _advance_to(self, tick: int) -> int:
-        """Advance to a tick, and return the number of periods that pass."""
+        """Advance the clock to a tick, and return the number of elapsed periods."""
         passed = max(0, tick - self.tick)
         self.tick += passed
         return passed
@@ -126,16 +126,16 @@ class LockStep:
 
     @property
     def due_ns(self) -> int:
-        """Time in nanoseconds at which the next period passes without a SYNC."""
+        """Time in nanoseconds at which the next period elapses without a SYNC."""
         return round(self._waiting_until_ns + self._period_ns)
 
     def sync(self, now_ns: float) -> int:
-        """Process a SYNC received at a time; return the number of periods that pass, always 1."""
+        """Process a SYNC received at `now_ns`; return the number of elapsed periods, always 1."""
         self._waiting_until_ns = now_ns + _LOCK_STEP_WAIT_NS
         return 1
 
     def elapse(self, now_ns: int) -> int:
-        """Return the number of periods that have passed by the wall clock without SYNC."""
+        """Return the number of periods that have elapsed by the wall clock without a SYNC."""
         passed = max(0, int((now_ns - self._waiting_until_ns) / self._period_ns))
         self._waiting_until_ns += passed * self._period_ns
         return passed
@@ -182,10 +182,10 @@ class SimulatedNode(Protocol):
         """Restart the device as after a loss of power."""
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Process a received frame."""
+        """Process a CAN frame that the device has received."""
 
     def tick(self, now_s: float) -> None:
-        """Process the passing of simulated time until `now_s`, in seconds."""
+        """Advance the device to the simulated time `now_s`, in seconds."""
 
 
 class SerialDevice(Protocol):
@@ -201,13 +201,13 @@ class SerialDevice(Protocol):
         """Restart the device as after a loss of power."""
 
     def receive(self, data: bytes) -> None:
-        """Process bytes received from the host."""
+        """Process bytes that the device has received from the host."""
 
     def emit(self) -> None:
         """Send the bytes that the device streams in a period."""
 
     def tick(self, now_s: float) -> None:
-        """Process the passing of simulated time until `now_s`, in seconds."""
+        """Advance the device to the simulated time `now_s`, in seconds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +226,7 @@ class BusSimulation:
 
     Parameters
     ----------
-    rig, simulated
+    rig, simulated_rig
         Parameters of the rig, and simulated plant with its devices.
     lock_step
         Whether each SYNC advances the rig by one period, instead of wall time.
@@ -258,7 +258,7 @@ class BusSimulation:
     def __init__(
         self,
         rig: RigParameters,
-        simulated: SimulatedRig,
+        simulated_rig: SimulatedRig,
         *,
         lock_step: bool,
         now_ns: int,
@@ -268,19 +268,19 @@ class BusSimulation:
         mend: Callable[[str], None],
         log: EventLog,
     ) -> None:
-        self._simulated = simulated
+        self._simulated_rig = simulated_rig
         self._period_s = 1 / rig.rate_hz
         self._period_ns = 1e9 / rig.rate_hz
         self._lock_step = lock_step
         self.clock = (LockStep if lock_step else WallClock)(self._period_ns, now_ns)
         self._now_ns = float(now_ns)
-        self._send = send
-        self._write = write
-        self._cut = cut
-        self._mend = mend
+        self._send_to_hosts = send
+        self._write_to_host = write
+        self._interrupt = cut
+        self._reconnect = mend
         self._log = log
         self._nodes: dict[str, SimulatedNode] = {}
-        self._serial: SerialDevice | None = None
+        self._serial_device: SerialDevice | None = None
         self._advance_is_due = False
         self._lines = {
             "host": FaultyLine("host", self._deliver_from_host, self._schedule_delivery, log),
@@ -293,7 +293,7 @@ class BusSimulation:
         }
         self._undelivered_frames: deque[tuple[str, int, bytes]] = deque()
         self._emitting = False
-        self._order = 0
+        self._action_count = 0
         self.bus_off = False
         self._delayed_deliveries: list[tuple[float, int, Callable[[], None]]] = []
         self._scheduled_actions: list[tuple[float, int, Callable[[], None]]] = []
@@ -324,7 +324,7 @@ class BusSimulation:
         return [sender for sender, line in self._lines.items() if line.disturbed]
 
     def can_sender(self, sender: str) -> Callable[[int, bytes], None]:
-        """Return the function by which a node sends frames on the CAN bus."""
+        """Return the function by which a node sends frames on the simulated CAN bus."""
         return self._lines[sender].send
 
     def serial_writer(self) -> Callable[[bytes], None]:
@@ -332,12 +332,12 @@ class BusSimulation:
         return self._write_serial
 
     def add_node(self, name: str, node: SimulatedNode) -> None:
-        """Connect a node to the CAN bus."""
+        """Connect a node to the simulated CAN bus."""
         self._nodes[name] = node
 
     def add_serial_device(self, device: SerialDevice) -> None:
-        """Connect the sensor to the serial line."""
-        self._serial = device
+        """Connect the simulated sensor to the simulated serial line."""
+        self._serial_device = device
         self._lines["sensor"] = FaultyLine(
             "sensor", self._deliver_to_serial_host, self._schedule_delivery, self._log
         )
@@ -368,9 +368,9 @@ class BusSimulation:
                 self._lines["host"].send(can_id, data, origin)
 
     def receive_serial(self, data: bytes) -> None:
-        """Process bytes of the host on the serial line."""
-        if self._serial is not None:
-            self._serial.receive(data)
+        """Pass bytes of the host on the serial line to the simulated sensor."""
+        if self._serial_device is not None:
+            self._serial_device.receive(data)
 
     def elapse(self, now_ns: int) -> None:
         """Advance the time without a SYNC; frames received before must already be processed."""
@@ -416,7 +416,7 @@ class BusSimulation:
     def _run_period(self) -> None:
         """Advance time and nodes by a period, and the rig unless it waits for its host."""
         # In lock-step, a rig waits for its host while its drive is off.
-        if not self._lock_step or self._simulated.plant.enabled:
+        if not self._lock_step or self._simulated_rig.plant.enabled:
             self._advance_rig()
         else:
             self.periods += 1
@@ -425,24 +425,24 @@ class BusSimulation:
 
     def _advance_rig(self) -> None:
         """Advance the rig by one period, and send the records of the serial sensor."""
-        self._simulated.advance(1)
+        self._simulated_rig.advance(1)
         self.periods += 1
         self.rig_periods += 1
         self._log.time_s = self.now_s
         # Before the drive answers, so that a host with its answer also finds the records.
-        if self._serial is not None:
+        if self._serial_device is not None:
             self._emitting = True
-            self._serial.emit()
+            self._serial_device.emit()
             self._emitting = False
 
     def _run_nodes(self) -> None:
         """Run the due actions of the nodes, and begin or end the due faults."""
-        if self._serial is not None:
-            self._serial.tick(self.now_s)
+        if self._serial_device is not None:
+            self._serial_device.tick(self.now_s)
         for node in self._nodes.values():
             node.tick(self.now_s)
         self._deliver_to_nodes()
-        if self._enabled_s is None and self._simulated.plant.enabled:
+        if self._enabled_s is None and self._simulated_rig.plant.enabled:
             self._enabled_s = self.now_s
             for fault in self._faults_after_enabling:
                 self.inject(fault)
@@ -457,7 +457,7 @@ class BusSimulation:
         """Deliver a frame of a host to the other hosts and to the nodes."""
         if self.bus_off:
             return
-        self._send(pack_frame(can_id, data), origin)
+        self._send_to_hosts(pack_frame(can_id, data), origin)
         for node in self._nodes.values():
             node.receive(can_id, data)
         self._deliver_to_nodes()
@@ -465,7 +465,7 @@ class BusSimulation:
     def _deliver_from_node(self, sender: str, can_id: int, data: bytes, _: object) -> None:
         """Deliver a frame of a node to the hosts, and queue it for the other nodes."""
         if not self.bus_off:
-            self._send(pack_frame(can_id, data), None)
+            self._send_to_hosts(pack_frame(can_id, data), None)
         self._undelivered_frames.append((sender, can_id, data))
 
     def _deliver_to_nodes(self) -> None:
@@ -486,8 +486,8 @@ class BusSimulation:
             line.send(SERIAL, data)
 
     def _deliver_to_serial_host(self, _: int, data: bytes, __: object) -> None:
-        """Pass bytes that got through the faulty line to the host."""
-        self._write(data)
+        """Pass bytes of the simulated sensor that the line has not dropped to the host."""
+        self._write_to_host(data)
 
     # Faults.
 
@@ -497,7 +497,7 @@ class BusSimulation:
         device = values.get("device", values.get("from", "drive"))
         if fault.kind in ("saturate", "status") or values.get("what") in ("sensor", "gauge"):
             device = "sensor"
-        on_serial = self._serial is not None and device == "sensor"
+        on_serial = self._serial_device is not None and device == "sensor"
         if device in ("drive", "sensor") and device not in self._nodes and not on_serial:
             raise FaultError(f"Fault '{fault}': this rig has no {device} on its lines.")
         if fault.kind == "cut" and device == "sensor" and not on_serial:
@@ -523,15 +523,15 @@ class BusSimulation:
 
         if fault.kind in DISTURBANCE_KINDS:
             try:
-                self._simulated.check_disturbance(disturbance_of(fault, 0.0))
+                self._simulated_rig.check_disturbance(disturbance_of(fault, 0.0))
             except (ObstacleError, RealisationError) as error:
                 raise FaultError(f"Fault '{fault}': {error}") from None
 
     def _begin_fault(self, fault: Fault) -> None:
-        """Begin a fault now."""
+        """Begin an injected fault now: change the device, line or rig that it concerns."""
         self._log("simulator", "fault", fault=str(fault))
         values: dict[str, Any] = dict(fault.values)
-        sensor: Any = self._serial or self._nodes.get("sensor")
+        sensor: Any = self._serial_device or self._nodes.get("sensor")
         drive: Any = self._nodes.get("drive")
         if fault.kind in LINE_KINDS:
             self._lines[values["from"]].add(fault)
@@ -550,7 +550,7 @@ class BusSimulation:
         elif fault.kind == "sto":
             self._override_attribute(fault, drive, "sto_dropped", True)
         elif fault.kind == "busoff":
-            self._send(BUS_OFF_FRAME, None)
+            self._send_to_hosts(BUS_OFF_FRAME, None)
             self._override_attribute(fault, self, "bus_off", True)
         elif fault.kind == "jump":
             drive.angle_offset_counts += values["counts"]
@@ -564,18 +564,18 @@ class BusSimulation:
         elif fault.kind in _DRIVE_ATTRIBUTES:
             self._override_attribute(fault, drive, _DRIVE_ATTRIBUTES[fault.kind], True)
         elif fault.kind in DISTURBANCE_KINDS:
-            now_s = self._simulated.plant.elapsed_s + (
+            now_s = self._simulated_rig.plant.elapsed_s + (
                 0.0 if self._lock_step else _OBSTACLE_LEAD_TIME_S
             )
             disturbance = disturbance_of(fault, now_s)
-            self._simulated.add_disturbance(disturbance, wait=self._lock_step)
+            self._simulated_rig.add_disturbance(disturbance, wait=self._lock_step)
             if isinstance(disturbance, Obstacle):
                 self._obstacles.append((fault, disturbance))
         elif fault.kind == "end":
             self._end_faults(values.get("fault"))
         else:
             self._cut_lines[values["device"]] = fault
-            self._cut(values["device"])
+            self._interrupt(values["device"])
         self._deliver_to_nodes()
 
     def _begin_stuck_readings(self, fault: Fault, sensor: Any) -> None:  # noqa: ANN401
@@ -583,9 +583,9 @@ class BusSimulation:
         stuck = StuckReadings(int(fault.values.get("every", 0)))
         what = fault.values["what"]
         if what == "encoder":
-            self._override_attribute(fault, self._simulated, "stuck_encoder", stuck)
+            self._override_attribute(fault, self._simulated_rig, "stuck_encoder", stuck)
         elif what == "sensor":
-            self._override_attribute(fault, self._simulated.sensor, "stuck", stuck)
+            self._override_attribute(fault, self._simulated_rig.sensor, "stuck", stuck)
         else:
             self._override_attribute(
                 fault, sensor.gauges, "stuck", (int(fault.values["gauge"]), stuck)
@@ -624,27 +624,29 @@ class BusSimulation:
         if kind in (None, "obstacle"):
             obstacles, self._obstacles = self._obstacles, []
             for fault, obstacle in obstacles:
-                self._simulated.remove_obstacle(obstacle)
+                self._simulated_rig.remove_obstacle(obstacle)
                 self._log("simulator", "fault over", fault=str(fault))
         if kind in (None, "cut"):
             cut, self._cut_lines = self._cut_lines, {}
             for device, fault in cut.items():
-                self._mend(device)
+                self._reconnect(device)
                 self._log("simulator", "fault over", fault=str(fault))
 
     def _schedule(self, when_s: float, action: Callable[[], None]) -> None:
         """Schedule an action at a simulated time in seconds since the start."""
-        self._order += 1
+        self._action_count += 1
         # Half a period of tolerance, so that the end of an interval does not depend on rounding.
         heapq.heappush(
-            self._scheduled_actions, (when_s - 0.5 * self._period_s, self._order, action)
+            self._scheduled_actions, (when_s - 0.5 * self._period_s, self._action_count, action)
         )
 
     def _schedule_delivery(self, delay_s: float, action: Callable[[], None]) -> None:
         """Schedule the delivery of a delayed frame; in real time by the wall clock."""
-        self._order += 1
+        self._action_count += 1
         now_ns = self.periods * self._period_ns if self._lock_step else self._now_ns
-        heapq.heappush(self._delayed_deliveries, (now_ns + delay_s * 1e9, self._order, action))
+        heapq.heappush(
+            self._delayed_deliveries, (now_ns + delay_s * 1e9, self._action_count, action)
+        )
 
     def _run_due(self, queue: list[tuple[float, int, Callable[[], None]]], now: float) -> None:
         """Run the actions of a queue that are due at a time, and deliver the nodes' frames."""

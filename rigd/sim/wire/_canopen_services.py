@@ -57,7 +57,7 @@ class Emergencies:
         self._cob_id = objects.add(0x1014, Entry("I", 0x80 + node_id, check=self._check_cob_id))
 
     def reset(self) -> None:
-        """Clear active errors and history, as at power-on."""
+        """Clear active errors and error history, as at power-on."""
         self.active.clear()
         self._history.clear()
 
@@ -87,7 +87,7 @@ class Emergencies:
         return True
 
     def clear(self, *codes: int) -> None:
-        """Clear errors, and send a message if any of them was active."""
+        """Clear error codes, and send an emergency message if any of them was active."""
         cleared = [code for code in codes if self.active.pop(code, None) is not None]
         if cleared:
             self._transmit(0, b"")
@@ -168,7 +168,7 @@ class HeartbeatWatch:
         self.restart()
 
     def restart(self) -> None:
-        """Restart the monitoring: wait for the first heartbeat."""
+        """Restart the monitoring: wait for the first heartbeat of the node again."""
         self.lost = False
         self._last_s: float | None = None
 
@@ -183,7 +183,7 @@ class HeartbeatWatch:
         self.lost = False
 
     def check(self, now_s: float) -> bool:
-        """Return whether the heartbeat has just been lost."""
+        """Return whether the monitored heartbeat has been lost since the last check."""
         timeout_s = 1e-3 * (self._entry.value & 0xFFFF)
         if self.lost or not timeout_s or self._last_s is None:
             return False
@@ -323,7 +323,7 @@ class Pdo:
         self.reset_exchange()
 
     def compile(self) -> None:
-        """Rebuild the mapping from the dictionary."""
+        """Rebuild the PDO's mapping from the object dictionary."""
         slots = self._slots[: self._count.value]
         try:
             self.entries = [self._mapped_entry(slot.value) for slot in slots]
@@ -411,7 +411,7 @@ class ReceivePdo(Pdo):
     direction = "r"
 
     def reset_exchange(self) -> None:
-        """Discard the received data."""
+        """Discard the data of received PDOs."""
         self.pending: bytes | None = None
         self.received_s: float | None = None
         self.applied = False
@@ -438,7 +438,7 @@ class TransmitPdo(Pdo):
     direction = "t"
 
     def compile(self) -> None:
-        """Rebuild the mapping from the dictionary, and the list of readers."""
+        """Rebuild the PDO's mapping from the object dictionary, and its list of readers."""
         super().compile()
         self._readers: list[Callable[[], int]] = [
             entry.read_value or entry.get for entry in self.entries

@@ -104,7 +104,7 @@ class DriveNode:
     ----------
     rig
         Parameters of the rig with a section [cia402].
-    simulated
+    simulated_rig
         Simulated rig whose plant the drive moves and measures.
     advance
         Function that advances the simulated rig to this SYNC. It is called at each valid SYNC, in
@@ -161,7 +161,7 @@ class DriveNode:
     def __init__(
         self,
         rig: RigParameters,
-        simulated: SimulatedRig,
+        simulated_rig: SimulatedRig,
         advance: Callable[[], None],
         send: Callable[[int, bytes], None],
         log: Log,
@@ -182,8 +182,8 @@ class DriveNode:
         self.stays_operational = self.watchless = False
         self._sto_dropped = False
         self._sto_error_code = rig.cia402.sto_error_code
-        self._simulated = simulated
-        self._plant = simulated.plant
+        self._simulated_rig = simulated_rig
+        self._plant = simulated_rig.plant
         self._advance = advance
         self._send = send
         self._log = partial(log, "drive")
@@ -254,7 +254,7 @@ class DriveNode:
         self._rebuild_pdos()
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Process a received frame."""
+        """Process a CAN frame that the simulated drive has received."""
         if self._nmt is Nmt.INITIALISING:
             self._boot()
         if can_id == self._sync_id:
@@ -265,7 +265,7 @@ class DriveNode:
                 handler(data)
 
     def tick(self, now_s: float) -> None:
-        """Process watchdogs, heartbeat, ramps and event-driven PDOs until a simulated time.
+        """Advance the drive to a simulated time: watchdogs, heartbeat, ramps, event-driven PDOs.
 
         Parameters
         ----------
@@ -323,7 +323,7 @@ class DriveNode:
     # NMT ---------------------------------------------------------------------------------------
 
     def _boot(self, last: int = _LAST_INDEX) -> None:
-        """Start with the values at power-on of all objects, or of those up to an index."""
+        """Start the node: set objects up to index `last` to their values at power-on."""
         self._log("nmt", state="initialising")
         if last == _LAST_INDEX:
             self._emergencies.reset()
@@ -340,7 +340,7 @@ class DriveNode:
         self._enter_nmt(Nmt.PRE_OPERATIONAL)
 
     def _on_nmt(self, data: bytes) -> None:
-        """Process an NMT command."""
+        """Process an NMT command: start, stop, pre-operational or reset."""
         if len(data) != 2 or data[1] not in (0, self._node_id):
             return
         command = data[0]
@@ -438,7 +438,7 @@ class DriveNode:
             pdo.apply(data)
 
     def _on_sdo(self, data: bytes) -> None:
-        """Process an SDO request."""
+        """Process an SDO request, unless the node is stopped."""
         if self._nmt is not Nmt.STOPPED:
             self._sdo.receive(data)
 
@@ -552,7 +552,7 @@ class DriveNode:
         return allowed
 
     def _fail(self, code: int, register: int, vendor: bytes = b"") -> None:
-        """Bring the drive to fault and report an error."""
+        """Bring the simulated drive to fault, and report an error code by an emergency message."""
         self._machine.fail()
         self._report(code, register, vendor)
 
@@ -675,7 +675,7 @@ class DriveNode:
 
     def _position(self) -> int:
         """Return the position in encoder counts as a 32-bit integer."""
-        steps = round(self._simulated.read_angle() / self._resolution_rad)
+        steps = round(self._simulated_rig.read_angle() / self._resolution_rad)
         counts = steps * self._direction + self.angle_offset_counts
         return (counts + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
 

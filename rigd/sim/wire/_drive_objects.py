@@ -130,7 +130,7 @@ class PdsStateMachine:
             self._switch_on(word, reset_bit)
 
     def disable_voltage(self) -> None:
-        """Switch the power off from any state except fault."""
+        """Switch the drive's power off, from any state except fault."""
         if self.state in _POWERED_STATES:
             self._enter(PdsState.SWITCH_ON_DISABLED)
 
@@ -142,7 +142,7 @@ class PdsStateMachine:
             self.disable_voltage()
 
     def fail(self) -> None:
-        """Change to fault, by the fault reaction."""
+        """Change to the state fault, by the fault reaction."""
         if self.state in (PdsState.FAULT, PdsState.FAULT_REACTION):
             return
         self._enter(PdsState.FAULT_REACTION)
@@ -150,7 +150,7 @@ class PdsStateMachine:
             self._enter(PdsState.FAULT)
 
     def tick(self, now_s: float) -> None:
-        """Complete transitions that take time, at a simulated time in seconds."""
+        """Complete transitions that take time, at the simulated time `now_s` in seconds."""
         if self.state not in (PdsState.QUICK_STOP, PdsState.FAULT_REACTION):
             return
         if self._ramp_since_s is None:
@@ -191,7 +191,7 @@ class PdsStateMachine:
             self._enter(PdsState.OPERATION_ENABLED)
 
     def _enter(self, state: PdsState) -> None:
-        """Change to a state, and report the change."""
+        """Change to a state of the power drive system, and report the change."""
         previous_state, self.state = self.state, state
         self._ramp_since_s = None
         if previous_state is not state:

@@ -300,7 +300,7 @@ class _ActiveFault:
         self.byte = int(values.get("byte", 0))
 
     def matches(self, can_id: int, data: bytes) -> bool:
-        """Return whether the fault acts on a frame."""
+        """Return whether the fault acts on a frame with this identifier and data."""
         if self.can_id is not None and self.can_id != can_id:
             return False
         return self.kind != "corrupt" or self.byte < len(data)
@@ -341,11 +341,11 @@ class FaultyLine:
         return bool(self._active_faults or self._held_frames)
 
     def add(self, fault: Fault) -> None:
-        """Activate a fault on this line."""
+        """Let a fault act on this line from now on."""
         self._active_faults.append(_ActiveFault(fault))
 
     def end(self, kind: str | None) -> list[str]:
-        """End the faults of a kind, or all; return the kinds of the faults that were active."""
+        """End the line's faults of a kind, or all; return the kinds of the ended faults."""
         ended = [fault for fault in self._active_faults if kind in (None, fault.kind)]
         self._active_faults = [fault for fault in self._active_faults if fault not in ended]
         return [fault.kind for fault in ended]
@@ -444,12 +444,12 @@ class EventLog:
                 sys.stdout.flush()
 
     def flush(self) -> None:
-        """Write the logged events to the file if the last write was some time ago."""
+        """Write the logged events to the log file, if the last write was some time ago."""
         if time.monotonic() - self._flushed_s > _FLUSH_INTERVAL_S:
             self._write_out()
 
     def close(self) -> None:
-        """Write the remaining events and close the file."""
+        """Write the remaining events and close the log file."""
         file, self._file = self._file, None
         if file is not None:
             with suppress(OSError):
@@ -462,7 +462,7 @@ class EventLog:
             self._path.unlink()
 
     def _write_out(self) -> None:
-        """Write the logged events to the file."""
+        """Write the logged events to the log file."""
         self._flushed_s = time.monotonic()
         self._run_on_file(lambda file: file.flush())
 

@@ -148,7 +148,7 @@ class VirtualBus:
             self._drop(client)
 
     def _accept(self) -> None:
-        """Accept a client."""
+        """Accept the connection of a client, and register it in the event loop."""
         with suppress(OSError):
             link, _ = self._listener.accept()
             link.setblocking(False)
@@ -227,7 +227,7 @@ class VirtualCan:
         self._use_socket(self._bound_socket(), handlers, on_frames)
 
     def open(self) -> None:
-        """Connect to the bus again, after `close`."""
+        """Open the kernel's CAN interface again, after `close`."""
         self._use_socket(self._bound_socket(), self._handlers, self._on_frames)
 
     def _bound_socket(self) -> socket.socket:
@@ -264,13 +264,13 @@ class VirtualCan:
                 self.lost += 1
 
     def close(self) -> None:
-        """Disconnect from the bus."""
+        """Close the socket on the kernel's CAN interface."""
         if self._link.fileno() >= 0:
             del self._handlers[self._link.fileno()]
             self._link.close()
 
     def _receive(self) -> None:
-        """Receive frames from the bus, and pass them on."""
+        """Receive frames from the kernel's CAN interface, and pass them to the simulation."""
         frames: list[bytes] = []
         with suppress(OSError):
             while len(frames) < _MOST_FRAMES_PER_READ:

@@ -152,7 +152,9 @@ class Entry:
             New value at power-on; None leaves it unchanged.
         """
         if self.read_value is not None and description.kind != self.kind:
-            self.read_value = partial(_limited, self.read_value, *_type_range(description.kind))
+            self.read_value = partial(
+                _clamped_value, self.read_value, *_type_range(description.kind)
+            )
         self.kind, self.access, self.mapping = (
             description.kind,
             description.access,
@@ -175,20 +177,20 @@ class Entry:
         self._high = largest if high is None else high
 
     def accepts_length(self, size: int) -> bool:
-        """Return whether a value of `size` bytes can be written."""
+        """Return whether a value of `size` bytes can be written to the entry."""
         if self.kind != "s":
             return 8 * size == self.bits
         return size == len(self.text) if self.fixed else size <= _MOST_TEXT_BYTES
 
     @property
     def most_bytes(self) -> int:
-        """Largest number of bytes that can be written."""
+        """Largest number of bytes that can be written to the entry."""
         if self.kind != "s":
             return self.bits // 8
         return len(self.text) if self.fixed else _MOST_TEXT_BYTES
 
     def get(self) -> int:
-        """Return the present value."""
+        """Return the present value of an integer entry."""
         return self.value if self.read_value is None else self.read_value()
 
     def store_integer(self, value: int) -> None:
@@ -206,7 +208,7 @@ class Entry:
         self.value = value
 
     def reset(self) -> None:
-        """Restore the value at power-on."""
+        """Restore the entry's value at power-on."""
         self.value = self.default
         self.text = self.default_text
 
@@ -240,7 +242,7 @@ def _type_range(kind: str) -> tuple[int, int]:
     return -(1 << (bits - 1)), (1 << (bits - 1)) - 1
 
 
-def _limited(read_value: Callable[[], int], lowest: int, largest: int) -> int:
+def _clamped_value(read_value: Callable[[], int], lowest: int, largest: int) -> int:
     """Return a read value, limited to a range."""
     return min(max(read_value(), lowest), largest)
 
@@ -256,7 +258,7 @@ class ObjectDictionary:
         return self._entries[key]
 
     def add(self, index: int, entry: Entry, sub: int = 0) -> Entry:
-        """Add an entry and return it."""
+        """Add an entry to the dictionary, and return the entry."""
         self._entries[index, sub] = entry
         self._indices.add(index)
         return entry
@@ -306,7 +308,7 @@ class ObjectDictionary:
         entry.value = entry.default = value
 
     def find(self, index: int, sub: int) -> Entry:
-        """Return the entry at an index and sub-index.
+        """Return the entry of the dictionary at an index and sub-index.
 
         Raises
         ------
@@ -415,7 +417,7 @@ class SdoServer:
         self.reset()
 
     def reset(self) -> None:
-        """Discard an unfinished transfer."""
+        """Discard an unfinished SDO transfer."""
         self._index = self._sub = 0
         self._awaited: int | None = None  # command specifier of the expected segments
         self._buffer = b""

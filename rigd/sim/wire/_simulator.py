@@ -154,7 +154,7 @@ class ControlSocket:
         handlers[self._listener.fileno()] = self._accept
 
     def close(self) -> None:
-        """Close the socket and all connections."""
+        """Close the control socket and the connections of all clients."""
         for link in list(self._links):
             self._drop(link)
         del self._handlers[self._listener.fileno()]
@@ -162,7 +162,7 @@ class ControlSocket:
         self._path.unlink(missing_ok=True)
 
     def _accept(self) -> None:
-        """Accept a connection."""
+        """Accept the connection of a client, and register it in the event loop."""
         with suppress(OSError):
             link, _ = self._listener.accept()
             link.setblocking(False)
@@ -170,7 +170,7 @@ class ControlSocket:
             self._handlers[link.fileno()] = lambda: self._receive(link)
 
     def _receive(self, link: socket.socket) -> None:
-        """Receive bytes of a connection, and reply to each complete line."""
+        """Receive bytes of a client, and reply to each complete line with a request."""
         try:
             received = link.recv(_LONGEST_REQUEST)
         except BlockingIOError:
@@ -197,7 +197,7 @@ class ControlSocket:
         return self._answer(request)
 
     def _drop(self, link: socket.socket) -> None:
-        """Close a connection."""
+        """Close the connection of a client."""
         del self._links[link]
         del self._handlers[link.fileno()]
         link.close()
@@ -335,15 +335,15 @@ class _SimulatorProcess:
         self._rig = rig
         self._options = options
         self._log = log
-        self._stack = stack
+        self._exit_stack = stack
         self._handlers: Handlers = {}
-        self._file: DeviceFile | None = None
+        self._device_file: DeviceFile | None = None
         assert rig.cia402 is not None
         eds = options.eds or (Path(rig.cia402.eds) if rig.cia402.eds else None)
         if eds is not None:
             from rigd.sim.wire._object_dictionary import read_device
 
-            self._file = read_device(eds, rig.cia402.node_id)
+            self._device_file = read_device(eds, rig.cia402.node_id)
         folder = stack.enter_context(socket_folder(rig.name))
         self._bus: VirtualBus | VirtualCan
         can_socket = ""
@@ -355,10 +355,10 @@ class _SimulatorProcess:
                 Path(can_socket), self._handlers, self._on_frames, self._on_clients
             )
         stack.callback(self._bus.close)
-        self._line: PtyLine | None = None
+        self._serial_line: PtyLine | None = None
         if rig.ati_serial is not None:
-            self._line = PtyLine(self._handlers, self._on_bytes, self._on_port)
-            stack.callback(self._line.close)
+            self._serial_line = PtyLine(self._handlers, self._on_bytes, self._on_port)
+            stack.callback(self._serial_line.close)
         stated_seed = None if rig.simulation is None else rig.simulation.seed
         self._seed = fresh_seed() if stated_seed is None else stated_seed
         self._sessions = 0
@@ -384,18 +384,18 @@ class _SimulatorProcess:
             "started",
             rig=self._rig.name,
             lock_step=self._options.lock_step,
-            **({} if self._file is None else {"eds": self._file.name}),
+            **({} if self._device_file is None else {"eds": self._device_file.name}),
             **started,
         )
         for line in self._start_messages():
             self._log.print_line(line)
         announce(self._rig.name, self._address)
-        self._stack.callback(forget, self._rig.name)
+        self._exit_stack.callback(forget, self._rig.name)
         # Set-up leaves objects that are never freed: exclude them from garbage collection.
         gc.collect()
         gc.freeze()
         gc.disable()
-        self._stack.callback(gc.enable)
+        self._exit_stack.callback(gc.enable)
         if not self._options.lock_step:
             # Real-time priority for replies in time while other processes work, below every
             # real-time loop. Of 2500 replies on two busy cores, 7 were late with it, 95 without.
@@ -403,11 +403,11 @@ class _SimulatorProcess:
                 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
 
     def serve(self, stop: Callable[[], bool]) -> None:
-        """Run the event loop until a stop is requested."""
+        """Run the simulator's event loop until a stop is requested."""
         handlers, bus_simulation, line, log = (
             self._handlers,
             self._bus_simulation,
-            self._line,
+            self._serial_line,
             self._log,
         )
         now_ns = time.monotonic_ns
@@ -435,11 +435,11 @@ class _SimulatorProcess:
         from rigd.sim.wire._drive_node import DriveNode
 
         rig = self._rig
-        simulated = self._simulated = SimulatedRig(without_transport_delay(rig))
-        line = self._line
+        simulated_rig = self._simulated_rig = SimulatedRig(without_transport_delay(rig))
+        line = self._serial_line
         bus_simulation = BusSimulation(
             rig,
-            simulated,
+            simulated_rig,
             lock_step=self._options.lock_step,
             now_ns=time.monotonic_ns(),
             send=self._bus.send,
@@ -451,25 +451,26 @@ class _SimulatorProcess:
         assert rig.cia402 is not None
         drive = DriveNode(
             rig,
-            simulated,
+            simulated_rig,
             bus_simulation.step,
             bus_simulation.can_sender("drive"),
             self._log,
             sync_timeout_s=self._sync_timeout_s(),
-            file=self._file,
+            file=self._device_file,
         )
         bus_simulation.add_node("drive", drive)
         if rig.ati_serial is not None:
             from rigd.sim.wire._ati_serial_device import AtiSerialDevice
 
             bus_simulation.add_serial_device(
-                AtiSerialDevice(rig, simulated, bus_simulation.serial_writer(), self._log)
+                AtiSerialDevice(rig, simulated_rig, bus_simulation.serial_writer(), self._log)
             )
         elif rig.ati_can is not None:
             from rigd.sim.wire._ati_can_node import AtiCanNode
 
             bus_simulation.add_node(
-                "sensor", AtiCanNode(rig, simulated, bus_simulation.can_sender("sensor"), self._log)
+                "sensor",
+                AtiCanNode(rig, simulated_rig, bus_simulation.can_sender("sensor"), self._log),
             )
         return bus_simulation
 
@@ -479,7 +480,7 @@ class _SimulatorProcess:
         assert drive is not None
         if drive.own_watchdog_s:
             return drive.own_watchdog_s
-        if self._file is not None and (0x1006, 0) not in self._file.entries:
+        if self._device_file is not None and (0x1006, 0) not in self._device_file.entries:
             return math.inf  # no period is configured
         # The tolerance of other drives is not known: use the heartbeat timeout.
         return drive.heartbeat_timeout_s
@@ -493,9 +494,9 @@ class _SimulatorProcess:
         yield f"  CAN      {address.can_socket or f'{rig.can.channel} (virtual)'}"
         if address.serial_port:
             yield f"  serial   {address.serial_port}"
-        if self._file is not None:
-            objects = len({index for index, _ in self._file.entries})
-            yield f"  drive    as {self._file.name} has it, {objects} objects"
+        if self._device_file is not None:
+            objects = len({index for index, _ in self._device_file.entries})
+            yield f"  drive    as {self._device_file.name} has it, {objects} objects"
         fast = " --fast" if address.lock_step else ""
         yield f"  session  rigd run chirp --profile {rig.name}{fast}"
         yield f"  fault    rigd inject --profile {rig.name} freeze,device=drive,for=0.5"
@@ -509,7 +510,7 @@ class _SimulatorProcess:
         self._bus_simulation.receive_serial(data)
 
     def _on_clients(self, what: str, count: int) -> None:
-        """Log that a client has connected or disconnected."""
+        """Log that a client of the CAN bus has connected or disconnected."""
         self._log("bus", what, clients=count)
         if count == 0:
             self._bus_simulation.stop_waiting(time.monotonic_ns())
@@ -519,18 +520,18 @@ class _SimulatorProcess:
         self._log("line", "port opened" if is_open else "port closed")
 
     def _interrupt(self, device: str) -> None:
-        """Interrupt the bus or the serial line."""
+        """Interrupt the simulated CAN bus or serial line."""
         if device == "bus":
             self._bus.close()
-        elif self._line is not None:
-            self._line.close()
+        elif self._serial_line is not None:
+            self._serial_line.close()
 
     def _reconnect(self, device: str) -> None:
-        """Reconnect the bus or the serial line."""
+        """Reconnect the simulated CAN bus or serial line."""
         if device == "bus":
             self._bus.open()
-        elif self._line is not None:
-            self._line.open()
+        elif self._serial_line is not None:
+            self._serial_line.open()
             # The line may have a new name, which the next process has to find.
             self._address = replace(self._address, serial_port=self._port)
             announce(self._rig.name, self._address)
@@ -538,7 +539,7 @@ class _SimulatorProcess:
     @property
     def _port(self) -> str:
         """Name of the serial port for the host; empty if there is none."""
-        return "" if self._line is None else self._line.port
+        return "" if self._serial_line is None else self._serial_line.port
 
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Return the reply to a request on the control socket."""
@@ -557,14 +558,14 @@ class _SimulatorProcess:
         if "status" in request:
             return {
                 "rig": self._rig.name,
-                "drive": "default" if self._file is None else self._file.name,
+                "drive": "default" if self._device_file is None else self._device_file.name,
                 "time_s": round(self._bus_simulation.now_s, 6),
                 "lock_step": self._options.lock_step,
                 "moved_periods": self._bus_simulation.rig_periods,
                 "syncs": self._bus_simulation.syncs,
                 "clients": self._bus.clients,
                 "lost_frames": self._bus.lost,
-                "lost_bytes": 0 if self._line is None else self._line.lost,
+                "lost_bytes": 0 if self._serial_line is None else self._serial_line.lost,
                 "disturbed": self._bus_simulation.disturbed,
             }
         return {"error": "A request has to be 'inject', 'status' or 'renew_noise'."}
@@ -574,7 +575,7 @@ class _SimulatorProcess:
         if seed is None:
             self._sessions += 1
             seed = session_seed(self._seed, self._sessions)
-        self._simulated.begin_session(seed)
+        self._simulated_rig.begin_session(seed)
         return seed
 
 
