@@ -85,18 +85,18 @@ def actuation_target(rig: RigParameters) -> ActuationTarget:
     return ActuationTarget.LOCK_STEP if simulator.lock_step else ActuationTarget.SIMULATOR
 
 
-def describe_actuation_target(rig: RigParameters, moving: ActuationTarget) -> str:
+def describe_actuation_target(rig: RigParameters, target: ActuationTarget) -> str:
     """Return a sentence for the operator about what will move: the hardware or its simulation.
 
     Parameters
     ----------
     rig
         Parameters of the rig.
-    moving
+    target
         Result of `actuation_target`.
     """
-    if moving is not ActuationTarget.HARDWARE:
-        how = "in this process" if moving is ActuationTarget.SIMULATED else moving.value
+    if target is not ActuationTarget.HARDWARE:
+        how = "in this process" if target is ActuationTarget.SIMULATED else target.value
         return f"No hardware: {rig.name} is simulated ({how})."
     assert rig.can is not None
     assert rig.cia402 is not None
@@ -137,14 +137,14 @@ def simulator() -> ModuleType:
     return importlib.import_module("rigd.sim.wire")
 
 
-def open_devices(rig: RigParameters, moving: ActuationTarget | None = None) -> Devices:
+def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> Devices:
     """Create the drivers that a profile names; nothing is connected yet.
 
     Parameters
     ----------
     rig
         Parameters of a profile.
-    moving
+    target
         What the operator has confirmed to move, or None if nothing was confirmed.
 
     Raises
@@ -164,10 +164,10 @@ def open_devices(rig: RigParameters, moving: ActuationTarget | None = None) -> D
         "Callable[[RigParameters], Devices]", getattr(importlib.import_module(module), name)
     )
     devices = opener(rig)
-    if moving is not None and devices.simulated is (moving is ActuationTarget.HARDWARE):
+    if target is not None and devices.simulated is (target is ActuationTarget.HARDWARE):
         reasons = "a simulated rig" if devices.simulated else ActuationTarget.HARDWARE.value
         raise DeviceError(
-            f"{moving.value.capitalize()} was to move, and now it would be {reasons}: rigd "
+            f"{target.value.capitalize()} was to move, and now it would be {reasons}: rigd "
             "simulate was started or ended in between. Nothing was sent; start again."
         )
     return devices

@@ -13,17 +13,17 @@ def fresh_seed() -> int:
     return secrets.randbits(_SEED_BITS)
 
 
-def session_seed(stated: int, number: int) -> int:
+def session_seed(series_seed: int, session_number: int) -> int:
     """Return the seed of one session of a series, derived from the seed of the series.
 
     Parameters
     ----------
-    stated
+    series_seed
         Seed of the series, which the first session uses unchanged.
-    number
+    session_number
         Number of the session in the series, from 1 on.
     """
-    if number == 1:
-        return stated
-    digest = hashlib.blake2b(f"{stated} {number}".encode(), digest_size=8).digest()
+    if session_number == 1:
+        return series_seed
+    digest = hashlib.blake2b(f"{series_seed} {session_number}".encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") >> (64 - _SEED_BITS)

@@ -99,12 +99,12 @@ class ResettableDrive(Protocol):
         """
 
 
-def reset_drive(rig: RigParameters, moving: ActuationTarget | None = None) -> str:
+def reset_drive(rig: RigParameters, target: ActuationTarget | None = None) -> str:
     """Reset the fault of a rig's drive, release the drive, and describe the result.
 
     Parameters
     ----------
-    rig, moving
+    rig, target
         See :func:`rigd.devices._registry.open_devices`.
 
     Returns
@@ -118,7 +118,7 @@ def reset_drive(rig: RigParameters, moving: ActuationTarget | None = None) -> st
         If the drive does not answer, may still turn, the fault persists, or the drive does not
         become ready, for instance because STO is open.
     """
-    drive = open_devices(rig, moving).drive
+    drive = open_devices(rig, target).drive
     if not isinstance(drive, ResettableDrive):
         return "Each session simulates a new drive: there is no fault to reset."
     try:

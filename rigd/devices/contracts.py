@@ -25,19 +25,19 @@ class DeviceError(FailureError):
     """Error: a device did not act as requested; the message states device and reply."""
 
 
-def wired_stop_dropped(device: str, shown: str = "") -> DeviceError:
+def wired_stop_dropped(device: str, explanation: str = "") -> DeviceError:
     """Return the error for a drive whose wired stop (STO) was dropped while it was enabled.
 
     Parameters
     ----------
     device
         Name of the drive.
-    shown
+    explanation
         How the drive reports it, as the rest of a sentence.
     """
     return DeviceError(
-        f"{device}: the wired stop (STO) was dropped{shown}. Find out who pressed it and why, "
-        "check that nobody is within reach of the beam, release it, then reset the rig."
+        f"{device}: the wired stop (STO) was dropped{explanation}. Find out who pressed it and "
+        "why, check that nobody is within reach of the beam, release it, then reset the rig."
     )
 
 

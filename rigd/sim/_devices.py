@@ -43,20 +43,20 @@ class StuckReadings:
 
     Parameters
     ----------
-    every
+    refresh_every
         Number of calls after which a new reading is returned; 0: the first is repeated for ever.
     """
 
-    __slots__ = ("_count", "_every", "_value")
+    __slots__ = ("_count", "_refresh_every", "_value")
 
-    def __init__(self, every: int = 0) -> None:
-        self._every = every
+    def __init__(self, refresh_every: int = 0) -> None:
+        self._refresh_every = refresh_every
         self._count = 0
         self._value: object = None
 
     def __call__(self, value: T) -> T:
         """Return the given reading, or the earlier reading that is repeated in its stead."""
-        if self._count == 0 or (self._every and self._count % self._every == 0):
+        if self._count == 0 or (self._refresh_every and self._count % self._refresh_every == 0):
             self._value = value
         self._count += 1
         return cast("T", self._value)
@@ -205,14 +205,14 @@ class SimulatedRig:
         file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it was read
         process = os.fork()
         if process == 0:
-            failed = True
+            has_failed = True
             with suppress(BaseException):
                 with suppress(OSError):  # it has time
                     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
                 pickle.dump(self._plant_with_disturbances(), file, protocol=5)
                 file.flush()
-                failed = False
-            os._exit(failed)
+                has_failed = False
+            os._exit(has_failed)
         self._preparation = process, file
 
     def _poll_preparation(self) -> None:
@@ -447,7 +447,9 @@ class SimulatedSensor:
         """Yield blocks of unloaded wrenches with noise and offset; without a seed, random ones."""
         simulation = self._simulation
         generator = np.random.default_rng(seed)
-        scale = np.array([simulation.force_noise_n] * 3 + [simulation.torque_noise_nm] * 3)
+        noise_deviations = np.array(
+            [simulation.force_noise_n] * 3 + [simulation.torque_noise_nm] * 3
+        )
         offset = np.array(simulation.offset)
         limit = np.array(self._sensor.range)
         step = np.array(self._sensor.resolution)
@@ -458,14 +460,17 @@ class SimulatedSensor:
         ]
         quantised_axes = [axis for axis in unloaded_axes if step[axis] > 0]
         while True:
-            block = offset + generator.standard_normal((_NOISE_BLOCK_READINGS, 6)) * scale
-            block[:, unloaded_axes] = np.clip(
-                block[:, unloaded_axes], -limit[unloaded_axes], limit[unloaded_axes]
+            noise_block = (
+                offset + generator.standard_normal((_NOISE_BLOCK_READINGS, 6)) * noise_deviations
             )
-            block[:, quantised_axes] = (
-                np.round(block[:, quantised_axes] / step[quantised_axes]) * step[quantised_axes]
+            noise_block[:, unloaded_axes] = np.clip(
+                noise_block[:, unloaded_axes], -limit[unloaded_axes], limit[unloaded_axes]
             )
-            yield block.tolist()
+            noise_block[:, quantised_axes] = (
+                np.round(noise_block[:, quantised_axes] / step[quantised_axes])
+                * step[quantised_axes]
+            )
+            yield noise_block.tolist()
 
 
 _CROSSTALK_PATTERN = (

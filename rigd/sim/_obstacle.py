@@ -95,10 +95,14 @@ class AttachedObstacles:
         ]
         # Rows: displacement at each body, torque, shear. Columns of `_force_state_rows`: states of
         # each force; columns of `_direct_rows`: forces.
-        self._force_state_rows = np.column_stack([each.rows for each in force_realisations])
-        self._direct_rows = np.column_stack([each.direct for each in force_realisations])
+        self._force_state_rows = np.column_stack(
+            [known_body.rows for known_body in force_realisations]
+        )
+        self._direct_rows = np.column_stack(
+            [known_body.direct for known_body in force_realisations]
+        )
         self._a, self._b = force_realisations[0].a, force_realisations[0].b  # equal for all forces
-        self._oscillating = 2 * force_realisations[0].modes
+        self._oscillating_states = 2 * force_realisations[0].modes
         angle_outputs = [
             state_output(
                 realisation,
@@ -141,12 +145,12 @@ class AttachedObstacles:
             Contribution of each force (1 N) to the derivative of the state, shape (n, bodies).
         """
         bodies, own_states = self._positions_m.size, self._b.size
-        n, more = model.b.size, bodies * own_states
+        n, added_states = model.b.size, bodies * own_states
         torque, shear = self._force_state_rows[-2], self._force_state_rows[-1]
-        a = np.zeros((n + more, n + more))
+        a = np.zeros((n + added_states, n + added_states))
         a[:n, :n] = model.a
         a[:n, n:] = -np.outer(model.b, torque)
-        of_force = np.zeros((n + more, bodies))
+        of_force = np.zeros((n + added_states, bodies))
         of_force[:n] = -np.outer(model.b, self._direct_rows[-2])
         for index in range(bodies):
             states = slice(n + index * own_states, n + (index + 1) * own_states)
@@ -155,9 +159,9 @@ class AttachedObstacles:
         extended = replace(
             model,
             a=a,
-            b=np.append(model.b, np.zeros(more)),
-            angle=np.append(model.angle, np.zeros(more)),
-            velocity=np.append(model.velocity, np.zeros(more)),
+            b=np.append(model.b, np.zeros(added_states)),
+            angle=np.append(model.angle, np.zeros(added_states)),
+            velocity=np.append(model.velocity, np.zeros(added_states)),
             acceleration=np.append(model.acceleration, -model.acceleration_per_torque * torque),
             beam_torque=np.append(model.beam_torque, (1 - model.beam_torque_per_torque) * torque),
             sensor_torque=np.append(
@@ -425,14 +429,14 @@ class AttachedObstacles:
         new_state = np.zeros(n + size * self._positions_m.size)
         new_state[:n] = state[:n]
         if other is not None:
-            modal_states = min(self._oscillating, other._oscillating)
-            real_states = min(size - self._oscillating, old_size - other._oscillating)
+            modal_states = min(self._oscillating_states, other._oscillating_states)
+            real_states = min(size - self._oscillating_states, old_size - other._oscillating_states)
             for index in range(old_bodies):
                 new = new_state[n + index * size :]
                 old = state[n + index * old_size :]
                 new[:modal_states] = old[:modal_states]
-                new[self._oscillating : self._oscillating + real_states] = old[
-                    other._oscillating : other._oscillating + real_states
+                new[self._oscillating_states : self._oscillating_states + real_states] = old[
+                    other._oscillating_states : other._oscillating_states + real_states
                 ]
             self._penetration_m.update(other._penetration_m)
         self._displacement_m = self.displacement_rows @ new_state
@@ -441,8 +445,14 @@ class AttachedObstacles:
     def remove(self, body: Disturbance, time_s: float) -> None:
         """Remove an obstacle from the simulation at a time in seconds."""
         self._obstacles = [
-            (index, replace(each, until_s=min(each.until_s, time_s)) if each == body else each, k)
-            for index, each, k in self._obstacles
+            (
+                index,
+                replace(known_body, until_s=min(known_body.until_s, time_s))
+                if known_body == body
+                else known_body,
+                k,
+            )
+            for index, known_body, k in self._obstacles
         ]
 
     def store_forces(

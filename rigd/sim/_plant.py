@@ -36,7 +36,7 @@ Real = NDArray[np.float64]
 
 _OBSTACLE_ATTRIBUTES = (
     "_contact", "_free_step", "_free_march", "_friction_effects", "_locked_step", "_locked_march",
-    "_states",
+    "_state_count",
 )  # fmt: skip
 """Attributes of a plant that depend on its obstacles."""
 
@@ -117,7 +117,7 @@ class SimulatedPlant:
         "_next_is_known",
         "_peak_nm",
         "_period_s",
-        "_periods",
+        "_periods_since_enabling",
         "_rest_state_per_angle",
         "_sensed_angles",
         "_sensed_shear_jump_gain",
@@ -125,7 +125,7 @@ class SimulatedPlant:
         "_sensed_torque_jump_gain",
         "_sensed_torques",
         "_shear_jump_gain",
-        "_states",
+        "_state_count",
         "_torque_instant_fraction",
         "_torque_jump_gain",
         "_torque_nm",
@@ -143,10 +143,10 @@ class SimulatedPlant:
 
     def __init__(self, parameters: RigParameters) -> None:
         period = 1 / parameters.rate_hz
-        periods, switch = split_delay(parameters.actuation.delay_s, period)
+        periods, switch_s = split_delay(parameters.actuation.delay_s, period)
         angle_periods, angle_age = split_delay(parameters.encoder.delay_s, period)
         torque_periods, torque_age = split_delay(parameters.sensor.delay_s, period)
-        instants = (switch, period - angle_age, period - torque_age)
+        instants = (switch_s, period - angle_age, period - torque_age)
 
         simulation = parameters.simulation or Simulation(torque_noise_nm=0.0, force_noise_n=0.0)
         nominal_beam = parameters.beam
@@ -157,7 +157,7 @@ class SimulatedPlant:
         )
         parameters = replace(parameters, beam=simulated_beam)
         beam, free, locked = beam_and_coupled_models(parameters, simulation)
-        filtered = simulation.torque_filter_hz > 0
+        has_sensor_filter = simulation.torque_filter_hz > 0
         self._air = _air(parameters, beam)
         if self._air is not None:
             (free, on_free), (locked, on_locked) = map(self._air.extended_model, (free, locked))
@@ -169,9 +169,9 @@ class SimulatedPlant:
         self._rest_state_per_angle[2:] = -np.linalg.solve(locked.a[2:, 2:], locked.a[2:, 0])
         step, locked_step, friction = free_and_locked_steps(free, locked, period, instants)
         self._friction_effects: list[float] = friction[n:].tolist()
-        points = 0
+        point_count = 0
         if self._air is not None:
-            points = len(self._air.speed)
+            point_count = len(self._air.speed)
             held_effect = constant_force_effect(
                 free, on_free, locked.sensor_torque, period, *instants[1:]
             )
@@ -190,7 +190,7 @@ class SimulatedPlant:
             self._drag_shear_fraction = -free.shear_per_torque
             self._torque_instant_fraction = 1 - torque_age / period
         if self._contact is not None:
-            points = len(self._contact.displacement_rows)
+            point_count = len(self._contact.displacement_rows)
             self._free_march, self._locked_march = (
                 self._contact.substep_matrices(
                     model, of_force, locked.sensor_torque, *instants, friction=friction[:n]
@@ -219,17 +219,19 @@ class SimulatedPlant:
         # Two vectors that are alternately the input [state, torque before and after the switch,
         # friction, drag force] and the output [state, outputs, speeds or displacements at the
         # obstacles] of a step. Each has the views that a step needs.
-        self._vectors = _vectors(n, points, drag_points=points if self._air is not None else 0)
-        self._states = n
+        self._vectors = _vectors(
+            n, point_count, drag_points=point_count if self._air is not None else 0
+        )
+        self._state_count = n
 
         self._coulomb_nm = parameters.motor.coulomb_nm
         self._peak_nm = parameters.motor.peak_torque_nm
         self._friction_nm = 0.0
         self._is_stuck = self._coulomb_nm > 0
         self._holding_beam_nm = 0.0
-        self._fraction_before_switch = switch / period
-        self._next_is_known = switch == 0 and periods > 0
-        self._jump_is_sensed = torque_age == 0 and not filtered
+        self._fraction_before_switch = switch_s / period
+        self._next_is_known = switch_s == 0 and periods > 0
+        self._jump_is_sensed = torque_age == 0 and not has_sensor_filter
         self._set_jump_gains(free.sensor_torque_per_torque, free.shear_per_torque)
 
         self._torque_nm = 0.0
@@ -243,7 +245,9 @@ class SimulatedPlant:
             for _ in range(2)
         )
         self._period_s = period
-        self._periods = -1  # number of periods since the drive was first enabled; -1 before
+        self._periods_since_enabling = (
+            -1
+        )  # number of periods since the drive was first enabled; -1 before
         self.enabled = False
         self.angle_rad = 0.0
         self.velocity_rad_s = 0.0
@@ -256,7 +260,7 @@ class SimulatedPlant:
     def enable(self) -> None:
         """Switch the drive on; its torque is zero until the next command takes effect."""
         self.enabled = True
-        self._periods = max(self._periods, 0)
+        self._periods_since_enabling = max(self._periods_since_enabling, 0)
 
     def disable(self) -> None:
         """Switch the drive off: the torque is zero at once, and delayed commands are dropped."""
@@ -275,7 +279,7 @@ class SimulatedPlant:
     @property
     def elapsed_s(self) -> float:
         """Time in seconds since the drive was first enabled; 0 before."""
-        return max(self._periods, 0) * self._period_s
+        return max(self._periods_since_enabling, 0) * self._period_s
 
     def adopt(self, other: "SimulatedPlant") -> None:
         """Adopt another plant's parameters, at rest at the present angle, with the drive off.
@@ -289,7 +293,7 @@ class SimulatedPlant:
         for name in self.__slots__:
             if hasattr(other, name):  # some attributes exist only with drag or obstacles
                 setattr(self, name, getattr(other, name))
-        self._vectors[0][0][: self._states] = self._rest_state_per_angle * angle_rad
+        self._vectors[0][0][: self._state_count] = self._rest_state_per_angle * angle_rad
         self._sensed_angles.extend([angle_rad] * len(self._sensed_angles))
         self.angle_rad = self.sensed_angle_rad = angle_rad
 
@@ -304,7 +308,7 @@ class SimulatedPlant:
         """
         contact = prepared._contact
         assert contact is not None
-        state = contact.adopt_states(self._vectors[0][0][: self._states], self._contact)
+        state = contact.adopt_states(self._vectors[0][0][: self._state_count], self._contact)
         for name in _OBSTACLE_ATTRIBUTES:
             setattr(self, name, getattr(prepared, name))
         self._vectors = _vectors(state.size, len(contact.bodies), drag_points=0)
@@ -334,14 +338,14 @@ class SimulatedPlant:
 
     def advance(self, n_periods: int = 1) -> None:
         """Advance by `n_periods` ticks; the last torque command acts in all of them."""
-        n = self._states
+        n = self._state_count
         torques = self._torques
         for _ in range(n_periods):
-            if self._drift is not None and self._drift.refresh_if_due(self._periods):
+            if self._drift is not None and self._drift.refresh_if_due(self._periods_since_enabling):
                 self._use_stiffness(self._drift)
             torques.append(self._torque_nm)
             torque_before, torque_after = torques[0], torques[1]
-            (vector, input_, _), (output, _, results) = self._vectors
+            (vector, input_, _), (output, _, output_values) = self._vectors
             vector[n] = torque_before
             vector[n + 1] = torque_after
             vector[n + 2] = self._friction_nm
@@ -366,7 +370,7 @@ class SimulatedPlant:
                     sensed_angle,
                     sensed_torque,
                     sensed_shear,
-                ) = results.tolist()
+                ) = output_values.tolist()
                 self._friction_nm = velocity = 0.0
                 free = False
             else:
@@ -377,7 +381,7 @@ class SimulatedPlant:
                 (
                     angle, velocity, torque, holding_torque, shear,
                     sensed_angle, sensed_torque, sensed_shear,
-                ) = results.tolist()  # fmt: skip
+                ) = output_values.tolist()  # fmt: skip
                 if self._torque_jump_gain:
                     torque_jump = torques[2] - torque_after
                     torque += self._torque_jump_gain * torque_jump
@@ -405,8 +409,8 @@ class SimulatedPlant:
                 torque, holding_torque, shear, sensed_torque, sensed_shear = self._with_drag_effect(
                     output, free, torque, holding_torque, shear, sensed_torque, sensed_shear
                 )
-            if self._periods >= 0:
-                self._periods += 1
+            if self._periods_since_enabling >= 0:
+                self._periods_since_enabling += 1
             self._holding_beam_nm = holding_torque
             self._sensed_angles.append(sensed_angle)
             self._sensed_torques.append(sensed_torque)
@@ -442,7 +446,7 @@ class SimulatedPlant:
         """
         contact = self._contact
         assert contact is not None
-        n = self._states
+        n = self._state_count
         time_s = self.elapsed_s
         if contact.cannot_touch(output[n + OUTPUTS :], time_s):
             return
@@ -477,7 +481,7 @@ class SimulatedPlant:
     ) -> tuple[float, float, float, float, float]:
         """Return the outputs at the end of a step with the immediate effect of the drag force."""
         assert self._air is not None
-        speed_m_s = output[self._states + OUTPUTS :]
+        speed_m_s = output[self._state_count + OUTPUTS :]
         if free and self._friction_nm:
             speed_m_s += self._friction_nm * self._friction_speed
         before_nm, before_n = self._drag_torque_nm, self._drag_shear_n
@@ -518,14 +522,16 @@ def _contact(
     return AttachedObstacles(parameters.beam, parameters.damping, beam, bodies, period_s)
 
 
-def _vectors(states: int, points: int, *, drag_points: int) -> tuple[tuple[Real, Real, Real], ...]:
+def _vectors(
+    states: int, point_count: int, *, drag_points: int
+) -> tuple[tuple[Real, Real, Real], ...]:
     """Return two vectors for the steps, with views of input and outputs.
 
     The input has `drag_points` drag forces.
     """
     return tuple(
         (vector, vector[: states + 3 + drag_points], vector[states : states + OUTPUTS])
-        for vector in np.zeros((2, states + OUTPUTS + points))
+        for vector in np.zeros((2, states + OUTPUTS + point_count))
     )
 
 

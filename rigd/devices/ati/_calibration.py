@@ -226,9 +226,9 @@ def wrench_function(
     return wrench
 
 
-def same_serial_number(wanted: str, found: str) -> bool:
+def same_serial_number(profile_number: str, sensor_number: str) -> bool:
     """Return whether a sensor's serial number is that of the profile; an empty one accepts any."""
-    return not wanted or wanted.strip().upper() == found.strip().upper()
+    return not profile_number or profile_number.strip().upper() == sensor_number.strip().upper()
 
 
 def printable_text(raw: Sequence[int]) -> str:
@@ -279,14 +279,14 @@ def parse_block(registers: Sequence[int]) -> CalibrationBlock:
     def register_bytes(first: int, count: int) -> bytes:
         return raw[2 * first : 2 * (first + count)]
 
-    entries = unpack(">36f", register_bytes(32, 72))
+    matrix_entries = unpack(">36f", register_bytes(32, 72))
     counts_per_force, counts_per_torque = unpack(">ii", register_bytes(117, 4))
     calibration = Calibration(
         serial_number=printable_text(register_bytes(0, 4)),
         part_number=printable_text(register_bytes(4, 16)),
         family=printable_text(register_bytes(20, 2)),
         date=printable_text(register_bytes(22, 10)),
-        matrix=tuple(tuple(entries[6 * axis : 6 * axis + 6]) for axis in range(6)),
+        matrix=tuple(tuple(matrix_entries[6 * axis : 6 * axis + 6]) for axis in range(6)),
         force_unit=registers[104] >> 8,
         torque_unit=registers[104] & 0xFF,
         ratings=unpack(">6f", register_bytes(105, 12)),
@@ -357,10 +357,10 @@ def describe_serial_status(status_word: int) -> list[str]:
     return _meanings_of_set_bits(status_word, _SERIAL_STATUS_BITS)
 
 
-def _meanings_of_set_bits(status_word: int, table: dict[int, str]) -> list[str]:
+def _meanings_of_set_bits(status_word: int, bit_meanings: dict[int, str]) -> list[str]:
     """Return the meanings of the set bits of a status word."""
     return [
-        table.get(bit, f"status bit {bit}, which has no known meaning, is set")
+        bit_meanings.get(bit, f"status bit {bit}, which has no known meaning, is set")
         for bit in range(16)
         if status_word >> bit & 1
     ]

@@ -88,7 +88,7 @@ class AtiCanSensor:
         self._lock_step = acquisition.deadline_us * rig.rate_hz > 1e6
         poll_frame = netcanoem.request(settings.base_id, netcanoem.GAUGES)
         self.polls = GaugePolls(poll_frame, self._name)
-        self._connected = False
+        self._is_connected = False
         self._subscribed_to: CanExchange | None = None
         self._inbox: dict[int, bytes] = {}
         self._restart_ticks = max(1, ceil(_RESTART_S * rig.rate_hz))
@@ -97,10 +97,10 @@ class AtiCanSensor:
         self._row_read_before = b""
         self._calibration: Calibration | None = None
         self._firmware: tuple[int, int, int] = (0, 0, 0)
-        self._status: list[str] = []
+        self._status_texts: list[str] = []
         self._status_word = 0
-        self._convert = wrench_function(((0.0,) * 6,) * 6)
-        self._previous: PollReply | None = None
+        self._wrench_from_counts = wrench_function(((0.0,) * 6,) * 6)
+        self._previous_reply: PollReply | None = None
         self._previous_ns = 0
         self._reply_deadline_ns = 0
         self._missed_deadline = False
@@ -122,7 +122,7 @@ class AtiCanSensor:
         """
         self.close()
         exchange = self._link.open()
-        self._connected = True
+        self._is_connected = True
         self.polls.open(exchange)
         try:
             self._subscribe(exchange)
@@ -139,10 +139,10 @@ class AtiCanSensor:
                     "check cable and termination."
                 )
             self._calibration = self._read_scale(serial_number, matrix)
-            self._convert = wrench_function(self._calibration.wrench_per_wire_count())
+            self._wrench_from_counts = wrench_function(self._calibration.wrench_per_wire_count())
             self._evaluate(self._first_reading())
             self.polls.forget()
-            self._previous = None
+            self._previous_reply = None
             self._unanswered_ticks = 0
             self._calibration_in_doubt = False
         except BaseException:
@@ -166,7 +166,7 @@ class AtiCanSensor:
             "calibration": self._settings.calibration,
             "firmware": f"{major}.{minor}.{build}",
             **({} if self._reports_scale else {"assumed": _ASSUMED_SCALE_TEXT}),
-            "status": self._status,
+            "status": self._status_texts,
             "base_id": self._settings.base_id,
         }
 
@@ -184,7 +184,7 @@ class AtiCanSensor:
             polls.wait(time.monotonic_ns() + self._deadline_ns)
         polls.drain()
         if not self._waits_for_reply:
-            self._previous, self._previous_ns = polls.process_replies(), polls.sent_ns
+            self._previous_reply, self._previous_ns = polls.process_replies(), polls.sent_ns
         elif self._missed_deadline:
             self.late_replies += polls.process_replies() is not None
         if self._calibration_in_doubt and not self._has_same_calibration():
@@ -205,7 +205,7 @@ class AtiCanSensor:
             answer, sent_ns = self.polls.wait(self._reply_deadline_ns), self.polls.sent_ns
             self._missed_deadline = answer is None
         else:
-            answer, sent_ns = self._previous, self._previous_ns
+            answer, sent_ns = self._previous_reply, self._previous_ns
         if answer is None:
             self.wrench_stale = True
             self._unanswered_ticks += 1
@@ -265,8 +265,8 @@ class AtiCanSensor:
 
     def close(self) -> None:
         """Release the bus; never raises."""
-        if self._connected:
-            self._connected = False
+        if self._is_connected:
+            self._is_connected = False
             self.polls.close()
             self._link.close()
         self._calibration = None
@@ -274,14 +274,14 @@ class AtiCanSensor:
     def _subscribe(self, exchange: CanExchange) -> None:
         """Subscribe to the sensor's replies, once per exchange, and discard queued frames."""
         if exchange is not self._subscribed_to:
-            base = self._settings.base_id
+            base_id = self._settings.base_id
             self.polls.subscribe(
-                identifier(base, netcanoem.GAUGES), identifier(base, netcanoem.GAUGES_REST)
+                identifier(base_id, netcanoem.GAUGES), identifier(base_id, netcanoem.GAUGES_REST)
             )
             for opcode in REPLY_LENGTHS:
                 if opcode not in (netcanoem.GAUGES, netcanoem.GAUGES_REST):
                     store = partial(self._inbox.__setitem__, opcode)
-                    exchange.subscribe(identifier(base, opcode), store)
+                    exchange.subscribe(identifier(base_id, opcode), store)
             self._subscribed_to = exchange
         exchange.start()
 
@@ -298,7 +298,7 @@ class AtiCanSensor:
             or min(g0, g2, g4, g1, g3, g5) <= -saturation_counts
         )
         self.gauges = g0, g1, g2, g3, g4, g5
-        self._wrench = wrench = self._convert(g0, g2, g4, g1, g3, g5)
+        self._wrench = wrench = self._wrench_from_counts(g0, g2, g4, g1, g3, g5)
         return wrench
 
     def _check_status(self, status: int, previous_status: int) -> None:
@@ -347,8 +347,8 @@ class AtiCanSensor:
             # A single mismatch may be a damaged reply, as at connecting.
             self._row_read_before = row_read
             inbox.clear()
-        base = self._settings.base_id
-        self.polls.exchange.send(netcanoem.request(base, netcanoem.MATRIX_ROW, 0))
+        base_id = self._settings.base_id
+        self.polls.exchange.send(netcanoem.request(base_id, netcanoem.MATRIX_ROW, 0))
         return False
 
     def _poll(self, timeout_s: float) -> PollReply | None:
@@ -364,58 +364,58 @@ class AtiCanSensor:
         for _ in range(_REQUEST_ATTEMPTS):
             answer = self._poll(_REPLY_TIMEOUT_S)
             if answer is not None:
-                self._status = describe_can_status(netcanoem.read_gauges(answer[0])[0])
+                self._status_texts = describe_can_status(netcanoem.read_gauges(answer[0])[0])
                 return answer
         raise self._no_reply_error("a reading")
 
     def _request_reply(
-        self, what: str, opcode: int, *arguments: int, replies: Sequence[int] = ()
+        self, requested_item: str, opcode: int, *arguments: int, replies: Sequence[int] = ()
     ) -> bytes:
         """Send a request and return its reply frames, concatenated; repeat it if unanswered."""
         exchange, inbox = self.polls.exchange, self._inbox
-        wanted = replies or (opcode,)
+        expected = replies or (opcode,)
         frame = netcanoem.request(self._settings.base_id, opcode, *arguments)
         for attempt in range(_REQUEST_ATTEMPTS):
             inbox.clear()
             exchange.send(frame)
             if exchange.wait_until(
-                lambda: all(each in inbox for each in wanted), _ns_after(_REPLY_TIMEOUT_S)
+                lambda: all(each in inbox for each in expected), _ns_after(_REPLY_TIMEOUT_S)
             ):
-                found = [inbox[each] for each in wanted]
+                received = [inbox[each] for each in expected]
                 if attempt:
                     exchange.wait_until(lambda: False, _ns_after(_LATE_REPLY_S))  # all is dropped
                 break
         else:
-            raise self._no_reply_error(what)
-        for each, data in zip(wanted, found, strict=True):
+            raise self._no_reply_error(requested_item)
+        for each, data in zip(expected, received, strict=True):
             if len(data) != REPLY_LENGTHS[each]:
                 raise DeviceError(
-                    f"{self._name}: asked for {what}, it sent {len(data)} bytes instead of "
-                    f"{REPLY_LENGTHS[each]}. Check that the box is a NETCANOEM and that no other "
-                    "device uses its identifiers."
+                    f"{self._name}: asked for {requested_item}, it sent {len(data)} bytes instead "
+                    f"of {REPLY_LENGTHS[each]}. Check that the box is a NETCANOEM and that no "
+                    "other device uses its identifiers."
                 )
-        return b"".join(found)
+        return b"".join(received)
 
-    def _no_reply_error(self, what: str) -> DeviceError:
+    def _no_reply_error(self, requested_item: str) -> DeviceError:
         """Return the error for a request without a complete reply."""
         return DeviceError(
-            f"{self._name}: asked for {what}, it gave no complete reply within {_REPLY_TIMEOUT_S} "
-            f"s in {_REQUEST_ATTEMPTS} tries. Check its power, cable and termination, "
-            "can.bitrate_bit_s and ati_can.base_id."
+            f"{self._name}: asked for {requested_item}, it gave no complete reply within "
+            f"{_REPLY_TIMEOUT_S} s in {_REQUEST_ATTEMPTS} tries. Check its power, cable and "
+            "termination, can.bitrate_bit_s and ati_can.base_id."
         )
 
     def _read_serial_number(self) -> str:
         """Read the sensor's serial number, compare it with the profile, and return it."""
-        found = netcanoem.serial_number(
+        received = netcanoem.serial_number(
             self._request_reply("its serial number", netcanoem.SERIAL_NUMBER)
         )
-        wanted = self._settings.serial_number
-        if not same_serial_number(wanted, found):
+        expected = self._settings.serial_number
+        if not same_serial_number(expected, received):
             raise DeviceError(
-                f"{self._name}: its serial number is {found or 'empty'}, where the profile asks "
-                f"for {wanted} (ati_can.serial_number). Check which sensor is on the rig."
+                f"{self._name}: its serial number is {received or 'empty'}, where the profile asks "
+                f"for {expected} (ati_can.serial_number). Check which sensor is on the rig."
             )
-        return found
+        return received
 
     @property
     def _reports_scale(self) -> bool:
@@ -424,12 +424,12 @@ class AtiCanSensor:
 
     def _select_calibration(self) -> None:
         """Select the calibration that the profile names, and check that it is valid."""
-        wanted = self._settings.calibration
-        what = f"calibration {wanted}"
-        selected = self._request_reply(what, netcanoem.SELECT_CALIBRATION, wanted)[0]
-        if selected != wanted:
+        expected = self._settings.calibration
+        requested_item = f"calibration {expected}"
+        selected = self._request_reply(requested_item, netcanoem.SELECT_CALIBRATION, expected)[0]
+        if selected != expected:
             raise DeviceError(
-                f"{self._name}: asked for calibration {wanted}, it selected {selected}. Choose "
+                f"{self._name}: asked for calibration {expected}, it selected {selected}. Choose "
                 "one that it has (ati_can.calibration)."
             )
         # The status shows whether the selected calibration is valid.

@@ -142,9 +142,11 @@ def reply_content(request: bytes, reply: bytes) -> bytes:
     """
     if not reply:
         raise BadReply("no reply came")
-    wanted = REFUSAL_LENGTH if is_refusal(reply) else reply_length(request)
-    if len(reply) != wanted:
-        raise BadReply(f"{len(reply)} bytes came instead of {wanted} ({reply[:16].hex(' ')})")
+    expected_length = REFUSAL_LENGTH if is_refusal(reply) else reply_length(request)
+    if len(reply) != expected_length:
+        raise BadReply(
+            f"{len(reply)} bytes came instead of {expected_length} ({reply[:16].hex(' ')})"
+        )
     if crc16(reply):
         raise BadReply(f"the checksum of the reply is wrong ({reply[:16].hex(' ')})")
     if reply[0] != ADDRESS or reply[1] & ~_EXCEPTION_FLAG != request[1]:
@@ -154,8 +156,8 @@ def reply_content(request: bytes, reply: bytes) -> bytes:
         code = content[0]
         raise ExceptionResponse(_EXCEPTION_MEANINGS.get(code, f"it declined with code {code}"))
     function = request[1]
-    if function == _READ_FUNCTION and content[0] != wanted - 5:
-        raise BadReply(f"{content[0]} bytes of registers came instead of {wanted - 5}")
+    if function == _READ_FUNCTION and content[0] != expected_length - 5:
+        raise BadReply(f"{content[0]} bytes of registers came instead of {expected_length - 5}")
     if function == _WRITE_FUNCTION and content != request[2:6]:
         raise BadReply("it confirmed other registers than were written")
     if function in (_LOCK_FUNCTION, _START_FUNCTION) and content[0] != _ACCEPTED_CODE:
@@ -207,7 +209,14 @@ class RecordStream:
         Number of bytes that wait for more bytes to complete a record.
     """
 
-    __slots__ = ("_held", "_phase", "checksum_errors", "dropped_bytes", "records", "synchronised")
+    __slots__ = (
+        "_expected_offset",
+        "_held_bytes",
+        "checksum_errors",
+        "dropped_bytes",
+        "records",
+        "synchronised",
+    )
 
     def __init__(self) -> None:
         self.records = 0
@@ -223,18 +232,18 @@ class RecordStream:
         aligned
             Whether the next byte is probably the first byte of a record.
         """
-        self._held = b""
-        self._phase = 0 if aligned else None
+        self._held_bytes = b""
+        self._expected_offset = 0 if aligned else None
         self.synchronised = False
 
     @property
     def pending(self) -> int:
         """Number of bytes that wait for more bytes to complete a record."""
-        return len(self._held)
+        return len(self._held_bytes)
 
     def feed(self, chunk: bytes) -> bytes:
         """Process received bytes; return the complete valid records, concatenated, oldest first."""
-        data = self._held + chunk if self._held else chunk
+        data = self._held_bytes + chunk if self._held_bytes else chunk
         records = b""
         while True:
             if not self.synchronised:
@@ -249,32 +258,35 @@ class RecordStream:
             records = records + data[:valid_length] if records else data[:valid_length]
             data = data[valid_length:]
             if valid_length == whole_length:
-                self._held = data
+                self._held_bytes = data
                 break
             self.checksum_errors += 1
             self.synchronised = False
-            self._phase = 0
+            self._expected_offset = 0
         self.records += len(records) // RECORD_SIZE
         return records
 
     def _find_first_record(self, data: bytes) -> int | None:
         """Return the offset of the first record, or None if more bytes are needed to find it."""
-        last = len(data) - _SYNC_SIZE
-        undecided = max(0, last + 1)
-        for begin in range(last + 1):
+        last_offset = len(data) - _SYNC_SIZE
+        undecided_offset = max(0, last_offset + 1)
+        for begin in range(last_offset + 1):
             if not _records_fit(data, begin):
                 continue
-            if self._phase is not None and (begin - self._phase) % RECORD_SIZE == 0:
+            if (
+                self._expected_offset is not None
+                and (begin - self._expected_offset) % RECORD_SIZE == 0
+            ):
                 return begin
-            if begin + _CHECKSUM_OFFSET > last:
+            if begin + _CHECKSUM_OFFSET > last_offset:
                 # Not all candidate offsets have arrived yet.
-                undecided = min(undecided, begin)
+                undecided_offset = min(undecided_offset, begin)
             elif not any(_records_fit(data, begin + shift) for shift in range(1, RECORD_SIZE)):
                 return begin
-        self.dropped_bytes += undecided
-        self._held = data[undecided:]
-        if self._phase is not None:
-            self._phase = (self._phase - undecided) % RECORD_SIZE
+        self.dropped_bytes += undecided_offset
+        self._held_bytes = data[undecided_offset:]
+        if self._expected_offset is not None:
+            self._expected_offset = (self._expected_offset - undecided_offset) % RECORD_SIZE
         return None
 
 
@@ -290,5 +302,5 @@ def _length_of_valid_records(data: bytes, whole_length: int) -> int:
 
 def _records_fit(data: bytes, begin: int) -> bool:
     """Return whether enough consecutive records for synchronisation fit at an offset."""
-    part = data[begin : begin + _SYNC_SIZE]
-    return _length_of_valid_records(part, _SYNC_SIZE) == _SYNC_SIZE
+    sync_bytes = data[begin : begin + _SYNC_SIZE]
+    return _length_of_valid_records(sync_bytes, _SYNC_SIZE) == _SYNC_SIZE

@@ -108,7 +108,7 @@ class AtiSerialSensor:
         if not self._lock_step:
             self._patience_ns = min(self._deadline_ns, int(1e9 / settings.stream_hz))
         self._line: SerialLine | None = None
-        self._block: CalibrationBlock | None = None
+        self._calibration_block: CalibrationBlock | None = None
         self._filter_matrix = np.zeros((6, 6 * len(self._weights)))
         self._history = b""
         self._history_size = len(self._weights) * RECORD_SIZE
@@ -150,10 +150,10 @@ class AtiSerialSensor:
             setup = SerialSetup(self._line, self._settings, self._name)
             setup.stop_streaming()
             self._check_status(setup)
-            self._block = setup.read_block()
-            setup.load_amplifiers(self._block)
+            self._calibration_block = setup.read_block()
+            setup.load_amplifiers(self._calibration_block)
             self._check_status(setup)
-            rows = self._block.calibration.wrench_per_wire_count()
+            rows = self._calibration_block.calibration.wrench_per_wire_count()
             self._filter_matrix = np.kron(np.array(self._weights), np.array(rows))
             self._start_streaming(setup)
         except BaseException:
@@ -168,14 +168,14 @@ class AtiSerialSensor:
         DeviceError
             If the sensor is not connected.
         """
-        if self._block is None or self._line is None:
+        if self._calibration_block is None or self._line is None:
             raise DeviceError(f"{self._name}: it is not connected.")
         return {
             "sensor": "ATI Digital F/T",
-            **self._block.calibration.as_dict(),
+            **self._calibration_block.calibration.as_dict(),
             "calibration": self._settings.calibration,
-            "gains": list(self._block.gains),
-            "offsets": list(self._block.offsets),
+            "gains": list(self._calibration_block.gains),
+            "offsets": list(self._calibration_block.offsets),
             "status": self.status,
             "port": self._port,
             "baud": self._settings.baud,
@@ -237,17 +237,17 @@ class AtiSerialSensor:
         left an incomplete record. This doubt is reported. A lag below one tick is the drift between
         two clocks, or the phase of the sensor.
         """
-        complete = self._arrived_bytes - self.stream.pending
-        if self._due_bytes - complete >= self._bytes_per_tick:
+        complete_bytes = self._arrived_bytes - self.stream.pending
+        if self._due_bytes - complete_bytes >= self._bytes_per_tick:
             in_step = abs(new - self._bytes_per_tick) <= RECORD_SIZE
             self._steady_ticks = self._steady_ticks + 1 if in_step else 0
             if self._steady_ticks < _STEADY_TICKS:
                 return True
             if self.stream.checksum_errors == self._known_checksum_errors:
-                self._missing_records += (self._due_bytes - complete) // RECORD_SIZE
+                self._missing_records += (self._due_bytes - complete_bytes) // RECORD_SIZE
         self._known_checksum_errors = self.stream.checksum_errors
         self._steady_ticks = 0
-        self._due_bytes = complete
+        self._due_bytes = complete_bytes
         return False
 
     def health(self) -> LineHealth:
@@ -410,12 +410,12 @@ class AtiSerialSensor:
     def _check_line_rate(self) -> None:
         """Raise if the line is too slow for the stream, or the stream is slower than the loop."""
         settings = self._settings
-        needed = settings.stream_hz * RECORD_BITS
-        if needed > settings.baud:
+        needed_bit_s = settings.stream_hz * RECORD_BITS
+        if needed_bit_s > settings.baud:
             raise DeviceError(
-                f"{self._name}: {settings.stream_hz:g} records a second need {needed:.0f} bit/s "
-                f"on the line, more than {settings.baud} baud; change ati_serial.stream_hz or "
-                "ati_serial.baud."
+                f"{self._name}: {settings.stream_hz:g} records a second need {needed_bit_s:.0f} "
+                f"bit/s on the line, more than {settings.baud} baud; change ati_serial.stream_hz "
+                "or ati_serial.baud."
             )
         if settings.stream_hz < self._rate_hz:
             raise DeviceError(
@@ -441,17 +441,17 @@ class AtiSerialSensor:
         self._history = b""
         self._error_records = 0
         self.stream.start(aligned=True)
-        before, first = self._arrived_bytes, self.stream.records
+        bytes_before, records_before = self._arrived_bytes, self.stream.records
         self._split_records(first_bytes)
         end_ns = time.monotonic_ns() + int(_FIRST_RECORDS_TIMEOUT_S * 1e9)
         # A simulated rig in lock-step sends the first records with the first tick.
-        while not self._lock_step and self.stream.records - first < len(self._weights):
+        while not self._lock_step and self.stream.records - records_before < len(self._weights):
             if time.monotonic_ns() > end_ns:
                 raise DeviceError(
                     f"{self._name}: it was commanded to stream, but of the "
-                    f"{self._arrived_bytes - before} bytes that came in {_FIRST_RECORDS_TIMEOUT_S} "
-                    f"s only {self.stream.records - first} were sound records. Check cable, "
-                    "ati_serial.baud and ati_serial.stream_hz."
+                    f"{self._arrived_bytes - bytes_before} bytes that came in "
+                    f"{_FIRST_RECORDS_TIMEOUT_S} s only {self.stream.records - records_before} "
+                    "were sound records. Check cable, ati_serial.baud and ati_serial.stream_hz."
                 )
             line.wait(SILENCE_S)
             self._split_records(line.read())

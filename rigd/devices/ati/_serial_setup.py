@@ -93,7 +93,7 @@ class SerialLine:
                 f"({_error_text(error)}); {_opening_remedy(error)}."
             ) from None
         self._fd = self._serial.fileno()
-        self._selectable = [self._fd]
+        self._descriptors = [self._fd]
         self.low_latency = False
         # Not every driver offers it; pyserial then reports a value it could not set.
         with suppress(ValueError, OSError, termios.error):
@@ -142,7 +142,7 @@ class SerialLine:
             If the line is gone.
         """
         try:
-            select.select(self._selectable, (), (), timeout_s)
+            select.select(self._descriptors, (), (), timeout_s)
         except OSError as error:
             raise self._failure_error(error.strerror) from None
         except ValueError as error:  # a descriptor beyond what select knows
@@ -279,20 +279,21 @@ class SerialSetup:
 
     def read_block(self) -> CalibrationBlock:
         """Read the calibration block that the profile selects, and check its serial number."""
-        number, wanted = self._settings.calibration, self._settings.serial_number
-        what = f"read out calibration {number}"
+        number, profile_number = self._settings.calibration, self._settings.serial_number
+        action_text = f"read out calibration {number}"
         registers = self._read_register_values(
-            first_block_register(number), BLOCK_LENGTH_REGISTERS, what
+            first_block_register(number), BLOCK_LENGTH_REGISTERS, action_text
         )
         try:
             block = parse_block(registers)
         except ValueError as error:
             raise DeviceError(f"{self._name}, ati_serial.calibration {number}: {error}") from None
-        found = block.calibration.serial_number
-        if not same_serial_number(wanted, found):
+        sensor_number = block.calibration.serial_number
+        if not same_serial_number(profile_number, sensor_number):
             raise DeviceError(
-                f"{self._name}: its serial number is {found or 'empty'}, where the profile asks "
-                f"for {wanted} (ati_serial.serial_number). Check which sensor is on the rig."
+                f"{self._name}: its serial number is {sensor_number or 'empty'}, where the profile "
+                f"asks for {profile_number} (ati_serial.serial_number). Check which sensor is on "
+                "the rig."
             )
         return block
 
@@ -309,14 +310,15 @@ class SerialSetup:
                 )
         finally:
             self._request_content(modbus.LOCK, "lock its memory")
-        written = tuple(chain(block.gains, block.offsets))
-        active = self._read_register_values(
-            modbus.ACTIVE_GAINS, len(written), "report its gains and offsets"
+        written_values = tuple(chain(block.gains, block.offsets))
+        active_values = self._read_register_values(
+            modbus.ACTIVE_GAINS, len(written_values), "report its gains and offsets"
         )
-        if active != written:
+        if active_values != written_values:
             raise DeviceError(
-                f"{self._name}: gains and offsets read back as {active}, where {written} were "
-                "written. Switch it off and on; without them its calibration does not hold."
+                f"{self._name}: gains and offsets read back as {active_values}, where "
+                f"{written_values} were written. Switch it off and on; without them its "
+                "calibration does not hold."
             )
 
     def start_streaming(self) -> bytes:
@@ -331,9 +333,9 @@ class SerialSetup:
             raise DeviceError(f"{self._name}: it does not start streaming: {error}.") from None
         return reply[length:]
 
-    def _request_content(self, request: bytes, what: str) -> bytes:
+    def _request_content(self, request: bytes, action_text: str) -> bytes:
         """Send a request and return the content of its reply; repeat a request that failed."""
-        problem = ""
+        last_error = ""
         for attempt in range(_REQUEST_ATTEMPTS):
             time.sleep(SILENCE_S)
             length = modbus.reply_length(request)
@@ -344,22 +346,22 @@ class SerialSetup:
                 return modbus.reply_content(request, reply)
             except modbus.ExceptionResponse as error:
                 raise DeviceError(
-                    f"{self._name}: asked to {what}, it refused: {error}. Check that it is a "
-                    "Digital F/T sensor, and ati_serial.calibration."
+                    f"{self._name}: asked to {action_text}, it refused: {error}. Check that it is "
+                    "a Digital F/T sensor, and ati_serial.calibration."
                 ) from None
             except modbus.BadReply as error:
-                problem = str(error)
+                last_error = str(error)
         raise DeviceError(
-            f"{self._name}: asked to {what}, it gave no usable reply in {_REQUEST_ATTEMPTS} tries: "
-            f"{problem}. Check power, cable (A and B swapped?), ati_serial.port and "
+            f"{self._name}: asked to {action_text}, it gave no usable reply in {_REQUEST_ATTEMPTS} "
+            f"tries: {last_error}. Check power, cable (A and B swapped?), ati_serial.port and "
             "ati_serial.baud."
         )
 
-    def _read_register_values(self, first: int, count: int, what: str) -> tuple[int, ...]:
+    def _read_register_values(self, first: int, count: int, action_text: str) -> tuple[int, ...]:
         """Read `count` registers, in requests of at most 64."""
         registers: tuple[int, ...] = ()
         while len(registers) < count:
             chunk = min(modbus.MAX_REGISTERS, count - len(registers))
             request = modbus.read_registers(first + len(registers), chunk)
-            registers += modbus.unpack_registers(self._request_content(request, what))
+            registers += modbus.unpack_registers(self._request_content(request, action_text))
         return registers

@@ -46,8 +46,8 @@ _NODE_SERVICES = {
 
 def sensor_identifiers(sensor: AtiCan) -> range:
     """Return the range of CAN identifiers that an ATI sensor uses: its base with 16 opcodes."""
-    first = sensor.base_id << 4
-    return range(first, first + 16)
+    first_id = sensor.base_id << 4
+    return range(first_id, first_id + 16)
 
 
 def drive_identifiers(drive: ServoDrive) -> dict[int, str]:
@@ -218,19 +218,21 @@ def bus_load(rig: RigParameters) -> BusLoad:
     if (drive := rig.cia402) is not None:
         host_heartbeat_hz = min(rig.rate_hz, 1.0 / drive.heartbeat_period_s)
         drive_heartbeat_hz = 1.0 / drive.drive_heartbeat_period_s
-        node, host = drive.node_id, drive.host_node_id
+        node_id, host_id = drive.node_id, drive.host_node_id
         traffic += [
             CyclicFrame("SYNC", 0x80, SYNC_LENGTH, rig.rate_hz),
-            CyclicFrame("drive's TPDO1", 0x180 + node, TPDO_LENGTH, rig.rate_hz),
-            CyclicFrame("drive's RPDO1", 0x200 + node, RPDO_LENGTH, rig.rate_hz),
-            CyclicFrame("drive's heartbeat", 0x700 + node, HEARTBEAT_LENGTH, drive_heartbeat_hz),
-            CyclicFrame("host's heartbeat", 0x700 + host, HEARTBEAT_LENGTH, host_heartbeat_hz),
+            CyclicFrame("drive's TPDO1", 0x180 + node_id, TPDO_LENGTH, rig.rate_hz),
+            CyclicFrame("drive's RPDO1", 0x200 + node_id, RPDO_LENGTH, rig.rate_hz),
+            CyclicFrame("drive's heartbeat", 0x700 + node_id, HEARTBEAT_LENGTH, drive_heartbeat_hz),
+            CyclicFrame("host's heartbeat", 0x700 + host_id, HEARTBEAT_LENGTH, host_heartbeat_hz),
         ]
     if (sensor := rig.ati_can) is not None:
-        first = sensor.base_id << 4
-        traffic.append(CyclicFrame("sensor's request", first, REQUEST_LENGTH, rig.rate_hz))
+        first_id = sensor.base_id << 4
+        traffic.append(CyclicFrame("sensor's request", first_id, REQUEST_LENGTH, rig.rate_hz))
         traffic += [
-            CyclicFrame(f"sensor's reply {part + 1}", first + part, length, rig.rate_hz)
-            for part, length in enumerate(REPLY_LENGTHS)
+            CyclicFrame(
+                f"sensor's reply {reply_index + 1}", first_id + reply_index, length, rig.rate_hz
+            )
+            for reply_index, length in enumerate(REPLY_LENGTHS)
         ]
     return load_of_frames(tuple(traffic), rig.can.bitrate_bit_s)

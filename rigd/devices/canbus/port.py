@@ -275,7 +275,7 @@ class PythonCanPort:
         self._bus = bus
         self._to_message, self._from_message = to_message, from_message
         self._error = can.CanError
-        self._next: bytes | None = None
+        self._next_frame: bytes | None = None
         self._damaged_in_a_row = 0
         self.name = name
 
@@ -291,15 +291,15 @@ class PythonCanPort:
 
     def receive(self) -> bytes | None:
         """Return the next received raw frame of 16 bytes, or None if no frame has arrived."""
-        if self._next is not None:
-            raw, self._next = self._next, None
+        if self._next_frame is not None:
+            raw, self._next_frame = self._next_frame, None
             return raw
         return self._receive(0.0)
 
     def wait(self, timeout_s: float) -> None:
         """Wait until a frame has arrived, at most for the timeout."""
-        if self._next is None:
-            self._next = self._receive(timeout_s)
+        if self._next_frame is None:
+            self._next_frame = self._receive(timeout_s)
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
         """Do nothing: python-can's filters end a poll at each dropped frame and drop errors."""

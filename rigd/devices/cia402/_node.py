@@ -155,8 +155,8 @@ class ReceivedFrames:
         if self.alarm:
             return
         if code == self.sto_error_code:
-            shown = f" (emergency message, error code 0x{code:04X})"
-            self.alarm = str(wired_stop_dropped(self.name, shown))
+            code_text = f" (emergency message, error code 0x{code:04X})"
+            self.alarm = str(wired_stop_dropped(self.name, code_text))
         else:
             vendor_text = f", vendor's bytes {vendor.hex(' ')}" if any(vendor) else ""
             self.alarm = f"{self.name}: emergency message: {describe_error(code)}{vendor_text}."
@@ -171,14 +171,14 @@ class ReceivedFrames:
         self.heartbeat_received = True
         if self.must_stay_operational and state != OPERATIONAL and not self.alarm:
             if state == BOOT_UP:
-                what = "it has restarted by itself; check its supply"
+                event_text = "it has restarted by itself; check its supply"
             else:
                 state_name = NMT_STATES.get(state, f"state {state}")
-                what = (
+                event_text = (
                     f"it has left operational for {state_name}, as it does when it misses "
                     "heartbeats, or when another master on the bus commands it to"
                 )
-            self.alarm = f"{self.name}: {what}."
+            self.alarm = f"{self.name}: {event_text}."
 
     def store_sdo_reply(self, data: bytes) -> None:
         """Store the data of a received SDO reply."""
@@ -370,11 +370,11 @@ class Node:
             self.sync_ns = time.monotonic_ns()
             return self.send_if_possible(self.frames.sync) and self.await_reply()
 
-    def sleep_until_next_period(self, grid_ns: int) -> None:
-        """Sleep until the next whole period after `grid_ns`, when the next SYNC is due."""
+    def sleep_until_next_period(self, sync_grid_ns: int) -> None:
+        """Sleep until the next whole period after `sync_grid_ns`, when the next SYNC is due."""
         if self.lock_step:
             return
-        wait_ns = self.period_ns - (time.monotonic_ns() - grid_ns) % self.period_ns
+        wait_ns = self.period_ns - (time.monotonic_ns() - sync_grid_ns) % self.period_ns
         time.sleep(wait_ns * 1e-9)
 
     def write(self, request: bytes, index: int, sub: int) -> bool:
@@ -437,11 +437,11 @@ class Node:
             )
         raise DeviceError(reason)
 
-    def _request_if_possible(self, request: bytes, answered: Callable[[], bool]) -> bool:
+    def _request_if_possible(self, request: bytes, is_reply_received: Callable[[], bool]) -> bool:
         """Send an SDO request despite bus errors; return whether the reply came in time."""
         with self.exchange.ignore_errors():
             return self.send_if_possible(request) and self.exchange.wait_until(
-                answered, time.monotonic_ns() + _SDO_REPLY_TIMEOUT_NS
+                is_reply_received, time.monotonic_ns() + _SDO_REPLY_TIMEOUT_NS
             )
 
     def _is_operational(self) -> bool:

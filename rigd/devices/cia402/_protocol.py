@@ -226,12 +226,12 @@ def read_statusword(data: bytes) -> int | None:
     return None if value is None else int.from_bytes(value[:2], "little")
 
 
-def _read_reply_data(data: bytes, wanted: int) -> bytes | None:
+def _read_reply_data(data: bytes, expected_index: int) -> bytes | None:
     """Return the data of an SDO reply to a read request, or None if it is for another object."""
     if len(data) != 8:
         return None
     command, index, sub, value = _unpack_sdo(data)
-    if (index, sub) != (wanted, 0) or command & 0xE0 != _SDO_READ_REPLY:
+    if (index, sub) != (expected_index, 0) or command & 0xE0 != _SDO_READ_REPLY:
         return None
     return bytes(value)
 

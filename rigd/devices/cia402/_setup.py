@@ -147,19 +147,19 @@ def set_up_drive(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilit
         configuration.configure_torque()
         configuration.configure_speed()
         configuration.configure_sync()
-        active = configuration.configure_watchdog()
-        configuration.configure_pdos(active)
+        active_watchdog = configuration.configure_watchdog()
+        configuration.configure_pdos(active_watchdog)
         configuration.read_stop_options(identity)
         configuration.set_object(requirement(objects.MODE))
         # Some drives show the mode only when enabled: it is checked again then.
         wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_TIMEOUT_S)
     return DriveCapabilities(
         identity,
-        active,
+        active_watchdog,
         {
             Watchdog.OWN: settings.own_watchdog_s,
             Watchdog.NONE: float("inf"),
-        }.get(active, settings.heartbeat_timeout_s),
+        }.get(active_watchdog, settings.heartbeat_timeout_s),
         tuple(configuration.lacks),
         settings.set_objects,
     )
@@ -180,12 +180,12 @@ def _check_identity(
     identity: dict[str, object], settings: ServoDrive, name: str, eds_identity: tuple[int, int]
 ) -> None:
     """Raise if the drive differs from the profile or its EDS file, or has no cyclic torque mode."""
-    vendor, product = eds_identity
+    eds_vendor, eds_product = eds_identity
     for key, source, required in (
         ("vendor_id", "cia402.vendor_id", settings.vendor_id),
         ("product_code", "cia402.product_code", settings.product_code),
-        ("vendor_id", f"VendorNumber in {settings.eds}", vendor),
-        ("product_code", f"ProductNumber in {settings.eds}", product),
+        ("vendor_id", f"VendorNumber in {settings.eds}", eds_vendor),
+        ("product_code", f"ProductNumber in {settings.eds}", eds_product),
     ):
         reported = identity[key]
         if required and reported != required:
@@ -223,7 +223,7 @@ class _DriveConfiguration:
         self._sdo = sdo
         self._settings = settings
         self._name = name
-        self._wanted = required
+        self._required_values = required
         self.lacks: list[Requirement] = []
 
     def set_object(self, row: Requirement, required: int | None = None) -> bool:
@@ -244,7 +244,7 @@ class _DriveConfiguration:
             If the object is indispensable, or the drive stores a value that is not acceptable.
         """
         if required is None:
-            required = self._wanted[row.index, row.sub]
+            required = self._required_values[row.index, row.sub]
         try:
             present_value = self._sdo.read_or_none(row.index, row.sub)
         except SdoRefusal as refusal:
@@ -398,7 +398,10 @@ class _DriveConfiguration:
         sdo = self._sdo
         cob_id = sdo.read_or_none(objects.SYNC_COB_ID)
         row = requirement(objects.SYNC_COB_ID)
-        if cob_id is not None and cob_id & ~objects.PDO_DISABLED != self._wanted[row.index, 0]:
+        if (
+            cob_id is not None
+            and cob_id & ~objects.PDO_DISABLED != self._required_values[row.index, 0]
+        ):
             self.set_object(row)
         if sdo.read_or_none(objects.SYNC_OVERFLOW):
             # It may be changed only while the period is 0 (CiA 301).
@@ -422,15 +425,15 @@ class _DriveConfiguration:
         deadline = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         heartbeat = self._configure_heartbeat_consumer()
         has_deadline = sdo.read_or_none(deadline.index, deadline.sub) is not None
-        active = watchdog(
+        active_watchdog = watchdog(
             heartbeat=heartbeat, rpdo_deadline=has_deadline, own=settings.own_watchdog_s > 0
         )
         row = requirement(objects.HEARTBEAT_CONSUMER, 1)
         if not heartbeat:
             self.lacks.append(row)
-        if active is Watchdog.NONE and not self._accepts(row):
+        if active_watchdog is Watchdog.NONE and not self._accepts(row):
             raise DeviceError(f"{self._name}: {row.refusal_reason()}")
-        if active in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
+        if active_watchdog in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
             # The drive's own watchdog acts as its manufacturer defines, whatever is set here.
             self.set_object(requirement(objects.ABORT_OPTION))
         row = requirement(objects.COMMUNICATION_ERROR, 1)
@@ -441,11 +444,11 @@ class _DriveConfiguration:
             )
         self.set_object(requirement(objects.HEARTBEAT_PRODUCER_MS))
         row = requirement(objects.EMERGENCY_COB_ID)
-        if sdo.read_or_none(row.index) not in (None, self._wanted[row.index, 0]):
+        if sdo.read_or_none(row.index) not in (None, self._required_values[row.index, 0]):
             self.set_object(row)
-        return active
+        return active_watchdog
 
-    def configure_pdos(self, active: Watchdog) -> None:
+    def configure_pdos(self, active_watchdog: Watchdog) -> None:
         """Map one RPDO and one TPDO, and disable all other PDOs."""
         settings, sdo = self._settings, self._sdo
         for communication in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
@@ -466,7 +469,7 @@ class _DriveConfiguration:
             objects.RPDO_COMMUNICATION,
             0,
             objects.RPDO_ENTRIES,
-            {objects.EVENT_TIMER: deadline_ms} if active is Watchdog.RPDO_DEADLINE else {},
+            {objects.EVENT_TIMER: deadline_ms} if active_watchdog is Watchdog.RPDO_DEADLINE else {},
         )
 
     def read_stop_options(self, identity: dict[str, object]) -> None:
@@ -518,8 +521,8 @@ class _DriveConfiguration:
         if present_value != required:
             # A second entry for one node is refused (0x06040043): clear stored entries first.
             for sub in range(2, min(sdo.read_or_none(index) or 0, _MOST_HEARTBEAT_CONSUMERS) + 1):
-                stored = sdo.read_or_none(index, sub)
-                if stored is not None and stored >> 16 & 0x7F == host:
+                stored_value = sdo.read_or_none(index, sub)
+                if stored_value is not None and stored_value >> 16 & 0x7F == host:
                     sdo.configure(index, sub, 0)
             try:
                 sdo.configure(index, 1, required)
@@ -551,11 +554,11 @@ class _DriveConfiguration:
             drive does not have is skipped.
         """
         sdo, mapping = self._sdo, communication + 0x200
-        can_id = self._wanted[communication, 1] | flags
-        transmission = self._wanted[communication, 2]
+        can_id = self._required_values[communication, 1] | flags
+        transmission_type = self._required_values[communication, 2]
         cob_id_bits = EVERY_BIT & ~objects.NO_REMOTE_REQUEST
         is_mapped = self._holds_values(mapping, (len(entries), *entries))
-        has_transmission_type = sdo.read_or_none(communication, 2) == transmission
+        has_transmission_type = sdo.read_or_none(communication, 2) == transmission_type
         cob_id_found = sdo.read_or_none(communication, 1)
         other_parameters = {
             sub: value
@@ -569,7 +572,7 @@ class _DriveConfiguration:
         if not is_mapped:
             self._write_mapping(communication, mapping, entries)
         if not has_transmission_type:
-            sdo.configure(communication, 2, transmission)
+            sdo.configure(communication, 2, transmission_type)
         for sub, value in other_parameters.items():
             self.set_object(requirement(communication, sub), value)
         sdo.configure(communication, 1, can_id, cob_id_bits)

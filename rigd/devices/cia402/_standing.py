@@ -131,12 +131,12 @@ def describe_remaining_torque(sdo: SdoAccess) -> str:
     return f' It is in "{state.value}" (statusword 0x{statusword:04X}): {_PRESS_STO_ADVICE}.'
 
 
-def wait_for(reached: Callable[[], bool], patience_s: float) -> bool:
+def wait_for(condition: Callable[[], bool], patience_s: float) -> bool:
     """Poll a condition, at least twice, and return whether it became true in time."""
     deadline = time.monotonic() + patience_s
-    while not reached():
+    while not condition():
         if time.monotonic() > deadline:
-            return reached()
+            return condition()
         time.sleep(_STATE_POLL_S)
     return True
 
@@ -149,23 +149,23 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
     DeviceError
         If the drive does not report that it is off within 0.2 s, or does not answer.
     """
-    began = time.monotonic()
+    start_s = time.monotonic()
     statusword: int | None = None
-    requested = False
+    is_requested = False
     with sdo.short_timeouts():
         while True:
             command_off(sdo)
-            if not requested:
+            if not is_requested:
                 # A drive whose node was stopped answers again; another may ignore it.
                 with suppress(Exception):
                     sdo.request_pre_operational()
-                    requested = True
+                    is_requested = True
             with suppress(Exception):
                 statusword = sdo.read(objects.STATUSWORD)
                 if drive_state(statusword) in TORQUE_FREE_STATES:
                     return
             patience_s = _FIRST_ANSWER_TIMEOUT_S if statusword is None else _SWITCH_OFF_TIMEOUT_S
-            if time.monotonic() - began > patience_s:
+            if time.monotonic() - start_s > patience_s:
                 break
             time.sleep(_STATE_POLL_S)
     if statusword is None:
@@ -216,29 +216,30 @@ def _confirm_ready(
     """
     with suppress(SdoRefusal):
         sdo.write(objects.CONTROLWORD, 0, SHUTDOWN)
-    ready = wait_for(lambda: _read_state(sdo) is DriveState.READY, patience_s)
+    is_ready = wait_for(lambda: _read_state(sdo) is DriveState.READY, patience_s)
     statusword = sdo.read(objects.STATUSWORD)
     sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
-    disabled = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
-    if ready and disabled:
+    is_disabled = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
+    if is_ready and is_disabled:
         return
-    done = f"its fault is reset ({fault})" if fault else "it is not in fault"
+    progress_text = f"its fault is reset ({fault})" if fault else "it is not in fault"
     state = drive_state(statusword)
-    if ready:
+    if is_ready:
         raise DeviceError(
-            f'{name}: {done}; it got ready and is now in "{_read_state(sdo).value}", not in '
-            f'"{DriveState.SWITCH_ON_DISABLED.value}"; switch it off and on.'
+            f'{name}: {progress_text}; it got ready and is now in "{_read_state(sdo).value}", not '
+            f'in "{DriveState.SWITCH_ON_DISABLED.value}"; switch it off and on.'
         )
     if statusword & FAULT_BIT:
         raise DeviceError(
-            f"{name}: {done}; when it was commanded to get ready it went to fault: "
+            f"{name}: {progress_text}; when it was commanded to get ready it went to fault: "
             f"{_describe_fault(sdo)}. Remove the cause, then: {command}"
         )
-    supplied = "is there" if statusword & VOLTAGE_ENABLED else "is not there"
+    supply_text = "is there" if statusword & VOLTAGE_ENABLED else "is not there"
     raise DeviceError(
-        f"{name}: {done}, and it is disabled, but it does not get ready: on that command it stays "
-        f'in "{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply {supplied}). '
-        f"STO is open or the motor supply is off; release or switch it on, then: {command}"
+        f"{name}: {progress_text}, and it is disabled, but it does not get ready: on that command "
+        f'it stays in "{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply '
+        f"{supply_text}). STO is open or the motor supply is off; release or switch it on, then: "
+        f"{command}"
     )
 
 

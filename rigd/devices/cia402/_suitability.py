@@ -120,7 +120,7 @@ class _SuitabilityCheck:
         self._eds = eds
         self._rig = rig if rig is not None and rig.cia402 is not None else None
         self._settings: ServoDrive | None = self._rig.cia402 if self._rig else None
-        self._wanted = (
+        self._required_values = (
             required_values(self._rig) if self._rig else profile_independent_values(eds.node_id)
         )
 
@@ -272,7 +272,7 @@ class _SuitabilityCheck:
     def _present_object(self, row: Requirement, entry: EdsEntry) -> SuitabilityFinding:
         """Return the finding on a required object that the file contains."""
         what = f"{row.address} {row.name}"
-        wanted = self._wanted.get((row.index, row.sub))
+        wanted = self._required_values.get((row.index, row.sub))
         wanted_text = "" if wanted is None else _format_value(row, wanted)
         default = "" if entry.default is None else f", {_format_value(row, entry.default)}"
         found = f"{entry.access}{default}"

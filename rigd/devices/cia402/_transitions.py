@@ -190,7 +190,7 @@ def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
         target torque or is in another mode of operation. It may be enabled then.
     """
     inbox = node.inbox
-    grid_ns = node.sync_ns
+    sync_grid_ns = node.sync_ns
     for controlword, state in _ENABLING_STEPS:
 
         def describe_failure(state: DriveState = state) -> str:
@@ -200,15 +200,15 @@ def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
                 "check STO, motor supply and its own diagnosis"
             )
 
-        def reached(state: DriveState = state) -> bool:
+        def is_reached(state: DriveState = state) -> bool:
             return drive_state(inbox.statusword) is state
 
-        _send_controlword_until(node, controlword, grid_ns, reached, describe_failure, stop)
+        _send_controlword_until(node, controlword, sync_grid_ns, is_reached, describe_failure, stop)
     if node.settings.follows_target_bit:
         _send_controlword_until(
             node,
             ENABLE_OPERATION,
-            grid_ns,
+            sync_grid_ns,
             lambda: inbox.statusword & FOLLOWS_TARGET != 0,
             lambda: (
                 "it is enabled and ignores the target torque: bit 12 of its statusword "
@@ -217,7 +217,7 @@ def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
             ),
             stop,
         )
-    _check_mode(node, grid_ns, stop)
+    _check_mode(node, sync_grid_ns, stop)
 
 
 def switch_off(node: Node) -> bool:
@@ -241,7 +241,7 @@ def switch_off(node: Node) -> bool:
     return False
 
 
-def _check_mode(node: Node, grid_ns: int, stop: Callable[[], bool]) -> None:
+def _check_mode(node: Node, sync_grid_ns: int, stop: Callable[[], bool]) -> None:
     """Check that the enabled drive is in cyclic torque mode; some drives show it only then."""
     inbox, frames, send = node.inbox, node.frames, node.exchange.send
     mode: int | None = None
@@ -261,7 +261,7 @@ def _check_mode(node: Node, grid_ns: int, stop: Callable[[], bool]) -> None:
     _send_controlword_until(
         node,
         ENABLE_OPERATION,
-        grid_ns,
+        sync_grid_ns,
         in_cyclic_torque,
         lambda: (
             f"its mode of operation (object 6061) is {mode}, not {CYCLIC_TORQUE} (cyclic "
@@ -274,12 +274,12 @@ def _check_mode(node: Node, grid_ns: int, stop: Callable[[], bool]) -> None:
 def _send_controlword_until(
     node: Node,
     controlword: int,
-    grid_ns: int,
-    reached: Callable[[], bool],
+    sync_grid_ns: int,
+    is_reached: Callable[[], bool],
     describe_failure: Callable[[], str],
     stop: Callable[[], bool],
 ) -> None:
-    """Send a controlword with zero torque once a period until `reached` returns True."""
+    """Send a controlword with zero torque once a period until `is_reached` returns True."""
     frame = node.frames.rpdo(controlword, 0)
     timeout_s = node.settings.enable_timeout_s
     limit = _MOST_UNANSWERED_SYNCS_IN_LOCK_STEP if node.lock_step else _MOST_UNANSWERED_SYNCS
@@ -288,13 +288,13 @@ def _send_controlword_until(
         if stop():
             raise StopRequestedError
         node.exchange.send(frame)
-        node.sleep_until_next_period(grid_ns)
+        node.sleep_until_next_period(sync_grid_ns)
         node.now_ns += node.period_ns
         node.send_sync()
         node.send_heartbeat()
         is_answered = node.await_reply()
         node.raise_if_alarmed()
-        if is_answered and reached():
+        if is_answered and is_reached():
             return
         unanswered_syncs = 0 if is_answered else unanswered_syncs + 1
         if unanswered_syncs >= limit:

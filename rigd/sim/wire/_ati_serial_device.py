@@ -167,7 +167,7 @@ class AtiSerialDevice:
         self._unset_gauges = list(range(6))
         """Numbers of the gauges whose gain or offset differs from the calibration."""
         self._incomplete_request = b""
-        self._received = False
+        self._has_received = False
         self._silent_since_s = math.inf
         self._bytes_while_streaming = 0
 
@@ -175,7 +175,7 @@ class AtiSerialDevice:
         """Process received bytes, in chunks of any length; answer complete requests at once."""
         if self.frozen:
             return
-        self._received = True
+        self._has_received = True
         received = self._incomplete_request + data
         while received and not self.streaming:
             request, remaining = _next_request(received)
@@ -207,8 +207,8 @@ class AtiSerialDevice:
 
     def tick(self, now_s: float) -> None:
         """Discard an incomplete request when the line has been silent for long enough."""
-        if self._received:
-            self._received = False
+        if self._has_received:
+            self._has_received = False
             self._silent_since_s = now_s
         elif now_s - self._silent_since_s > _SILENCE_S:
             self._incomplete_request = b""
@@ -353,8 +353,8 @@ def _holding_registers_at_power_up(
         *_GAUGE_GAINS,
         *_GAUGE_OFFSETS,
     ).ljust(2 * _CALIBRATION_SIZE, b"\0")
-    block = _CALIBRATIONS_REGISTER + (settings.calibration - 1) * _CALIBRATION_SIZE
-    holding.update(enumerate(np.frombuffer(content, ">u2").tolist(), start=block))
+    block_register = _CALIBRATIONS_REGISTER + (settings.calibration - 1) * _CALIBRATION_SIZE
+    holding.update(enumerate(np.frombuffer(content, ">u2").tolist(), start=block_register))
     return holding
 
 
@@ -398,18 +398,20 @@ def _next_request(received: bytes) -> tuple[bytes | None, bytes]:
 def _request_length(received: bytes, start: int) -> int:
     """Return the length of the request at `start`; if unknown, a length that exceeds the data."""
     available = len(received) - start
-    unknown = available + 1
+    unknown_length = available + 1
     if available < 4:
-        return unknown
+        return unknown_length
     function = received[start + 1]
     if function in (_READ_HOLDING_FUNCTION, _READ_INPUT_FUNCTION):
         return 8
     if function in (_STREAM_FUNCTION, _LOCK_FUNCTION):
         return 5
     if function == _WRITE_FUNCTION:
-        return 9 + received[start + 6] if available > 6 else unknown
+        return 9 + received[start + 6] if available > 6 else unknown_length
     # A request with an unknown function ends where its checksum holds.
-    return unknown if available > _LONGEST_FRAME or _checksum(received[start:]) else available
+    return (
+        unknown_length if available > _LONGEST_FRAME or _checksum(received[start:]) else available
+    )
 
 
 def _checksum_table() -> tuple[int, ...]:

@@ -98,9 +98,9 @@ class WallClock:
 
     def _advance_to(self, tick: int) -> int:
         """Advance the clock to a tick, and return the number of elapsed periods."""
-        passed = max(0, tick - self.tick)
-        self.tick += passed
-        return passed
+        elapsed_periods = max(0, tick - self.tick)
+        self.tick += elapsed_periods
+        return elapsed_periods
 
 
 class LockStep:
@@ -136,9 +136,9 @@ class LockStep:
 
     def elapse(self, now_ns: int) -> int:
         """Return the number of periods that have elapsed by the wall clock without a SYNC."""
-        passed = max(0, int((now_ns - self._waiting_until_ns) / self._period_ns))
-        self._waiting_until_ns += passed * self._period_ns
-        return passed
+        elapsed_periods = max(0, int((now_ns - self._waiting_until_ns) / self._period_ns))
+        self._waiting_until_ns += elapsed_periods * self._period_ns
+        return elapsed_periods
 
     def stop_waiting(self, now_ns: int) -> None:
         """Stop waiting for a SYNC, since no client is connected any more."""
@@ -218,7 +218,7 @@ class _AttributeOverride:
     device: Any
     attribute: str
     value: object
-    normal: object
+    normal_value: object
 
 
 class BusSimulation:
@@ -292,7 +292,7 @@ class BusSimulation:
             ),
         }
         self._undelivered_frames: deque[tuple[str, int, bytes]] = deque()
-        self._emitting = False
+        self._is_streaming = False
         self._action_count = 0
         self.bus_off = False
         self._delayed_deliveries: list[tuple[float, int, Callable[[], None]]] = []
@@ -431,9 +431,9 @@ class BusSimulation:
         self._log.time_s = self.now_s
         # Before the drive answers, so that a host with its answer also finds the records.
         if self._serial_device is not None:
-            self._emitting = True
+            self._is_streaming = True
             self._serial_device.emit()
-            self._emitting = False
+            self._is_streaming = False
 
     def _run_nodes(self) -> None:
         """Run the due actions of the nodes, and begin or end the due faults."""
@@ -479,7 +479,7 @@ class BusSimulation:
     def _write_serial(self, data: bytes) -> None:
         """Send bytes of the sensor over the serial line, record by record if a fault acts on it."""
         line = self._lines["sensor"]
-        if self._emitting and line.disturbed:  # record by record
+        if self._is_streaming and line.disturbed:  # record by record
             for offset in range(0, len(data), _RECORD_SIZE):
                 line.send(SERIAL, data[offset : offset + _RECORD_SIZE])
         else:
@@ -581,10 +581,10 @@ class BusSimulation:
     def _begin_stuck_readings(self, fault: Fault, sensor: Any) -> None:  # noqa: ANN401
         """Make the encoder, the sensor or one gauge repeat its readings."""
         stuck = StuckReadings(int(fault.values.get("every", 0)))
-        what = fault.values["what"]
-        if what == "encoder":
+        stuck_device = fault.values["what"]
+        if stuck_device == "encoder":
             self._override_attribute(fault, self._simulated_rig, "stuck_encoder", stuck)
-        elif what == "sensor":
+        elif stuck_device == "sensor":
             self._override_attribute(fault, self._simulated_rig.sensor, "stuck", stuck)
         else:
             self._override_attribute(
@@ -593,9 +593,13 @@ class BusSimulation:
 
     def _override_attribute(self, fault: Fault, device: Any, attribute: str, value: object) -> None:  # noqa: ANN401
         """Let a fault override an attribute of a device until the fault ends."""
-        others = [s for s in self._overrides if (s.device, s.attribute) == (device, attribute)]
-        normal = others[0].normal if others else getattr(device, attribute)
-        override = _AttributeOverride(fault, device, attribute, value, normal)
+        other_overrides = [
+            s for s in self._overrides if (s.device, s.attribute) == (device, attribute)
+        ]
+        normal_value = (
+            other_overrides[0].normal_value if other_overrides else getattr(device, attribute)
+        )
+        override = _AttributeOverride(fault, device, attribute, value, normal_value)
         self._overrides.append(override)
         setattr(device, attribute, value)
         if "for" in fault.values:
@@ -607,7 +611,7 @@ class BusSimulation:
         if override not in self._overrides:  # it was ended before its time
             return
         self._overrides.remove(override)
-        value = override.normal
+        value = override.normal_value
         for other in self._overrides:
             if (other.device, other.attribute) == (override.device, override.attribute):
                 value = other.value

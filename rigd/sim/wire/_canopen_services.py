@@ -197,7 +197,7 @@ def _watched_node(value: int) -> int:
 
 
 def add_heartbeat_watches(
-    objects: ObjectDictionary, count: int, restarted: Callable[[], None]
+    objects: ObjectDictionary, count: int, on_restart: Callable[[], None]
 ) -> list[HeartbeatWatch]:
     """Add object 1016 to a dictionary, and return the heartbeat monitors of its entries.
 
@@ -207,7 +207,7 @@ def add_heartbeat_watches(
         Dictionary to which the object is added.
     count
         Number of nodes that can be monitored; with 0 the object is not added.
-    restarted
+    on_restart
         Function that is called after an entry was set, which restarts its monitoring.
     """
     entries = {sub: Entry("I") for sub in range(1, count + 1)}
@@ -222,7 +222,7 @@ def add_heartbeat_watches(
 
     def restart(watch: HeartbeatWatch) -> None:
         watch.restart()
-        restarted()
+        on_restart()
 
     for entry, watch in zip(entries.values(), watches, strict=True):
         entry.check = partial(check, entry)
@@ -271,7 +271,7 @@ class Pdo:
         "r" or "t", which mapped entries must have in `Entry.mapping`.
     cob_id
         COB-ID at power-on, with or without `COB_ID_DISABLED`.
-    mapped
+    default_mapping
         Mapping at power-on; each entry is index << 16 | sub-index << 8 | bits.
     slots
         Largest number of mapped objects.
@@ -297,7 +297,7 @@ class Pdo:
         communication: int,
         mapping: int,
         cob_id: int,
-        mapped: tuple[int, ...],
+        default_mapping: tuple[int, ...],
         slots: int,
         changed: Callable[[], None],
     ) -> None:
@@ -310,11 +310,13 @@ class Pdo:
         objects.add_record(
             communication, {1: self._cob_id, 2: self._type, 3: self._inhibit, 5: self._timer}
         )
-        self._count = Entry("B", len(mapped), check=self._check_count, after_write=self._rebuild)
+        self._count = Entry(
+            "B", len(default_mapping), check=self._check_count, after_write=self._rebuild
+        )
         objects.add(mapping, self._count)
         self._slots = [
             objects.add(mapping, Entry("I", value, check=self._check_slot), sub)
-            for sub, value in enumerate((mapped + (0,) * slots)[:slots], 1)
+            for sub, value in enumerate((default_mapping + (0,) * slots)[:slots], 1)
         ]
         self.can_id = -1
         self.size = 0

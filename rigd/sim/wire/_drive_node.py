@@ -241,7 +241,7 @@ class DriveNode:
             entries.negative_limit,
         ):
             entry.after_write = self._refresh_torque
-        self._machine = PdsStateMachine(
+        self._state_machine = PdsStateMachine(
             entries.quick_stop_option,
             entries.fault_option,
             on_state_change=self._on_state_change,
@@ -279,7 +279,7 @@ class DriveNode:
             self._watch_heartbeats(now_s)
             self._watch_sync(now_s)
             self._watch_rpdos(now_s)
-        self._machine.tick(now_s)
+        self._state_machine.tick(now_s)
         if self._producer.is_due(now_s):
             self._transmit(0x700 + self._node_id, bytes([self._nmt]))
         if self._nmt is Nmt.OPERATIONAL and not self.frozen:
@@ -318,7 +318,7 @@ class DriveNode:
         if self._sto_error_code:
             self._fail(self._sto_error_code, _GENERIC_ERROR_BIT)
         else:
-            self._machine.disable_voltage()
+            self._state_machine.disable_voltage()
 
     # NMT ---------------------------------------------------------------------------------------
 
@@ -327,7 +327,7 @@ class DriveNode:
         self._log("nmt", state="initialising")
         if last == _LAST_INDEX:
             self._emergencies.reset()
-            self._machine.start()
+            self._state_machine.start()
         self._nmt = Nmt.INITIALISING
         self._sync_alive = False
         self._objects.reset(last)
@@ -370,15 +370,15 @@ class DriveNode:
 
     def _end_connection(self) -> None:
         """Leave operation enabled before the NMT state changes, as the abort option says."""
-        if self._machine.state is not PdsState.OPERATION_ENABLED:
+        if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
         option = self._entries.abort_option.value
         if option == 1:
             self._fail(_CONNECTION_ENDED_CODE, _COMMUNICATION_ERROR_BIT)
         elif option == 3:
-            self._machine.quick_stop()
+            self._state_machine.quick_stop()
         else:
-            self._machine.disable_voltage()
+            self._state_machine.disable_voltage()
 
     # Frames ------------------------------------------------------------------------------------
 
@@ -406,14 +406,14 @@ class DriveNode:
             self._measure_torque()
         if is_operational:
             limit_rad_s = self._entries.max_speed_rpm.value * self._rad_s_per_rpm
-            too_fast = not -limit_rad_s <= self._plant.velocity_rad_s <= limit_rad_s
-            if too_fast or self._is_too_fast:
-                self._is_too_fast = too_fast
+            is_too_fast = not -limit_rad_s <= self._plant.velocity_rad_s <= limit_rad_s
+            if is_too_fast or self._is_too_fast:
+                self._is_too_fast = is_too_fast
                 self._refresh_torque()
             for tpdo in self._sync_tpdos:
-                sample = tpdo.data_at_sync(self._now_s)
-                if sample is not None:
-                    self._transmit(tpdo.can_id, sample)
+                tpdo_data = tpdo.data_at_sync(self._now_s)
+                if tpdo_data is not None:
+                    self._transmit(tpdo.can_id, tpdo_data)
 
     def _on_rpdo(self, pdo: ReceivePdo, data: bytes) -> None:
         """Process a received RPDO: check its length, and apply it now or at the next SYNC."""
@@ -421,7 +421,7 @@ class DriveNode:
             return
         if len(data) < pdo.size:
             vendor = bytes([len(data), pdo.size])
-            if self._machine.state is PdsState.OPERATION_ENABLED:
+            if self._state_machine.state is PdsState.OPERATION_ENABLED:
                 self._fail(_PDO_TOO_SHORT_CODE, _COMMUNICATION_ERROR_BIT, vendor)
             else:
                 self._report(_PDO_TOO_SHORT_CODE, _COMMUNICATION_ERROR_BIT, vendor)
@@ -473,8 +473,10 @@ class DriveNode:
         self._sync_length = 1 if self._entries.sync_overflow.value else 0
         active_rpdos = [pdo for pdo in self._receive_pdos if pdo.can_id >= 0]
         self._sync_rpdos = [pdo for pdo in active_rpdos if pdo.is_synchronous]
-        target = self._entries.target_torque
-        self._target_pdos = [pdo for pdo in active_rpdos if any(e is target for e in pdo.entries)]
+        target_entry = self._entries.target_torque
+        self._target_pdos = [
+            pdo for pdo in active_rpdos if any(e is target_entry for e in pdo.entries)
+        ]
         active_tpdos = [pdo for pdo in self._transmit_pdos if pdo.can_id >= 0]
         self._sync_tpdos = [pdo for pdo in active_tpdos if pdo.is_synchronous]
         self._event_tpdos = [pdo for pdo in active_tpdos if not pdo.is_synchronous]
@@ -493,13 +495,13 @@ class DriveNode:
         for watch in self._watches:
             if not watch.check(now_s):
                 continue
-            option, state = self._entries.abort_option.value, self._machine.state
+            option, state = self._entries.abort_option.value, self._state_machine.state
             if option == 1 and state not in (PdsState.READY, PdsState.SWITCH_ON_DISABLED):
-                self._machine.fail()
+                self._state_machine.fail()
             elif option == 3:
-                self._machine.quick_stop()
+                self._state_machine.quick_stop()
             elif option:
-                self._machine.disable_voltage()
+                self._state_machine.disable_voltage()
             self._log("heartbeat lost", node_id=watch.node_id)
             self._report(_HEARTBEAT_LOST_CODE, _COMMUNICATION_ERROR_BIT, bytes([watch.node_id]))
             reaction = self._entries.communication_error.value
@@ -517,13 +519,13 @@ class DriveNode:
         timeout_s = self._sync_timeout_s or SYNC_TIMEOUT_PERIODS * self._entries.sync_period_s
         if now_s - self._last_sync_s > timeout_s + _TIME_TOLERANCE_S:
             self._sync_alive = False
-            if self._machine.state is PdsState.OPERATION_ENABLED:
+            if self._state_machine.state is PdsState.OPERATION_ENABLED:
                 self._fail(_SYNC_LOST_CODE, _COMMUNICATION_ERROR_BIT)
                 self._log("sync lost", timeout_s=timeout_s)
 
     def _watch_rpdos(self, now_s: float) -> None:
         """Go to fault if an RPDO has missed its deadline in operation enabled."""
-        if self._machine.state is not PdsState.OPERATION_ENABLED:
+        if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
         for number, pdo in enumerate(self._receive_pdos, 1):
             deadline_s = pdo.deadline_s
@@ -553,7 +555,7 @@ class DriveNode:
 
     def _fail(self, code: int, register: int, vendor: bytes = b"") -> None:
         """Bring the simulated drive to fault, and report an error code by an emergency message."""
-        self._machine.fail()
+        self._state_machine.fail()
         self._report(code, register, vendor)
 
     def _report(self, code: int, register: int, vendor: bytes = b"") -> None:
@@ -563,7 +565,7 @@ class DriveNode:
 
     def _clear(self, *codes: int) -> None:
         """Clear errors whose cause has ended; errors of a fault remain until its reset."""
-        if self._machine.state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
+        if self._state_machine.state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
             self._emergencies.clear(*codes)
 
     def _send_emergency(self, can_id: int, data: bytes) -> None:
@@ -586,10 +588,10 @@ class DriveNode:
         controlword = self._entries.controlword.value
         mask, unchanged_value = _UNCHANGED_OPERATION
         if (
-            self._machine.state is not PdsState.OPERATION_ENABLED
+            self._state_machine.state is not PdsState.OPERATION_ENABLED
             or controlword & mask != unchanged_value
         ):
-            self._machine.control(controlword)
+            self._state_machine.control(controlword)
         self._refresh_torque()
 
     def _on_mode(self) -> None:
@@ -601,7 +603,7 @@ class DriveNode:
 
     def _on_state_change(self, previous_state: PdsState) -> None:
         """Process a change of the drive's state: switch the plant on or off, and log it."""
-        state = self._machine.state
+        state = self._state_machine.state
         if previous_state is PdsState.OPERATION_ENABLED:
             self._plant.disable()
             self._per_mille = 0
@@ -621,7 +623,7 @@ class DriveNode:
 
     def _refresh_torque(self) -> None:
         """Pass the torque that follows from the dictionary to the plant, if it has changed."""
-        if self._machine.state is not PdsState.OPERATION_ENABLED:
+        if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
         entries = self._entries
         self._follows_target = (
@@ -654,20 +656,20 @@ class DriveNode:
 
     def _statusword(self) -> int:
         """Return the present statusword."""
-        state = self._machine.state
-        word = state.bits | (_REMOTE_BIT if self._sto_dropped else _VOLTAGE_AND_REMOTE_BITS)
+        state = self._state_machine.state
+        statusword = state.bits | (_REMOTE_BIT if self._sto_dropped else _VOLTAGE_AND_REMOTE_BITS)
         if state is PdsState.OPERATION_ENABLED:
             if self._follows_target:
-                word |= 0 if self.never_follows else _FOLLOWS_TARGET_BIT
+                statusword |= 0 if self.never_follows else _FOLLOWS_TARGET_BIT
             elif self._entries.controlword.value & _HALT_BIT and self._is_at_rest():
-                word |= _TARGET_REACHED_BIT
+                statusword |= _TARGET_REACHED_BIT
             if self._is_limited:
-                word |= _INTERNAL_LIMIT_BIT
+                statusword |= _INTERNAL_LIMIT_BIT
         elif state is PdsState.QUICK_STOP and self._is_at_rest():
-            word |= _TARGET_REACHED_BIT
+            statusword |= _TARGET_REACHED_BIT
         if self._emergencies.active and state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
-            word |= _WARNING_BIT
-        return word
+            statusword |= _WARNING_BIT
+        return statusword
 
     def _is_at_rest(self) -> bool:
         """Return whether the shaft turns by less than one count per second."""

@@ -113,21 +113,21 @@ class PdsStateMachine:
         self._enter(PdsState.NOT_READY)
         self._enter(PdsState.SWITCH_ON_DISABLED)
 
-    def control(self, word: int) -> None:
+    def control(self, controlword: int) -> None:
         """Process a controlword."""
-        reset_bit = word & _FAULT_RESET_BIT
-        rising, self._reset_bit = reset_bit and not self._reset_bit, reset_bit
+        reset_bit = controlword & _FAULT_RESET_BIT
+        is_rising, self._reset_bit = reset_bit and not self._reset_bit, reset_bit
         if self.state is PdsState.FAULT:
-            if rising and self._may_reset():
+            if is_rising and self._may_reset():
                 self._enter(PdsState.SWITCH_ON_DISABLED)
-        elif not word & _ENABLE_VOLTAGE_BIT:
+        elif not controlword & _ENABLE_VOLTAGE_BIT:
             self.disable_voltage()
-        elif not word & _NO_QUICK_STOP_BIT:
+        elif not controlword & _NO_QUICK_STOP_BIT:
             self.quick_stop()
-        elif not word & _SWITCH_ON_BIT:
+        elif not controlword & _SWITCH_ON_BIT:
             self._shut_down(reset_bit)
         else:
-            self._switch_on(word, reset_bit)
+            self._switch_on(controlword, reset_bit)
 
     def disable_voltage(self) -> None:
         """Switch the drive's power off, from any state except fault."""
@@ -170,10 +170,10 @@ class PdsStateMachine:
         elif self.state in (PdsState.SWITCHED_ON, PdsState.OPERATION_ENABLED):
             self._enter(PdsState.READY)
 
-    def _switch_on(self, word: int, reset_bit: int) -> None:
+    def _switch_on(self, controlword: int, reset_bit: int) -> None:
         """Switch on, enable operation or disable it; upwards only while bit 7 is 0."""
-        enable = word & _ENABLE_OPERATION_BIT
-        if self.state is PdsState.OPERATION_ENABLED and not enable:
+        enable_bit = controlword & _ENABLE_OPERATION_BIT
+        if self.state is PdsState.OPERATION_ENABLED and not enable_bit:
             self._enter(PdsState.SWITCHED_ON)
         if reset_bit:
             return
@@ -184,7 +184,7 @@ class PdsStateMachine:
             and self._quick_stop_option.value >= _FIRST_STAYING_OPTION
         )
         if (
-            enable
+            enable_bit
             and (self.state is PdsState.SWITCHED_ON or is_quick_stopped)
             and self._may_enable()
         ):
@@ -322,7 +322,7 @@ def add_drive_objects(
     communication_error = Entry("B", high=2)
     objects.add_record(0x1029, {1: communication_error})
 
-    peak = peak_per_mille(motor)
+    peak_torque_per_mille = peak_per_mille(motor)
     add(0x605B, Entry("h", 0, low=0, high=1))
     add(0x605C, Entry("h", 0, low=0, high=1))
     add(0x6076, Entry("I", rated_torque_counts(motor, drive), "ro"))
@@ -334,11 +334,11 @@ def add_drive_objects(
 
     gear = Fraction(drive.gear_ratio).limit_denominator(_LARGEST_GEAR_REVOLUTIONS)
     increments = round(_ENCODER_REVOLUTIONS * math.tau / resolution_rad / drive.gear_ratio)
-    scales = {
+    ratios_by_index = {
         0x608F: (increments, _ENCODER_REVOLUTIONS),
         0x6091: (gear.numerator, gear.denominator),
     }
-    for index, ratio in scales.items():
+    for index, ratio in ratios_by_index.items():
         objects.add_record(index, {sub: Entry("I", n, "ro") for sub, n in enumerate(ratio, 1)})
 
     interpolation = {1: Entry("B", max(1, round(1e3 / rate_hz)), low=1)}
@@ -360,14 +360,14 @@ def add_drive_objects(
         position=add(0x6064, Entry("i", 0, "ro", "t")),
         velocity=add(0x606C, Entry("i", 0, "ro", "t")),
         target_torque=add(0x6071, Entry("h", 0, mapping="rt")),
-        max_torque=add(0x6072, Entry("H", peak, mapping="rt")),
+        max_torque=add(0x6072, Entry("H", peak_torque_per_mille, mapping="rt")),
         actual_torque=add(0x6077, Entry("h", 0, "ro", "t")),
         max_speed_rpm=add(0x6080, Entry("I", _MAX_SPEED_RPM)),
         torque_offset=add(0x60B2, Entry("h", 0, mapping="rt")),
         interpolation_value=interpolation[1],
         interpolation_exponent=interpolation[2],
-        positive_limit=add(0x60E0, Entry("H", peak, mapping="rt")),
-        negative_limit=add(0x60E1, Entry("H", peak, mapping="rt")),
+        positive_limit=add(0x60E0, Entry("H", peak_torque_per_mille, mapping="rt")),
+        negative_limit=add(0x60E1, Entry("H", peak_torque_per_mille, mapping="rt")),
     )
 
 

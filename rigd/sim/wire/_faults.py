@@ -295,7 +295,7 @@ class _ActiveFault:
         self.kind = fault.kind
         self.can_id = values.get("id")
         self.in_bytes = "bytes" in values
-        self.left = int(values["bytes"] if self.in_bytes else values["frames"])
+        self.remaining = int(values["bytes"] if self.in_bytes else values["frames"])
         self.delay_s = float(values.get("ms", 0)) * 1e-3
         self.byte = int(values.get("byte", 0))
 
@@ -369,9 +369,9 @@ class FaultyLine:
 
     def _disturb(self, fault: _ActiveFault, can_id: int, data: bytes, origin: object) -> None:
         """Apply a fault to a frame: drop, delay, corrupt or hold it, and log it."""
-        bytes_hit = min(fault.left, len(data)) if fault.in_bytes else 1
-        fault.left -= bytes_hit
-        if fault.left == 0:
+        bytes_hit = min(fault.remaining, len(data)) if fault.in_bytes else 1
+        fault.remaining -= bytes_hit
+        if fault.remaining == 0:
             self._active_faults.remove(fault)
         identifier = {} if can_id == SERIAL else {"can_id": can_id}
         self._log("simulator", fault.kind, sender=self._sender, data=data.hex(), **identifier)

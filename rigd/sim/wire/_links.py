@@ -420,19 +420,19 @@ class PtyLine:
         self.port = os.ttyname(host_end)
         os.close(host_end)
         os.set_blocking(self._simulator_end, False)
-        self._open = False
+        self._is_open = False
 
     def write(self, data: bytes) -> None:
         """Send bytes; bytes that the host does not accept are lost."""
         sent = 0
-        if self._open:
+        if self._is_open:
             with suppress(OSError):
                 sent = os.write(self._simulator_end, data)
             self.lost += len(data) - sent
 
     def poll(self) -> None:
         """Check whether the host has opened or closed the port."""
-        if not self._open and self._simulator_end >= 0:
+        if not self._is_open and self._simulator_end >= 0:
             self._receive()
 
     def close(self) -> None:
@@ -441,7 +441,7 @@ class PtyLine:
             self._handlers.pop(self._simulator_end, None)
             os.close(self._simulator_end)
             self._simulator_end = -1
-            self._open = False
+            self._is_open = False
 
     def _receive(self) -> None:
         """Read bytes of the host, and register whether the host has the port open."""
@@ -453,12 +453,12 @@ class PtyLine:
             is_open = True
         except OSError:
             is_open = False
-        if is_open and not self._open:
+        if is_open and not self._is_open:
             self._handlers[self._simulator_end] = self._receive
-        elif self._open and not is_open:
+        elif self._is_open and not is_open:
             del self._handlers[self._simulator_end]
-        if is_open != self._open:
-            self._open = is_open
+        if is_open != self._is_open:
+            self._is_open = is_open
             self._on_open(is_open)
         if data:
             self._on_bytes(data)

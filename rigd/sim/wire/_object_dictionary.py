@@ -71,7 +71,7 @@ class Description:
     """Upper limit of the value; None if not stated."""
     text: bytes = b""
     """Bytes at power-on of an entry that is no number."""
-    fixed: bool = False
+    has_fixed_length: bool = False
     """Whether bytes can be written only with the length of `text`."""
 
     def entry(self) -> "Entry":
@@ -84,7 +84,7 @@ class Description:
             self.low,
             self.high,
             self.text,
-            fixed=self.fixed,
+            has_fixed_length=self.has_fixed_length,
         )
 
 
@@ -107,7 +107,7 @@ class Entry:
         Range of values that can be written; by default that of the type.
     text
         Bytes at power-on.
-    fixed
+    has_fixed_length
         Whether bytes can be written only with the length of `text`.
     read_value
         Function that returns the value if it is not stored; None if it is stored.
@@ -124,7 +124,7 @@ class Entry:
     low: int | None = None
     high: int | None = None
     text: bytes = b""
-    fixed: bool = False
+    has_fixed_length: bool = False
     read_value: Callable[[], int] | None = None
     check: Callable[[int], None] | None = None
     after_write: Callable[[], None] | None = None
@@ -180,14 +180,14 @@ class Entry:
         """Return whether a value of `size` bytes can be written to the entry."""
         if self.kind != "s":
             return 8 * size == self.bits
-        return size == len(self.text) if self.fixed else size <= _MOST_TEXT_BYTES
+        return size == len(self.text) if self.has_fixed_length else size <= _MOST_TEXT_BYTES
 
     @property
     def most_bytes(self) -> int:
         """Largest number of bytes that can be written to the entry."""
         if self.kind != "s":
             return self.bits // 8
-        return len(self.text) if self.fixed else _MOST_TEXT_BYTES
+        return len(self.text) if self.has_fixed_length else _MOST_TEXT_BYTES
 
     def get(self) -> int:
         """Return the present value of an integer entry."""
@@ -270,7 +270,7 @@ class ObjectDictionary:
             self.add(index, entry, sub)
 
     def adopt_file_entries(
-        self, file: Mapping[tuple[int, int], Description], own: Container[int]
+        self, file: Mapping[tuple[int, int], Description], unchanged_indices: Container[int]
     ) -> None:
         """Restrict the dictionary to the entries of a device's file, and adopt their descriptions.
 
@@ -281,7 +281,7 @@ class ObjectDictionary:
         ----------
         file
             Descriptions in the file, by index and sub-index.
-        own
+        unchanged_indices
             Indices whose values at power-on remain unchanged.
         """
         previous_entries, self._entries = self._entries, {}
@@ -291,7 +291,9 @@ class ObjectDictionary:
             if entry is None or "s" in (entry.kind, description.kind):
                 entry = description.entry()
             else:
-                entry.adopt_description(description, None if index in own else description.default)
+                entry.adopt_description(
+                    description, None if index in unchanged_indices else description.default
+                )
             self.add(index, entry, sub)
 
     def override_entry(self, index: int, sub: int, value: int | None) -> None:
@@ -413,13 +415,13 @@ class SdoServer:
     ) -> None:
         self._objects = objects
         self._reply = reply
-        self._wrote = after_write
+        self._after_write = after_write
         self.reset()
 
     def reset(self) -> None:
         """Discard an unfinished SDO transfer."""
         self._index = self._sub = 0
-        self._awaited: int | None = None  # command specifier of the expected segments
+        self._expected_specifier: int | None = None  # command specifier of the expected segments
         self._buffer = b""
         self._toggle = 0
 
@@ -459,7 +461,7 @@ class SdoServer:
             stated_size = int.from_bytes(data[4:8], "little")
             if command & _SIZE_STATED_BIT and not entry.accepts_length(stated_size):
                 raise Abort(AbortCode.LENGTH)
-            self._awaited = _DOWNLOAD_SEGMENT
+            self._expected_specifier = _DOWNLOAD_SEGMENT
         self._reply(_SDO_HEADER.pack(0x60, self._index, self._sub).ljust(8, b"\0"))
 
     def _start_upload(self) -> None:
@@ -467,17 +469,17 @@ class SdoServer:
         value = self._objects.read(self._index, self._sub)
         size = len(value)
         if 0 < size <= _EXPEDITED_SIZE:
-            head = _SDO_HEADER.pack(0x43 | (_EXPEDITED_SIZE - size) << 2, self._index, self._sub)
-            self._reply(head + value.ljust(_EXPEDITED_SIZE, b"\0"))
+            header = _SDO_HEADER.pack(0x43 | (_EXPEDITED_SIZE - size) << 2, self._index, self._sub)
+            self._reply(header + value.ljust(_EXPEDITED_SIZE, b"\0"))
             return
-        self._awaited = _UPLOAD_SEGMENT
+        self._expected_specifier = _UPLOAD_SEGMENT
         self._buffer = value
         self._reply(_SDO_HEADER.pack(0x41, self._index, self._sub) + size.to_bytes(4, "little"))
 
     def _process_segment(self, specifier: int, data: bytes) -> None:
         """Process the request for the next segment: store or send it."""
         command = data[0]
-        if specifier != self._awaited:
+        if specifier != self._expected_specifier:
             raise Abort(AbortCode.COMMAND)
         if command & _TOGGLE_BIT != self._toggle:
             raise Abort(AbortCode.TOGGLE)
@@ -485,10 +487,10 @@ class SdoServer:
         if specifier == _UPLOAD_SEGMENT:
             segment, self._buffer = self._buffer[:_SEGMENT_SIZE], self._buffer[_SEGMENT_SIZE:]
             is_last = not self._buffer
-            head = (
+            header = (
                 toggle | (_SEGMENT_SIZE - len(segment)) << 1 | (_LAST_SEGMENT_BIT if is_last else 0)
             )
-            self._reply(bytes([head]) + segment.ljust(_SEGMENT_SIZE, b"\0"))
+            self._reply(bytes([header]) + segment.ljust(_SEGMENT_SIZE, b"\0"))
         else:
             self._buffer += data[1 : 1 + _SEGMENT_SIZE - (command >> 1 & 0x07)]
             # No writable entry is longer. Without this check a client could fill the memory.
@@ -503,7 +505,7 @@ class SdoServer:
 
     def _write(self, data: bytes) -> None:
         """Write a complete value to the dictionary, and report the write."""
-        self._wrote(self._index, self._sub, self._objects.write(self._index, self._sub, data))
+        self._after_write(self._index, self._sub, self._objects.write(self._index, self._sub, data))
 
 
 # EDS files
@@ -601,7 +603,9 @@ def _to_description(entry: EdsEntry) -> Description:
     kind = _TYPE_LETTERS.get(entry.data_type)
     if kind is None:
         size = _TIME_TYPE_LENGTHS.get(entry.data_type) or (entry.bits or 0) // 8
-        return Description("s", access, "", text=_default_bytes(entry, size), fixed=size > 0)
+        return Description(
+            "s", access, "", text=_default_bytes(entry, size), has_fixed_length=size > 0
+        )
     is_boolean = entry.data_type == _BOOLEAN_TYPE
     # A boolean takes one bit in a PDO, which is not needed here.
     mappable = entry.mappable and not is_boolean

@@ -83,8 +83,10 @@ def reserve_rig_name(rig_name: str) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            running = find_simulator(rig_name)
-            process_text = "" if running is None else f" (process {running.pid})"
+            running_simulator = find_simulator(rig_name)
+            process_text = (
+                "" if running_simulator is None else f" (process {running_simulator.pid})"
+            )
             raise DeviceError(
                 f"A simulated rig of the profile {rig_name} is already running{process_text}; end "
                 "it first, or use that one."
@@ -101,8 +103,8 @@ def socket_folder(rig_name: str) -> Iterator[Path]:
     if len(os.fsencode(folder / f"{rig_name}.control")) <= _LONGEST_SOCKET_NAME:
         yield folder
         return
-    with tempfile.TemporaryDirectory(prefix="rigd-", dir="/tmp") as short:
-        yield Path(short)
+    with tempfile.TemporaryDirectory(prefix="rigd-", dir="/tmp") as short_folder:
+        yield Path(short_folder)
 
 
 @contextmanager
@@ -112,15 +114,17 @@ def stop_requested() -> Iterator[Callable[[], bool]]:
     Signals that the process ignores remain ignored.
     """
     requested: list[int] = []
-    before = {number: signal.getsignal(number) for number in _STOP_SIGNALS}
-    handled_signals = [number for number, handler in before.items() if handler != signal.SIG_IGN]
+    previous_handlers = {number: signal.getsignal(number) for number in _STOP_SIGNALS}
+    handled_signals = [
+        number for number, handler in previous_handlers.items() if handler != signal.SIG_IGN
+    ]
     for number in handled_signals:
         signal.signal(number, lambda number_received, _: requested.append(number_received))
     try:
         yield lambda: bool(requested)
     finally:
         for number in handled_signals:
-            signal.signal(number, before[number])
+            signal.signal(number, previous_handlers[number])
 
 
 # Control socket
@@ -265,20 +269,20 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
         If its simulated rig is already running, or if sockets or files cannot be created.
     """
     check_on_wire(rig)
-    if unknown := describe_unknown_values(rig):
-        raise WrongUseError(unknown)
+    if unknown_text := describe_unknown_values(rig):
+        raise WrongUseError(unknown_text)
     if rig.devices.sensor != "ati_serial":
         rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses
     with ExitStack() as stack:
         stack.enter_context(reserve_rig_name(rig.name))
         log = EventLog(options.log, quiet=options.quiet)
         stack.callback(log.close)
-        starting = stack.enter_context(ExitStack())
-        starting.callback(log.discard)
+        startup_stack = stack.enter_context(ExitStack())
+        startup_stack.callback(log.discard)
         process = _SimulatorProcess(rig, options, log, stack)
         stop = stack.enter_context(stop_requested())
         process.start()
-        starting.pop_all()
+        startup_stack.pop_all()
         process.serve(stop)
     return 0
 
@@ -378,14 +382,14 @@ class _SimulatorProcess:
         """Inject the initial faults, print the rig's addresses, and write the address file."""
         for fault in self._options.faults:
             self._bus_simulation.inject(fault)
-        started = {} if self._options.lock_step else {"monotonic_ns": time.monotonic_ns()}
+        start_values = {} if self._options.lock_step else {"monotonic_ns": time.monotonic_ns()}
         self._log(
             "simulator",
             "started",
             rig=self._rig.name,
             lock_step=self._options.lock_step,
             **({} if self._device_file is None else {"eds": self._device_file.name}),
-            **started,
+            **start_values,
         )
         for line in self._start_messages():
             self._log.print_line(line)
@@ -497,8 +501,8 @@ class _SimulatorProcess:
         if self._device_file is not None:
             objects = len({index for index, _ in self._device_file.entries})
             yield f"  drive    as {self._device_file.name} has it, {objects} objects"
-        fast = " --fast" if address.lock_step else ""
-        yield f"  session  rigd run chirp --profile {rig.name}{fast}"
+        fast_option = " --fast" if address.lock_step else ""
+        yield f"  session  rigd run chirp --profile {rig.name}{fast_option}"
         yield f"  fault    rigd inject --profile {rig.name} freeze,device=drive,for=0.5"
 
     def _on_frames(self, frames: list[bytes], origin: object) -> None:
@@ -509,9 +513,9 @@ class _SimulatorProcess:
         """Pass bytes of the serial host to the simulation."""
         self._bus_simulation.receive_serial(data)
 
-    def _on_clients(self, what: str, count: int) -> None:
+    def _on_clients(self, event: str, count: int) -> None:
         """Log that a client of the CAN bus has connected or disconnected."""
-        self._log("bus", what, clients=count)
+        self._log("bus", event, clients=count)
         if count == 0:
             self._bus_simulation.stop_waiting(time.monotonic_ns())
 
