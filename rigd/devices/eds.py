@@ -202,7 +202,7 @@ def _commissioned_node_id(sections: Sections) -> int:
 def _read_text(path: Path) -> str:
     """Return the decoded text of an EDS file (UTF-8, UTF-16 or cp1252), or raise."""
     try:
-        # Opened before its kind is known, a pipe would be waited for.
+        # Check the kind of file first, since opening a pipe would wait for its other end.
         file_status = path.stat()
         if stat.S_ISDIR(file_status.st_mode):
             raise EdsError(f"{path}: is a folder; name the EDS file in it.")
@@ -290,7 +290,7 @@ def _correct_sections(sections: Sections, path: Path) -> dict[tuple[int, int], M
         # Sub-indices are kept even if the object's type is missing or wrong.
         kind = _parse_integer_or_zero(keys.get("objecttype", ""))
         if not sub_sections and kind in (_ARRAY_OBJECT, _RECORD_OBJECT) and "datatype" not in keys:
-            continue  # nothing of it is described
+            continue  # the file describes no sub-index of the object
         name = keys.get("parametername") or title.upper()
         shared_keys = {"parametername": name}
         if not sub_sections:

@@ -16,7 +16,7 @@ from rigd.runtime.addresses import announce as write_address
 from rigd.runtime.addresses import answers, read_address, runtime_folder
 from rigd.runtime.processes import listening_sockets
 
-if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
+if TYPE_CHECKING:  # it imports numpy, which takes longer than a stop may take
     from rigd.devices.parameters import RigParameters
 
 _LONGEST_REPLY = 65_536

@@ -111,7 +111,7 @@ class SimulatedRig:
         if rig.ati_serial is not None:
             weights = rig.ati_serial.weights(rig.rate_hz)
             self.records_per_period = rig.ati_serial.records_per_tick(rig.rate_hz)
-            # The filter's own delay is part of what the profile states; the rest is the sensor's.
+            # The delay in the profile includes the filter's delay; the rest is the sensor's delay.
             remaining_delay_s = rig.sensor.delay_s - rig.ati_serial.filter_delay_s(rig.rate_hz)
             rig = replace(rig, sensor=replace(rig.sensor, delay_s=max(0.0, remaining_delay_s)))
         rig = replace(rig, rate_hz=rig.rate_hz * self.records_per_period)
@@ -200,7 +200,7 @@ class SimulatedRig:
 
         A thread would block the interpreter.
         """
-        import tempfile  # late: no session needs it
+        import tempfile  # imported late, because no session needs it
 
         file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it was read
         process = os.fork()

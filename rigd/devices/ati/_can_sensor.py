@@ -132,7 +132,7 @@ class AtiCanSensor:
             self._select_calibration()
             serial_number = self._read_serial_number()  # belongs to the calibration, not to the box
             matrix = self._read_matrix()
-            # A wrong entry would bend every result, and the protocol has no checksum of its own.
+            # A wrong entry would falsify every result, and the protocol has no checksum of its own.
             if self._read_matrix() != matrix:
                 raise DeviceError(
                     f"{self._name}: its calibration matrix read differently the second time; "

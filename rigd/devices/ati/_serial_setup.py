@@ -95,7 +95,7 @@ class SerialLine:
         self._fd = self._serial.fileno()
         self._descriptors = [self._fd]
         self.low_latency = False
-        # Not every driver offers it; pyserial then reports a value it could not set.
+        # Not every adapter's driver supports it; pyserial then raises an error.
         with suppress(ValueError, OSError, termios.error):
             self._serial.set_low_latency_mode(True)
             self.low_latency = True
@@ -145,7 +145,7 @@ class SerialLine:
             select.select(self._descriptors, (), (), timeout_s)
         except OSError as error:
             raise self._failure_error(error.strerror) from None
-        except ValueError as error:  # a descriptor beyond what select knows
+        except ValueError as error:  # a file descriptor too large for select
             raise self._failure_error(str(error)) from None
 
     def transact(self, request: bytes, length: int, timeout_s: float) -> bytes:

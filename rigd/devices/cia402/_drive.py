@@ -143,7 +143,7 @@ class Cia402Drive:
         self.angle_rad = 0.0
         self.angle_stale = False
         self.angle_time_ns = node.sync_ns
-        node.pairing.process_replies()  # that reply is of no tick
+        node.pairing.process_replies()  # the first reply belongs to no tick
         self._awaits_reply = False
         node.resume()
 

@@ -398,7 +398,7 @@ class Node:
         """Send a frame, and return whether the bus accepted it; never raises."""
         try:
             self.exchange.send(frame)
-        except Exception:  # an adapter's library may raise anything, and this is the way off
+        except Exception:  # an adapter's library may raise anything; switching off must continue
             return False
         return True
 

@@ -238,7 +238,7 @@ def _read_reply_data(data: bytes, expected_index: int) -> bytes | None:
 
 # Error codes
 
-# Most digits first. Classes: CiA 301; single codes: those on which vendors' manuals agree.
+# Specific codes precede classes. Classes: CiA 301; codes: those on which vendors' manuals agree.
 _ERROR_MEANINGS: Final = (
     (0xFFFF, 0x3210, "over-voltage in the DC link"),
     (0xFFFF, 0x3220, "under-voltage in the DC link"),

@@ -144,7 +144,7 @@ class SdoAccess:
         self._node = canopen.RemoteNode(node_id, canopen.import_od(str(_DEFAULT_EDS_PATH), node_id))
         self._node.sdo.RESPONSE_TIMEOUT = _SDO_TIMEOUT_S
         self._node.sdo.MAX_RETRIES = _SDO_ATTEMPTS
-        port.accept(None)  # a sensor on the same bus may have narrowed it to its own frames
+        port.accept(None)  # a sensor on the same bus may have restricted it to its own frames
         self._network = canopen.Network(port.open_bus())
         self._network.NOTIFIER_CYCLE = _RECEIVER_POLL_S
         self._network.listeners = [_Receiver(self._network)]

@@ -83,7 +83,7 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
 
 def command_off(sdo: SdoAccess) -> None:
     """Command the drive to switch off (controlword 0) and ignore its answer; never raises."""
-    # An adapter's library may raise anything, and this is the way off.
+    # An adapter's library may raise anything; switching off must continue.
     with suppress(Exception), sdo.short_timeouts():
         sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
 
@@ -170,7 +170,7 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
             time.sleep(_STATE_POLL_S)
     if statusword is None:
         try:
-            sdo.enter_pre_operational()  # patiently, and it names what else is on the bus
+            sdo.enter_pre_operational()  # with the normal timeout; its error names other nodes
             sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
             statusword = sdo.read(objects.STATUSWORD)
         except Exception as error:

@@ -254,7 +254,7 @@ class _SuitabilityCheck:
             sentence = f"{what}: {found}.{stand_in}"
             return SuitabilityFinding(what, found, wanted, Grade.ACCEPTED, sentence, row.accept)
         sentence = _capitalise(row.refusal_reason()) + stand_in
-        # Without a profile there was no chance to accept it.
+        # Without a profile, nobody could accept the missing object yet.
         grade = Grade.DOUBT if self._settings is None else Grade.REFUSED
         return SuitabilityFinding(what, found, wanted, grade, sentence, row.accept)
 

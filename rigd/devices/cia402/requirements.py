@@ -375,7 +375,7 @@ OPTIONAL_REQUIREMENTS: Final = (
         "the SYNC: each torque holds until the next",
         "With 60C2:1 it has to be the period of rig.rate_hz.",
     ),
-    # Who watches over whom.
+    # Monitoring of this computer by the drive, and of the drive by this computer.
     Requirement(
         objects.HEARTBEAT_CONSUMER,
         1,
@@ -526,7 +526,7 @@ OPTIONAL_REQUIREMENTS: Final = (
         "The drive has no limit of its own for the speed: set cia402.max_speed_rad_s = 0, and see "
         "what rigd check then says of the worst travel.",
     ),
-    # What a drive may hold from before.
+    # Values that a drive may have stored in earlier use.
     Requirement(
         objects.TPDO_COMMUNICATION,
         objects.INHIBIT_TIME,

@@ -163,8 +163,8 @@ _MOST_CAN_DATA_BYTES = 8
 """Largest number of data bytes of a CAN frame."""
 _DRIVE_ATTRIBUTES = {
     "no_pre_operational": "stays_operational",
-    "no_bit_12": "never_follows",
-    "no_watch": "watchless",
+    "no_bit_12": "never_sets_bit_12",
+    "no_watch": "ignores_silent_host",
 }
 """Attribute of the simulated drive that a kind of fault sets to True."""
 
@@ -608,7 +608,7 @@ class BusSimulation:
 
     def _end_override(self, override: "_AttributeOverride") -> None:
         """End an overriding fault: restore the value of the latest remaining one, or the normal."""
-        if override not in self._overrides:  # it was ended before its time
+        if override not in self._overrides:  # it was ended before its scheduled end
             return
         self._overrides.remove(override)
         value = override.normal_value

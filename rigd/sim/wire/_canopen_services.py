@@ -126,7 +126,7 @@ class Emergencies:
 
 # Heartbeats
 
-DEFAULT_WATCH_COUNT = 2
+DEFAULT_MONITOR_COUNT = 2
 """Number of heartbeats that a node can monitor, without a device file."""
 _TIME_TOLERANCE_S = 1e-9
 """Tolerance in seconds for rounding errors of times."""
@@ -154,8 +154,8 @@ class HeartbeatProducer:
         return True
 
 
-class HeartbeatWatch:
-    """Monitoring of one heartbeat by an entry of object 1016, active after the first heartbeat.
+class HeartbeatMonitor:
+    """Monitor of one heartbeat by an entry of object 1016, active after the first heartbeat.
 
     Attributes
     ----------
@@ -175,7 +175,7 @@ class HeartbeatWatch:
     @property
     def node_id(self) -> int:
         """Number of the monitored node; 0 for none."""
-        return _watched_node(self._entry.value)
+        return _monitored_node(self._entry.value)
 
     def register_heartbeat(self, now_s: float) -> None:
         """Register a received heartbeat at a time in seconds."""
@@ -191,14 +191,14 @@ class HeartbeatWatch:
         return self.lost
 
 
-def _watched_node(value: int) -> int:
+def _monitored_node(value: int) -> int:
     """Return the number of the monitored node in a value of object 1016; 0 for none."""
     return value >> 16 & 0x7F if value & 0xFFFF else 0
 
 
-def add_heartbeat_watches(
+def add_heartbeat_monitors(
     objects: ObjectDictionary, count: int, on_restart: Callable[[], None]
-) -> list[HeartbeatWatch]:
+) -> list[HeartbeatMonitor]:
     """Add object 1016 to a dictionary, and return the heartbeat monitors of its entries.
 
     Parameters
@@ -211,25 +211,27 @@ def add_heartbeat_watches(
         Function that is called after an entry was set, which restarts its monitoring.
     """
     entries = {sub: Entry("I") for sub in range(1, count + 1)}
-    watches = [HeartbeatWatch(entry) for entry in entries.values()]
+    monitors = [HeartbeatMonitor(entry) for entry in entries.values()]
 
     def check(entry: Entry, value: int) -> None:
         if value >> 24 or value >> 16 > 0x7F:
             raise Abort(AbortCode.VALUE)
-        others = {_watched_node(other.value) for other in entries.values() if other is not entry}
-        if _watched_node(value) and _watched_node(value) in others:
+        other_nodes = {
+            _monitored_node(other.value) for other in entries.values() if other is not entry
+        }
+        if _monitored_node(value) and _monitored_node(value) in other_nodes:
             raise Abort(AbortCode.INCOMPATIBLE)
 
-    def restart(watch: HeartbeatWatch) -> None:
-        watch.restart()
+    def restart(monitor: HeartbeatMonitor) -> None:
+        monitor.restart()
         on_restart()
 
-    for entry, watch in zip(entries.values(), watches, strict=True):
+    for entry, monitor in zip(entries.values(), monitors, strict=True):
         entry.check = partial(check, entry)
-        entry.after_write = partial(restart, watch)
+        entry.after_write = partial(restart, monitor)
     if entries:
         objects.add_record(0x1016, entries)
-    return watches
+    return monitors
 
 
 # PDOs

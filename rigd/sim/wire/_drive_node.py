@@ -16,13 +16,13 @@ from rigd.devices.parameters import RigParameters
 from rigd.sim import SimulatedRig
 from rigd.sim.wire._canopen_services import (
     COB_ID_DISABLED,
-    DEFAULT_WATCH_COUNT,
+    DEFAULT_MONITOR_COUNT,
     MAX_MAPPING_ENTRIES,
     Emergencies,
     HeartbeatProducer,
     ReceivePdo,
     TransmitPdo,
-    add_heartbeat_watches,
+    add_heartbeat_monitors,
 )
 from rigd.sim.wire._drive_objects import (
     CYCLIC_SYNCHRONOUS_TORQUE,
@@ -130,10 +130,10 @@ class DriveNode:
         if it were measured and filtered; 0: at once. Initially the profile's ``torque_response_s``.
     stays_operational : bool
         Whether the drive ignores the NMT command to pre-operational.
-    never_follows : bool
+    never_sets_bit_12 : bool
         Whether the drive never sets bit 12 of its statusword, which means that it follows the
         target. Initially as the profile's ``follows_target_bit`` states.
-    watchless : bool
+    ignores_silent_host : bool
         Whether the drive ignores missing heartbeats, SYNCs and RPDOs.
     angle_offset_counts : int
         Offset added to the position in counts, as of an encoder that has jumped.
@@ -178,8 +178,8 @@ class DriveNode:
         self.frozen = False
         self.angle_offset_counts = 0
         self.torque_lag_s = rig.cia402.torque_response_s
-        self.never_follows = not rig.cia402.follows_target_bit
-        self.stays_operational = self.watchless = False
+        self.never_sets_bit_12 = not rig.cia402.follows_target_bit
+        self.stays_operational = self.ignores_silent_host = False
         self._sto_dropped = False
         self._sto_error_code = rig.cia402.sto_error_code
         self._simulated_rig = simulated_rig
@@ -211,8 +211,10 @@ class DriveNode:
         )
         self._emergencies = Emergencies(objects, node_id, self._send_emergency)
         self._producer = HeartbeatProducer(objects)
-        watch_count = DEFAULT_WATCH_COUNT if file is None else file.sub_index_count(0x1016)
-        self._watches = add_heartbeat_watches(objects, watch_count, self._clear_heartbeat_error)
+        monitor_count = DEFAULT_MONITOR_COUNT if file is None else file.sub_index_count(0x1016)
+        self._heartbeat_monitors = add_heartbeat_monitors(
+            objects, monitor_count, self._clear_heartbeat_error
+        )
         self._receive_pdos = [
             ReceivePdo(objects, *pdo, self._rebuild_tables)
             for pdo in _pdo_parameters(0x1400, 0x200 + node_id, 0x6040, file)
@@ -275,10 +277,10 @@ class DriveNode:
         self._now_s = now_s
         if self._nmt is Nmt.INITIALISING:
             self._boot()
-        if not self.watchless:
-            self._watch_heartbeats(now_s)
-            self._watch_sync(now_s)
-            self._watch_rpdos(now_s)
+        if not self.ignores_silent_host:
+            self._check_heartbeats(now_s)
+            self._check_sync(now_s)
+            self._check_rpdos(now_s)
         self._state_machine.tick(now_s)
         if self._producer.is_due(now_s):
             self._transmit(0x700 + self._node_id, bytes([self._nmt]))
@@ -334,8 +336,8 @@ class DriveNode:
         self._on_mode()
         self._rebuild_pdos()
         self._sdo.reset()
-        for watch in self._watches:
-            watch.restart()
+        for monitor in self._heartbeat_monitors:
+            monitor.restart()
         self._transmit(0x700 + self._node_id, bytes([Nmt.INITIALISING]))
         self._enter_nmt(Nmt.PRE_OPERATIONAL)
 
@@ -446,9 +448,9 @@ class DriveNode:
         """Process the heartbeat of another node."""
         if len(data) != 1 or data[0] & 0x7F == Nmt.INITIALISING:  # a boot-up is not a heartbeat
             return
-        for watch in self._watches:
-            if watch.node_id == node_id:
-                watch.register_heartbeat(self._now_s)
+        for monitor in self._heartbeat_monitors:
+            if monitor.node_id == node_id:
+                monitor.register_heartbeat(self._now_s)
         if self._emergencies.active:
             self._clear_heartbeat_error()
 
@@ -490,10 +492,10 @@ class DriveNode:
 
     # Watchdogs and errors ----------------------------------------------------------------------
 
-    def _watch_heartbeats(self, now_s: float) -> None:
+    def _check_heartbeats(self, now_s: float) -> None:
         """React to heartbeats that have just been lost, as the options in the dictionary say."""
-        for watch in self._watches:
-            if not watch.check(now_s):
+        for monitor in self._heartbeat_monitors:
+            if not monitor.check(now_s):
                 continue
             option, state = self._entries.abort_option.value, self._state_machine.state
             if option == 1 and state not in (PdsState.READY, PdsState.SWITCH_ON_DISABLED):
@@ -502,8 +504,8 @@ class DriveNode:
                 self._state_machine.quick_stop()
             elif option:
                 self._state_machine.disable_voltage()
-            self._log("heartbeat lost", node_id=watch.node_id)
-            self._report(_HEARTBEAT_LOST_CODE, _COMMUNICATION_ERROR_BIT, bytes([watch.node_id]))
+            self._log("heartbeat lost", node_id=monitor.node_id)
+            self._report(_HEARTBEAT_LOST_CODE, _COMMUNICATION_ERROR_BIT, bytes([monitor.node_id]))
             reaction = self._entries.communication_error.value
             if reaction == 2:
                 self._end_connection()
@@ -512,7 +514,7 @@ class DriveNode:
                 self._end_connection()
                 self._enter_nmt(Nmt.PRE_OPERATIONAL)
 
-    def _watch_sync(self, now_s: float) -> None:
+    def _check_sync(self, now_s: float) -> None:
         """Go to fault if SYNC has been missing for too long in operation enabled."""
         if not self._sync_alive:
             return
@@ -523,7 +525,7 @@ class DriveNode:
                 self._fail(_SYNC_LOST_CODE, _COMMUNICATION_ERROR_BIT)
                 self._log("sync lost", timeout_s=timeout_s)
 
-    def _watch_rpdos(self, now_s: float) -> None:
+    def _check_rpdos(self, now_s: float) -> None:
         """Go to fault if an RPDO has missed its deadline in operation enabled."""
         if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
@@ -540,12 +542,15 @@ class DriveNode:
 
     def _clear_heartbeat_error(self) -> None:
         """Clear the heartbeat error if no monitored heartbeat is missing any more."""
-        if not any(watch.lost for watch in self._watches):
+        if not any(monitor.lost for monitor in self._heartbeat_monitors):
             self._clear(_HEARTBEAT_LOST_CODE)
 
     def _has_all_heartbeats(self) -> bool:
         """Return whether no missing heartbeat forbids operation."""
-        return not (self._entries.abort_option.value and any(watch.lost for watch in self._watches))
+        return not (
+            self._entries.abort_option.value
+            and any(monitor.lost for monitor in self._heartbeat_monitors)
+        )
 
     def _may_reset(self) -> bool:
         """Return whether a fault may be reset, and log the attempt."""
@@ -617,7 +622,9 @@ class DriveNode:
         elif previous_state is PdsState.FAULT:
             self._entries.error_code.value = 0
             remaining = (
-                {_HEARTBEAT_LOST_CODE} if any(watch.lost for watch in self._watches) else set()
+                {_HEARTBEAT_LOST_CODE}
+                if any(monitor.lost for monitor in self._heartbeat_monitors)
+                else set()
             )
             self._emergencies.clear(*(self._emergencies.active.keys() - remaining))
 
@@ -660,7 +667,7 @@ class DriveNode:
         statusword = state.bits | (_REMOTE_BIT if self._sto_dropped else _VOLTAGE_AND_REMOTE_BITS)
         if state is PdsState.OPERATION_ENABLED:
             if self._follows_target:
-                statusword |= 0 if self.never_follows else _FOLLOWS_TARGET_BIT
+                statusword |= 0 if self.never_sets_bit_12 else _FOLLOWS_TARGET_BIT
             elif self._entries.controlword.value & _HALT_BIT and self._is_at_rest():
                 statusword |= _TARGET_REACHED_BIT
             if self._is_limited:

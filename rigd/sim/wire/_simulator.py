@@ -272,7 +272,7 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
     if unknown_text := describe_unknown_values(rig):
         raise WrongUseError(unknown_text)
     if rig.devices.sensor != "ati_serial":
-        rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses
+        rig = replace(rig, ati_serial=None)  # a profile may describe a sensor that it does not use
     with ExitStack() as stack:
         stack.enter_context(reserve_rig_name(rig.name))
         log = EventLog(options.log, quiet=options.quiet)

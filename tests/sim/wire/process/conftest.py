@@ -30,7 +30,7 @@ class Drive:
     def __init__(self, step, send):
         self.frozen = self.sto_dropped = False
         self.torque_lag_s = 0.0
-        self.never_follows = self.stays_operational = self.watchless = False
+        self.never_sets_bit_12 = self.stays_operational = self.ignores_silent_host = False
         self.restarts = []
         self.angle_offset_counts = 0
         self.heard = []

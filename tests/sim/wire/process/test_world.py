@@ -300,9 +300,9 @@ ENDLESS = [
     ("status,bits=0x0080", "sensor", "status_bits", 0),
     ("stuck,what=encoder", "simulated", "stuck_encoder", None),
     ("lag,ms=3", "drive", "torque_lag_s", 0.0),
-    ("no_bit_12", "drive", "never_follows", False),
+    ("no_bit_12", "drive", "never_sets_bit_12", False),
     ("no_pre_operational", "drive", "stays_operational", False),
-    ("no_watch", "drive", "watchless", False),
+    ("no_watch", "drive", "ignores_silent_host", False),
 ]
 
 
