@@ -78,7 +78,7 @@ class WallClock:
 
     @property
     def is_idle(self) -> bool:
-        """Whether no SYNC has been received for a long time."""
+        """Whether no SYNC has been received yet, or none in the last 100 periods."""
         return self._averaged_syncs == 0 or self.tick - self._last_sync > _NEW_PHASE_PERIODS
 
     def sync(self, now_ns: float) -> int:
