@@ -1,12 +1,12 @@
-"""Devices that the loop talks to: contracts, their parameters, and the registry of drivers.
+"""Devices that the control loop uses: contracts, their parameters, and the registry of drivers.
 
-Offers the opening of the devices that a profile names (`open_devices`), and what will move: the
-hardware or a simulation (`actuation_target`).
+`open_devices` creates the drivers that a profile names. `actuation_target` states what will move:
+the hardware or a simulation.
 
 Public modules: `contracts` (`Devices`, `WrenchSensor`, `DeviceError`), `parameters`
 (`RigParameters`), `running_simulator` (the address of ``rigd simulate``), `obstacles` and `eds`
 (EDS files). The drivers are in `canbus`, `cia402` and `ati`, the simulated devices in `rigd.sim`.
-Nothing here knows of sessions, limits or the controller.
+This package does not depend on sessions, limits or the controller.
 """
 
 import lazy_loader as lazy

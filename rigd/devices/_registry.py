@@ -1,4 +1,4 @@
-"""Registry of drivers: those that a profile names, found without importing the others."""
+"""Registry of the drivers that a profile can name; only the named drivers are imported."""
 
 import importlib
 from collections.abc import Callable
@@ -25,29 +25,33 @@ _OPENERS = {
         "open_wired_rig",
     ),
 }
+"""Module and function that open a pair of drive and sensor, by the selection in a profile."""
 
 
 class UnknownDeviceError(UserError, ValueError):
-    """A profile names drivers that do not exist or cannot be combined."""
+    """Error: a profile names drivers that do not exist or cannot be combined."""
 
 
 class ActuationTarget(Enum):
-    """Target of the actuation: the hardware, or which simulation."""
+    """What moves when a session runs: the hardware, or which simulation."""
 
     HARDWARE = "the hardware"
+    """The motor of the real rig."""
     SIMULATED = "the simulated rig"
-    """Simulated in the process that opens it, under either clock."""
+    """A rig simulated in the process that opens it, under the real or the virtual clock."""
     SIMULATOR = "rigd simulate, by the clock"
+    """A rig simulated by ``rigd simulate`` in real time."""
     LOCK_STEP = "rigd simulate, in lock-step"
+    """A rig simulated by ``rigd simulate`` whose time advances with each SYNC."""
 
     @property
     def any_clock(self) -> bool:
-        """Whether the rig may run under the virtual clock."""
+        """Whether the target can also run under the virtual clock."""
         return self in (ActuationTarget.SIMULATED, ActuationTarget.LOCK_STEP)
 
 
 def check_selection(selection: DeviceSelection, source: Path | None = None) -> None:
-    """Raise if no driver exists for a selection of devices.
+    """Raise if there are no drivers for the drive and sensor that a profile names.
 
     Parameters
     ----------
@@ -59,19 +63,20 @@ def check_selection(selection: DeviceSelection, source: Path | None = None) -> N
     Raises
     ------
     UnknownDeviceError
-        If the combination does not exist; the message lists those that do.
+        If there is no such combination; the message lists the existing combinations.
     """
     if selection not in _OPENERS:
-        known = "; ".join(f'drive = "{s.drive}" with sensor = "{s.sensor}"' for s in _OPENERS)
-        where = "" if source is None else f"{source}: "
+        known_pairs = "; ".join(f'drive = "{s.drive}" with sensor = "{s.sensor}"' for s in _OPENERS)
+        file_prefix = "" if source is None else f"{source}: "
         raise UnknownDeviceError(
-            f'{where}devices: drive = "{selection.drive}" with sensor = "{selection.sensor}" is no '
-            f"known combination; choose {known}."
+            f'{file_prefix}devices: drive = "{selection.drive}" with sensor = '
+            f'"{selection.sensor}" is no '
+            f"known combination; choose {known_pairs}."
         )
 
 
 def actuation_target(rig: RigParameters) -> ActuationTarget:
-    """Return what moves if the devices of a rig are opened now."""
+    """Return what would move if the devices of a rig were opened now."""
     if rig.devices.drive == "sim":
         return ActuationTarget.SIMULATED
     simulator = find_simulator(rig.name)
@@ -80,18 +85,18 @@ def actuation_target(rig: RigParameters) -> ActuationTarget:
     return ActuationTarget.LOCK_STEP if simulator.lock_step else ActuationTarget.SIMULATOR
 
 
-def describe_actuation_target(rig: RigParameters, moving: ActuationTarget) -> str:
-    """Say what will move, the hardware or its simulation.
+def describe_actuation_target(rig: RigParameters, target: ActuationTarget) -> str:
+    """Return a sentence for the operator about what will move: the hardware or its simulation.
 
     Parameters
     ----------
     rig
         Parameters of the rig.
-    moving
+    target
         Result of `actuation_target`.
     """
-    if moving is not ActuationTarget.HARDWARE:
-        how = "in this process" if moving is ActuationTarget.SIMULATED else moving.value
+    if target is not ActuationTarget.HARDWARE:
+        how = "in this process" if target is ActuationTarget.SIMULATED else target.value
         return f"No hardware: {rig.name} is simulated ({how})."
     assert rig.can is not None
     assert rig.cia402 is not None
@@ -102,50 +107,53 @@ def describe_actuation_target(rig: RigParameters, moving: ActuationTarget) -> st
 
 
 def simulated_differently(rig: RigParameters) -> list[str]:
-    """List the differences of a running simulated rig, if any, from the profile's."""
+    """Return the differences between a profile and the running simulator of its rig, as phrases.
+
+    The list is empty if no simulator runs.
+    """
     simulator = None if rig.devices.drive == "sim" else find_simulator(rig.name)
     return [] if simulator is None else differences(rig, simulator)
 
 
 def objections(rig: RigParameters) -> list[str]:
-    """List the reasons why the devices of a rig cannot use one bus, before anything is sent."""
+    """Return the reasons why the devices of a rig cannot use one CAN bus; nothing is sent."""
     if rig.can is None:
         return []
     from rigd.devices.canbus import MAX_LOAD, bus_load, check_identifiers
 
-    found = check_identifiers(rig)
+    reasons = check_identifiers(rig)
     load = bus_load(rig).worst
     if load > MAX_LOAD:
-        found.append(
+        reasons.append(
             f"The frames of a tick take up to {100 * load:.0f} % of the CAN bus at "
             f"{rig.can.bitrate_bit_s} bit/s, more than {100 * MAX_LOAD:.0f} %; choose a higher "
             "can.bitrate_bit_s or a lower rig.rate_hz."
         )
-    return found
+    return reasons
 
 
 def simulator() -> ModuleType:
-    """Return the package that puts a simulated rig on the wire."""
+    """Import and return the package `rigd.sim.wire`, which simulates a rig's bus and line."""
     return importlib.import_module("rigd.sim.wire")
 
 
-def open_devices(rig: RigParameters, moving: ActuationTarget | None = None) -> Devices:
-    """Make the drivers that a profile names; nothing is connected yet.
+def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> Devices:
+    """Create the drivers that a profile names; nothing is connected yet.
 
     Parameters
     ----------
     rig
         Parameters of a profile.
-    moving
-        Target that the operator has confirmed, if any.
+    target
+        What the operator has confirmed to move, or None if nothing was confirmed.
 
     Raises
     ------
     UnknownDeviceError
         If the profile names drivers that do not exist.
     DeviceError
-        If the profile contradicts what these drivers can do, values of it are unknown, or something
-        else would move now.
+        If the drivers cannot work with the profile, a value of the profile is unknown, or something
+        else would move now than was confirmed.
     """
     check_selection(rig.devices)
     unknown = describe_unknown_values(rig)
@@ -156,10 +164,10 @@ def open_devices(rig: RigParameters, moving: ActuationTarget | None = None) -> D
         "Callable[[RigParameters], Devices]", getattr(importlib.import_module(module), name)
     )
     devices = opener(rig)
-    if moving is not None and devices.simulated is (moving is ActuationTarget.HARDWARE):
-        found = "a simulated rig" if devices.simulated else ActuationTarget.HARDWARE.value
+    if target is not None and devices.simulated is (target is ActuationTarget.HARDWARE):
+        reasons = "a simulated rig" if devices.simulated else ActuationTarget.HARDWARE.value
         raise DeviceError(
-            f"{moving.value.capitalize()} was to move, and now it would be {found}: rigd simulate "
-            "was started or ended in between. Nothing was sent; start again."
+            f"{target.value.capitalize()} was to move, and now it would be {reasons}: rigd "
+            "simulate was started or ended in between. Nothing was sent; start again."
         )
     return devices

@@ -1,29 +1,29 @@
-"""Seeds of a simulated rig's noise: a fresh one for each session, unless one is stated."""
+"""Random seeds for the noise of a simulated rig: a fresh seed per session, unless one is stated."""
 
 import hashlib
 import secrets
 from typing import Final
 
-_BITS: Final = 53
-"""A double holds it exactly, as in JSON."""
+_SEED_BITS: Final = 53
+"""Number of random bits in a seed, which a JSON number (a double) represents exactly."""
 
 
 def fresh_seed() -> int:
-    """Return a random seed."""
-    return secrets.randbits(_BITS)
+    """Return a random seed for the noise of a simulated rig."""
+    return secrets.randbits(_SEED_BITS)
 
 
-def session_seed(stated: int, number: int) -> int:
-    """Return the seed of a session of a series.
+def session_seed(series_seed: int, session_number: int) -> int:
+    """Return the seed of one session of a series, derived from the seed of the series.
 
     Parameters
     ----------
-    stated
-        Seed of the series, which its first session has.
-    number
-        Number of the session, from 1 on.
+    series_seed
+        Seed of the series, which the first session uses unchanged.
+    session_number
+        Number of the session in the series, from 1 on.
     """
-    if number == 1:
-        return stated
-    digest = hashlib.blake2b(f"{stated} {number}".encode(), digest_size=8).digest()
-    return int.from_bytes(digest, "big") >> (64 - _BITS)
+    if session_number == 1:
+        return series_seed
+    digest = hashlib.blake2b(f"{series_seed} {session_number}".encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "big") >> (64 - _SEED_BITS)

@@ -1,7 +1,7 @@
-"""Values of a rig that its profile states as unknown: NaN in the parameters, refused by name.
+"""Values of a rig that its profile states as unknown, and how the operator can find them.
 
-A profile writes such a value as ``{ source = "unknown" }``. Nothing may be computed from it, and no
-device is opened with it.
+A profile writes such a value as ``{ source = "is_unknown" }``; the parameter is then NaN. Nothing
+may be computed from it, and no device is opened with it.
 """
 
 from math import isnan
@@ -43,11 +43,11 @@ MAY_BE_UNKNOWN: Final = {
         "manual of the drive, object 6076: one count in N·m (mN·m: 1e-3, µN·m: 1e-6)"
     ),
 }
-"""Keys of a profile that may have no value yet, and where to find it."""
+"""Keys of a profile whose value may be unknown, each with advice where to find the value."""
 
 
 def unknown_values(rig: "RigParameters") -> tuple[str, ...]:
-    """Return the keys whose values are unknown.
+    """Return the keys of a profile whose values are unknown.
 
     Parameters
     ----------
@@ -60,16 +60,18 @@ def unknown_values(rig: "RigParameters") -> tuple[str, ...]:
         Keys of `MAY_BE_UNKNOWN`, in its order.
     """
 
-    def unknown(key: str) -> bool:
+    def is_unknown(key: str) -> bool:
         section, _, name = key.partition(".")
         parameters = getattr(rig, section)
         return parameters is not None and isnan(getattr(parameters, name))
 
-    return tuple(key for key in MAY_BE_UNKNOWN if unknown(key))
+    return tuple(key for key in MAY_BE_UNKNOWN if is_unknown(key))
 
 
 def describe_unknown_values(rig: "RigParameters") -> str:
-    """List the unknown values, one a line, with where to find each; empty if there are none.
+    """Return one line per unknown value of a profile, with advice where to find the value.
+
+    The text is empty if no value is unknown.
 
     Parameters
     ----------

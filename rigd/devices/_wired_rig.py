@@ -1,4 +1,4 @@
-"""Drive and sensor on a CAN bus or serial line, opened as one rig, and the reset of a fault."""
+"""Opening of drive and sensor on a CAN bus or serial line as one rig, and the reset of a fault."""
 
 from dataclasses import replace
 from functools import partial
@@ -12,14 +12,17 @@ from rigd.devices.contracts import DeviceError, Devices, WrenchSensor
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import SimulatorAddress, ask_simulator, find_simulator
 
-_LOCK_STEP_PATIENCE_US = 0.5e6
-"""In lock-step the simulated rig waits for the replies, so a tick can wait for them too."""
+_LOCK_STEP_DEADLINE_US = 0.5e6
+"""Deadline in microseconds for replies of a simulated rig in lock-step.
 
-_INTERFACES = Path("/sys/class/net")
+It may be long, since the simulated rig waits for the loop."""
+
+_NETWORK_INTERFACES_FOLDER = Path("/sys/class/net")
+"""Folder in which the kernel lists the network interfaces, CAN included."""
 
 
 def open_wired_rig(rig: RigParameters) -> Devices:
-    """Make the drivers of a rig on CAN, or on CAN and a serial line.
+    """Create the drivers of a rig on CAN, or on CAN and a serial line; nothing is connected yet.
 
     Raises
     ------
@@ -37,23 +40,26 @@ def open_wired_rig(rig: RigParameters) -> Devices:
         _refuse_ambiguity(rig, simulator)
         if simulator.lock_step:
             assert rig.acquisition is not None
-            patient = replace(rig.acquisition, deadline_us=_LOCK_STEP_PATIENCE_US)
-            rig = replace(rig, acquisition=patient)
+            long_deadline = replace(rig.acquisition, deadline_us=_LOCK_STEP_DEADLINE_US)
+            rig = replace(rig, acquisition=long_deadline)
     link = CanLink(bus, simulator)
     return Devices(
         drive=Cia402Drive(rig, link),
-        sensor=_sensor(rig, link, simulator),
+        sensor=_make_sensor(rig, link, simulator),
         simulated=simulator is not None,
-        renew_noise=None if simulator is None else partial(_renew_noise, simulator),
+        renew_noise=None if simulator is None else partial(_restart_simulator_noise, simulator),
     )
 
 
-def _renew_noise(simulator: SimulatorAddress, seed: int | None) -> int:
-    """Restart the noise of a simulated rig; return the seed."""
+def _restart_simulator_noise(simulator: SimulatorAddress, seed: int | None) -> int:
+    """Restart the noise of a simulated rig with a seed (None: a random one); return the seed."""
     return int(ask_simulator(simulator, {"renew_noise": seed})["seed"])
 
 
-def _sensor(rig: RigParameters, link: CanLink, simulator: SimulatorAddress | None) -> WrenchSensor:
+def _make_sensor(
+    rig: RigParameters, link: CanLink, simulator: SimulatorAddress | None
+) -> WrenchSensor:
+    """Create the sensor's driver, on the serial line or on the CAN bus."""
     if rig.devices.sensor == "ati_serial":
         from rigd.devices.ati import AtiSerialSensor
 
@@ -64,47 +70,47 @@ def _sensor(rig: RigParameters, link: CanLink, simulator: SimulatorAddress | Non
 
 
 def _refuse_ambiguity(rig: RigParameters, simulator: SimulatorAddress) -> None:
-    """Raise if both a simulated rig and hardware are available."""
+    """Raise if both a simulated rig and the hardware that it replaces are available."""
     assert rig.can is not None
-    found = []
-    if simulator.can_socket and (_INTERFACES / rig.can.channel).exists():
-        found.append(f"the CAN interface {rig.can.channel}")
+    hardware_found = []
+    if simulator.can_socket and (_NETWORK_INTERFACES_FOLDER / rig.can.channel).exists():
+        hardware_found.append(f"the CAN interface {rig.can.channel}")
     if simulator.serial_port and rig.ati_serial is not None and Path(rig.ati_serial.port).exists():
-        found.append(f"the serial port {rig.ati_serial.port}")
-    if found:
+        hardware_found.append(f"the serial port {rig.ati_serial.port}")
+    if hardware_found:
         raise DeviceError(
             f"A simulated rig of {rig.name} is running (rigd simulate, process {simulator.pid}), "
-            f"and {' and '.join(found)} of the real one is here too; stop the simulated rig, or "
-            "unplug the real one."
+            f"and {' and '.join(hardware_found)} of the real one is here too; stop the simulated "
+            "rig, or unplug the real one."
         )
 
 
 @runtime_checkable
 class ResettableDrive(Protocol):
-    """Drive that can be in fault; drives simulated in this process cannot."""
+    """Drive whose faults can be reset, unlike a drive simulated in this process."""
 
     def reset_fault(self) -> str | None:
-        """Switch off, reset a fault, check that it would get ready; return the fault, or None.
+        """Switch off, reset the fault, check that the drive gets ready; return the fault or None.
 
         Raises
         ------
         DeviceError
-            If the drive may still turn, the fault persists, or no session could be started.
+            If the drive may still turn, the fault persists, or the drive does not get ready.
         """
 
 
-def reset_drive(rig: RigParameters, moving: ActuationTarget | None = None) -> str:
-    """Reset the fault of a rig's drive, and release the drive.
+def reset_drive(rig: RigParameters, target: ActuationTarget | None = None) -> str:
+    """Reset the fault of a rig's drive, release the drive, and describe the result.
 
     Parameters
     ----------
-    rig, moving
+    rig, target
         See :func:`rigd.devices._registry.open_devices`.
 
     Returns
     -------
     str
-        Fault that was found and present state of the drive, for the operator.
+        Sentence for the operator with the fault that was found and the drive's present state.
 
     Raises
     ------
@@ -112,7 +118,7 @@ def reset_drive(rig: RigParameters, moving: ActuationTarget | None = None) -> st
         If the drive does not answer, may still turn, the fault persists, or the drive does not
         become ready, for instance because STO is open.
     """
-    drive = open_devices(rig, moving).drive
+    drive = open_devices(rig, target).drive
     if not isinstance(drive, ResettableDrive):
         return "Each session simulates a new drive: there is no fault to reset."
     try:

@@ -1,14 +1,14 @@
-"""Contracts between the 1 kHz cycle and its devices: a drive and a force-torque sensor.
+"""Interfaces between the 1 kHz loop and its devices: a drive and a force-torque sensor.
 
-Real and simulated devices implement the same two contracts, and one conformance suite runs on every
-implementation. Constructors touch no hardware; ``connect`` does.
+Real and simulated devices implement the same two interfaces, and one conformance suite tests every
+implementation. Constructors access no hardware; ``connect`` does.
 
-In every tick the cycle calls, in this order: ``drive.latch``, ``sensor.request``,
-``drive.read_angle``, ``sensor.read_wrench``, ``drive.command``. A driver that has no fresh value
-returns the last one and says so in ``angle_stale`` or ``wrench_stale``; it never blocks longer
-than the deadline its profile gives. ``due_ns`` is the tick's scheduled time on the engine's clock;
-it grows by one period a tick, and by more where ticks were missed. The sensor is connected first,
-and the drive right before the first tick: once it is operational it expects one every period.
+In every tick the loop calls, in this order: ``drive.latch``, ``sensor.request``,
+``drive.read_angle``, ``sensor.read_wrench``, ``drive.command``. A driver without a new value
+returns the last value and sets ``angle_stale`` or ``wrench_stale``. It never blocks longer than the
+deadline in its profile. ``due_ns`` is the tick's scheduled time on the engine's clock; it increases
+by one period per tick, and by more if ticks were missed. The sensor is connected first, and the
+drive right before the first tick, because an operational drive expects a tick in every period.
 """
 
 from collections.abc import Callable
@@ -18,50 +18,50 @@ from typing import Protocol, runtime_checkable
 from rigd.errors import FailureError
 
 Wrench = tuple[float, float, float, float, float, float]
-"""fx, fy, fz in N and tx, ty, tz in N·m, in the sensor's frame, as read (not tared)."""
+"""Wrench as read, without tare: fx, fy, fz in N and tx, ty, tz in N·m, in the sensor's frame."""
 
 
 class DeviceError(FailureError):
-    """A device did not act as requested: the message states device, expectation and reply."""
+    """Error: a device did not act as requested; the message states device and reply."""
 
 
-def wired_stop_dropped(device: str, shown: str = "") -> DeviceError:
-    """Return the error of a drive whose wired stop (STO) was dropped while it was enabled.
+def wired_stop_dropped(device: str, explanation: str = "") -> DeviceError:
+    """Return the error for a drive whose wired stop (STO) was dropped while it was enabled.
 
     Parameters
     ----------
     device
         Name of the drive.
-    shown
-        How the drive shows it, as the rest of a sentence.
+    explanation
+        How the drive reports it, as the rest of a sentence.
     """
     return DeviceError(
-        f"{device}: the wired stop (STO) was dropped{shown}. Find out who pressed it and why, "
-        "check that nobody is within reach of the beam, release it, then reset the rig."
+        f"{device}: the wired stop (STO) was dropped{explanation}. Find out who pressed it and "
+        "why, check that nobody is within reach of the beam, release it, then reset the rig."
     )
 
 
 @dataclass(frozen=True, slots=True)
 class LineHealth:
-    """Health of a device's line since it was connected; None: not known.
+    """Health of a device's line since it was connected; None means that a value is unknown.
 
     Attributes
     ----------
     bits
-        Bits of all frames sent and received, without stuff bits.
+        Total number of bits of all frames sent and received, without stuff bits.
     bit_rate_bit_s
-        Bit rate of the line.
+        Bit rate of the line in bit/s.
     errors
-        Disturbed, damaged and missing messages.
+        Number of disturbed, damaged and missing messages.
     status
-        Status word of the device; 0: all is well.
+        Status word of the device; 0 means no error.
     doubt
-        Why its readings may be older than reported, for the operator, in the same words as long as
-        the reason is the same; empty: no doubt.
+        Reason why readings may be older than reported, for the operator; the same text while the
+        reason is the same. Empty if there is no such doubt.
     doubt_count
-        How much of it there has been so far, a sentence; empty without a doubt.
+        Sentence that states the number of readings concerned so far; empty if `doubt` is empty.
     cause
-        Probable cause of missing readings, with its remedy; empty: not known.
+        Probable cause of missing readings, with its remedy; empty if unknown.
     """
 
     bits: int | None = None
@@ -74,27 +74,27 @@ class LineHealth:
 
 
 class Drive(Protocol):
-    """A torque-controlled drive with a position encoder, at the output shaft of its gear."""
+    """Torque-controlled drive with a position encoder, as seen at the output shaft of its gear."""
 
     angle_stale: bool
-    """The last angle read is not the one of the last latch."""
+    """Whether the last angle read is older than the last call of `latch`."""
     angle_time_ns: int
-    """When the last angle read was latched, as far as the host knows; ``time.monotonic_ns``."""
+    """Time in nanoseconds (``time.monotonic_ns``) at which the last angle read was sampled."""
 
     off_doubt: str
-    """Why the drive may still exert torque after `disable`, for the operator; empty if not."""
+    """Reason why the drive may still exert torque after `disable`, for the operator; else empty."""
 
     def connect(self) -> None:
-        """Open the line and verify identity and configuration; no torque.
+        """Open the line and verify identity and configuration of the drive; no torque is exerted.
 
         Raises
         ------
         DeviceError
-            If the drive is absent or not what the profile says.
+            If the drive is absent or differs from the profile.
         """
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Bring the drive to operation enabled, at zero torque.
+        """Bring the drive to the state operation enabled, at zero torque.
 
         Parameters
         ----------
@@ -104,101 +104,106 @@ class Drive(Protocol):
         Raises
         ------
         DeviceError
-            If the drive does not reach that state.
+            If the drive does not reach the state.
         """
 
     def latch(self, due_ns: int) -> None:
-        """Ask for the angle as it is now; ``due_ns`` is when the tick was due."""
+        """Request the drive to sample its angle; `due_ns` is the time at which the tick was due."""
 
     def read_angle(self) -> float:
-        """Return the latched angle in rad, at the output shaft."""
+        """Return the last sampled angle of the output shaft in rad."""
 
     def command(self, torque_nm: float) -> float:
-        """Set the torque in N·m at the output shaft, held until the next command.
+        """Command a torque in N·m at the output shaft, which acts until the next command.
 
         Returns
         -------
         float
-            The torque as it was sent: what the drive's steps and limits make of it; 0 while it is
+            Torque as sent, in N·m: rounded to the drive's steps and limited; 0 while the drive is
             not enabled.
         """
 
     def health(self) -> LineHealth:
-        """Return the health of its line; quick enough for an occasional call in the loop."""
+        """Return the health of the drive's line; fast enough for an occasional call in the loop."""
 
     def disable(self) -> None:
-        """Zero the torque and disable the drive. Works in every state and never raises."""
+        """Zero the torque and disable the drive; works in every state and never raises."""
 
     def close(self) -> None:
-        """Release the line; disables first."""
+        """Disable the drive and release its line."""
 
 
 @runtime_checkable
 class StatedDrive(Protocol):
-    """Safeguards of the drive itself, which a session's file has to state."""
+    """Drive whose own safeguards are stated in the session file."""
 
     def statement(self) -> dict[str, str]:
-        """Return them as keys of the file's metadata; known once it is connected."""
+        """Return the drive's safeguards as metadata of a session file, known after `connect`."""
 
 
 class WrenchSensor(Protocol):
-    """A six-axis force-torque sensor."""
+    """Six-axis force-torque sensor."""
 
     wrench_stale: bool
-    """The last wrench read is not the answer to the last request."""
+    """Whether the last wrench read is not the reply to the last request."""
     wrench_time_ns: int
-    """When the last wrench read was requested, or arrived if it is streamed; as for the angle."""
+    """Time in nanoseconds (``time.monotonic_ns``) at which the last wrench read was requested.
+
+    If the sensor streams, it is the time at which the wrench arrived."""
     wrench_saturated: bool
-    """An axis of the last wrench is at the end of its range."""
+    """Whether an axis or gauge of the last wrench read was at the end of its range."""
 
     def connect(self) -> None:
-        """Open the line and read identity and calibration.
+        """Open the line and read identity and calibration of the sensor.
 
         Raises
         ------
         DeviceError
-            If the sensor is absent or not what the profile says.
+            If the sensor is absent or differs from the profile.
         """
 
     def calibration(self) -> dict[str, object]:
         """Return identity and calibration as read from the sensor, for the session file."""
 
     def request(self, due_ns: int) -> None:
-        """Ask for the wrench as it is now; ``due_ns`` is when the tick was due."""
+        """Request the sensor to sample the wrench now; `due_ns` is when the tick was due."""
 
     def read_wrench(self) -> Wrench:
-        """Return the requested wrench."""
+        """Return the requested wrench in N and N·m, or the last one if no new one has arrived."""
 
     def health(self) -> LineHealth:
-        """Return the health of line and sensor; quick enough for an occasional call in the loop."""
+        """Return the health of line and sensor; fast enough for an occasional call in the loop."""
 
     def close(self) -> None:
-        """Release the line."""
+        """Release the sensor's line."""
 
 
 @runtime_checkable
 class GaugeSensor(Protocol):
-    """A sensor that shows its raw channels, so that a single one that fails is detected."""
+    """Sensor that offers its raw gauge readings, so that a failed gauge can be detected."""
 
     gauges: tuple[int, ...]
-    """Raw counts of each gauge, as of the last wrench read."""
+    """Raw counts of each gauge at the last wrench read."""
 
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """The devices of one rig."""
+    """Drive and sensor of one rig."""
 
     drive: Drive
     """Drive of the motor."""
     sensor: WrenchSensor
     """Force-torque sensor under the clamp."""
     simulated: bool
-    """No motor moves: the rig may run under the virtual clock."""
+    """Whether the devices are simulated, so that no motor moves and the virtual clock is
+    possible."""
     renew_noise: Callable[[int | None], int] | None = None
-    """Restarts the noise of a simulated rig before a session, from a given seed or (None) one of
-    its own, and returns the seed; None: there is no noise to restart."""
+    """Function that restarts the noise of a simulated rig before a session and returns the seed.
+
+    Its argument is the seed, or None for a random seed. The field is None if there is no noise to
+    restart."""
 
     @property
     def on_lines(self) -> bool:
-        """Whether the drive is at the other end of a line, simulated or not."""
+        """Whether the drive is connected by a bus or line, real or simulated."""
         return self.drive.health().bits is not None

@@ -1,9 +1,9 @@
-"""Electronic data sheets (EDS and DCF files, CiA 306): what a drive has, as its vendor's file says.
+"""Electronic data sheets of drives (EDS and DCF files, CiA 306): their objects and identity.
 
-Real files have what the canopen library refuses: byte order marks, keys in lower case, sections
-given twice or out of order, empty values, octal numbers, missing names. :func:`_put_right` corrects
-all of it. A file that the library accepts is read with the same result, but without importing the
-library, which takes longer than reading a file.
+Real files contain what the canopen library refuses: byte order marks, keys in lower case, sections
+given twice or out of order, empty values, octal numbers, missing names. :func:`_correct_sections`
+corrects them. A file that the library accepts is read with the same result, but without importing
+the library, which takes longer than reading a file.
 """
 
 import re
@@ -18,79 +18,91 @@ from rigd.errors import FailureError
 from rigd.printable import printable
 
 MAX_BYTES: Final = 4_000_000
-"""Largest file: the largest that vendors publish have a quarter of it."""
+"""Largest size of a file in bytes: four times the size of the largest that vendors publish."""
 MAX_ENTRIES: Final = 20_000
-"""Most objects and sub-indices: five times what the largest drives have."""
+"""Largest number of objects and sub-indices in a file: five times that of the largest drives."""
 
-_MOST_SHOWN: Final = 80
-"""Characters of a text of the file."""
+_MOST_SHOWN_CHARACTERS: Final = 80
+"""Largest number of characters of a text from a file that messages show."""
 
 _BIT_RATES_KBIT_S: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
-_ARRAY, _RECORD = 0x8, 0x9
-_BITS: Final = {
+"""Bit rates of CANopen in kbit/s, for which an EDS file states whether the drive supports them."""
+_ARRAY_OBJECT, _RECORD_OBJECT = 0x8, 0x9
+"""Object type (CiA 301) of an array."""
+_TYPE_LENGTHS_BIT: Final = {
     0x01: 1, 0x02: 8, 0x03: 16, 0x04: 32, 0x05: 8, 0x06: 16, 0x07: 32, 0x08: 32,
     0x10: 24, 0x11: 64, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64,
     0x16: 24, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64,
 }  # fmt: skip
-"""Lengths of the basic data types (CiA 301)."""
-_SIGNED: Final = frozenset((0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15))
-_TEXTS: Final = (0x09, 0x0B)
-_OCTETS, _DOMAIN = 0x0A, 0x0F
-_FRACTIONS: Final = {0x08: "<f", 0x11: "<d"}
+"""Length in bits of the basic data types (CiA 301)."""
+_SIGNED_TYPES: Final = frozenset((0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15))
+"""Data types (CiA 301) of signed integers."""
+_TEXT_TYPES: Final = (0x09, 0x0B)
+"""Data types (CiA 301) of texts."""
+_OCTET_STRING_TYPE, _DOMAIN_TYPE = 0x0A, 0x0F
+"""Data type (CiA 301) of a string of bytes."""
+_FLOAT_LAYOUTS: Final = {0x08: "<f", 0x11: "<d"}
+"""Layout in bytes of the data types (CiA 301) of floating-point numbers."""
 _LAST_BASIC_TYPE: Final = 0x1B
-_ACCESS: Final = ("ro", "rw", "wo", "const", "rwr", "rww")
+"""Largest number of a basic data type (CiA 301); larger numbers are types defined in the file."""
+_ACCESS_RIGHTS: Final = ("ro", "rw", "wo", "const", "rwr", "rww")
+"""Access rights that an object can have."""
 
-_OBJECT = re.compile(r"[0-9A-F]{4}", re.IGNORECASE)
-_MEMBER = re.compile(r"([0-9A-F]{4})sub([0-9A-F]{1,2})", re.IGNORECASE)
-_QUOTED = re.compile(r"""(?s)^(["'])(.*)\1$""")
-"""Some editors quote every value."""
-_YES: Final = ("true", "yes", "on")
-_NODE_ID = re.compile(r"\+?\$NODEID\+?", re.IGNORECASE)
-_NUMBER = re.compile(r"[+-]?(0x[0-9a-f]{1,32}|[0-9]{1,32})", re.IGNORECASE)
+_OBJECT_TITLE = re.compile(r"[0-9A-F]{4}", re.IGNORECASE)
+"""Pattern of the title of an object's section: its index."""
+_SUB_INDEX_TITLE = re.compile(r"([0-9A-F]{4})sub([0-9A-F]{1,2})", re.IGNORECASE)
+"""Pattern of the title of a sub-index's section: index and sub-index."""
+_QUOTED_VALUE = re.compile(r"""(?s)^(["'])(.*)\1$""")
+"""Pattern of a value in quotation marks, which some editors write around every value."""
+_TRUE_WORDS: Final = ("true", "yes", "on")
+"""Words that some tools write for a flag that is set."""
+_NODE_ID_PLACEHOLDER = re.compile(r"\+?\$NODEID\+?", re.IGNORECASE)
+"""Pattern of the placeholder for the node number in a value, with its plus sign."""
+_INTEGER_PATTERN = re.compile(r"[+-]?(0x[0-9a-f]{1,32}|[0-9]{1,32})", re.IGNORECASE)
+"""Pattern of an integer in CiA 306's notation."""
 
 Sections = dict[str, dict[str, str]]
-"""Keys and values of a file, by the names of its sections; both in lower case."""
+"""Keys and values of a file by section title; titles and keys in lower case."""
 
 
 class EdsError(FailureError, ValueError):
-    """A file cannot be used as an EDS; the message is one sentence that names it."""
+    """Error: a file cannot be used as an EDS; the message is one sentence that names the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class EdsEntry:
-    """One object, or one sub-index of one, as the file describes it."""
+    """One object of a drive, or one sub-index of an object, as an EDS file describes it."""
 
     index: int
     """Index of the object."""
     sub: int
     """Sub-index; 0 for a plain variable."""
     name: str
-    """As the file has it."""
+    """Name of the object or sub-index in the file."""
     data_type: int
-    """Data type by CiA 301: 0x0006 is UNSIGNED16; 0: not stated."""
+    """Number of the data type by CiA 301, such as 0x0006 for UNSIGNED16; 0: not stated."""
     access: str
-    """``ro``, ``rw``, ``wo``, ``const``, ``rwr`` or ``rww``."""
+    """Access right: ``ro``, ``rw``, ``wo``, ``const``, ``rwr`` or ``rww``."""
     mappable: bool
-    """Into a PDO."""
+    """Whether the object can be mapped into a PDO."""
     default: int | None
-    """Value after power-up, or the one that a DCF sets; None: not stated, or no integer."""
+    """Value after power-up, or value that a DCF sets; None: not stated, or not an integer."""
     low: int | None
-    """Least value; None: not stated."""
+    """Lower limit of the value; None: not stated."""
     high: int | None
-    """Largest value; None: not stated."""
+    """Upper limit of the value; None: not stated."""
     content: bytes = b""
-    """The default where it is a text, a block or a fraction, as the drive holds it; empty: not
-    stated."""
+    """Default value as the drive's bytes if it is a text, block or fraction; empty: not stated."""
 
     @property
     def writable(self) -> bool:
-        """Whether the drive takes a value."""
+        """Whether the object can be written."""
         return "w" in self.access
 
     @property
     def bits(self) -> int | None:
-        """Length of the value; None for a text or block, or if no type is stated."""
-        return _BITS.get(self.data_type)
+        """Length of the object's value in bits; None for a text or block, or if untyped."""
+        return _TYPE_LENGTHS_BIT.get(self.data_type)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,28 +110,28 @@ class Eds:
     """Content of a drive's EDS or DCF file."""
 
     path: Path
-    """The file."""
+    """Path of the file."""
     node_id: int
     """Node number for which the file was read."""
     vendor_name: str
-    """As the file has it."""
+    """Name of the vendor in the file."""
     vendor_id: int
-    """Value of object 1018:1; 0: not stated."""
+    """Vendor number (object 1018:1); 0: not stated."""
     product_name: str
-    """As the file has it."""
+    """Name of the product in the file."""
     product_code: int
-    """Value of object 1018:2; 0: not stated."""
+    """Product code (object 1018:2); 0: not stated."""
     revision: int
-    """Value of object 1018:3; 0: not stated."""
+    """Revision number (object 1018:3); 0: not stated."""
     bit_rates_bit_s: tuple[int, ...]
-    """Bit rates that the drive supports; empty: not stated."""
+    """Bit rates in bit/s that the drive supports; empty: not stated."""
     commissioned_node_id: int
-    """Node number of the one drive that a DCF configures; 0: not stated."""
+    """Node number of the drive that a DCF file configures; 0: not stated."""
     entries: Mapping[tuple[int, int], EdsEntry]
-    """By index and sub-index; a plain variable has the sub-index 0."""
+    """Entries by index and sub-index; a plain variable has the sub-index 0."""
 
     def get(self, index: int, sub: int = 0) -> EdsEntry | None:
-        """Return an object, or None where the file has none.
+        """Return the entry of an object or sub-index, or None if the file does not contain it.
 
         Parameters
         ----------
@@ -129,12 +141,12 @@ class Eds:
         return self.entries.get((index, sub))
 
     def has(self, index: int) -> bool:
-        """Whether the file has an object, or any sub-index of it."""
+        """Return whether the file contains an object, or any sub-index of it."""
         return any((index, sub) in self.entries for sub in range(256))
 
 
 def read_eds(path: Path, node_id: int = 1) -> Eds:
-    """Read an EDS or DCF file.
+    """Read a drive's EDS or DCF file.
 
     Parameters
     ----------
@@ -146,50 +158,55 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
     Returns
     -------
     Eds
+        Objects, identity and bit rates of the drive.
 
     Raises
     ------
     EdsError
-        If there is no such file, it is too large, or no EDS.
+        If the file does not exist, is too large, or is not an EDS.
     """
-    sections = _sections(_text(path), path)
+    sections = _parse_sections(_read_text(path), path)
     device = sections.get("deviceinfo", {})
-    entries = {(e.index, e.sub): e for e in _entries(_put_right(sections, path), sections, node_id)}
+    entries = {
+        (e.index, e.sub): e
+        for e in _parse_entries(_correct_sections(sections, path), sections, node_id)
+    }
     if not entries:
         raise EdsError(f"{path}: is not an EDS file: it describes no object of a drive.")
     return Eds(
         path=path,
         node_id=node_id,
-        vendor_name=_shown(device.get("vendorname", "")),
-        vendor_id=_identity(entries, 1, device.get("vendornumber", "")),
-        product_name=_shown(device.get("productname", "")),
-        product_code=_identity(entries, 2, device.get("productnumber", "")),
-        revision=_identity(entries, 3, device.get("revisionnumber", "")),
+        vendor_name=_printable_line(device.get("vendorname", "")),
+        vendor_id=_identity_number(entries, 1, device.get("vendornumber", "")),
+        product_name=_printable_line(device.get("productname", "")),
+        product_code=_identity_number(entries, 2, device.get("productnumber", "")),
+        revision=_identity_number(entries, 3, device.get("revisionnumber", "")),
         bit_rates_bit_s=tuple(
             1000 * rate for rate in _BIT_RATES_KBIT_S if _is_set(device.get(f"baudrate_{rate}", ""))
         ),
-        commissioned_node_id=_commissioned(sections),
+        commissioned_node_id=_commissioned_node_id(sections),
         entries=entries,
     )
 
 
-def _commissioned(sections: Sections) -> int:
+def _commissioned_node_id(sections: Sections) -> int:
+    """Return the node number that a DCF file configures, or 0."""
     # The first spelling is CiA 306's.
     for title in ("devicecomissioning", "devicecommissioning"):
-        node_id = _integer(sections.get(title, {}).get("nodeid", ""))
+        node_id = _parse_integer_or_zero(sections.get(title, {}).get("nodeid", ""))
         if 1 <= node_id <= 127:
             return node_id
     return 0
 
 
-def _text(path: Path) -> str:
-    """Return the text of a file of reasonable size, whatever its encoding."""
+def _read_text(path: Path) -> str:
+    """Return the decoded text of an EDS file (UTF-8, UTF-16 or cp1252), or raise."""
     try:
-        # Opened before its kind is known, a pipe would be waited for.
-        found = path.stat()
-        if stat.S_ISDIR(found.st_mode):
+        # Check the kind of file first, since opening a pipe would wait for its other end.
+        file_status = path.stat()
+        if stat.S_ISDIR(file_status.st_mode):
             raise EdsError(f"{path}: is a folder; name the EDS file in it.")
-        if not stat.S_ISREG(found.st_mode):
+        if not stat.S_ISREG(file_status.st_mode):
             raise EdsError(f"{path}: is not an ordinary file; name the drive's EDS file.")
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -220,10 +237,10 @@ def _text(path: Path) -> str:
     return text
 
 
-def _sections(text: str, path: Path) -> Sections:
-    """Parse a file into sections; lines that are neither section nor key are ignored.
+def _parse_sections(text: str, path: Path) -> Sections:
+    """Parse the text of a file into sections; other lines than section titles and keys are ignored.
 
-    If a section or key is given twice, the first one counts.
+    If a section or key occurs twice, the first occurrence is used.
     """
     sections: Sections = {}
     keys: dict[str, str] = {}
@@ -232,70 +249,72 @@ def _sections(text: str, path: Path) -> Sections:
             continue
         if line[0] == "[":
             title, bracket, _ = line[1:].partition("]")
-            # Without its end it is not a section, and what follows belongs to none.
+            # Without a closing bracket it is no section title; the next keys belong to no section.
             keys = sections.setdefault(title.strip().lower(), {}) if bracket else {}
             if len(sections) > MAX_ENTRIES:
-                raise _too_many(path)
+                raise _too_many_entries_error(path)
             continue
         key, equals, value = line.partition("=")
         if equals:
-            # A comment may follow after white space, as canopen has it.
-            bare = _QUOTED.sub(r"\2", re.split(r"\s;", value, maxsplit=1)[0].strip())
-            keys.setdefault(key.strip().lower(), bare.strip())
+            # As in canopen, a comment may follow the value after white space.
+            unquoted = _QUOTED_VALUE.sub(r"\2", re.split(r"\s;", value, maxsplit=1)[0].strip())
+            keys.setdefault(key.strip().lower(), unquoted.strip())
     return sections
 
 
-def _too_many(path: Path) -> EdsError:
+def _too_many_entries_error(path: Path) -> EdsError:
+    """Return the error for a file with more than `MAX_ENTRIES` sections or objects."""
     return EdsError(
         f"{path}: describes more than {MAX_ENTRIES} objects, which no EDS file of a drive does."
     )
 
 
-def _put_right(sections: Sections, path: Path) -> dict[tuple[int, int], Mapping[str, str]]:
-    """Return the keys of each object, or sub-index of one, that holds a value.
+def _correct_sections(sections: Sections, path: Path) -> dict[tuple[int, int], Mapping[str, str]]:
+    """Return corrected keys for each object or sub-index that has a value, sorted by index.
 
-    In the order of the indices, also those that an array declares together (``CompactSubObj``).
-    Name, type and access rights are those of the whole object where a sub-index has none.
+    Sub-indices that an array declares together (``CompactSubObj``) are included. A sub-index
+    without name, type or access right gets those of the whole object.
     """
     members: dict[int, dict[int, dict[str, str]]] = {}
     for title, keys in sections.items():
-        if match := _MEMBER.fullmatch(title):
+        if match := _SUB_INDEX_TITLE.fullmatch(title):
             members.setdefault(int(match[1], 16), {}).setdefault(int(match[2], 16), keys)
-        elif _OBJECT.fullmatch(title):
+        elif _OBJECT_TITLE.fullmatch(title):
             members.setdefault(int(title, 16), {})
-    right: dict[tuple[int, int], Mapping[str, str]] = {}
-    for index, subs in sorted(members.items()):
+    corrected: dict[tuple[int, int], Mapping[str, str]] = {}
+    for index, sub_sections in sorted(members.items()):
         title = f"{index:04x}"
-        keys = _with_values(sections.get(title, {}))
-        for sub, compact in _compact_members(title, sections):
-            subs.setdefault(sub, compact)
-        # Neither a kind that is missing nor a wrong one makes members disappear.
-        kind = _integer(keys.get("objecttype", ""))
-        if not subs and kind in (_ARRAY, _RECORD) and "datatype" not in keys:
-            continue  # nothing of it is described
+        keys = _keys_with_values(sections.get(title, {}))
+        for sub, compact_keys in _compact_sub_indices(title, sections):
+            sub_sections.setdefault(sub, compact_keys)
+        # Sub-indices are kept even if the object's type is missing or wrong.
+        kind = _parse_integer_or_zero(keys.get("objecttype", ""))
+        if not sub_sections and kind in (_ARRAY_OBJECT, _RECORD_OBJECT) and "datatype" not in keys:
+            continue  # the file describes no sub-index of the object
         name = keys.get("parametername") or title.upper()
-        shared = {"parametername": name}
-        if not subs:
-            right[index, 0] = shared | keys
-        shared |= {key: keys[key] for key in ("datatype", "accesstype") if key in keys}
-        for sub in sorted(subs):
-            right[index, sub] = shared | _with_values(subs[sub])
-        if len(right) > MAX_ENTRIES:
-            raise _too_many(path)
-    return right
+        shared_keys = {"parametername": name}
+        if not sub_sections:
+            corrected[index, 0] = shared_keys | keys
+        shared_keys |= {key: keys[key] for key in ("datatype", "accesstype") if key in keys}
+        for sub in sorted(sub_sections):
+            corrected[index, sub] = shared_keys | _keys_with_values(sub_sections[sub])
+        if len(corrected) > MAX_ENTRIES:
+            raise _too_many_entries_error(path)
+    return corrected
 
 
-def _with_values(keys: Mapping[str, str]) -> dict[str, str]:
+def _keys_with_values(keys: Mapping[str, str]) -> dict[str, str]:
+    """Return the keys of a section that have a value."""
     return {key: value for key, value in keys.items() if value}
 
 
-def _compact_members(title: str, sections: Sections) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the sub-indices that an object declares together, with their own names and values."""
-    shared = dict(sections.get(title, {}))
-    count = _integer(shared.pop("compactsubobj", ""))
+def _compact_sub_indices(title: str, sections: Sections) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield the sub-indices that an object declares together, with their keys."""
+    shared_keys = dict(sections.get(title, {}))
+    count = _parse_integer_or_zero(shared_keys.pop("compactsubobj", ""))
     if not 0 < count < 255:
         return
-    names, values = (sections.get(title + end, {}) for end in ("name", "value"))
+    names, values = (sections.get(title + suffix, {}) for suffix in ("name", "value"))
     yield (
         0,
         {
@@ -306,94 +325,104 @@ def _compact_members(title: str, sections: Sections) -> Iterator[tuple[int, dict
         },
     )
     for sub in range(1, count + 1):
-        own = {"parametername": names.get(str(sub), ""), "parametervalue": values.get(str(sub), "")}
-        yield sub, shared | {key: value for key, value in own.items() if value}
+        own_keys = {
+            "parametername": names.get(str(sub), ""),
+            "parametervalue": values.get(str(sub), ""),
+        }
+        yield sub, shared_keys | {key: value for key, value in own_keys.items() if value}
 
 
-def _entries(
-    right: Mapping[tuple[int, int], Mapping[str, str]], sections: Sections, node_id: int
+def _parse_entries(
+    corrected: Mapping[tuple[int, int], Mapping[str, str]], sections: Sections, node_id: int
 ) -> Iterator[EdsEntry]:
-    """Interpret the objects of a file that has been put right."""
-    for (index, sub), keys in right.items():
+    """Yield the entries that corrected sections describe."""
+    for (index, sub), keys in corrected.items():
         data_type = _data_type(keys, sections)
         value: int | bytes | None = None
-        # The value that a DCF sets comes before the default, unless it is none.
+        # A valid value that a DCF sets takes precedence over the default.
         for key in ("parametervalue", "defaultvalue"):
             if value is None and key in keys:
-                value = _value(keys[key], data_type, node_id)
+                value = _parse_value(keys[key], data_type, node_id)
         access = keys.get("accesstype", "").lower()
         yield EdsEntry(
             index=index,
             sub=sub,
-            name=_shown(keys["parametername"]),
+            name=_printable_line(keys["parametername"]),
             data_type=data_type,
-            access=access if access in _ACCESS else "rw",
+            access=access if access in _ACCESS_RIGHTS else "rw",
             mappable=_is_set(keys.get("pdomapping", "")),
             default=value if isinstance(value, int) else None,
-            low=_signed(_whole(keys.get("lowlimit", "")), data_type),
-            high=_signed(_whole(keys.get("highlimit", "")), data_type),
+            low=_to_signed(_parse_integer(keys.get("lowlimit", "")), data_type),
+            high=_to_signed(_parse_integer(keys.get("highlimit", "")), data_type),
             content=value if isinstance(value, bytes) else b"",
         )
 
 
 def _data_type(keys: Mapping[str, str], sections: Sections) -> int:
-    data_type = _integer(keys.get("datatype", ""))
+    """Return the basic data type of an object; a type defined in the file is resolved."""
+    data_type = _parse_integer_or_zero(keys.get("datatype", ""))
     if data_type > _LAST_BASIC_TYPE:
         # Tools define their own type for a number with limits, as an object whose sub-index 1
         # names the basic type.
-        basic = sections.get(f"{data_type:x}sub1", {}).get("defaultvalue", "")
-        data_type = _integer(basic)
+        basic_type_text = sections.get(f"{data_type:x}sub1", {}).get("defaultvalue", "")
+        data_type = _parse_integer_or_zero(basic_type_text)
         if not 0 < data_type <= _LAST_BASIC_TYPE:
-            data_type = _DOMAIN
+            data_type = _DOMAIN_TYPE
     return max(data_type, 0)
 
 
-def _value(text: str, data_type: int, node_id: int) -> int | bytes | None:
-    """Return a number, or what else the drive holds as its bytes; None of what is neither."""
+def _parse_value(text: str, data_type: int, node_id: int) -> int | bytes | None:
+    """Return a default value as integer, or as the drive's bytes; None if it is invalid."""
     try:
-        if data_type in _TEXTS:
+        if data_type in _TEXT_TYPES:
             return text.encode("utf-8", errors="replace")
-        if data_type in (_OCTETS, _DOMAIN):
+        if data_type in (_OCTET_STRING_TYPE, _DOMAIN_TYPE):
             return bytes.fromhex(text)
-        if data_type in _FRACTIONS:
-            return struct.pack(_FRACTIONS[data_type], float(text))
+        if data_type in _FLOAT_LAYOUTS:
+            return struct.pack(_FLOAT_LAYOUTS[data_type], float(text))
     except (ValueError, OverflowError):
         return None
-    # An identifier may stand as $NODEID+0x180.
-    rest, relative = _NODE_ID.subn("", text.replace(" ", ""))
-    number = 0 if relative and not rest else _whole(rest)
+    # A CAN identifier may be written as $NODEID+0x180.
+    number_text, placeholder_count = _NODE_ID_PLACEHOLDER.subn("", text.replace(" ", ""))
+    number = 0 if placeholder_count and not number_text else _parse_integer(number_text)
     if number is None:
         return None
-    return _signed(number + node_id if relative else number, data_type)
+    return _to_signed(number + node_id if placeholder_count else number, data_type)
 
 
-def _signed(number: int | None, data_type: int) -> int | None:
-    """Return a number below zero that is written as a positive hexadecimal one."""
-    if number is not None and data_type in _SIGNED and number >> _BITS[data_type] - 1 == 1:
-        return number - (1 << _BITS[data_type])
+def _to_signed(number: int | None, data_type: int) -> int | None:
+    """Convert a positive number that encodes a negative one (two's complement) of a data type."""
+    if (
+        number is not None
+        and data_type in _SIGNED_TYPES
+        and number >> _TYPE_LENGTHS_BIT[data_type] - 1 == 1
+    ):
+        return number - (1 << _TYPE_LENGTHS_BIT[data_type])
     return number
 
 
-def _identity(entries: Mapping[tuple[int, int], EdsEntry], sub: int, stated: str) -> int:
-    """Return what 1018 shows of itself: as the object says, else as the head of the file does."""
+def _identity_number(
+    entries: Mapping[tuple[int, int], EdsEntry], sub: int, header_text: str
+) -> int:
+    """Return a number of the drive's identity from object 1018, else from the file's header."""
     entry = entries.get((0x1018, sub))
-    value = (entry.default if entry else None) or _integer(stated)
-    return value if 0 <= value < 0xFFFF_FFFF else 0  # all bits set is how some say nothing
+    value = (entry.default if entry else None) or _parse_integer_or_zero(header_text)
+    return value if 0 <= value < 0xFFFF_FFFF else 0  # in some files, all bits set: not stated
 
 
-def _integer(text: str) -> int:
-    """Return a number as :func:`_whole` does; 0 of anything else."""
-    return _whole(text) or 0
+def _parse_integer_or_zero(text: str) -> int:
+    """Parse an integer in CiA 306's notation; return 0 if the text is not an integer."""
+    return _parse_integer(text) or 0
 
 
 def _is_set(text: str) -> bool:
-    """Whether a flag is set: 1 in CiA 306's notation, TRUE in that of some tools."""
-    return text.lower() in _YES or _integer(text) != 0
+    """Return whether a flag is set: 1 in CiA 306's notation, TRUE in that of some tools."""
+    return text.lower() in _TRUE_WORDS or _parse_integer_or_zero(text) != 0
 
 
-def _whole(text: str) -> int | None:
-    """Return a number in CiA 306's notation: 0x1F, 31, or octal 037; None of anything else."""
-    match = _NUMBER.fullmatch(text.strip())
+def _parse_integer(text: str) -> int | None:
+    """Parse an integer in CiA 306's notation: 0x1F, 31, or octal 037; return None if invalid."""
+    match = _INTEGER_PATTERN.fullmatch(text.strip())
     if match is None:
         return None
     digits = match[0].lower()
@@ -403,6 +432,6 @@ def _whole(text: str) -> int | None:
     return int(digits, 16) if "x" in digits else int(digits)
 
 
-def _shown(text: str) -> str:
+def _printable_line(text: str) -> str:
     """Return a text of the file as messages may show it: one line, printable, not too long."""
-    return printable(" ".join(text.split()), _MOST_SHOWN)
+    return printable(" ".join(text.split()), _MOST_SHOWN_CHARACTERS)

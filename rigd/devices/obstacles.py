@@ -1,6 +1,6 @@
 """Obstacles and impacts on a simulated beam, as written in a profile or on the command line.
 
-``x=0.62,angle=0.6,stiffness=3000`` is an obstacle, ``x=0.5,force=2,duration=0.02,at=3`` a knock.
+``x=0.62,angle=0.6,stiffness=3000`` is an obstacle, ``x=0.5,force=2,duration=0.02,at=3`` an impact.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -13,46 +13,50 @@ from rigd.errors import UserError
 
 
 class ObstacleError(UserError, ValueError):
-    """An obstacle has a syntax error; the message states what is allowed."""
+    """Error: an obstacle or impact is written wrongly or cannot be simulated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """Obstacle in the path of the beam: it pushes, and never pulls.
+    """Obstacle in the path of the simulated beam, which pushes the beam and never pulls it.
 
-    Its force is ``stiffness · penetration + damping · its rate``, while that pushes.
+    Its force is ``stiffness · penetration + damping · rate of penetration``, and 0 while that sum
+    is negative.
     """
 
     x_m: float
-    """Where it meets the beam, from the motor's axis."""
+    """Position along the beam in m, from the motor's axis, at which the obstacle touches it."""
     angle_rad: float
-    """Angle at which the straight beam just touches it."""
+    """Angle in rad of the straight beam when it just touches the obstacle."""
     stiffness_n_per_m: float = inf
-    """Stiffness of the obstacle; infinite: it does not yield."""
+    """Stiffness of the obstacle in N/m; infinite for a rigid obstacle."""
     damping_n_s_per_m: float = 0.0
-    """Damping of the obstacle."""
+    """Damping coefficient of the obstacle in N·s/m."""
     side: int = 1
-    """1: it stops a beam that turns in the positive direction; -1: in the negative one."""
+    """Direction of motion that the obstacle stops: 1 for increasing angles, -1 for decreasing
+    angles."""
     rate_rad_s: float = 0.0
-    """Speed at which its angle grows, from `from_s` on."""
+    """Rate in rad/s at which the obstacle's angle increases after `from_s`."""
     from_s: float = 0.0
-    """Time at which it appears; times are counted from the first enabling of the drive."""
+    """Time in seconds at which the obstacle appears, counted from the first enabling of the
+    drive."""
     until_s: float = inf
-    """Time at which it is gone."""
+    """Time in seconds at which the obstacle disappears, counted from the first enabling of the
+    drive."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImpactSpecification:
-    """Pulse of force on the beam: half a sine."""
+    """Impact on the simulated beam: a force pulse with the shape of half a sine."""
 
     x_m: float
-    """Where it hits the beam, from the motor's axis."""
+    """Position along the beam in m, from the motor's axis, at which the force acts."""
     force_n: float
-    """Largest force; positive in the direction of a positive angle."""
+    """Peak force in N, positive in the direction of increasing angles."""
     duration_s: float
-    """Length of the pulse."""
+    """Duration of the force pulse in seconds."""
     at_s: float
-    """When it begins, from the first enabling of the drive."""
+    """Time in seconds at which the pulse begins, counted from the first enabling of the drive."""
 
 
 Disturbance = Obstacle | ImpactSpecification
@@ -61,30 +65,39 @@ Disturbance = Obstacle | ImpactSpecification
 
 @dataclass(frozen=True, slots=True)
 class _ObstacleKey:
+    """Key of the text form of an obstacle or impact."""
+
     field: str
-    says: str
-    fits: Callable[[float], bool]
-    needed: bool = False
+    """Name of the dataclass field that the key sets."""
+    allowed_text: str
+    """Description of the allowed values, for error messages."""
+    is_allowed: Callable[[float], bool]
+    """Function that returns whether a value is allowed."""
+    is_required: bool = False
+    """Whether the key must be given."""
 
 
-_MOST_STIFF = 1e7
-_LONGEST_S = 1e6
+_LARGEST_STIFFNESS_N_PER_M = 1e7
+"""Largest stiffness in N/m of an obstacle that is not rigid."""
+_LATEST_TIME_S = 1e6
+"""Largest time in seconds at which an obstacle or impact can begin or end."""
 
 
-def _time(value: float) -> bool:
-    return 0 <= value <= _LONGEST_S
+def _is_time_allowed(value: float) -> bool:
+    """Return whether a value in seconds is allowed as a time."""
+    return 0 <= value <= _LATEST_TIME_S
 
 
-_KEYS: dict[type[Disturbance], dict[str, _ObstacleKey]] = {
+_OBSTACLE_KEYS: dict[type[Disturbance], dict[str, _ObstacleKey]] = {
     Obstacle: {
-        "x": _ObstacleKey("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
+        "x": _ObstacleKey("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, is_required=True),
         "angle": _ObstacleKey(
             "angle_rad", "an angle in rad, -10 to 10", lambda v: abs(v) <= 10, True
         ),
         "stiffness": _ObstacleKey(
             "stiffness_n_per_m",
-            f"a stiffness of 1 to {_MOST_STIFF:.0f} N/m, or rigid",
-            lambda v: 1 <= v <= _MOST_STIFF or v == inf,
+            f"a stiffness of 1 to {_LARGEST_STIFFNESS_N_PER_M:.0f} N/m, or rigid",
+            lambda v: 1 <= v <= _LARGEST_STIFFNESS_N_PER_M or v == inf,
         ),
         "damping": _ObstacleKey(
             "damping_n_s_per_m", "a damping of 0 to 10000 N·s/m", lambda v: 0 <= v <= 1e4
@@ -93,47 +106,49 @@ _KEYS: dict[type[Disturbance], dict[str, _ObstacleKey]] = {
         "rate": _ObstacleKey(
             "rate_rad_s", "a speed in rad/s, -100 to 100", lambda v: abs(v) <= 100
         ),
-        "from": _ObstacleKey("from_s", "a time in s, at least 0", _time),
-        "until": _ObstacleKey("until_s", "a time in s, at least 0", _time),
+        "from": _ObstacleKey("from_s", "a time in s, at least 0", _is_time_allowed),
+        "until": _ObstacleKey("until_s", "a time in s, at least 0", _is_time_allowed),
     },
     ImpactSpecification: {
-        "x": _ObstacleKey("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
+        "x": _ObstacleKey("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, is_required=True),
         "force": _ObstacleKey(
             "force_n", "a force in N, -1000 to 1000", lambda v: abs(v) <= 1e3, True
         ),
         "duration": _ObstacleKey(
             "duration_s", "a time in s, 0.0001 to 100", lambda v: 1e-4 <= v <= 100, True
         ),
-        "at": _ObstacleKey("at_s", "a time in s, at least 0", _time, True),
+        "at": _ObstacleKey("at_s", "a time in s, at least 0", _is_time_allowed, True),
     },
 }
-_WORDS = {"rigid": inf}
+"""Keys of the text form of an obstacle and of an impact."""
+_NAMED_VALUES = {"rigid": inf}
+"""Numbers that can be written as a word."""
 INCOMPATIBLE_WITH_FORCES = (
     "clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz", "stiffness_drift_per_s",
 )  # fmt: skip
-"""Keys of ``[simulation]`` with which no force along the beam is simulated, whatever exerts it."""
+"""Keys of ``[simulation]`` that cannot be combined with a force along the beam."""
 INCOMPATIBLE_WITH_OBSTACLES = (
     *INCOMPATIBLE_WITH_FORCES, "air_drag_m", "zeta_scatter_percent", "gamma_scatter_percent",
     "stiffness_scatter_percent",
 )  # fmt: skip
-"""Keys of ``[simulation]`` with which no obstacle is simulated."""
+"""Keys of ``[simulation]`` that cannot be combined with an obstacle or impact."""
 
 
 def parse_obstacle(text: str) -> Disturbance:
-    """Read an obstacle or a knock.
+    """Parse the text form of an obstacle or impact.
 
     Parameters
     ----------
     text
-        ``key=value`` with commas: ``x`` (m), ``angle`` (rad) and, if wanted, ``stiffness`` (N/m,
-        or ``rigid``, the default), ``damping`` (N·s/m), ``side`` (1 or -1; by default that of the
-        angle's sign), ``rate`` (rad/s), ``from`` and ``until`` (s); for a knock ``x``, ``force``
-        (N), ``duration`` and ``at`` (s).
+        ``key=value`` pairs, separated by commas. For an obstacle: ``x`` (m), ``angle`` (rad) and,
+        optionally, ``stiffness`` (N/m, or ``rigid``, the default), ``damping`` (N·s/m), ``side`` (1
+        or -1; by default the sign of the angle), ``rate`` (rad/s), ``from`` and ``until`` (s). For
+        an impact: ``x``, ``force`` (N), ``duration`` and ``at`` (s).
 
     Raises
     ------
     ObstacleError
-        If a key or value is wrong; the message states what is allowed.
+        If a key or value is wrong; the message states the allowed ones.
 
     Examples
     --------
@@ -141,59 +156,63 @@ def parse_obstacle(text: str) -> Disturbance:
     >>> parse_obstacle("x=0.62,angle=0.6,stiffness=3000").stiffness_n_per_m
     3000.0
     """
-    words = [word.strip() for word in text.split(",")]
+    assignments = [assignment.strip() for assignment in text.split(",")]
     kind = (
         ImpactSpecification
-        if any(word.partition("=")[0].strip() == "force" for word in words)
+        if any(assignment.partition("=")[0].strip() == "force" for assignment in assignments)
         else Obstacle
     )
-    keys = _KEYS[kind]
+    keys = _OBSTACLE_KEYS[kind]
     values: dict[str, float] = {}
-    for word in words:
-        name, _, given = (part.strip() for part in word.partition("="))
+    for assignment in assignments:
+        name, _, value_text = (part.strip() for part in assignment.partition("="))
         if name not in keys:
-            raise _complaint(text, f"unknown key '{name}'; give {', '.join(keys)}")
+            raise _obstacle_error(text, f"unknown key '{name}'; give {', '.join(keys)}")
         key = keys[name]
         if key.field in values:
-            raise _complaint(text, f"'{name}' is given twice")
+            raise _obstacle_error(text, f"'{name}' is given twice")
         try:
-            value = _WORDS[given] if given in _WORDS else _finite(given)
-            if not key.fits(value):
-                raise ValueError(given)
+            value = (
+                _NAMED_VALUES[value_text]
+                if value_text in _NAMED_VALUES
+                else _parse_finite(value_text)
+            )
+            if not key.is_allowed(value):
+                raise ValueError(value_text)
         except ValueError:
-            raise _complaint(text, f"{name}={given}: give {key.says}") from None
+            raise _obstacle_error(text, f"{name}={value_text}: give {key.allowed_text}") from None
         values[key.field] = value
     for name, key in keys.items():
-        if key.needed and key.field not in values:
-            raise _complaint(text, f"'{name}' is missing; give {name}=…, {key.says}")
+        if key.is_required and key.field not in values:
+            raise _obstacle_error(text, f"'{name}' is missing; give {name}=…, {key.allowed_text}")
     if kind is ImpactSpecification:
         return ImpactSpecification(**values)
-    side = int(values.pop("side", _side_of(values["angle_rad"])))
+    side = int(values.pop("side", _default_side(values["angle_rad"])))
     obstacle = Obstacle(**values, side=side)
     if obstacle.until_s <= obstacle.from_s:
-        raise _complaint(text, "until is not later than from")
+        raise _obstacle_error(text, "until is not later than from")
     return obstacle
 
 
 def check_obstacles(
-    disturbances: Iterable[Disturbance], beam: Beam, simulated: Mapping[str, float | None]
+    disturbances: Iterable[Disturbance], beam: Beam, simulated_effects: Mapping[str, float | None]
 ) -> None:
-    """Refuse obstacles that cannot be simulated on a rig.
+    """Raise if obstacles or impacts cannot be simulated on a beam with its other simulated effects.
 
     Parameters
     ----------
     disturbances
-        Obstacles and knocks.
+        Obstacles and impacts.
     beam
-        The beam, on which they have to be.
-    simulated
-        Other simulated effects, by the keys of `INCOMPATIBLE_WITH_OBSTACLES`; 0 or None: none
-        of that kind.
+        Beam, within whose length every obstacle and impact has to be.
+    simulated_effects
+        Values of the other simulated effects by the keys in `INCOMPATIBLE_WITH_OBSTACLES`; 0 or
+        None if the effect is not simulated.
 
     Raises
     ------
     ObstacleError
-        If one cannot be simulated; the message states reason and remedy.
+        If an obstacle or impact cannot be simulated; the message states reason and remedy.
     """
     for disturbance in disturbances:
         if disturbance.x_m > beam.length_m:
@@ -201,7 +220,7 @@ def check_obstacles(
                 f"Obstacle '{describe_obstacle(disturbance)}': x={disturbance.x_m:g} m lies beyond "
                 f"the tip of the beam at {beam.length_m:g} m (beam.length_m); give a smaller x."
             )
-        for name, value in simulated.items():
+        for name, value in simulated_effects.items():
             if value:
                 raise ObstacleError(
                     f"simulation.{name} and an obstacle cannot be simulated together; leave one of "
@@ -210,19 +229,19 @@ def check_obstacles(
 
 
 def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
-    """Add obstacles to those of a rig's simulated beam.
+    """Return a rig's parameters with more obstacles and impacts on its simulated beam.
 
     Parameters
     ----------
     rig
         Parameters of the rig, with a section ``simulation``.
     texts
-        Obstacles and knocks, as for `parse_obstacle`.
+        Obstacles and impacts in the syntax of `parse_obstacle`.
 
     Raises
     ------
     ObstacleError
-        If one has a syntax error, or cannot be simulated on this rig.
+        If a text has a syntax error, or cannot be simulated on this rig.
     """
     simulation = rig.simulation
     if simulation is None:
@@ -231,40 +250,42 @@ def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
             "obstacle; copy it from that of rigd profiles show sim."
         )
     texts = tuple(texts)
-    simulated = {name: getattr(simulation, name) for name in INCOMPATIBLE_WITH_OBSTACLES}
-    check_obstacles(map(parse_obstacle, texts), rig.beam, simulated)
+    simulated_effects = {name: getattr(simulation, name) for name in INCOMPATIBLE_WITH_OBSTACLES}
+    check_obstacles(map(parse_obstacle, texts), rig.beam, simulated_effects)
     return replace(rig, simulation=replace(simulation, obstacles=simulation.obstacles + texts))
 
 
 def describe_obstacle(disturbance: Disturbance) -> str:
-    """Write an obstacle or a knock so that `parse_obstacle` reads it back.
+    """Return the text form of an obstacle or impact, which `parse_obstacle` reads back.
 
     Parameters
     ----------
     disturbance
         Obstacle or impact.
     """
-    default = {each.name: each.default for each in fields(disturbance)}
+    default_values = {each.name: each.default for each in fields(disturbance)}
     if isinstance(disturbance, Obstacle):
-        default["side"] = _side_of(disturbance.angle_rad)
+        default_values["side"] = _default_side(disturbance.angle_rad)
     return ",".join(
         f"{name}={value:g}" if float(f"{value:g}") == value else f"{name}={value!r}"
-        for name, key in _KEYS[type(disturbance)].items()
-        if (value := getattr(disturbance, key.field)) != default[key.field]
+        for name, key in _OBSTACLE_KEYS[type(disturbance)].items()
+        if (value := getattr(disturbance, key.field)) != default_values[key.field]
     )
 
 
-def _side_of(angle_rad: float) -> int:
-    """Side of an obstacle of which none is given: that from which a beam at zero comes."""
+def _default_side(angle_rad: float) -> int:
+    """Return the default side of an obstacle: that from which a beam at angle zero approaches."""
     return -1 if angle_rad < 0 else 1
 
 
-def _finite(text: str) -> float:
+def _parse_finite(text: str) -> float:
+    """Parse a finite number, or raise ValueError."""
     value = float(text)
     if not isfinite(value):
         raise ValueError(text)
     return value
 
 
-def _complaint(text: str, what: str) -> ObstacleError:
+def _obstacle_error(text: str, what: str) -> ObstacleError:
+    """Return the error for an obstacle's text, with the text and the reason."""
     return ObstacleError(f"Obstacle '{text}': {what}.")

@@ -1,7 +1,7 @@
 """Address of a running ``rigd simulate``: one small file for each simulated rig.
 
-A simulated rig replaces the hardware of one profile. Code that opens the devices of a profile
-checks here first, so that a motor never moves where a simulation was meant.
+A simulated rig replaces the hardware of one profile. Code that opens the devices of a profile first
+checks whether a simulated rig runs, so that a motor never moves when a simulation was intended.
 """
 
 import json
@@ -16,40 +16,43 @@ from rigd.runtime.addresses import announce as write_address
 from rigd.runtime.addresses import answers, read_address, runtime_folder
 from rigd.runtime.processes import listening_sockets
 
-if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
+if TYPE_CHECKING:  # it imports numpy, which takes longer than a stop may take
     from rigd.devices.parameters import RigParameters
 
-_LONGEST_LINE = 65_536
-_TIMEOUT_S = 2.0
+_LONGEST_REPLY = 65_536
+"""Largest length in bytes of a simulator's reply."""
+_REPLY_TIMEOUT_S = 2.0
+"""Time in seconds to wait for a simulator's reply."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatorAddress:
-    """Address of a simulated rig."""
+    """Address of a running simulated rig, as written to its address file."""
 
     pid: int
-    """Its process."""
+    """Number of the simulator's process."""
     control_socket: str
-    """Unix socket that takes faults to inject; as long as it answers, the simulator runs."""
+    """Unix socket that accepts faults to inject; while it answers, the simulator runs."""
     can_socket: str = ""
-    """Unix socket that carries CAN frames; empty where it sits on a real (virtual) CAN bus."""
+    """Unix socket that carries CAN frames; empty if the simulator is on a real (virtual) CAN
+    bus."""
     serial_port: str = ""
-    """Pseudo-terminal of the serial sensor; empty where it has none."""
+    """Pseudo-terminal of the simulated serial sensor; empty if there is none."""
     lock_step: bool = False
-    """It advances one period per SYNC instead of by the clock."""
+    """Whether the simulation advances by one period per SYNC instead of in real time."""
     rig: Mapping[str, object] = field(default_factory=dict)
-    """What it simulates: the rig's parameters by dotted key, as `described` gives them."""
+    """Parameters of the simulated rig by dotted key, as returned by `described`."""
 
 
 def described(rig: "RigParameters") -> dict[str, object]:
-    """Return a rig's parameters by dotted key, as JSON has them."""
-    return json.loads(json.dumps(dict(_flat(asdict(rig), ""))))  # type: ignore[no-any-return]
+    """Return a rig's parameters as a flat JSON object, by dotted key."""
+    return json.loads(json.dumps(dict(_flatten(asdict(rig), ""))))  # type: ignore[no-any-return]
 
 
 def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
-    """List the differences of the simulated rig from a profile's: one phrase per key.
+    """Return the differences between a profile and the simulated rig, one phrase per key.
 
-    The seed of the noise is none: each session has its own.
+    A different seed of the noise does not count, since each session has its own.
 
     Parameters
     ----------
@@ -58,23 +61,25 @@ def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
     simulator
         Address of the simulated rig.
     """
-    ours, theirs = described(rig), simulator.rig
+    own_parameters, simulated_parameters = described(rig), simulator.rig
     return [
-        f"{key} = {_shown(theirs[key])} instead of {_shown(value)}"
-        for key, value in ours.items()
-        if key in theirs and theirs[key] != value and key != "simulation.seed"
+        f"{key} = {_format_value(simulated_parameters[key])} instead of {_format_value(value)}"
+        for key, value in own_parameters.items()
+        if key in simulated_parameters
+        and simulated_parameters[key] != value
+        and key != "simulation.seed"
     ]
 
 
 def announce(rig_name: str, address: SimulatorAddress) -> Path:
-    """Write down where the simulator of a rig is, until `forget`; return the file.
+    """Write the address file of a simulator, and return its path.
 
     Parameters
     ----------
     rig_name
-        Name of the profile that it replaces.
+        Name of the profile whose hardware the simulator replaces.
     address
-        Where it is.
+        Address of the simulator.
     """
     path = _address_file(rig_name)
     write_address(path, asdict(address))
@@ -82,18 +87,18 @@ def announce(rig_name: str, address: SimulatorAddress) -> Path:
 
 
 def forget(rig_name: str) -> None:
-    """Take the address of a simulator away, its own or what a dead one left."""
+    """Remove the address file of a simulator, also the file of a simulator that was killed."""
     _address_file(rig_name).unlink(missing_ok=True)
 
 
 def find_simulator(rig_name: str) -> SimulatorAddress | None:
-    """Return the running simulator of a rig, or None; what a dead one left is not one."""
+    """Return the address of the running simulator of a rig, or None if none answers."""
     try:
         address = SimulatorAddress(**read_address(_address_file(rig_name)))
-    except TypeError:  # it has other members
+    except TypeError:  # the file has missing or other members
         return None
-    found = isinstance(address.control_socket, str) and answers(address.control_socket)
-    return address if found else None
+    is_running = isinstance(address.control_socket, str) and answers(address.control_socket)
+    return address if is_running else None
 
 
 def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[str, Any]:
@@ -104,20 +109,20 @@ def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[st
     address
         Address of the simulator.
     request
-        The request, by one key: ``inject``, ``status`` or ``renew_noise``.
+        Request with one key: ``inject``, ``status`` or ``renew_noise``.
 
     Raises
     ------
     DeviceError
-        If it does not answer, or refuses; then with its own words.
+        If the simulator does not answer, or refuses; the message is then that of the simulator.
     """
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
-            link.settimeout(_TIMEOUT_S)
+            link.settimeout(_REPLY_TIMEOUT_S)
             link.connect(address.control_socket)
             link.sendall(json.dumps(request).encode() + b"\n")
             with link.makefile("rb") as lines:
-                reply = json.loads(lines.readline(_LONGEST_LINE))
+                reply = json.loads(lines.readline(_LONGEST_REPLY))
     except (OSError, ValueError) as error:
         raise DeviceError(
             f"The simulated rig (process {address.pid}) does not answer ({error}); start it again."
@@ -128,10 +133,10 @@ def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[st
 
 
 def unreachable_simulators(rig_name: str) -> list[Path]:
-    """Return the control sockets on which any simulator of a rig listens on this computer.
+    """Return the control sockets on which simulators of a rig listen on this computer.
 
-    The kernel lists them for every user who runs the simulator, and wherever its runtime folder is.
-    Ask only if `find_simulator` finds none: those that are listed then cannot be reached from here.
+    The kernel lists the sockets of all users, in every runtime folder. Call this function only if
+    `find_simulator` finds no simulator: this process then cannot reach those that are listed.
     """
     try:
         return [path for path in listening_sockets() if path.name == f"{rig_name}.control"]
@@ -139,18 +144,21 @@ def unreachable_simulators(rig_name: str) -> list[Path]:
         return []
 
 
-def _flat(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, object]]:
+def _flatten(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, object]]:
+    """Yield dotted key and value of each leaf of a nested table."""
     for key, value in table.items():
-        dotted = prefix + key.rstrip("_")
+        dotted_key = prefix + key.rstrip("_")
         if isinstance(value, dict):
-            yield from _flat(value, dotted + ".")
+            yield from _flatten(value, dotted_key + ".")
         else:
-            yield dotted, value
+            yield dotted_key, value
 
 
-def _shown(value: object) -> str:
+def _format_value(value: object) -> str:
+    """Format a parameter's value for messages."""
     return f"{value:g}" if isinstance(value, float) else json.dumps(value)
 
 
 def _address_file(rig_name: str) -> Path:
+    """Return the path of a simulator's address file."""
     return runtime_folder() / f"{rig_name}.json"

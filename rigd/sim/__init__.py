@@ -1,8 +1,9 @@
-"""The simulated rig: plant physics, and devices that show it to the loop.
+"""Simulated rig: physics of the plant, and simulated drive and sensor for the control loop.
 
-Offers the plant (`SimulatedPlant`: motor, clamp, beam and air, stepped exactly between ticks) and
-drive and sensor on it (`SimulatedRig`), in the loop's own process. The same rig as a process of its
-own, behind CAN and a serial line, is in `wire`. It knows neither controller nor sessions.
+`SimulatedPlant` is the plant: motor, clamp, beam and air, stepped exactly between ticks.
+`SimulatedRig` is the plant with drive and sensor, in the process of the loop. The package `wire`
+runs the same rig in a process of its own, on a CAN bus and a serial line. This package does not
+depend on controller and sessions.
 """
 
 import lazy_loader as lazy

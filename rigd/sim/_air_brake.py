@@ -1,9 +1,9 @@
-"""Drag of the air on the simulated beam, tick by tick.
+"""Air drag on the simulated beam, computed tick by tick.
 
-The force per metre at the points of a `DragGrid` acts on the modes, whose poles are those of the
-beam's realisation, and by its moment on the shaft; the speeds at the points follow from the state.
-The force over the coming period is not known at its start: what is held is the mean over the period
-of the parabola through the last three forces.
+The drag force per metre at the points of a `DragGrid` acts on the modes, whose poles are those of
+the beam's realisation, and by its moment on the shaft. The speeds at the points follow from the
+state. The force over the coming period is not known at its start. It is extrapolated: the held
+value is the mean over the period of the parabola through the last three forces.
 """
 
 from dataclasses import replace
@@ -22,29 +22,38 @@ from rigd.beam import (
 from rigd.beam.realisation import CoupledModel, Realisation
 
 Real = NDArray[np.float64]
+"""Array of real numbers."""
 Complex = NDArray[np.complex128]
+"""Array of complex numbers."""
 
-_MODES = 5
-"""The fifth of the paper's link is at 145 Hz: three times the end of its sweep."""
-_POINTS = 16
-_MEAN_OF_PARABOLA = (23 / 12, -16 / 12, 5 / 12)
-"""The newest force first (Adams and Bashforth)."""
+_DRAG_MODES = 5
+"""Number of modes of the beam on which the drag acts.
+
+The fifth mode of the paper's link is at 145 Hz: three times the end of its sweep."""
+_DRAG_POINTS = 16
+"""Number of points along the beam at which the drag force is computed."""
+_EXTRAPOLATION_WEIGHTS = (23 / 12, -16 / 12, 5 / 12)
+"""Weights of the last three forces in the mean over the next period, newest first.
+
+They are those of the third-order Adams-Bashforth method."""
 
 
 class AirBrake:
-    """Air around a beam.
+    """Air drag on a beam: its forces, and its effect on the coupled model of motor and beam.
 
     Parameters
     ----------
     beam, damping, realisation
-        The beam's. The first oscillating poles of the realisation are those of the first modes.
+        Beam, its damping and its realisation, whose first oscillating poles belong to the first
+        modes.
     drag_m
-        ``C_D d``.
+        Drag coefficient times diameter of the beam in m, ``C_D d``.
 
     Attributes
     ----------
     speed
-        Row by row the speeds at the points (m/s) by the state of `attached`, shape (points, n).
+        Matrix that gives the speeds at the points (m/s) from the state of the model that
+        `extended_model` returns, shape (points, n).
     """
 
     __slots__ = (
@@ -65,10 +74,10 @@ class AirBrake:
     def __init__(
         self, beam: Beam, damping: Damping, realisation: Realisation, drag_m: float
     ) -> None:
-        poles = realisation.poles_rad_s[realisation.poles_rad_s.imag > 0][:_MODES]
+        poles = realisation.poles_rad_s[realisation.poles_rad_s.imag > 0][:_DRAG_MODES]
         modes = poles.size
         self._poles = poles
-        self._grid = grid = DragGrid.of(beam, modes, _POINTS)
+        self._grid = grid = DragGrid.of(beam, modes, _DRAG_POINTS)
         k_fourth = (clamped_free_eigenvalues(modes) / beam.length_m) ** 4
         inertial = beam.density_over_stiffness * poles**2
         external = damping.gamma * poles**damping.lambda_
@@ -76,57 +85,58 @@ class AirBrake:
         load = inertial + external
         slope = (2 * inertial + damping.lambda_ * external + damping.alpha * internal) / poles
         leverage_m2 = beam.length_m * grid.leverage_m
-        self._torque_of_mode = _rows(leverage_m2 * load / slope).sum(axis=0)
+        self._torque_of_mode = _real_part_rows(leverage_m2 * load / slope).sum(axis=0)
         self._moment_m2 = leverage_m2 @ grid.to_modes - grid.to_moment
         mean_m = beam.length_m * mode_mean(modes)
-        self._shear_of_mode = _rows(mean_m * load / slope).sum(axis=0)
+        self._shear_of_mode = _real_part_rows(mean_m * load / slope).sum(axis=0)
         self._force_m = mean_m @ grid.to_modes - grid.weight_m
 
         states = 2 + realisation.b.size
-        self.speed: Real = np.zeros((_POINTS, states + 2 * modes))
+        self.speed: Real = np.zeros((_DRAG_POINTS, states + 2 * modes))
         self.speed[:, 1] = grid.x_m
-        driven = _rows(-grid.leverage_m * load / slope / poles)
-        self.speed[:, 2 : 2 + 2 * modes] = grid.shapes.T @ driven
-        pushed = _rows(poles / slope / beam.bending_stiffness_n_m2)
-        self.speed[:, states:] = grid.shapes.T @ pushed
+        modal_rows = _real_part_rows(-grid.leverage_m * load / slope / poles)
+        self.speed[:, 2 : 2 + 2 * modes] = grid.shapes.T @ modal_rows
+        force_rows = _real_part_rows(poles / slope / beam.bending_stiffness_n_m2)
+        self.speed[:, states:] = grid.shapes.T @ force_rows
 
-        self._forces = np.zeros((3, _POINTS))
-        self._magnitude = np.zeros(_POINTS)
+        self._forces = np.zeros((3, _DRAG_POINTS))
+        self._magnitude = np.zeros(_DRAG_POINTS)
         self._newest = 0
         # The forces are in a ring buffer: one set of weights for each position of the newest.
-        backwards = (newest - np.arange(3) for newest in range(3))
-        self._weights = [np.array(_MEAN_OF_PARABOLA)[back % 3] for back in backwards]
+        ages_by_newest = (newest - np.arange(3) for newest in range(3))
+        self._weights = [np.array(_EXTRAPOLATION_WEIGHTS)[ages % 3] for ages in ages_by_newest]
         self._per_square = -0.5 * AIR_DENSITY_KG_PER_M3 * drag_m
 
-    def attached(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
-        """Extend motor and beam by the effect of the force on the modes.
+    def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
+        """Return the model of motor and beam, extended by the effect of the drag on the modes.
 
         Returns
         -------
         model
-            With two more states a mode, which act on the shaft.
+            Model with two more states per mode, which act on the shaft.
         of_force
-            What the force per metre at the points adds to the state's derivative, (n, points).
+            Matrix that gives the contribution of the force per metre at the points to the
+            derivative of the state, shape (n, points).
         """
-        n, more = model.b.size, 2 * self._poles.size
-        a = np.zeros((n + more, n + more))
+        n, added_states = model.b.size, 2 * self._poles.size
+        a = np.zeros((n + added_states, n + added_states))
         a[:n, :n] = model.a
         a[:n, n:] = -np.outer(model.b, self._torque_of_mode)
-        even = np.arange(n, n + more, 2)
-        a[even, even] = a[even + 1, even + 1] = self._poles.real
-        a[even, even + 1] = self._poles.imag
-        a[even + 1, even] = -self._poles.imag
-        of_force = np.zeros((n + more, _POINTS))
+        first_states = np.arange(n, n + added_states, 2)
+        a[first_states, first_states] = a[first_states + 1, first_states + 1] = self._poles.real
+        a[first_states, first_states + 1] = self._poles.imag
+        a[first_states + 1, first_states] = -self._poles.imag
+        of_force = np.zeros((n + added_states, _DRAG_POINTS))
         of_force[:n] = -np.outer(model.b, self._moment_m2)
-        of_force[even] = self._grid.to_modes
+        of_force[first_states] = self._grid.to_modes
 
-        def row(own: Real, per_torque: float = 0.0, direct: float = 0.0) -> Real:
-            return np.concatenate([own, (direct - per_torque) * self._torque_of_mode])
+        def row(model_row: Real, per_torque: float = 0.0, direct_effect: float = 0.0) -> Real:
+            return np.concatenate([model_row, (direct_effect - per_torque) * self._torque_of_mode])
 
         extended = replace(
             model,
             a=a,
-            b=np.concatenate([model.b, np.zeros(more)]),
+            b=np.concatenate([model.b, np.zeros(added_states)]),
             angle=row(model.angle),
             velocity=row(model.velocity),
             acceleration=row(model.acceleration, model.acceleration_per_torque),
@@ -139,13 +149,13 @@ class AirBrake:
         )
         return extended, of_force
 
-    def feel(self, speed_m_s: Real) -> tuple[float, float]:
-        """Set the speeds at an instant, shape (points,), and return their immediate effect.
+    def update_force(self, speed_m_s: Real) -> tuple[float, float]:
+        """Compute and store the drag force for the given speeds; return its immediate effect.
 
         Returns
         -------
         torque_nm, shear_n : float
-            Immediate effect of the force on the beam's torque and shear, with the modes unchanged.
+            Immediate effect of the force on the beam's torque and shear, for unchanged modes.
         """
         self._newest = (self._newest + 1) % 3
         force = self._forces[self._newest]
@@ -154,15 +164,15 @@ class AirBrake:
         force *= self._per_square
         return float(self._moment_m2.dot(force)), float(self._force_m.dot(force))
 
-    def hold(self, out: Real) -> None:
-        """Write the force per metre to be held over the coming period, shape (points,), N/m."""
+    def write_held_force(self, out: Real) -> None:
+        """Write the force per metre that acts over the coming period to `out`, in N/m."""
         self._weights[self._newest].dot(self._forces, out)
 
 
-def _rows(gains: Complex) -> Real:
-    """Rows that take ``2 Re(gain z)`` from the two states of each pole's z, shape (m, 2 m).
+def _real_part_rows(gains: Complex) -> Real:
+    """Return rows that compute ``2 Re(gain z)`` from the states of each pole's z, (m, 2 m).
 
-    They are the real part of z and the negative of its imaginary part.
+    The two states are the real part of z and the negative of its imaginary part.
     """
     rows = np.zeros((gains.size, 2 * gains.size))
     number = np.arange(gains.size)

@@ -1,7 +1,7 @@
-"""Drive and sensor of the simulated rig: the plant as the devices measure it.
+"""Simulated drive and sensor, which measure the simulated plant.
 
-The drive's latch, which comes first in a tick, moves the rig on to it; periods that the loop
-missed pass with the last torque held, as they do on a real rig.
+The drive's `latch`, the first call in a tick, advances the rig to this tick. During periods that
+the loop missed, the last torque keeps acting, as on a real rig.
 """
 
 import os
@@ -26,45 +26,50 @@ from rigd.sim._plant import SimulatedPlant
 from rigd.sim._session_scatter import scatters_between_sessions, session_parameters
 
 T = TypeVar("T")
+"""Type of a reading."""
 
-_NAME = "Simulated drive"
-_MOST_MET = 4
-_NOISE_BLOCK = 128
-"""Readings drawn at a time, 50 µs of work in one tick; thousands would take a whole period."""
+_DRIVE_NAME = "Simulated drive"
+"""Name of the simulated drive in messages."""
+_MOST_ADDED_DISTURBANCES = 4
+"""Largest number of disturbances that can be added while the rig runs."""
+_NOISE_BLOCK_READINGS = 128
+"""Number of readings whose noise is drawn at a time, which takes 50 µs in one tick.
+
+Thousands would take a whole period."""
 
 
-class Stuck:
-    """Readings that repeat the one before although their messages are new.
+class StuckReadings:
+    """Replacement for the readings of a failed device, which repeats earlier readings.
 
     Parameters
     ----------
-    every
-        Number of readings of which the first is new; 0: none is.
+    refresh_every
+        Number of calls after which a new reading is returned; 0: the first is repeated for ever.
     """
 
-    __slots__ = ("_count", "_every", "_value")
+    __slots__ = ("_count", "_refresh_every", "_value")
 
-    def __init__(self, every: int = 0) -> None:
-        self._every = every
+    def __init__(self, refresh_every: int = 0) -> None:
+        self._refresh_every = refresh_every
         self._count = 0
         self._value: object = None
 
     def __call__(self, value: T) -> T:
-        """Return the reading that replaces a given one."""
-        if self._count == 0 or (self._every and self._count % self._every == 0):
+        """Return the given reading, or the earlier reading that is repeated in its stead."""
+        if self._count == 0 or (self._refresh_every and self._count % self._refresh_every == 0):
             self._value = value
         self._count += 1
         return cast("T", self._value)
 
 
 def open_simulated_rig(rig: RigParameters) -> Devices:
-    """Make the devices of a simulated rig; a seed gives the same noise again."""
+    """Create drive and sensor of a rig that is simulated in this process."""
     simulated = SimulatedRig(rig)
 
     def renew_noise(seed: int | None) -> int:
-        chosen = fresh_seed() if seed is None else seed
-        simulated.begin_session(chosen)
-        return chosen
+        used_seed = fresh_seed() if seed is None else seed
+        simulated.begin_session(used_seed)
+        return used_seed
 
     return Devices(
         SimulatedDrive(simulated, rig.rate_hz),
@@ -75,24 +80,24 @@ def open_simulated_rig(rig: RigParameters) -> Devices:
 
 
 class SimulatedRig:
-    """Plant, encoder and sensor, moved on period by period.
+    """Simulated plant with encoder and sensor, which advances period by period.
 
-    A sensor that streams is sampled several times a period; then the plant goes in steps of its
-    records.
+    A streaming sensor is sampled several times per period; the step of the plant is then the period
+    of the sensor's records.
 
     Parameters
     ----------
     rig
-        With a section ``simulation``; its delays are those of the plant and of the readings.
+        Parameters of the rig with a section ``simulation``, including the delays to simulate.
 
     Attributes
     ----------
     plant, sensor
-        Plant, and the sensor that measures it.
+        Simulated plant, and simulated sensor that measures it.
     records_per_period : int
-        Readings of the sensor in one period.
+        Number of readings of the sensor per period.
     stuck_encoder : Stuck or None
-        Readings of a failed encoder; None: it works.
+        Replacement for the readings of a failed encoder; None if it works.
     """
 
     def __init__(self, rig: RigParameters) -> None:
@@ -106,131 +111,135 @@ class SimulatedRig:
         if rig.ati_serial is not None:
             weights = rig.ati_serial.weights(rig.rate_hz)
             self.records_per_period = rig.ati_serial.records_per_tick(rig.rate_hz)
-            # The filter's own delay is part of what the profile states; the rest is the sensor's.
-            rest_s = rig.sensor.delay_s - rig.ati_serial.filter_delay_s(rig.rate_hz)
-            rig = replace(rig, sensor=replace(rig.sensor, delay_s=max(0.0, rest_s)))
+            # The delay in the profile includes the filter's delay; the rest is the sensor's delay.
+            remaining_delay_s = rig.sensor.delay_s - rig.ati_serial.filter_delay_s(rig.rate_hz)
+            rig = replace(rig, sensor=replace(rig.sensor, delay_s=max(0.0, remaining_delay_s)))
         rig = replace(rig, rate_hz=rig.rate_hz * self.records_per_period)
         assert rig.simulation is not None
         self._parameters = rig
-        self._met: list[Disturbance] = []
-        self._ended: list[Disturbance] = []
-        self._preparing: tuple[int, IO[bytes]] | None = None
+        self._added_disturbances: list[Disturbance] = []
+        self._removed_disturbances: list[Disturbance] = []
+        self._preparation: tuple[int, IO[bytes]] | None = None
         self.plant = SimulatedPlant(rig)
         self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, rig.rate_hz, weights)
         self._resolution_rad = rig.encoder.resolution_rad
-        self.stuck_encoder: Stuck | None = None
+        self.stuck_encoder: StuckReadings | None = None
 
     def begin_session(self, seed: int) -> None:
         """Restart the noise, and use the beam of this session if beams differ between sessions.
 
-        The drive is off. A beam takes a tenth of a second to make.
+        The drive is off afterwards. Computing a new beam takes a tenth of a second.
 
         Parameters
         ----------
         seed
-            Seed of the session.
+            Seed of the session's noise and beam.
         """
         self.sensor.renew_noise(seed)
         if scatters_between_sessions(self._parameters):
-            self.plant.become(SimulatedPlant(session_parameters(self._parameters, seed)))
+            self.plant.adopt(SimulatedPlant(session_parameters(self._parameters, seed)))
 
     def advance(self, n_periods: int) -> None:
-        """Move on by whole periods, the torque held."""
-        if self._preparing is not None:
+        """Advance plant and sensor by whole periods, while the last torque command acts."""
+        if self._preparation is not None:
             self._poll_preparation()
         if self.records_per_period == 1:
             self.plant.advance(n_periods)
-            self.sensor.elapse(n_periods)
+            self.sensor.advance_hum(n_periods)
             return
         for _ in range(n_periods * self.records_per_period):
             self.plant.advance(1)
-            self.sensor.elapse(1)
+            self.sensor.advance_hum(1)
             self.sensor.sample()
 
-    def check(self, disturbance: Disturbance) -> None:
+    def check_disturbance(self, disturbance: Disturbance) -> None:
         """Raise if a disturbance cannot be simulated in addition to the present ones.
 
         Raises
         ------
         ObstacleError, RealisationError
-            Saying why.
+            If the disturbance cannot be simulated; the message states the reason.
         """
         with_obstacles(self._parameters, [describe_obstacle(disturbance)])
         check_order(self._parameters.damping)
-        if len(self._met) == _MOST_MET:
+        if len(self._added_disturbances) == _MOST_ADDED_DISTURBANCES:
             raise ObstacleError(
-                f"{_MOST_MET} obstacles and knocks were added while the simulated rig ran, and one "
-                "more would take too long a tick; start it again."
+                f"{_MOST_ADDED_DISTURBANCES} obstacles and knocks were added while the simulated "
+                "rig ran, and one more would take too long a tick; start it again."
             )
 
-    def meet(self, disturbance: Disturbance, *, wait: bool) -> None:
-        """Add an obstacle or a knock.
+    def add_disturbance(self, disturbance: Disturbance, *, wait: bool) -> None:
+        """Add an obstacle or impact to the simulation.
 
         Parameters
         ----------
         disturbance
-            Its times count from the first enabling of the drive.
+            Obstacle or impact, whose times count from the first enabling of the drive.
         wait
-            Whether it takes effect before the next period; the caller then waits a tenth of a
-            second. Otherwise another process prepares it, and the rig continues meanwhile.
+            Whether the disturbance is present before the next period; the caller then waits a tenth
+            of a second. Otherwise another process prepares it while the rig continues.
         """
-        self._met.append(disturbance)
+        self._added_disturbances.append(disturbance)
         if wait:
-            self._take_over(self._prepared()[1])
-        elif self._preparing is None:
-            self._prepare()
+            self._use_prepared_plant(self._plant_with_disturbances()[1])
+        elif self._preparation is None:
+            self._start_preparation()
 
-    def end(self, disturbance: Disturbance) -> None:
-        """Remove an obstacle that `meet` added."""
-        self._ended.append(disturbance)
-        self.plant.end_obstacle(disturbance)
+    def remove_obstacle(self, disturbance: Disturbance) -> None:
+        """Remove an obstacle that `add_disturbance` added."""
+        self._removed_disturbances.append(disturbance)
+        self.plant.remove_obstacle(disturbance)
 
-    def _prepared(self) -> tuple[int, SimulatedPlant]:
-        """Return a plant with all disturbances added so far, and their number."""
-        texts = [describe_obstacle(disturbance) for disturbance in self._met]
+    def _plant_with_disturbances(self) -> tuple[int, SimulatedPlant]:
+        """Return the number of added disturbances, and a plant with all of them."""
+        texts = [describe_obstacle(disturbance) for disturbance in self._added_disturbances]
         return len(texts), SimulatedPlant(with_obstacles(self._parameters, texts))
 
-    def _prepare(self) -> None:
-        """Start the preparation in a process: a thread would hold the interpreter's lock."""
-        import tempfile  # late: no session needs it
+    def _start_preparation(self) -> None:
+        """Start computing the plant with all disturbances in another process.
+
+        A thread would block the interpreter.
+        """
+        import tempfile  # imported late, because no session needs it
 
         file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it was read
         process = os.fork()
         if process == 0:
-            failed = True
+            has_failed = True
             with suppress(BaseException):
                 with suppress(OSError):  # it has time
                     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-                pickle.dump(self._prepared(), file, protocol=5)
+                pickle.dump(self._plant_with_disturbances(), file, protocol=5)
                 file.flush()
-                failed = False
-            os._exit(failed)
-        self._preparing = process, file
+                has_failed = False
+            os._exit(has_failed)
+        self._preparation = process, file
 
     def _poll_preparation(self) -> None:
-        """Use the prepared plant if it is ready; then prepare disturbances added meanwhile."""
-        assert self._preparing is not None
-        process, file = self._preparing
-        ended, status = os.waitpid(process, os.WNOHANG)
-        if not ended:
+        """Use the prepared plant if it is ready, and prepare disturbances added since then."""
+        assert self._preparation is not None
+        process, file = self._preparation
+        ended_process, status = os.waitpid(process, os.WNOHANG)
+        if not ended_process:
             return
-        self._preparing = None
+        self._preparation = None
         with file:
             if status != 0:
                 raise DeviceError("The simulated rig could not make ready for an obstacle.")
             file.seek(0)
             count, plant = pickle.load(file)
-        self._take_over(plant)
-        if count < len(self._met):
-            self._prepare()
+        self._use_prepared_plant(plant)
+        if count < len(self._added_disturbances):
+            self._start_preparation()
 
-    def _take_over(self, plant: SimulatedPlant) -> None:
-        self.plant.meet(plant)
-        for disturbance in self._ended:
-            self.plant.end_obstacle(disturbance)
+    def _use_prepared_plant(self, plant: SimulatedPlant) -> None:
+        """Let the plant use the disturbances of a prepared plant, without the removed ones."""
+        self.plant.use_obstacles_of(plant)
+        for disturbance in self._removed_disturbances:
+            self.plant.remove_obstacle(disturbance)
 
     def read_angle(self) -> float:
-        """Return the angle in whole encoder steps, in rad."""
+        """Return the sensed angle of the output shaft in rad, rounded to encoder steps."""
         angle_rad = self.plant.sensed_angle_rad
         step_rad = self._resolution_rad
         if step_rad:
@@ -239,7 +248,7 @@ class SimulatedRig:
 
 
 class SimulatedDrive:
-    """Torque-controlled drive with an incremental encoder."""
+    """Simulated torque-controlled drive with an incremental encoder."""
 
     def __init__(self, rig: SimulatedRig, rate_hz: float) -> None:
         self._rig = rig
@@ -253,45 +262,45 @@ class SimulatedDrive:
         self.off_doubt = ""
 
     @property
-    def stuck_encoder(self) -> Stuck | None:
-        """Readings of a failed encoder; None: it works. Can be set."""
+    def stuck_encoder(self) -> StuckReadings | None:
+        """Replacement for the readings of a failed encoder; None if it works. It can be set."""
         return self._rig.stuck_encoder
 
     @stuck_encoder.setter
-    def stuck_encoder(self, stuck: Stuck | None) -> None:
+    def stuck_encoder(self, stuck: StuckReadings | None) -> None:
         self._rig.stuck_encoder = stuck
 
     def connect(self) -> None:
-        """Nothing to connect to."""
+        """Do nothing: a drive simulated in this process has no line to open."""
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:  # noqa: ARG002
-        """Enable the drive."""
+        """Switch the simulated drive on, or raise if the wired stop is dropped."""
         if self._sto_dropped:
-            raise wired_stop_dropped(_NAME)
+            raise wired_stop_dropped(_DRIVE_NAME)
         self._plant.enable()
 
     def latch(self, due_ns: int) -> None:
-        """Move the rig on to the tick at ``due_ns``."""
+        """Advance the simulated rig to the tick that was due at `due_ns`."""
         if self._due_ns is not None:
             self._rig.advance(round((due_ns - self._due_ns) / self._period_ns))
         self._due_ns = self.angle_time_ns = due_ns
 
     def command(self, torque_nm: float) -> float:
-        """Set the torque in N·m, and return what is exerted: none while it is not enabled."""
+        """Command a torque in N·m; return the torque that will act, which is 0 while disabled."""
         return self._plant.command(torque_nm)
 
     def health(self) -> LineHealth:
-        """Report that there is no line."""
+        """Return an empty line health, since there is no line."""
         return LineHealth()
 
     def disable(self) -> None:
-        """Zero the torque, and ignore further commands."""
+        """Zero the simulated drive's torque, and ignore further commands until it is enabled."""
         self._plant.disable()
         self.read_angle = self._rig.read_angle
 
     @property
     def sto_dropped(self) -> bool:
-        """Whether the wired stop is pressed; it may be set, and takes the torque away at once."""
+        """Whether the wired stop (STO) is dropped; setting it True removes the torque at once."""
         return self._sto_dropped
 
     @sto_dropped.setter
@@ -299,37 +308,38 @@ class SimulatedDrive:
         self._sto_dropped = dropped
         if dropped and self._plant.enabled:
             self._plant.disable()
-            self.read_angle = self._refuse
+            self.read_angle = self._raise_wired_stop
 
-    def _refuse(self) -> float:
-        raise wired_stop_dropped(_NAME)
+    def _raise_wired_stop(self) -> float:
+        """Raise the error for a dropped wired stop."""
+        raise wired_stop_dropped(_DRIVE_NAME)
 
     def close(self) -> None:
-        """Disable."""
+        """Disable the simulated drive."""
         self.disable()
 
 
 class SimulatedSensor:
-    """Six-axis sensor with white noise, hum, offset, limited resolution and range.
+    """Simulated six-axis sensor with white noise, hum, offset, limited resolution and range.
 
-    Coupling torque, with the hum on it, and base shear appear as the smallest wrench whose
-    projections they are, with the crosstalk of the simulation. Where the readings are streamed,
-    what is read is the last of them through the decimating filter.
+    The wrench is the smallest one whose projections are the coupling torque (with hum) and the base
+    shear; crosstalk is added to it. If the sensor streams, the value read is the output of the
+    decimating filter over the last readings.
 
     Parameters
     ----------
     plant, sensor, simulation
-        Plant, sensor and its noise.
+        Plant to measure, parameters of the sensor, and its noise and imperfections.
     rate_hz
-        Rate of the readings, by which the hum goes on.
+        Number of readings per second, which determines the phase of the hum.
     weights
-        Weights of the last readings in the value, oldest first; one weight: a reading is taken on
-        request.
+        Weights of the last readings in the decimating filter, oldest first. A single weight means
+        that a reading is taken on request.
 
     Attributes
     ----------
     stuck : Stuck or None
-        Readings of a failed sensor; None: it works.
+        Replacement for the readings of a failed sensor; None if it works.
     """
 
     def __init__(
@@ -345,26 +355,26 @@ class SimulatedSensor:
         self.records: deque[Wrench] = deque(maxlen=len(weights))
         self._sensor = sensor
         self._simulation = simulation
-        per_torque, per_shear = _wrenches(sensor, simulation.crosstalk_percent)
-        # Axes that neither torque nor shear reaches show noise only, which is drawn, limited and
-        # quantised by the block; the others are finished tick by tick.
-        self._active = [
+        per_torque, per_shear = _unit_wrenches(sensor, simulation.crosstalk_percent)
+        # Axes on which neither torque nor shear acts show noise only, which is drawn, limited and
+        # quantised in blocks. The other axes are computed tick by tick.
+        self._loaded_axes = [
             (axis, per_torque[axis], per_shear[axis], sensor.range[axis], sensor.resolution[axis])
             for axis in range(6)
             if per_torque[axis] != 0.0 or per_shear[axis] != 0.0
         ]
-        self._rows = chain.from_iterable(self._noise(simulation.seed))
+        self._noise_rows = chain.from_iterable(self._noise(simulation.seed))
         self._hum_nm = simulation.hum_nm
-        self._hum_turn = simulation.hum_hz / rate_hz
-        self._hum_turns = 0.0
-        self.stuck: Stuck | None = None
-        self._saturated = False  # since the last that was read
+        self._hum_cycles_per_reading = simulation.hum_hz / rate_hz
+        self._hum_cycles = 0.0
+        self.stuck: StuckReadings | None = None
+        self._saturated = False  # whether a reading since the last value read was saturated
         self.wrench_stale = False
         self.wrench_time_ns = 0
         self.wrench_saturated = False
 
     def connect(self) -> None:
-        """Nothing to connect to."""
+        """Do nothing: a sensor simulated in this process has no line to open."""
 
     def calibration(self) -> dict[str, object]:
         """Return the calibration as a real sensor would report it."""
@@ -376,11 +386,11 @@ class SimulatedSensor:
         }
 
     def request(self, due_ns: int) -> None:
-        """Note the time; the drive's latch has moved the plant on."""
+        """Store the time of the tick; the drive's `latch` has already advanced the plant."""
         self.wrench_time_ns = due_ns
 
     def read_wrench(self) -> Wrench:
-        """Return the wrench of this tick."""
+        """Return the wrench of this tick in N and N·m."""
         if len(self._weights) == 1:
             return self.measure()
         while len(self.records) < len(self._weights):  # before the first period
@@ -392,34 +402,34 @@ class SimulatedSensor:
         return fx, fy, fz, tx, ty, tz
 
     def health(self) -> LineHealth:
-        """Report that there is no line, and no fault."""
+        """Return the line health of a sensor without errors and without line."""
         return LineHealth(status=0)
 
     def renew_noise(self, seed: int) -> None:
-        """Restart the noise from a seed."""
-        self._rows = chain.from_iterable(self._noise(seed))
+        """Restart the simulated sensor's noise from a seed."""
+        self._noise_rows = chain.from_iterable(self._noise(seed))
         self.records.clear()
 
     def sample(self) -> None:
-        """Take a reading into the filter."""
+        """Take a reading of the simulated sensor and add it to the decimating filter."""
         self.records.append(self.measure())
         self._saturated |= self.wrench_saturated
 
-    def elapse(self, readings: int) -> None:
-        """Advance the time by some readings."""
+    def advance_hum(self, readings: int) -> None:
+        """Advance the phase of the hum by a number of reading periods."""
         if self._hum_nm:
-            # Whole turns are left out, for the phase to stay exact.
-            self._hum_turns = (self._hum_turns + readings * self._hum_turn) % 1.0
+            # Whole cycles are dropped to keep the phase exact.
+            self._hum_cycles = (self._hum_cycles + readings * self._hum_cycles_per_reading) % 1.0
 
     def measure(self) -> Wrench:
-        """Return a reading taken now."""
-        row = next(self._rows)
+        """Return the simulated wrench, in N and N·m, at the current simulation time."""
+        row = next(self._noise_rows)
         torque_nm = self._plant.sensed_torque_nm
         if self._hum_nm:
-            torque_nm += self._hum_nm * sin(tau * self._hum_turns)
+            torque_nm += self._hum_nm * sin(tau * self._hum_cycles)
         shear_n = self._plant.sensed_shear_n
         saturated = False
-        for axis, per_torque, per_shear, limit, step in self._active:
+        for axis, per_torque, per_shear, limit, step in self._loaded_axes:
             value = row[axis] + per_torque * torque_nm + per_shear * shear_n
             if not -limit < value < limit:
                 value = limit if value > 0 else -limit
@@ -431,26 +441,39 @@ class SimulatedSensor:
         return wrench if self.stuck is None else self.stuck(wrench)
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: a sensor simulated in this process has no line to release."""
 
     def _noise(self, seed: int | None) -> Iterator[list[list[float]]]:
-        """Yield blocks of rows, each an unloaded wrench; without a seed no others are alike."""
+        """Yield blocks of unloaded wrenches with noise and offset; without a seed, random ones."""
         simulation = self._simulation
         generator = np.random.default_rng(seed)
-        scale = np.array([simulation.force_noise_n] * 3 + [simulation.torque_noise_nm] * 3)
+        noise_deviations = np.array(
+            [simulation.force_noise_n] * 3 + [simulation.torque_noise_nm] * 3
+        )
         offset = np.array(simulation.offset)
         limit = np.array(self._sensor.range)
         step = np.array(self._sensor.resolution)
-        passive = [axis for axis in range(6) if axis not in {active[0] for active in self._active}]
-        quantised = [axis for axis in passive if step[axis] > 0]
+        unloaded_axes = [
+            axis
+            for axis in range(6)
+            if axis not in {loaded_axis[0] for loaded_axis in self._loaded_axes}
+        ]
+        quantised_axes = [axis for axis in unloaded_axes if step[axis] > 0]
         while True:
-            block = offset + generator.standard_normal((_NOISE_BLOCK, 6)) * scale
-            block[:, passive] = np.clip(block[:, passive], -limit[passive], limit[passive])
-            block[:, quantised] = np.round(block[:, quantised] / step[quantised]) * step[quantised]
-            yield block.tolist()
+            noise_block = (
+                offset + generator.standard_normal((_NOISE_BLOCK_READINGS, 6)) * noise_deviations
+            )
+            noise_block[:, unloaded_axes] = np.clip(
+                noise_block[:, unloaded_axes], -limit[unloaded_axes], limit[unloaded_axes]
+            )
+            noise_block[:, quantised_axes] = (
+                np.round(noise_block[:, quantised_axes] / step[quantised_axes])
+                * step[quantised_axes]
+            )
+            yield noise_block.tolist()
 
 
-_CROSSTALK = (
+_CROSSTALK_PATTERN = (
     (0.0, -0.62, 0.31, 0.85, -0.44, 0.57),
     (0.73, 0.0, -0.52, -0.28, 0.91, -0.66),
     (-0.48, 0.39, 0.0, 0.64, -0.83, 1.0),
@@ -458,22 +481,23 @@ _CROSSTALK = (
     (-0.88, -0.33, 0.46, 0.54, 0.0, 0.79),
     (0.41, -0.97, 0.68, -0.75, 0.29, 0.0),
 )
-"""Crosstalk of each axis (row) at the full range of another, over its range and the largest
-entry."""
+"""Relative crosstalk of each axis (row) at the full range of another axis (column).
+
+The values are fractions of the crosstalk percentage, whose largest entry is 1."""
 
 
-def _wrenches(
+def _unit_wrenches(
     sensor: WrenchSensorSettings, crosstalk_percent: float
 ) -> tuple[list[float], list[float]]:
-    """Wrenches of a coupling torque of 1 N·m without shear, and of a base shear of 1 N alone."""
+    """Return the wrenches of a coupling torque of 1 N·m alone and of a base shear of 1 N alone."""
     projections = np.array([sensor.projection, sensor.shear_projection])
-    known = projections.any(axis=1)
+    is_known = projections.any(axis=1)
     wrenches = np.zeros((6, 2))
-    rows = projections[known]
-    wrenches[:, known] = rows.T @ np.linalg.inv(rows @ rows.T)
+    rows = projections[is_known]
+    wrenches[:, is_known] = rows.T @ np.linalg.inv(rows @ rows.T)
     if crosstalk_percent:
-        full = np.array(sensor.range)
-        crosstalk = 0.01 * crosstalk_percent * np.array(_CROSSTALK)
-        wrenches += crosstalk * full[:, None] / full @ wrenches
+        full_ranges = np.array(sensor.range)
+        crosstalk = 0.01 * crosstalk_percent * np.array(_CROSSTALK_PATTERN)
+        wrenches += crosstalk * full_ranges[:, None] / full_ranges @ wrenches
     per_torque, per_shear = wrenches.T.tolist()
     return per_torque, per_shear

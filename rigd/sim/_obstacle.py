@@ -1,15 +1,16 @@
-"""Obstacles in the way of the simulated beam, and knocks on it, tick by tick.
+"""Obstacles in the path of the simulated beam and impacts on it, computed tick by tick.
 
-A force on the beam drives additional states (`realise_force`): they describe its effect on the
-beam, and their torque acts on the shaft. Where the beam touches nothing, plant and these states go
-on by whole periods. Near an obstacle a period is divided into substeps, over each of which the
-force is constant; all that the rest of the plant does meanwhile is linear and known exactly, so the
-force of each substep is the root of one scalar equation.
+A force on the beam drives additional states (`realise_force`), which describe its effect on the
+beam, and whose torque acts on the shaft. While the beam touches nothing, plant and these states
+advance by whole periods. Near an obstacle a period is divided into substeps with a constant force
+each. The rest of the plant is linear and known exactly, so the force of each substep is the root of
+one scalar equation.
 
-Within a substep the penetration goes from a to q. The mean of the obstacle's elastic force over it
-is taken so that the work done on the obstacle is the energy it then holds, or has given back: no
-energy is created, whatever the stiffness. An obstacle that is stiffer than the beam is within one
-substep takes some more, or its force would ring from substep to substep.
+Within a substep the penetration changes from a to q. The mean elastic force of the obstacle over
+the substep is chosen so that the work done on the obstacle equals the change of its stored energy.
+So no energy is created, whatever the stiffness. An obstacle that is stiffer than the beam within
+one substep dissipates some energy, because its force would otherwise oscillate from substep to
+substep.
 """
 
 from collections.abc import Callable
@@ -26,47 +27,53 @@ from rigd.beam.realisation import CoupledModel, Realisation, held_inputs, propag
 from rigd.devices.obstacles import Disturbance, ImpactSpecification, Obstacle
 
 Real = NDArray[np.float64]
+"""Array of real numbers."""
 Complex = NDArray[np.complexfloating]
+"""Array of complex numbers."""
 
 _RIGID_N_PER_M = 1e9
-"""Stiffness of a rigid obstacle: it yields a nanometre for a newton."""
+"""Stiffness in N/m of a rigid obstacle: its deflection is a nanometre per newton."""
 _STIFFEST_N_PER_M = 1e5
-"""Stiffest obstacle whose touch the substeps resolve."""
-_PER_CONTACT_TIME = 6
-"""Substeps in the time in which a struck beam gets out of the way of an obstacle."""
-_FEWEST_PER_S = 16e3
+"""Stiffness in N/m of the stiffest obstacle whose contact the substeps resolve."""
+_SUBSTEPS_PER_CONTACT_TIME = 6
+"""Number of substeps in the time in which a beam that is hit recedes from an obstacle."""
+_FEWEST_SUBSTEPS_PER_S = 16e3
+"""Smallest number of substeps per second."""
 _FEWEST_SUBSTEPS = 8
-_FREE_END = 4.0
-"""By how much a beam gives way more readily at its tip than far from it."""
-_NEAR_M = 1e-3
-"""Distance, in addition to the beam's motion, within which it may touch during a period."""
-_SMALL = 0.01
-"""Displacement, as a fraction of the rigid beam's, below which the absolute error counts: there the
-beam hardly follows the motor."""
-_SWEEPS = 3
-"""Over several obstacles that the beam touches in one substep."""
+"""Smallest number of substeps per period."""
+_TIP_COMPLIANCE_RATIO = 4.0
+"""Compliance of a beam at its tip, relative to that of a beam without ends."""
+_CONTACT_MARGIN_M = 1e-3
+"""Distance in m, in addition to the beam's motion, within which it may touch during a period."""
+_SMALL_DISPLACEMENT_RATIO = 0.01
+"""Displacement relative to a rigid beam's, below which the absolute error of the fit counts.
+
+There the beam hardly follows the motor."""
+_CONTACT_ITERATIONS = 3
+"""Number of iterations over several obstacles that the beam touches in one substep."""
 
 
 class AttachedObstacles:
-    """Obstacles and knocks, attached to the plant.
+    """Obstacles and impacts that act on the plant.
 
     Parameters
     ----------
     beam, damping, realisation
-        The beam's.
+        Beam, its damping and its realisation.
     bodies
-        Obstacles and knocks.
+        Obstacles and impacts.
     period_s
-        Length of a step of the plant.
+        Duration of a step of the plant in seconds.
 
     Attributes
     ----------
     forces_n : (substeps, bodies)
-        Force on the beam over each substep of the last period, positive towards a positive angle.
+        Force in N on the beam in each substep of the last period, positive in the direction of
+        increasing angles.
     substeps : int
-        Substeps of a period.
+        Number of substeps per period.
     bodies : tuple of Disturbance
-        The obstacles and knocks.
+        Obstacles and impacts.
     """
 
     def __init__(
@@ -79,37 +86,44 @@ class AttachedObstacles:
     ) -> None:
         self.bodies = bodies
         self._period_s = period_s
-        self.substeps = _substeps(beam, bodies, period_s)
+        self.substeps = _substeps_per_period(beam, bodies, period_s)
         self._step_s = period_s / self.substeps
-        at_m = np.array([body.x_m for body in bodies])
-        pushed = [realise_force(beam, damping, x, at_m, 1 / self._step_s) for x in at_m.tolist()]
-        # Rows: displacement at each body, torque, shear. Columns: the states of each force, or the
-        # forces.
-        self._own = np.column_stack([each.rows for each in pushed])
-        self._direct = np.column_stack([each.direct for each in pushed])
-        self._a, self._b = pushed[0].a, pushed[0].b  # the same for all
-        self._oscillating = 2 * pushed[0].modes
-        turned = [
+        positions_m = np.array([body.x_m for body in bodies])
+        force_realisations = [
+            realise_force(beam, damping, x, positions_m, 1 / self._step_s)
+            for x in positions_m.tolist()
+        ]
+        # Rows: displacement at each body, torque, shear. Columns of `_force_state_rows`: states of
+        # each force; columns of `_direct_rows`: forces.
+        self._force_state_rows = np.column_stack(
+            [known_body.rows for known_body in force_realisations]
+        )
+        self._direct_rows = np.column_stack(
+            [known_body.direct for known_body in force_realisations]
+        )
+        self._a, self._b = force_realisations[0].a, force_realisations[0].b  # equal for all forces
+        self._oscillating_states = 2 * force_realisations[0].modes
+        angle_outputs = [
             state_output(
                 realisation,
-                partial(_displacement, beam, damping, x),
+                partial(_displacement_per_angle, beam, damping, x),
                 inertial=False,
-                small=_SMALL * x,
+                small=_SMALL_DISPLACEMENT_RATIO * x,
             )
-            for x in at_m.tolist()
+            for x in positions_m.tolist()
         ]
-        self._turned = np.array([[t.per_angle, t.per_velocity, *t.c] for t in turned])
-        self._at_m = at_m
+        self._rigid_rows = np.array([[t.per_angle, t.per_velocity, *t.c] for t in angle_outputs])
+        self._positions_m = positions_m
         self._obstacles = [
             (index, body, min(body.stiffness_n_per_m, _RIGID_N_PER_M))
             for index, body in enumerate(bodies)
             if isinstance(body, Obstacle)
         ]
-        self._knocks = [
+        self._impacts = [
             (i, body) for i, body in enumerate(bodies) if isinstance(body, ImpactSpecification)
         ]
-        self._none: Real = np.zeros((self.substeps, len(bodies)))
-        self.forces_n = self._none
+        self._zero_forces: Real = np.zeros((self.substeps, len(bodies)))
+        self.forces_n = self._zero_forces
         # Displacement at each body at the end of the last period, and at its start.
         self._displacement_m: Real = np.zeros(len(bodies))
         self._start_m = self._displacement_m
@@ -117,27 +131,27 @@ class AttachedObstacles:
 
     @property
     def displacement_rows(self) -> Real:
-        """Displacement of the beam at each body by the state of `attached`, (bodies, n)."""
-        return np.column_stack([self._turned, self._own[:-2]])
+        """Matrix that gives the displacement in m at each body from the extended model's state."""
+        return np.column_stack([self._rigid_rows, self._force_state_rows[:-2]])
 
-    def attached(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
-        """Extend motor and beam by the effect of the forces on the beam.
+    def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
+        """Return the model of motor and beam, extended by the effect of the forces on the beam.
 
         Returns
         -------
         model
-            With more states for each force, whose torque acts on the shaft.
+            Model with additional states for each force, whose torque acts on the shaft.
         of_force
-            Effect of each force on the state's derivative, (n, bodies).
+            Contribution of each force (1 N) to the derivative of the state, shape (n, bodies).
         """
-        bodies, own_states = self._at_m.size, self._b.size
-        n, more = model.b.size, bodies * own_states
-        torque, shear = self._own[-2], self._own[-1]
-        a = np.zeros((n + more, n + more))
+        bodies, own_states = self._positions_m.size, self._b.size
+        n, added_states = model.b.size, bodies * own_states
+        torque, shear = self._force_state_rows[-2], self._force_state_rows[-1]
+        a = np.zeros((n + added_states, n + added_states))
         a[:n, :n] = model.a
         a[:n, n:] = -np.outer(model.b, torque)
-        of_force = np.zeros((n + more, bodies))
-        of_force[:n] = -np.outer(model.b, self._direct[-2])
+        of_force = np.zeros((n + added_states, bodies))
+        of_force[:n] = -np.outer(model.b, self._direct_rows[-2])
         for index in range(bodies):
             states = slice(n + index * own_states, n + (index + 1) * own_states)
             a[states, states] = self._a
@@ -145,9 +159,9 @@ class AttachedObstacles:
         extended = replace(
             model,
             a=a,
-            b=np.append(model.b, np.zeros(more)),
-            angle=np.append(model.angle, np.zeros(more)),
-            velocity=np.append(model.velocity, np.zeros(more)),
+            b=np.append(model.b, np.zeros(added_states)),
+            angle=np.append(model.angle, np.zeros(added_states)),
+            velocity=np.append(model.velocity, np.zeros(added_states)),
             acceleration=np.append(model.acceleration, -model.acceleration_per_torque * torque),
             beam_torque=np.append(model.beam_torque, (1 - model.beam_torque_per_torque) * torque),
             sensor_torque=np.append(
@@ -157,7 +171,7 @@ class AttachedObstacles:
         )
         return extended, of_force
 
-    def march(
+    def substep_matrices(
         self,
         model: CoupledModel,
         of_force: Real,
@@ -166,25 +180,24 @@ class AttachedObstacles:
         angle_instant_s: float,
         torque_instant_s: float,
         friction: Real,
-    ) -> "March":
-        """Prepare the substeps of a period of a motor that turns, or is locked.
+    ) -> "SubstepMatrices":
+        """Compute the matrices for the substeps of a period, for a free or a locked motor.
 
         Parameters
         ----------
         model, of_force
-            As `attached` returns them.
+            As `extended_model` returns them.
         holding_torque, switch_s, angle_instant_s, torque_instant_s
             As for a step of the plant.
         friction
-            Effect on the state of friction of the period before, shape (n,).
+            Effect of the previous period's friction (1 N·m) on the state, shape (n,).
         """
-        steps, step_s, bodies = self.substeps, self._step_s, self._at_m.size
+        steps, step_s, bodies = self.substeps, self._step_s, self._positions_m.size
         n = model.b.size
-        phi, whole = propagator(model, step_s)
+        phi, step_response = propagator(model, step_s)
         displacement_rows = self.displacement_rows
 
-        # Without a force: contribution of the states, row by row, and of the torques, column by
-        # column.
+        # Displacement without a force: rows for the states, columns for the torques.
         rows = np.empty((steps, bodies, n))
         row = displacement_rows
         for j in range(steps):
@@ -193,20 +206,22 @@ class AttachedObstacles:
         state = np.zeros((n, 2))
         for j in range(steps):
             before_s = min(max(switch_s - j * step_s, 0.0), step_s)
-            after = propagator(model, step_s - before_s)[1] if 0 < before_s < step_s else whole
+            after = (
+                propagator(model, step_s - before_s)[1] if 0 < before_s < step_s else step_response
+            )
             after = after * (before_s < step_s)
-            state = phi @ state + np.column_stack([whole - after, after])
+            state = phi @ state + np.column_stack([step_response - after, after])
             torques[j] = displacement_rows @ state
         free = np.column_stack([rows.reshape(-1, n), torques.reshape(-1, 2)])
         free = np.column_stack([free, free[:, :n] @ friction])
 
-        # State that remains of a force of 1 N over one substep, j substeps later.
-        left = np.empty((steps, n, bodies))
-        left[0] = held_inputs(model, of_force, step_s)
+        # State j substeps after a force of 1 N that acted for one substep.
+        decayed_states = np.empty((steps, n, bodies))
+        decayed_states[0] = held_inputs(model, of_force, step_s)
         for j in range(1, steps):
-            left[j] = phi @ left[j - 1]
-        kernel = displacement_rows @ left
-        kernel[0] += self._direct[:-2]
+            decayed_states[j] = phi @ decayed_states[j - 1]
+        kernel = displacement_rows @ decayed_states
+        kernel[0] += self._direct_rows[:-2]
 
         def effect_on(row: Real, direct: Real, instant_s: float) -> Real:
             """Return the effect of each substep's force on an output at an instant."""
@@ -215,265 +230,287 @@ class AttachedObstacles:
             fraction = at - number
             effect = np.zeros((steps, bodies))
             for node, weight in ((number, 1 - fraction), (number + 1, fraction)):
-                effect[:node] += weight * (row @ left[:node])[::-1]
+                effect[:node] += weight * (row @ decayed_states[:node])[::-1]
             effect[number] += direct
             return effect.ravel()
 
-        at_sensor = (1 - model.sensor_torque_per_torque) * self._direct[-2]
-        shear = self._direct[-1] - model.shear_per_torque * self._direct[-2]
-        none, period_s = np.zeros(bodies), self._period_s
+        at_sensor = (1 - model.sensor_torque_per_torque) * self._direct_rows[-2]
+        shear = self._direct_rows[-1] - model.shear_per_torque * self._direct_rows[-2]
+        zero_row, period_s = np.zeros(bodies), self._period_s
         effect = np.vstack(
             [
-                left[::-1].transpose(1, 0, 2).reshape(n, -1),
-                effect_on(model.angle, none, period_s),
-                effect_on(model.velocity, none, period_s),
+                decayed_states[::-1].transpose(1, 0, 2).reshape(n, -1),
+                effect_on(model.angle, zero_row, period_s),
+                effect_on(model.velocity, zero_row, period_s),
                 effect_on(model.sensor_torque, at_sensor, period_s),
-                effect_on(holding_torque, self._direct[-2], period_s),
+                effect_on(holding_torque, self._direct_rows[-2], period_s),
                 effect_on(model.shear, shear, period_s),
-                effect_on(model.angle, none, angle_instant_s),
+                effect_on(model.angle, zero_row, angle_instant_s),
                 effect_on(model.sensor_torque, at_sensor, torque_instant_s),
                 effect_on(model.shear, shear, torque_instant_s),
             ]
         )
-        return March(
+        return SubstepMatrices(
             free=np.asfortranarray(free).dot,
             friction=-torques.sum(axis=2),
             kernel=kernel,
-            history=_history(kernel),
+            history=_history_matrices(kernel),
             effect=np.asfortranarray(effect).dot,
             velocity_row=n + 1,
         )
 
-    def nothing(self, displacement_m: Real, time_s: float) -> bool:
-        """Return whether the beam cannot have touched anything over a period without a force.
+    def cannot_touch(self, displacement_m: Real, time_s: float) -> bool:
+        """Return whether the beam cannot have touched any obstacle, nor been hit, in a period.
 
         Parameters
         ----------
         displacement_m
-            Displacement at each body at its end, shape (bodies,).
+            Displacement in m at each body at the end of a period without a force, shape (bodies,).
         time_s
-            Time at its start.
+            Time in seconds at the start of the period.
         """
         end_s = time_s + self._period_s
         before_m = self._start_m = self._displacement_m
         self._displacement_m = displacement_m.copy()
-        for _, knock in self._knocks:
-            if time_s < knock.at_s + knock.duration_s and knock.at_s < end_s:
+        for _, impact in self._impacts:
+            if time_s < impact.at_s + impact.duration_s and impact.at_s < end_s:
                 return False
         for index, body, _ in self._obstacles:
             if body.from_s < end_s and time_s < body.until_s:
                 if self._penetration_m[index] > 0:
                     return False
                 old, new = before_m.item(index), displacement_m.item(index)
-                moves = 2 * abs(new - old) + body.x_m * abs(body.rate_rad_s) * self._period_s
-                if body.side * (new - _surface(body, end_s)) > -(moves + _NEAR_M):
+                motion_m = 2 * abs(new - old) + body.x_m * abs(body.rate_rad_s) * self._period_s
+                if body.side * (new - _surface_displacement_m(body, end_s)) > -(
+                    motion_m + _CONTACT_MARGIN_M
+                ):
                     return False
-        self._penetration_m = dict.fromkeys(range(self._at_m.size), -inf)
-        self.forces_n = self._none
+        self._penetration_m = dict.fromkeys(range(self._positions_m.size), -inf)
+        self.forces_n = self._zero_forces
         return True
 
-    def forces(self, march: "March", free_m: Real, time_s: float) -> Real:
-        """Find the forces of a period.
+    def forces(self, substep_matrices: "SubstepMatrices", free_m: Real, time_s: float) -> Real:
+        """Compute the forces of obstacles and impacts on the beam in each substep of a period.
 
         Parameters
         ----------
         march
-            Substeps of the plant as it is.
+            Matrices for the substeps, of the free or the locked motor.
         free_m
-            Displacement at the end of each substep that the beam would have without a force, shape
-            (substeps, bodies).
+            Displacement in m at the end of each substep without any force, shape (substeps,
+            bodies).
         time_s
-            Time at the period's start.
+            Time in seconds at the start of the period.
 
         Returns
         -------
         (substeps, bodies)
-            In N, positive towards a positive angle.
+            Forces in N, positive in the direction of increasing angles.
         """
         steps, step_s = self.substeps, self._step_s
-        kernel = march.kernel
-        forces = np.zeros_like(self._none)
+        kernel = substep_matrices.kernel
+        forces = np.zeros_like(self._zero_forces)
         free_m = free_m.copy()
-        for index, knock in self._knocks:
-            edges_s = time_s - knock.at_s + step_s * np.arange(steps + 1)
+        for index, impact in self._impacts:
+            edges_s = time_s - impact.at_s + step_s * np.arange(steps + 1)
             # Mean of half a sine over each substep.
-            phase = pi / knock.duration_s * np.clip(edges_s, 0.0, knock.duration_s)
+            phase = pi / impact.duration_s * np.clip(edges_s, 0.0, impact.duration_s)
             forces[:, index] = (
-                -knock.force_n * knock.duration_s / pi / step_s * np.diff(np.cos(phase))
+                -impact.force_n * impact.duration_s / pi / step_s * np.diff(np.cos(phase))
             )
             for j in np.flatnonzero(forces[:, index]).tolist():
                 free_m[j:] += kernel[: steps - j, :, index] * forces[j, index]
 
         ends_s = time_s + step_s * np.arange(1, steps + 1)
-        walls = []
+        obstacles = []
         for index, body, stiffness in self._obstacles:
-            there = (ends_s > body.from_s) & (ends_s <= body.until_s)
-            if not there.any():
+            is_present = (ends_s > body.from_s) & (ends_s <= body.until_s)
+            if not is_present.any():
                 continue
-            surface_m = _surface(body, ends_s)
+            surface_m = _surface_displacement_m(body, ends_s)
             start_m = self._penetration_m[index]
             if start_m == -inf and body.from_s <= time_s:
-                start_m = body.side * (self._start_m.item(index) - _surface(body, time_s))
-            walls.append(
-                _Wall(
+                start_m = body.side * (
+                    self._start_m.item(index) - _surface_displacement_m(body, time_s)
+                )
+            obstacles.append(
+                _ActiveObstacle(
                     index=index,
                     side=body.side,
                     stiffness_n_per_m=stiffness,
                     damping_n_per_m=body.damping_n_s_per_m / step_s,
                     compliance_m_per_n=kernel.item(0, index, index),
-                    free_m=np.where(there, body.side * (free_m[:, index] - surface_m), -inf),
+                    free_m=np.where(is_present, body.side * (free_m[:, index] - surface_m), -inf),
                     start_m=start_m,
                     force_n=np.zeros(steps),
                 )
             )
-        if walls:
-            self._meet(march, walls)
-        self._ends_m = dict.fromkeys(range(self._at_m.size), -inf)
-        for wall in walls:
-            self._ends_m[wall.index] = wall.start_m
-            forces[:, wall.index] = -wall.side * wall.force_n
+        if obstacles:
+            self._compute_obstacle_forces(substep_matrices, obstacles)
+        self._ends_m = dict.fromkeys(range(self._positions_m.size), -inf)
+        for obstacle in obstacles:
+            self._ends_m[obstacle.index] = obstacle.start_m
+            forces[:, obstacle.index] = -obstacle.side * obstacle.force_n
         return forces
 
-    def _meet(self, march: "March", walls: "list[_Wall]") -> None:
-        """Compute the walls' forces, substep by substep, through a period.
+    def _compute_obstacle_forces(
+        self, substep_matrices: "SubstepMatrices", obstacles: "list[_ActiveObstacle]"
+    ) -> None:
+        """Compute the forces of all obstacles in the order of the substeps of a period.
 
-        Forces of the substeps to come are zero, so that whole rows may be summed.
+        Forces of later substeps are still zero, so that whole rows can be summed.
         """
         steps = self.substeps
-        # By how much each push takes the beam out of a wall at the end of each substep.
-        relief = [
-            [(one.side * other.side * march.history[one.index, other.index], other.force_n)
-             for other in walls]
-            for one in walls
+        # By how much each force moves the beam out of an obstacle until the end of each substep.
+        displacement_kernels = [
+            [(one.side * other.side * substep_matrices.history[one.index, other.index],
+              other.force_n) for other in obstacles]
+            for one in obstacles
         ]  # fmt: skip
-        rows = [[(list(matrix), force_n) for matrix, force_n in pairs] for pairs in relief]
-        tasks = list(zip(walls, rows, strict=True))
-        sweeps = _SWEEPS if len(walls) > 1 else 1
+        rows = [
+            [(list(matrix), force_n) for matrix, force_n in pairs] for pairs in displacement_kernels
+        ]
+        obstacles_with_rows = list(zip(obstacles, rows, strict=True))
+        iterations = _CONTACT_ITERATIONS if len(obstacles) > 1 else 1
         j = 0
         while j < steps:
-            if all(wall.start_m <= 0 for wall in walls):
-                # Nothing is touched: on to the substep at whose end something would be.
+            if all(obstacle.start_m <= 0 for obstacle in obstacles):
+                # Nothing is touched: skip to the first substep with a contact at its end.
                 first = steps
-                ahead_m = [
-                    wall.free_m - sum(matrix @ force_n for matrix, force_n in pairs)
-                    for wall, pairs in zip(walls, relief, strict=True)
+                free_penetrations_m = [
+                    obstacle.free_m - sum(matrix @ force_n for matrix, force_n in pairs)
+                    for obstacle, pairs in zip(obstacles, displacement_kernels, strict=True)
                 ]
-                for without_m in ahead_m:
-                    touched = without_m[j:first] > 0
-                    if touched.any():
-                        first = j + int(touched.argmax())
+                for free_penetration_m in free_penetrations_m:
+                    is_touching = free_penetration_m[j:first] > 0
+                    if is_touching.any():
+                        first = j + int(is_touching.argmax())
                 if first > j:
-                    for wall, without_m in zip(walls, ahead_m, strict=True):
-                        wall.start_m = without_m.item(first - 1)
+                    for obstacle, free_penetration_m in zip(
+                        obstacles, free_penetrations_m, strict=True
+                    ):
+                        obstacle.start_m = free_penetration_m.item(first - 1)
                 j = first
                 if j == steps:
                     return
-            for _ in range(sweeps):
-                for wall, pairs_of_rows in tasks:
-                    wall.force_n[j] = 0.0
-                    without = wall.free_m.item(j)
+            for _ in range(iterations):
+                for obstacle, pairs_of_rows in obstacles_with_rows:
+                    obstacle.force_n[j] = 0.0
+                    free_penetration = obstacle.free_m.item(j)
                     for matrix_rows, force_n in pairs_of_rows:
-                        without -= matrix_rows[j].dot(force_n)
-                    push, wall.end_m = wall.meet(without)
-                    wall.force_n[j] = push
-            for wall in walls:
-                wall.start_m = wall.end_m
+                        free_penetration -= matrix_rows[j].dot(force_n)
+                    force, obstacle.end_m = obstacle.force_and_penetration(free_penetration)
+                    obstacle.force_n[j] = force
+            for obstacle in obstacles:
+                obstacle.start_m = obstacle.end_m
             j += 1
 
-    def take_over(self, state: Real, other: "AttachedObstacles | None") -> Real:
-        """Continue from another contact of the beam, whose bodies are the first of these.
+    def adopt_states(self, state: Real, other: "AttachedObstacles | None") -> Real:
+        """Adopt the states of the obstacles so far, and return the plant's new state.
+
+        The obstacles so far are the first of these obstacles.
 
         Parameters
         ----------
         state
-            State of the plant with the other contact.
+            State of the plant with the other obstacles.
         other
-            None: there was no contact before.
+            Obstacles that have acted so far; None if there were none.
 
         Returns
         -------
         ndarray
-            State of the plant with this contact.
+            State of the plant with these obstacles.
         """
         size = self._b.size
         old_size = 0 if other is None else other._b.size
-        old_bodies = 0 if other is None else other._at_m.size
+        old_bodies = 0 if other is None else other._positions_m.size
         n = state.size - old_size * old_bodies
-        whole = np.zeros(n + size * self._at_m.size)
-        whole[:n] = state[:n]
+        new_state = np.zeros(n + size * self._positions_m.size)
+        new_state[:n] = state[:n]
         if other is not None:
-            modal = min(self._oscillating, other._oscillating)
-            real = min(size - self._oscillating, old_size - other._oscillating)
+            modal_states = min(self._oscillating_states, other._oscillating_states)
+            real_states = min(size - self._oscillating_states, old_size - other._oscillating_states)
             for index in range(old_bodies):
-                new = whole[n + index * size :]
+                new = new_state[n + index * size :]
                 old = state[n + index * old_size :]
-                new[:modal] = old[:modal]
-                new[self._oscillating : self._oscillating + real] = old[
-                    other._oscillating : other._oscillating + real
+                new[:modal_states] = old[:modal_states]
+                new[self._oscillating_states : self._oscillating_states + real_states] = old[
+                    other._oscillating_states : other._oscillating_states + real_states
                 ]
             self._penetration_m.update(other._penetration_m)
-        self._displacement_m = self.displacement_rows @ whole
-        return whole
+        self._displacement_m = self.displacement_rows @ new_state
+        return new_state
 
-    def end(self, body: Disturbance, time_s: float) -> None:
-        """Remove an obstacle."""
+    def remove(self, body: Disturbance, time_s: float) -> None:
+        """Remove an obstacle from the simulation at a time in seconds."""
         self._obstacles = [
-            (index, replace(each, until_s=min(each.until_s, time_s)) if each == body else each, k)
-            for index, each, k in self._obstacles
+            (
+                index,
+                replace(known_body, until_s=min(known_body.until_s, time_s))
+                if known_body == body
+                else known_body,
+                k,
+            )
+            for index, known_body, k in self._obstacles
         ]
 
-    def take(self, march: "March", forces_n: Real, free_m: Real) -> None:
-        """Continue from the last result of `forces`."""
+    def store_forces(
+        self, substep_matrices: "SubstepMatrices", forces_n: Real, free_m: Real
+    ) -> None:
+        """Store the forces of a period and the displacements and penetrations at its end."""
         self.forces_n = forces_n
         self._penetration_m = self._ends_m
-        self._displacement_m = free_m[-1] + np.einsum("jab,jb->a", march.kernel[::-1], forces_n)
+        self._displacement_m = free_m[-1] + np.einsum(
+            "jab,jb->a", substep_matrices.kernel[::-1], forces_n
+        )
 
 
 @dataclass(slots=True, eq=False)
-class _Wall:
-    """An obstacle over one period."""
+class _ActiveObstacle:
+    """Obstacle during one period, with its penetration by the beam and its force."""
 
     index: int
     side: int
     stiffness_n_per_m: float
-    damping_n_per_m: float  # over the length of a substep
-    compliance_m_per_n: float  # by how much the beam gives way within a substep
-    free_m: Real  # penetration at the end of each substep without any push of this period
+    damping_n_per_m: float  # damping coefficient divided by the length of a substep
+    compliance_m_per_n: float  # displacement of the beam by 1 N within a substep
+    free_m: Real  # penetration at the end of each substep without any force in this period
     start_m: float  # penetration at the start of the present substep
-    force_n: Real  # the pushes, as far as found; positive, whatever the side
+    force_n: Real  # forces of the substeps computed so far, else 0; positive on either side
     end_m: float = -inf  # penetration at the end of the present substep
 
-    def meet(self, p: float) -> tuple[float, float]:
-        """Return push and penetration at the end of a substep that without a push would be p.
+    def force_and_penetration(self, p: float) -> tuple[float, float]:
+        """Return mean force and final penetration of a substep that ends at p without the force.
 
-        The push is the mean over the substep, which the work decides: see the module.
+        The mean force over the substep follows from the work, as the module's docstring explains.
         """
-        if p == -inf:  # it is not there
+        if p == -inf:  # the obstacle is not present
             return 0.0, p
         a, compliance, damping = self.start_m, self.compliance_m_per_n, self.damping_n_per_m
         stiffness = self.stiffness_n_per_m
-        if a == -inf:  # it has just appeared
+        if a == -inf:  # the obstacle has just appeared
             a = 0.0
         if a >= 0:
             ratio = (stiffness * compliance) ** 2
-            # From 1/2, which conserves energy, to 1, which takes what would ring.
+            # From 1/2, which conserves energy, to 1, which damps oscillation between substeps.
             weight = 0.5 + 0.5 * ratio / (1 + ratio)
             force = stiffness * ((1 - weight) * a + weight * p) + damping * (p - a)
             force /= 1 + compliance * (stiffness * weight + damping)
             q = p - compliance * force
             if q >= 0:
                 return (force, q) if force > 0 else (0.0, p)
-            # It leaves: (p - q) (a - q) / compliance = k a²/2 - damping a (a - q)
+            # The beam leaves: (p - q) (a - q) / compliance = k a²/2 - damping a (a - q)
             p_less = p + compliance * damping * a
             root = sqrt((p_less - a) ** 2 + 2 * compliance * stiffness * a * a)
             q = 0.5 * (p_less + a - root)
             force = 0.5 * stiffness * a * a / (a - q) - damping * a
         elif p > 0:
-            # It arrives: (p - q) (q - a) / compliance = k q²/2 + damping q (q - a)
+            # The beam arrives: (p - q) (q - a) / compliance = k q²/2 + damping q (q - a)
             square = 1 + compliance * (0.5 * stiffness + damping)
             linear = p + a + compliance * damping * a
             root = sqrt(linear * linear - 4 * square * p * a)
-            # Either form of the positive root cancels where the other does not.
+            # Two forms of the positive root: choose the one without cancellation.
             q = (linear + root) / (2 * square) if linear > 0 else 2 * p * a / (linear - root)
             force = 0.5 * stiffness * q * q / (q - a) + damping * q
         else:
@@ -482,52 +519,56 @@ class _Wall:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class March:
-    """Substeps of a period, for a motor that turns or one that is locked."""
+class SubstepMatrices:
+    """Matrices for the substeps of a period, for a free or a locked motor."""
 
     free: Callable[[Real], Real]
-    """From [state, torque before and after the switch, friction of the period before] to the
-    displacement at the end of each substep, body by body."""
+    """Function from [state, torque before and after the switch, friction of the previous period] to
+    the displacement at the end of each substep without forces, body by body."""
     friction: Real
-    """(substeps, bodies): what friction of 1 N·m adds to it."""
+    """Effect of friction of 1 N·m on these displacements, shape (substeps, bodies)."""
     kernel: Real
-    """(substeps, bodies, bodies): displacement at the end of the same substep and of each later one
-    by a force of 1 N over one."""
+    """Displacement at the end of the same and of each later substep by a force of 1 N in one
+    substep, shape (substeps, bodies, bodies)."""
     history: Real
-    """(bodies, bodies, substeps, substeps): the same by the forces of all substeps up to each."""
+    """Displacement at the end of each substep by forces of 1 N in all substeps up to it, shape
+    (bodies, bodies, substeps, substeps)."""
     effect: Callable[[Real], Real]
-    """From the forces to what they add to [next state, outputs]."""
+    """Function from the forces of all substeps to their effect on [next state, outputs]."""
     velocity_row: int
-    """Row of the velocity there."""
+    """Row of the velocity in [next state, outputs]."""
 
 
-def _history(kernel: Real) -> Real:
-    """Lower triangular matrices of a kernel (substeps, m, m), shape (m, m, substeps, substeps)."""
+def _history_matrices(kernel: Real) -> Real:
+    """Return lower triangular matrices (m, m, substeps, substeps) of a kernel (substeps, m, m)."""
     steps = len(kernel)
     lag = np.subtract.outer(np.arange(steps), np.arange(steps))
     history: Real = np.where(lag >= 0, kernel.transpose(1, 2, 0)[:, :, np.maximum(lag, 0)], 0.0)
     return history
 
 
-def _surface(body: Obstacle, time_s: Any) -> Any:  # noqa: ANN401 - one time or several
-    """Displacement at which the beam touches an obstacle."""
+def _surface_displacement_m(body: Obstacle, time_s: Any) -> Any:  # noqa: ANN401 - one time or several
+    """Return the displacement in m of the beam, at given times, at which it touches an obstacle."""
     return body.x_m * (body.angle_rad + body.rate_rad_s * (time_s - body.from_s))
 
 
-def _substeps(beam: Beam, bodies: tuple[Disturbance, ...], period_s: float) -> int:
-    """Substeps of a period, fine enough for the stiffest obstacle."""
+def _substeps_per_period(beam: Beam, bodies: tuple[Disturbance, ...], period_s: float) -> int:
+    """Return the number of substeps per period, which resolves the contacts of all obstacles."""
     # A force that grows like k t moves a beam without ends by k t^(3/2) / unit.
     unit = 2 * sqrt(2) * beam.density_kg_per_m**0.75 * beam.bending_stiffness_n_m2**0.25
-    wanted = [_FEWEST_PER_S]
+    required_rates_per_s = [_FEWEST_SUBSTEPS_PER_S]
     for body in bodies:
         if isinstance(body, Obstacle):
             rate_per_s = (min(body.stiffness_n_per_m, _STIFFEST_N_PER_M) / unit) ** (2 / 3)
             reach_m = (beam.density_over_stiffness * rate_per_s**2) ** -0.25
-            nearness = exp((body.x_m - beam.length_m) / reach_m)
-            gives_way = 1 + (_FREE_END - 1) * nearness
-            wanted.append(_PER_CONTACT_TIME * rate_per_s * gives_way ** (2 / 3))
-    return max(_FEWEST_SUBSTEPS, ceil(max(wanted) * period_s))
+            tip_proximity = exp((body.x_m - beam.length_m) / reach_m)
+            compliance_ratio = 1 + (_TIP_COMPLIANCE_RATIO - 1) * tip_proximity
+            required_rates_per_s.append(
+                _SUBSTEPS_PER_CONTACT_TIME * rate_per_s * compliance_ratio ** (2 / 3)
+            )
+    return max(_FEWEST_SUBSTEPS, ceil(max(required_rates_per_s) * period_s))
 
 
-def _displacement(beam: Beam, damping: Damping, x_m: float, s: Complex) -> Complex:
+def _displacement_per_angle(beam: Beam, damping: Damping, x_m: float, s: Complex) -> Complex:
+    """Return the transfer function from motor angle to displacement of the beam at a position."""
     return PointForceGrid(s, beam, damping).per_angle(x_m)

@@ -1,4 +1,4 @@
-"""Scatter of the simulated beam between sessions, drawn from the seed of each session."""
+"""Random variation of the simulated beam between sessions, drawn from the seed of each session."""
 
 from dataclasses import replace
 
@@ -6,33 +6,33 @@ import numpy as np
 
 from rigd.devices.parameters import RigParameters
 
-_STREAM = 1
-"""Separates these draws from those of the noise, which has the same seed."""
+_RANDOM_STREAM = 1
+"""Number that separates these random draws from those of the noise, which has the same seed."""
 
 
 def scatters_between_sessions(rig: RigParameters) -> bool:
-    """Return whether the simulated beam differs between sessions.
+    """Return whether the simulated beam varies between sessions.
 
     Parameters
     ----------
     rig
         Parameters of the rig.
     """
-    return any(_percentages(rig))
+    return any(_scatter_percentages(rig))
 
 
 def session_parameters(rig: RigParameters, seed: int) -> RigParameters:
-    """Return the parameters that the simulated rig has in one session.
+    """Return the parameters of the simulated rig in one session, with the beam of this session.
 
-    zeta, gamma and the bending stiffness are multiplied by ``exp(0.01 p z)``: p is the percentage
-    that the profile states for each, z a standard normal number that follows from the seed.
+    zeta, gamma and the bending stiffness are each multiplied by ``exp(0.01 p z)``. Here p is the
+    percentage in the profile, and z a standard normal number that follows from the seed.
 
     Parameters
     ----------
     rig
         Parameters of the rig, with a section ``simulation``.
     seed
-        Seed of the session, `simulation_seed` in its file.
+        Seed of the session (`simulation_seed` in its file).
 
     Examples
     --------
@@ -44,12 +44,14 @@ def session_parameters(rig: RigParameters, seed: int) -> RigParameters:
     >>> print(*(f"{session_parameters(rig, seed).damping.gamma:.4f}" for seed in (1, 2, 3)))
     0.0585 0.0498 0.0536
     """
-    percentages = np.array(_percentages(rig))
+    percentages = np.array(_scatter_percentages(rig))
     simulation = rig.simulation
     if simulation is None or not percentages.any():
         return rig
-    normal = np.random.default_rng((seed, _STREAM)).standard_normal(percentages.size)
-    zeta, gamma, stiffness = np.exp(0.01 * percentages * normal).tolist()
+    standard_normals = np.random.default_rng((seed, _RANDOM_STREAM)).standard_normal(
+        percentages.size
+    )
+    zeta, gamma, stiffness = np.exp(0.01 * percentages * standard_normals).tolist()
     damping = rig.damping
     return replace(
         rig,
@@ -58,7 +60,8 @@ def session_parameters(rig: RigParameters, seed: int) -> RigParameters:
     )
 
 
-def _percentages(rig: RigParameters) -> tuple[float, float, float]:
+def _scatter_percentages(rig: RigParameters) -> tuple[float, float, float]:
+    """Return the percentages by which zeta, gamma and stiffness scatter between sessions."""
     simulation = rig.simulation
     if simulation is None:
         return 0.0, 0.0, 0.0

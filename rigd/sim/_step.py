@@ -1,7 +1,8 @@
-"""One period of the simulated rig as matrices: motor and beam, on a free and on a locked shaft.
+"""Matrices for one period of the simulated rig: motor and beam, with a free or a locked shaft.
 
-The input is the state, the motor's torque before and after it changes, and the friction; the output
-is the state at the period's end and the quantities for sensors and friction.
+The input consists of the state, the motor's torque before and after its change within the period,
+and the friction. The output consists of the state at the end of the period and the quantities for
+sensors and friction.
 """
 
 from dataclasses import replace
@@ -23,30 +24,34 @@ from rigd.beam.realisation import (
     with_filter,
 )
 from rigd.devices.parameters import RigParameters, Simulation
-from rigd.sim._stiffness_drift import in_displacements
+from rigd.sim._stiffness_drift import with_modal_displacements
 
 Real = NDArray[np.float64]
+"""Array of real numbers."""
 
 OUTPUTS = 8
-"""Rows of a step beyond the state: angle, velocity, sensor torque, the same if the shaft did not
-accelerate, base shear, sensed angle, sensed torque, sensed shear."""
+"""Number of outputs of a step in addition to the state.
+
+They are angle, velocity, sensor torque, sensor torque on a shaft that does not accelerate, base
+shear, sensed angle, sensed torque, sensed shear."""
 
 _SAME_INSTANT_PERIODS = 1e-9
+"""Difference of two instants, in periods, below which they count as equal."""
 
 
-def models_of(
+def beam_and_coupled_models(
     parameters: RigParameters, simulation: Simulation, modes_of: Beam | None = None
 ) -> tuple[Realisation, CoupledModel, CoupledModel]:
-    """Realise the beam, and attach it to the free and to the locked shaft.
+    """Return the realisation of the beam, and the models of the beam on a free and a locked shaft.
 
     Parameters
     ----------
     parameters
-        The rig, with the beam as it is simulated.
+        Parameters of the rig, with the beam that is simulated.
     simulation
-        What is at the beam and in its sensor.
+        Tip mass, clamp compliance and sensor filter of the simulated rig.
     modes_of
-        As for `realise`.
+        As for :func:`rigd.beam.realisation.realise`.
     """
     beam = realise(
         parameters.beam,
@@ -81,20 +86,20 @@ def models_of(
     return beam, free, locked
 
 
-def steps_of(
+def free_and_locked_steps(
     free: CoupledModel, locked: CoupledModel, period_s: float, instants: tuple[float, float, float]
 ) -> tuple[Real, Real, Real]:
-    """One period on the free and on the locked shaft, and what friction of 1 N·m does in it.
+    """Return step matrices of the free and the locked shaft, and the effect of friction of 1 N·m.
 
-    A period's friction is known only after its step, from the speed reached without it. The outputs
-    are then corrected at once, the state by a last column of the next step.
+    The friction of a period is known only after its step, from the speed reached without friction.
+    The outputs are then corrected at once, and the state by the last column of the next step.
 
     Parameters
     ----------
     free, locked
-        Motor and beam.
+        Models of motor and beam.
     period_s, instants
-        As for `_step`.
+        As for `_step_matrix`.
 
     Returns
     -------
@@ -102,15 +107,15 @@ def steps_of(
     friction : (n + 8,)
     """
     n = free.b.size
-    step = _step(free, locked.sensor_torque, period_s, *instants)
-    locked_step = _step(locked, locked.sensor_torque, period_s, *instants)
+    step = _step_matrix(free, locked.sensor_torque, period_s, *instants)
+    locked_step = _step_matrix(locked, locked.sensor_torque, period_s, *instants)
     friction = -(step[:, n] + step[:, n + 1])
     step = np.column_stack([step, step[:, :n] @ friction[:n]])
     locked_step = np.column_stack([locked_step, locked_step[:, :n] @ friction[:n]])
     return step, locked_step, friction
 
 
-def arrays_at(
+def drifted_step_arrays(
     stiffness_ratio: float,
     parameters: RigParameters,
     simulation: Simulation,
@@ -118,18 +123,18 @@ def arrays_at(
     period_s: float,
     instants: tuple[float, float, float],
 ) -> tuple[Real, Real, Real, Real]:
-    """Compute the arrays of a step for a beam whose stiffness has drifted.
+    """Return the arrays of a step for a beam whose bending stiffness has drifted.
 
     Parameters
     ----------
     stiffness_ratio
-        The stiffness over that at the start.
+        Bending stiffness divided by that at the start of the drift.
     parameters, simulation
-        As for `models_of`, at the start.
+        As for `beam_and_coupled_models`, at the start of the drift.
     at_start
-        The beam there.
+        Realisation of the beam at the start of the drift.
     period_s, instants
-        As for `_step`.
+        As for `_step_matrix`.
 
     Returns
     -------
@@ -143,36 +148,40 @@ def arrays_at(
     RealisationError
         If the beam cannot be realised at that stiffness.
     """
-    own = parameters.beam
-    drifted = replace(own, bending_stiffness_n_m2=stiffness_ratio * own.bending_stiffness_n_m2)
+    beam_at_start = parameters.beam
+    drifted_beam = replace(
+        beam_at_start, bending_stiffness_n_m2=stiffness_ratio * beam_at_start.bending_stiffness_n_m2
+    )
     try:
-        beam, *models = models_of(replace(parameters, beam=drifted), simulation, own)
+        beam, *models = beam_and_coupled_models(
+            replace(parameters, beam=drifted_beam), simulation, beam_at_start
+        )
     except RealisationError as error:
         raise RealisationError(
             "simulation.stiffness_drift_per_s: this beam cannot be simulated at "
             f"{stiffness_ratio:.4g} times its stiffness, which it drifts to; leave the drift out. "
             f"{error}"
         ) from error
-    free, locked = (in_displacements(model, beam, at_start) for model in models)
-    step, locked_step, friction = steps_of(free, locked, period_s, instants)
+    free, locked = (with_modal_displacements(model, beam, at_start) for model in models)
+    step, locked_step, friction = free_and_locked_steps(free, locked, period_s, instants)
     per_torque = np.array([free.sensor_torque_per_torque, free.shear_per_torque])
     return step, locked_step, friction[free.b.size :], per_torque
 
 
 def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
-    """Return the whole periods in a delay, and the remainder in seconds.
+    """Split a delay into a number of whole periods and a remainder in seconds.
 
     Parameters
     ----------
     delay_s, period_s
-        The delay, and the length of a period.
+        Delay and duration of a period in seconds.
     """
     periods = int(delay_s / period_s + _SAME_INSTANT_PERIODS)
-    rest = delay_s - periods * period_s
-    return periods, rest if rest > _SAME_INSTANT_PERIODS * period_s else 0.0
+    remainder_s = delay_s - periods * period_s
+    return periods, remainder_s if remainder_s > _SAME_INSTANT_PERIODS * period_s else 0.0
 
 
-def _step(
+def _step_matrix(
     model: CoupledModel,
     holding_torque: Real,
     period_s: float,
@@ -180,20 +189,20 @@ def _step(
     angle_instant_s: float,
     torque_instant_s: float,
 ) -> Real:
-    """One period: from [state, torque before and after the switch] to [next state, outputs].
+    """Return the matrix from [state, torque before and after its change] to [state, outputs].
 
     Parameters
     ----------
     model
-        Motor and beam.
+        Model of motor and beam.
     holding_torque
-        (n,) row: sensor torque on a shaft that does not accelerate.
+        Row for the sensor torque on a shaft that does not accelerate, shape (n,).
     period_s
-        Length of the step.
+        Duration of the step in seconds.
     switch_s
-        Time at which the motor's torque changes, from the step's start.
+        Time in seconds from the start of the step at which the motor's torque changes.
     angle_instant_s, torque_instant_s
-        Instants of the sensed values, from the start of the step.
+        Times in seconds from the start of the step at which angle and torque are sensed.
 
     Returns
     -------
@@ -202,24 +211,26 @@ def _step(
 
     @cache
     def state_at(instant_s: float) -> Real:
-        phi, whole = propagator(model, instant_s)
+        phi, step_response = propagator(model, instant_s)
         after = propagator(model, max(instant_s - switch_s, 0.0))[1]
-        return np.column_stack([phi, whole - after, after])
+        return np.column_stack([phi, step_response - after, after])
 
     def torque_at(instant_s: float) -> Real:
-        return at_once(model.sensor_torque, model.sensor_torque_per_torque, instant_s)
+        return row_with_immediate_effect(
+            model.sensor_torque, model.sensor_torque_per_torque, instant_s
+        )
 
     def shear_at(instant_s: float) -> Real:
-        return at_once(model.shear, model.shear_per_torque, instant_s)
+        return row_with_immediate_effect(model.shear, model.shear_per_torque, instant_s)
 
-    def at_once(of_state: Real, per_torque: float, instant_s: float) -> Real:
+    def row_with_immediate_effect(of_state: Real, per_torque: float, instant_s: float) -> Real:
         """Return the row of the immediate effect of the torque."""
         row: Real = of_state @ state_at(instant_s)
-        apart_s = instant_s - switch_s
-        if abs(apart_s) <= _SAME_INSTANT_PERIODS * period_s:
+        after_switch_s = instant_s - switch_s
+        if abs(after_switch_s) <= _SAME_INSTANT_PERIODS * period_s:
             fraction_after = 0.5
         else:
-            fraction_after = 1.0 if apart_s > 0 else 0.0
+            fraction_after = 1.0 if after_switch_s > 0 else 0.0
         row[-2:] += per_torque * np.array([1 - fraction_after, fraction_after])
         return row
 
@@ -242,11 +253,11 @@ def _step(
 def _output_rows(
     model: CoupledModel, end: Real, torque: Real, holding_torque: Real
 ) -> tuple[Real, ...]:
-    """Return the rows of the state at a period's end, and of outputs other than the sensors'."""
+    """Return the rows of the state after a period, and of the outputs except shear and sensors."""
     return end, model.angle @ end, model.velocity @ end, torque, holding_torque @ end
 
 
-def held_of(
+def constant_force_effect(
     model: CoupledModel,
     of_force: Real,
     holding_torque: Real,
@@ -254,16 +265,17 @@ def held_of(
     angle_instant_s: float,
     torque_instant_s: float,
 ) -> Real:
-    """Return the effect of a constant force of the air over a period on [next state, outputs].
+    """Return the effect of a drag force, constant over a period, on [next state, outputs].
 
     Parameters
     ----------
     model
-        Motor and beam.
+        Model of motor and beam.
     of_force
-        Effect of the force on the state's derivative, (n, points).
+        Contribution of the force per metre at the points to the derivative of the state, shape (n,
+        points).
     holding_torque, period_s, angle_instant_s, torque_instant_s
-        As for `_step`.
+        As for `_step_matrix`.
 
     Returns
     -------

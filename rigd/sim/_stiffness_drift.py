@@ -1,11 +1,11 @@
-"""A beam whose bending stiffness drifts: the matrices of a step, renewed now and then.
+"""Drift of the simulated beam's bending stiffness: step matrices that are updated now and then.
 
-They are computed at a few stiffnesses, Chebyshev's points, and interpolated by a polynomial. The
-state has to mean the same at all of them. A mode's states in a realisation are those of
-``x' = p x + θ''`` for its two poles p, which the stiffness moves and perhaps makes real. The
-displacement and the speed of the oscillator ``q'' - (p + p*) q' + p p* q = -θ''`` do not jump with
-the stiffness, and are the mode's states here. The states of the branch cut have poles that stay.
-The shapes of the modes are taken for unchanged, as they are on a clamp that does not give way.
+The matrices are computed at a few stiffnesses (Chebyshev points) and interpolated by a polynomial.
+This requires that the state has the same meaning at all stiffnesses. A mode's states in a
+realisation are those of ``x' = p x + θ''`` for its two poles p, which change with the stiffness and
+may become real. Displacement and speed of the oscillator ``q'' - (p + p*) q' + p p* q = -θ''`` are
+continuous when the stiffness changes, so they are the mode's states here. The states of the branch
+cut have constant poles. The mode shapes are assumed constant, which is true for a rigid clamp.
 """
 
 import math
@@ -18,35 +18,43 @@ from numpy.typing import NDArray
 from rigd.beam.realisation import CoupledModel, Realisation
 
 Real = NDArray[np.float64]
+"""Array of real numbers."""
 
-MOST_DRIFT = 0.05
+LARGEST_DRIFT = 0.05
 """Relative change of the stiffness at which the drift ends."""
-_RENEWED_EVERY_S = 0.02
-_ERROR = 1e-10
-"""Error of the interpolation, in the steps of a mode without damping."""
+_UPDATE_INTERVAL_S = 0.02
+"""Time in seconds between two updates of the matrices."""
+_LARGEST_INTERPOLATION_ERROR = 1e-10
+"""Largest error of the interpolation, for the step matrix of a mode without damping."""
 
 
 class StiffnessDrift:
-    """Arrays that depend on the beam's stiffness, as it is now.
+    """Step matrices that depend on the beam's bending stiffness, interpolated for the present time.
 
     Parameters
     ----------
     rate_per_s
-        Relative change of the stiffness each second; not 0.
+        Relative change of the stiffness per second; not 0.
     period_s
-        Length of a step.
+        Duration of a step in seconds.
     fastest_rad_s
-        Largest natural frequency in the arrays.
+        Largest natural frequency of the modelled modes in rad/s.
     arrays_at
-        Returns the arrays for a ratio of the stiffness to that at the start.
+        Function that returns the arrays for the stiffness divided by that at the start.
 
     Attributes
     ----------
     arrays : tuple of ndarray
-        As they are now, in column order: at first those of the start.
+        Arrays for the present stiffness, in column order; initially those at the start.
     """
 
-    __slots__ = ("_all", "_block", "_coefficients", "_per_period", "arrays")
+    __slots__ = (
+        "_coefficients",
+        "_drift_fraction_per_period",
+        "_flat_arrays",
+        "_periods_per_update",
+        "arrays",
+    )
 
     def __init__(
         self,
@@ -56,77 +64,86 @@ class StiffnessDrift:
         arrays_at: Callable[[float], Sequence[Real]],
     ) -> None:
         # The phase of the fastest mode in a step, from the middle of the drift to its ends.
-        half_rad = 0.25 * MOST_DRIFT * fastest_rad_s * period_s
+        half_rad = 0.25 * LARGEST_DRIFT * fastest_rad_s * period_s
         points = 3
-        while 2 * (0.5 * half_rad) ** points / math.factorial(points) > _ERROR:
+        while (
+            2 * (0.5 * half_rad) ** points / math.factorial(points) > _LARGEST_INTERPOLATION_ERROR
+        ):
             points += 1
-        positions = -np.cos(np.pi * np.arange(points) / (points - 1))
-        end = math.copysign(MOST_DRIFT, rate_per_s)
-        found = [arrays_at(1 + end * 0.5 * (1 + position)) for position in positions.tolist()]
-        shapes = [array.shape for array in found[0]]
-        values = np.stack([np.concatenate([a.ravel("F") for a in arrays]) for arrays in found])
-        self._coefficients = np.linalg.solve(
-            np.polynomial.chebyshev.chebvander(positions, points - 1), values
+        chebyshev_points = -np.cos(np.pi * np.arange(points) / (points - 1))
+        end = math.copysign(LARGEST_DRIFT, rate_per_s)
+        arrays_at_points = [
+            arrays_at(1 + end * 0.5 * (1 + chebyshev_point))
+            for chebyshev_point in chebyshev_points.tolist()
+        ]
+        shapes = [array.shape for array in arrays_at_points[0]]
+        values = np.stack(
+            [np.concatenate([a.ravel("F") for a in arrays]) for arrays in arrays_at_points]
         )
-        self._all = values[0].copy()
+        self._coefficients = np.linalg.solve(
+            np.polynomial.chebyshev.chebvander(chebyshev_points, points - 1), values
+        )
+        self._flat_arrays = values[0].copy()
         sizes = [math.prod(shape) for shape in shapes]
-        parts = np.split(self._all, np.cumsum(sizes[:-1]))
+        parts = np.split(self._flat_arrays, np.cumsum(sizes[:-1]))
         self.arrays = tuple(
             part.reshape(shape, order="F") for part, shape in zip(parts, shapes, strict=True)
         )
-        self._block = max(1, round(_RENEWED_EVERY_S / period_s))
-        self._per_period = abs(rate_per_s) * period_s / MOST_DRIFT
+        self._periods_per_update = max(1, round(_UPDATE_INTERVAL_S / period_s))
+        self._drift_fraction_per_period = abs(rate_per_s) * period_s / LARGEST_DRIFT
 
-    def renew(self, periods: int) -> bool:
-        """Update the arrays for the coming periods, if an update is due.
+    def refresh_if_due(self, periods: int) -> bool:
+        """Update the arrays for the coming periods if an update is due.
 
         Parameters
         ----------
         periods
-            Periods since the drift began; call it for every period.
+            Number of periods since the drift began; call this method in every period.
 
         Returns
         -------
         bool
             Whether the arrays have changed.
         """
-        if periods < 0 or periods % self._block:
+        if periods < 0 or periods % self._periods_per_update:
             return False
-        fraction = (periods + 0.5 * self._block) * self._per_period
-        if fraction - self._block * self._per_period > 1:
-            return False  # it stays as it is
+        fraction = (periods + 0.5 * self._periods_per_update) * self._drift_fraction_per_period
+        if fraction - self._periods_per_update * self._drift_fraction_per_period > 1:
+            return False  # the drift has ended
         angle = math.acos(1 - 2 * min(fraction, 1.0))
         # The k-th polynomial is cos(k arccos x); x runs from -1 to 1.
         weights = np.cos((math.pi - angle) * np.arange(len(self._coefficients)))
-        weights.dot(self._coefficients, self._all)
+        weights.dot(self._coefficients, self._flat_arrays)
         return True
 
 
-def in_displacements(model: CoupledModel, beam: Realisation, at_start: Realisation) -> CoupledModel:
-    """Describe a coupled model by the displacements and speeds of its modes.
+def with_modal_displacements(
+    model: CoupledModel, beam: Realisation, at_start: Realisation
+) -> CoupledModel:
+    """Transform a coupled model so that its states are displacements and speeds of the modes.
 
     Parameters
     ----------
     model
-        Motor and beam, with the states of the realisation after angle and speed.
+        Model of motor and beam, with the states of the realisation after angle and speed.
     beam
-        The realisation.
+        Realisation of the beam.
     at_start
-        That before the stiffness began to drift; displacements are in units that it fixes.
+        Realisation at the start of the drift, which defines the units of the displacements.
     """
     n, states = model.b.size, beam.b.size
-    back = np.eye(n)
-    back[2 : 2 + states, 2 : 2 + states] = _from_displacements(beam, at_start)
-    to = np.linalg.inv(back)
+    from_displacements = np.eye(n)
+    from_displacements[2 : 2 + states, 2 : 2 + states] = _states_from_displacements(beam, at_start)
+    to_displacements = np.linalg.inv(from_displacements)
 
     def row(own: Real) -> Real:
-        turned: Real = own @ back
-        return turned
+        transformed: Real = own @ from_displacements
+        return transformed
 
     return replace(
         model,
-        a=to @ model.a @ back,
-        b=to @ model.b,
+        a=to_displacements @ model.a @ from_displacements,
+        b=to_displacements @ model.b,
         angle=row(model.angle),
         velocity=row(model.velocity),
         acceleration=row(model.acceleration),
@@ -138,8 +155,8 @@ def in_displacements(model: CoupledModel, beam: Realisation, at_start: Realisati
     )
 
 
-def _from_displacements(beam: Realisation, at_start: Realisation) -> Real:
-    """Matrix from displacements and speeds, mode by mode, then the other states, to the states."""
+def _states_from_displacements(beam: Realisation, at_start: Realisation) -> Real:
+    """Return the matrix from modal displacements, speeds and other states to the states."""
     rates_at_start = {
         mode: abs(pole)
         for mode, pole in zip(at_start.modes.tolist(), at_start.poles_rad_s.tolist(), strict=True)
@@ -148,7 +165,7 @@ def _from_displacements(beam: Realisation, at_start: Realisation) -> Real:
     first = np.cumsum([0, *np.where(poles.imag > 0, 2, 1)])  # state of each pole
     matrix = np.zeros((beam.b.size, beam.b.size))
     column = 0
-    alone: list[int] = []
+    unchanged_states: list[int] = []
     for mode in np.unique(modes):
         of_mode = np.flatnonzero(modes == mode)
         states = first[of_mode]
@@ -160,10 +177,10 @@ def _from_displacements(beam: Realisation, at_start: Realisation) -> Real:
         elif mode >= 0 and of_mode.size == 2:
             rows = [[pole.real, -1.0] for pole in poles[of_mode[::-1]]]
         else:
-            alone += states.tolist()
+            unchanged_states += states.tolist()
             continue
         unit = np.array([1 / rates_at_start[int(mode)], 1.0])
         matrix[states, column : column + 2] = np.array(rows) * unit
         column += 2
-    matrix[alone, np.arange(column, beam.b.size)] = 1.0
+    matrix[unchanged_states, np.arange(column, beam.b.size)] = 1.0
     return matrix

@@ -17,7 +17,7 @@ from rigd.excitation import chirp, hold
 from rigd.profile import load_profile
 from rigd.safety.limits import INTERLOCKS, Action
 from rigd.session.layout import Status
-from rigd.sim import Stuck
+from rigd.sim import StuckReadings
 
 MIDDLE_NS = 3_000_000_000
 MIDDLE = 3000
@@ -108,7 +108,7 @@ def jump(session):
 
 
 def stick_encoder(session, at, every=0):
-    session.drive.fault_at, session.drive.fault = at, Stuck(every)
+    session.drive.fault_at, session.drive.fault = at, StuckReadings(every)
 
 
 def strengthen(session):
@@ -190,15 +190,15 @@ CASES = {
         r"Ratio of the net torque .* acceleration 0\.\d+ below limit 0\.5 ",
     ),
     "frozen sensor": Case(
-        lambda s: sensor(s, stuck=Stuck()),
+        lambda s: sensor(s, stuck=StuckReadings()),
         r"Run of identical readings of all sensor channels 20 ticks exceeds limit 19 ticks",
     ),
     "frozen channel": Case(
-        lambda s: sensor(s, stuck_axis=(1, Stuck())),
+        lambda s: sensor(s, stuck_axis=(1, StuckReadings())),
         r"Run of identical readings of the sensor's fy_n \d+ ticks exceeds limit \d+ ticks",
     ),
     "repeated wrench": Case(
-        lambda s: sensor(s, stuck=Stuck(2)),
+        lambda s: sensor(s, stuck=StuckReadings(2)),
         r"Percentage of readings of the sensor's whole wrench that repeat the one before \d\d\.\d",
     ),
     "torque command": Case(

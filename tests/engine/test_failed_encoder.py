@@ -17,7 +17,7 @@ from rigd.engine.messages import Ending
 from rigd.excitation import Excitation, chirp, hold, multisine, step
 from rigd.excitation.moves import quintic
 from rigd.profile import load_profile
-from rigd.sim import Stuck
+from rigd.sim import StuckReadings
 
 RATE_HZ = 1000.0
 BEFORE_RECORD = 1500
@@ -89,7 +89,7 @@ def run_with_failing_encoder(make_session, reference_rad, at, friction_nm, stuck
     rig = session.profile.rig
     truth = replace(rig, motor=replace(rig.motor, coulomb_nm=friction_nm))
     devices = open_devices(truth)
-    drive = FailingDrive(devices.drive, at, stuck or Stuck())
+    drive = FailingDrive(devices.drive, at, stuck or StuckReadings())
     session.devices = Devices(drive, devices.sensor, simulated=True)
     excitation = Excitation("file", {}, RATE_HZ, reference_rad, {})
     damper = design_damper(close_loop(session.profile.loop_model()))
@@ -166,7 +166,7 @@ def coasting_rad(drive, friction_nm):
 )
 def test_an_encoder_that_repeats_readings_is_detected(make_session, name, every):
     finished, _ = run_with_failing_encoder(
-        make_session, REFERENCES[name], BEFORE_RECORD, 0.03, Stuck(every)
+        make_session, REFERENCES[name], BEFORE_RECORD, 0.03, StuckReadings(every)
     )
     assert finished.outcome == "fault"
     # Of three readings two repeat: the shaft seems to stop.

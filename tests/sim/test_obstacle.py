@@ -18,7 +18,7 @@ from shipped_profile import load_shipped
 from rigd.beam import Damping, PointForceGrid
 from rigd.devices.obstacles import ObstacleError
 from rigd.sim import SimulatedPlant
-from rigd.sim._obstacle import _Wall
+from rigd.sim._obstacle import _ActiveObstacle
 
 RIG = load_shipped("sim").rig
 BEAM, DAMPING = RIG.beam, RIG.damping
@@ -231,8 +231,8 @@ DEPTHS_M = st.integers(-(10**10), 10**10).map(lambda picometres: 1e-12 * picomet
 def test_a_substep_takes_at_least_the_energy_that_the_obstacle_then_holds(
     a, p, stiffness, damping, compliance
 ):
-    wall = _Wall(0, 1, stiffness, damping, compliance, np.zeros(1), a, np.zeros(1))
-    push, q = wall.meet(p)
+    wall = _ActiveObstacle(0, 1, stiffness, damping, compliance, np.zeros(1), a, np.zeros(1))
+    push, q = wall.force_and_penetration(p)
     assert push >= 0
     assert q == pytest.approx(p - compliance * push, abs=1e-9 * (abs(a) + abs(p)))
     held = [0.5 * stiffness * max(0.0, inside) ** 2 for inside in (a, q)]

@@ -1,8 +1,8 @@
 """ATI force-torque sensors: the NETCANOEM box on CAN, and Digital F/T on a serial line.
 
-Offers the two drivers (`AtiCanSensor`, `AtiSerialSensor`). Both sensors send raw gauge counts; the
-wrench is computed here with the calibration read from the sensor. Neither tares: the engine does
-that, in floating point, on wrenches.
+The package offers two drivers, `AtiCanSensor` and `AtiSerialSensor`. Both sensors send raw gauge
+counts; the drivers compute the wrench with the calibration read from the sensor. The drivers apply
+no tare: the engine subtracts the tare from the wrenches, in floating point.
 """
 
 import lazy_loader as lazy

@@ -1,11 +1,11 @@
-"""Calibration of an ATI sensor, from gauge counts to a wrench, and its status words.
+"""Calibration of an ATI sensor (from gauge counts to a wrench), and descriptions of its status.
 
-A force (N after the unit's factor) is ``F_i = unit · Σ_j M_ij g_j / counts_per_force``, a torque
-(N·m) the same with its own unit and counts. NETCANOEM sends the matrix row by row, Digital F/T in a
-block of registers.
+A force is ``F_i = unit · Σ_j M_ij g_j / counts_per_force`` in N; a torque in N·m follows likewise
+with the unit of torque and the counts per torque. NETCANOEM sends the matrix row by row, Digital
+F/T in a block of registers.
 
-The status words of both sensors are put into words, and some of their bits forbid measuring.
-Sources: the manuals of NETCANOEM and of Digital F/T. They differ in bits 9, 10 and 13.
+The status words of both sensors are described in words, and some of their bits forbid measuring.
+Sources: the manuals of NETCANOEM and of Digital F/T. The sensors differ in bits 9, 10 and 13.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,12 +18,15 @@ import numpy as np
 from rigd.devices.contracts import Wrench
 
 WIRE_ORDER = (0, 2, 4, 1, 3, 5)
-"""Gauge at each position of a reading, on CAN and on the serial line."""
+"""Number of the gauge at each position of a reading, on CAN and on the serial line."""
 
-Rows = tuple[tuple[float, ...], ...]
+MatrixRows = tuple[tuple[float, ...], ...]
+"""Rows of a 6x6 matrix."""
 
 _LBF_N = 4.4482216152605
+"""One pound-force in N."""
 _KGF_N = 9.80665
+"""One kilogram-force in N."""
 _FORCE_UNITS = {
     1: ("lbf", _LBF_N),
     2: ("N", 1.0),
@@ -32,6 +35,7 @@ _FORCE_UNITS = {
     5: ("kgf", _KGF_N),
     6: ("gf", 1e-3 * _KGF_N),
 }
+"""Name and value in N of each unit of force, by ATI's unit code."""
 _TORQUE_UNITS = {
     1: ("lbf·in", 0.0254 * _LBF_N),
     2: ("lbf·ft", 0.3048 * _LBF_N),
@@ -40,38 +44,43 @@ _TORQUE_UNITS = {
     5: ("kgf·cm", 1e-2 * _KGF_N),
     6: ("kN·m", 1e3),
 }
+"""Name and value in N·m of each unit of torque, by ATI's unit code."""
 _AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
+"""Names of the six axes of a wrench."""
 
 _FULL_SCALE_COUNTS = 32768
-_LARGEST, _SMALLEST = 1e6, 1e-6
-"""N or N·m of one gauge at its full scale: no sensor is built for more or for less (the largest has
-40 kN, the smallest resolves 1 mN)."""
-_LEAST_RANK = 1e-6
-"""Ratio of the singular values below which some loads are not distinguishable in single
-precision."""
+"""Gauge counts at full scale."""
+_LARGEST_ENTRY, _SMALLEST_ENTRY = 1e6, 1e-6
+"""Limits of a plausible matrix entry: N or N·m of one gauge at full scale.
+
+No sensor is built for more or for less: the largest has 40 kN, the smallest resolves 1 mN."""
+_LEAST_SINGULAR_VALUE_RATIO = 1e-6
+"""Smallest permitted ratio of smallest to largest singular value of the scaled matrix.
+
+Below it some loads are not distinguishable in single precision."""
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """One calibration of a sensor.
+    """Calibration of an ATI sensor: matrix, units and identity.
 
     Parameters
     ----------
     serial_number, part_number, date, family
-        As the sensor spells them; empty where it has none.
+        Texts as stored in the sensor; empty if it has none.
     force_unit, torque_unit
-        ATI's codes, from 1.
+        ATI's codes of the units, from 1.
     counts_per_force, counts_per_torque
-        Counts for one such unit.
+        Counts per unit of force and per unit of torque.
     matrix
-        Rows Fx, Fy, Fz, Tx, Ty, Tz; columns gauges 0 to 5.
+        Calibration matrix; rows Fx, Fy, Fz, Tx, Ty, Tz, columns gauges 0 to 5.
     ratings
-        Largest rated load of each axis in the calibration's units; None where it does not say.
+        Largest rated load of each axis in the calibration's units; None if not stated.
 
     Raises
     ------
     ValueError
-        If no wrench can be computed with it; the message is a sentence for the operator.
+        If no wrench can be computed with the calibration; the message is for the operator.
     """
 
     serial_number: str
@@ -79,7 +88,7 @@ class Calibration:
     torque_unit: int
     counts_per_force: int
     counts_per_torque: int
-    matrix: Rows
+    matrix: MatrixRows
     part_number: str = ""
     date: str = ""
     family: str = ""
@@ -101,10 +110,11 @@ class Calibration:
         self._check_matrix()
 
     def _check_matrix(self) -> None:
+        """Raise if an entry of the calibration matrix is implausible, or the matrix is singular."""
         for number, (axis, row) in enumerate(zip(_AXES, self.matrix, strict=True)):
             unit = self.force_unit_n if number < 3 else self.torque_unit_nm
             counts = self.counts_per_force if number < 3 else self.counts_per_torque
-            per_entry = unit / counts * _FULL_SCALE_COUNTS
+            full_scale_unit = unit / counts * _FULL_SCALE_COUNTS
             name = "N" if number < 3 else "N·m"
             for gauge, entry in enumerate(row):
                 if not isfinite(entry):
@@ -112,30 +122,30 @@ class Calibration:
                         f"the entry {axis}, gauge {gauge} of its calibration matrix is {entry}, "
                         "which is not a number. Choose another calibration."
                     )
-                if abs(entry) * per_entry > _LARGEST:
+                if abs(entry) * full_scale_unit > _LARGEST_ENTRY:
                     raise ValueError(
                         f"the entry {axis}, gauge {gauge} of its calibration matrix is {entry:.4g} "
-                        f"({abs(entry) * per_entry:.2g} {name} for a gauge at full scale), more "
-                        f"than any sensor has ({_LARGEST:g} {name}): its memory is damaged. Choose "
-                        "another calibration, or have the sensor repaired."
+                        f"({abs(entry) * full_scale_unit:.2g} {name} for a gauge at full scale), "
+                        f"more than any sensor has ({_LARGEST_ENTRY:g} {name}): its memory is "
+                        "damaged. Choose another calibration, or have the sensor repaired."
                     )
             if not any(row):
                 raise ValueError(
                     f"the row {axis} of its calibration matrix is zero: that calibration is "
                     "empty. Choose another calibration."
                 )
-            if max(map(abs, row)) * per_entry < _SMALLEST:
+            if max(map(abs, row)) * full_scale_unit < _SMALLEST_ENTRY:
                 raise ValueError(
                     f"no entry of the row {axis} of its calibration matrix is beyond "
-                    f"{max(map(abs, row)):.2g} (less than {_SMALLEST:g} {name} for a gauge at full "
-                    "scale): its memory is damaged. Choose another calibration, or have the sensor "
-                    "repaired."
+                    f"{max(map(abs, row)):.2g} (less than {_SMALLEST_ENTRY:g} {name} for a gauge "
+                    "at full scale): its memory is damaged. Choose another calibration, or have "
+                    "the sensor repaired."
                 )
         rows = np.array(self.matrix)
         rows /= np.abs(rows).max(axis=1, keepdims=True)
         rows /= np.abs(rows).max(axis=0, keepdims=True).clip(min=np.finfo(float).tiny)
         singular_values = np.linalg.svd(rows, compute_uv=False)
-        if singular_values[-1] < _LEAST_RANK * singular_values[0]:
+        if singular_values[-1] < _LEAST_SINGULAR_VALUE_RATIO * singular_values[0]:
             raise ValueError(
                 "its calibration matrix is singular: some of its six axes are combinations of the "
                 "others. Its memory is damaged; choose another calibration, or have the sensor "
@@ -144,16 +154,16 @@ class Calibration:
 
     @property
     def force_unit_n(self) -> float:
-        """One unit of force in N."""
+        """Calibration's unit of force in N."""
         return _FORCE_UNITS[self.force_unit][1]
 
     @property
     def torque_unit_nm(self) -> float:
-        """One unit of torque in N·m."""
+        """Calibration's unit of torque in N·m."""
         return _TORQUE_UNITS[self.torque_unit][1]
 
-    def wrench_per_count(self) -> Rows:
-        """Return the matrix from gauge counts, in natural order, to N and N·m."""
+    def wrench_per_count(self) -> MatrixRows:
+        """Return the 6x6 matrix that converts counts of gauges 0 to 5 to a wrench in N and N·m."""
         force = self.force_unit_n / self.counts_per_force
         torque = self.torque_unit_nm / self.counts_per_torque
         return tuple(
@@ -161,12 +171,12 @@ class Calibration:
             for axis, row in enumerate(self.matrix)
         )
 
-    def wrench_per_wire_count(self) -> Rows:
-        """Return the same matrix with its columns in the order of the wire."""
+    def wrench_per_wire_count(self) -> MatrixRows:
+        """Return the 6x6 matrix that converts gauge counts in wire order to a wrench in N, N·m."""
         return tuple(tuple(row[gauge] for gauge in WIRE_ORDER) for row in self.wrench_per_count())
 
     def as_dict(self) -> dict[str, object]:
-        """Return the calibration for the session file; ranges in N and N·m."""
+        """Return the calibration for the session file; ranges are in N and N·m."""
         ranges: list[float] | str = "not stated by the sensor"
         if self.ratings is not None and all(map(isfinite, self.ratings)):
             ranges = [
@@ -187,10 +197,12 @@ class Calibration:
         }
 
 
-def wrench_function(rows: Rows) -> Callable[[float, float, float, float, float, float], Wrench]:
-    """Return the product with a 6x6 matrix as a function of six numbers.
+def wrench_function(
+    rows: MatrixRows,
+) -> Callable[[float, float, float, float, float, float], Wrench]:
+    """Return a function that multiplies six gauge counts by a 6x6 matrix.
 
-    Written out it takes half the time of NumPy on six numbers that come as Python integers.
+    The written-out product takes half the time of NumPy for six Python integers.
     """
     (
         (xa, xb, xc, xd, xe, xf),
@@ -214,13 +226,13 @@ def wrench_function(rows: Rows) -> Callable[[float, float, float, float, float, 
     return wrench
 
 
-def same_serial_number(wanted: str, found: str) -> bool:
-    """Return whether a sensor has the serial number of the profile; an empty one accepts any."""
-    return not wanted or wanted.strip().upper() == found.strip().upper()
+def same_serial_number(profile_number: str, sensor_number: str) -> bool:
+    """Return whether a sensor's serial number is that of the profile; an empty one accepts any."""
+    return not profile_number or profile_number.strip().upper() == sensor_number.strip().upper()
 
 
-def text_of(raw: Sequence[int]) -> str:
-    """Return bytes as text without padding, or in hexadecimal if they are not text."""
+def printable_text(raw: Sequence[int]) -> str:
+    """Decode bytes to text without padding, or to hexadecimal digits if they are not text."""
     data = bytes(raw).rstrip(b"\0\xff ")
     text = data.decode("latin-1").strip()
     return text if text.isascii() and (text.isprintable() or not text) else data.hex(" ")
@@ -228,69 +240,76 @@ def text_of(raw: Sequence[int]) -> str:
 
 # Calibration block of a Digital F/T
 
-BLOCK_REGISTERS = 133
-"""Length of a block, as far as the driver needs it."""
+BLOCK_LENGTH_REGISTERS = 133
+"""Number of 16-bit registers of a calibration block that the driver reads."""
 
-_FIRST_BLOCK = 0x00E3
-_BLOCK_SPACING = 192
+_FIRST_BLOCK_REGISTER = 0x00E3
+"""Address of the first register of calibration block 1."""
+_BLOCK_SPACING_REGISTERS = 192
+"""Number of registers from the beginning of one calibration block to the next."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationBlock:
-    """A calibration, and the amplifier settings that belong to it."""
+    """Calibration of a Digital F/T sensor, with the amplifier settings that belong to it."""
 
     calibration: Calibration
+    """Calibration matrix, units and identity."""
     gains: tuple[int, ...]
-    """Gains of gauges 0 to 5, as register values."""
+    """Amplifier gains of gauges 0 to 5, as register values."""
     offsets: tuple[int, ...]
+    """Amplifier offsets of gauges 0 to 5, as register values."""
 
 
-def first_register(number: int) -> int:
-    """Return where block ``number`` (1 to 16) begins."""
-    return _FIRST_BLOCK + (number - 1) * _BLOCK_SPACING
+def first_block_register(number: int) -> int:
+    """Return the address of the first register of calibration block `number` (1 to 16)."""
+    return _FIRST_BLOCK_REGISTER + (number - 1) * _BLOCK_SPACING_REGISTERS
 
 
 def parse_block(registers: Sequence[int]) -> CalibrationBlock:
-    """Read a block.
+    """Parse the registers of a calibration block.
 
     Raises
     ------
     ValueError
-        If no wrench can be computed with it; the message is a sentence for the operator.
+        If no wrench can be computed with the calibration; the message is for the operator.
     """
-    raw = pack(f">{BLOCK_REGISTERS}H", *registers)
+    raw = pack(f">{BLOCK_LENGTH_REGISTERS}H", *registers)
 
-    def part(first: int, count: int) -> bytes:
+    def register_bytes(first: int, count: int) -> bytes:
         return raw[2 * first : 2 * (first + count)]
 
-    entries = unpack(">36f", part(32, 72))
-    counts_per_force, counts_per_torque = unpack(">ii", part(117, 4))
+    matrix_entries = unpack(">36f", register_bytes(32, 72))
+    counts_per_force, counts_per_torque = unpack(">ii", register_bytes(117, 4))
     calibration = Calibration(
-        serial_number=text_of(part(0, 4)),
-        part_number=text_of(part(4, 16)),
-        family=text_of(part(20, 2)),
-        date=text_of(part(22, 10)),
-        matrix=tuple(tuple(entries[6 * axis : 6 * axis + 6]) for axis in range(6)),
+        serial_number=printable_text(register_bytes(0, 4)),
+        part_number=printable_text(register_bytes(4, 16)),
+        family=printable_text(register_bytes(20, 2)),
+        date=printable_text(register_bytes(22, 10)),
+        matrix=tuple(tuple(matrix_entries[6 * axis : 6 * axis + 6]) for axis in range(6)),
         force_unit=registers[104] >> 8,
         torque_unit=registers[104] & 0xFF,
-        ratings=unpack(">6f", part(105, 12)),
+        ratings=unpack(">6f", register_bytes(105, 12)),
         counts_per_force=counts_per_force,
         counts_per_torque=counts_per_torque,
     )
     return CalibrationBlock(
         calibration=calibration,
-        gains=unpack(">6H", part(121, 6)),
-        offsets=unpack(">6H", part(127, 6)),
+        gains=unpack(">6H", register_bytes(121, 6)),
+        offsets=unpack(">6H", register_bytes(127, 6)),
     )
 
 
 # Status words
 
 CAN_WATCHDOG_RESET = 0x0001
+"""Status bit of a NETCANOEM box: its watchdog has reset it."""
 CAN_BAD_CALIBRATION = 0x0040
+"""Status bit of a NETCANOEM box: the active calibration is bad."""
 CAN_BUS_ERROR = 0x4000
+"""Status bit of a NETCANOEM box: it has seen errors on the CAN bus."""
 
-_COMMON_WORDS = {
+_COMMON_STATUS_BITS = {
     0: "its watchdog has reset the board",
     1: "the gauges' excitation is too high",
     2: "the gauges' excitation is too low",
@@ -300,42 +319,48 @@ _COMMON_WORDS = {
     7: "its memory (EEPROM) has failed",
     8: "its configuration is invalid",
 }
-_CAN_WORDS = {
-    **_COMMON_WORDS,
+"""Meanings of the status bits that both kinds of sensor have, by bit number."""
+_CAN_STATUS_BITS = {
+    **_COMMON_STATUS_BITS,
     6: "the active calibration is bad",
     11: "the sensor is too hot",
     12: "the sensor is too cold",
     14: "it has seen errors on the CAN bus",
 }
-CAN_CRITICAL = 0x18FE
-"""Bits 1 to 7, 11 and 12."""
+"""Meanings of the status bits of a NETCANOEM box, by bit number."""
+CRITICAL_CAN_STATUS_BITS = 0x18FE
+"""Status bits of a NETCANOEM box that forbid measuring: 1 to 7, 11 and 12."""
 
-_SERIAL_WORDS = {
-    **_COMMON_WORDS,
+_SERIAL_STATUS_BITS = {
+    **_COMMON_STATUS_BITS,
     9: "the bridges take too much current (broken gauge or cable)",
     10: "the bridges take too little current (broken gauge or cable)",
     11: "the reading of its thermistor is too high",
     12: "the reading of its thermistor is too low",
     13: "the reading of its analogue output is out of range",
 }
-SERIAL_CRITICAL = 0x3EBE
-"""Bits 1 to 5, 7 and 9 to 13: what is critical on NETCANOEM, and the bits only this one has."""
+"""Meanings of the status bits of a Digital F/T sensor, by bit number."""
+CRITICAL_SERIAL_STATUS_BITS = 0x3EBE
+"""Status bits of a Digital F/T sensor that forbid measuring: 1 to 5, 7 and 9 to 13.
+
+They are the bits that are critical on NETCANOEM, and the bits that only Digital F/T has."""
 
 
-def can_status(word: int) -> list[str]:
-    """Describe the status word of a NETCANOEM box, one clause per bit."""
+def describe_can_status(status_word: int) -> list[str]:
+    """Describe the status word of a NETCANOEM box, one clause per set bit."""
     # Bit 15 summarises the others.
-    return _words(word & 0x7FFF, _CAN_WORDS)
+    return _meanings_of_set_bits(status_word & 0x7FFF, _CAN_STATUS_BITS)
 
 
-def serial_status(word: int) -> list[str]:
-    """Describe the status word of a Digital F/T sensor, one clause per bit."""
-    return _words(word, _SERIAL_WORDS)
+def describe_serial_status(status_word: int) -> list[str]:
+    """Describe the status word of a Digital F/T sensor, one clause per set bit."""
+    return _meanings_of_set_bits(status_word, _SERIAL_STATUS_BITS)
 
 
-def _words(word: int, table: dict[int, str]) -> list[str]:
+def _meanings_of_set_bits(status_word: int, bit_meanings: dict[int, str]) -> list[str]:
+    """Return the meanings of the set bits of a status word."""
     return [
-        table.get(bit, f"status bit {bit}, which has no known meaning, is set")
+        bit_meanings.get(bit, f"status bit {bit}, which has no known meaning, is set")
         for bit in range(16)
-        if word >> bit & 1
+        if status_word >> bit & 1
     ]

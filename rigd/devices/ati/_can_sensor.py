@@ -1,4 +1,4 @@
-"""ATI sensor with a NETCANOEM box on CAN: set up once, then polled once a tick."""
+"""Driver of an ATI sensor with a NETCANOEM box on CAN: set up once, then polled once per tick."""
 
 import time
 from collections.abc import Sequence
@@ -9,55 +9,62 @@ from rigd.devices.ati import _netcanoem as netcanoem
 from rigd.devices.ati._calibration import (
     CAN_BAD_CALIBRATION,
     CAN_BUS_ERROR,
-    CAN_CRITICAL,
     CAN_WATCHDOG_RESET,
+    CRITICAL_CAN_STATUS_BITS,
     Calibration,
-    Rows,
-    can_status,
+    MatrixRows,
+    describe_can_status,
     same_serial_number,
     wrench_function,
 )
-from rigd.devices.ati._netcanoem import REPLY_LENGTHS, Answer, GaugePolls, identifier
+from rigd.devices.ati._netcanoem import REPLY_LENGTHS, GaugePolls, PollReply, identifier
 from rigd.devices.canbus import CanExchange, CanLink
 from rigd.devices.contracts import DeviceError, LineHealth, Wrench
 from rigd.devices.parameters import RigParameters
 
 _REPLY_TIMEOUT_S = 0.2
-_TRIES = 3
-# A repeated request may be answered twice, and no reply states which row of the matrix it holds.
+"""Time in seconds to wait for the reply to one request during set-up."""
+_REQUEST_ATTEMPTS = 3
+"""Number of attempts of one request during set-up."""
 _LATE_REPLY_S = 0.5
-_LOST_POLL_S = 0.02
-# A box that was silent for this long may have restarted; no box starts faster.
-_RESTART_S = 0.005
+"""Time in seconds in which late replies are discarded after a repeated request.
 
-_ASSUMED = (
+A repeated request may be answered twice, and no reply states which row of the matrix it holds."""
+_LOST_POLL_S = 0.02
+"""Time in seconds after which a poll of `measure` counts as lost."""
+_RESTART_S = 0.005
+"""Silence in seconds after which a box may have restarted; no box starts faster."""
+
+_ASSUMED_SCALE_TEXT = (
     f"{netcanoem.COUNTS_BEFORE_SCALE} counts per N and per N·m: firmware before "
     f"{'.'.join(map(str, netcanoem.FIRST_FIRMWARE_WITH_SCALE))} tells neither counts per unit nor "
     "units"
 )
-"""Scale assumed for old firmware, for the session file and the operator."""
+"""Scale assumed for old firmware, as text for the session file and the operator."""
 
 
 class AtiCanSensor:
-    """Sensor of a profile with a section ``ati_can``.
+    """Driver of an ATI sensor with a NETCANOEM box on the CAN bus.
 
     Parameters
     ----------
     rig
         Parameters with sections ``ati_can`` and ``acquisition``.
     link
-        The bus, shared with the drive.
+        CAN bus, which the drive uses, too.
 
     Attributes
     ----------
     wrench_stale, wrench_saturated, wrench_time_ns
-        State of the last reading; the time (``time.monotonic_ns``) is when its poll was sent.
+        Whether the last wrench is old, whether a gauge is saturated, and the time in nanoseconds
+        (``time.monotonic_ns``) at which the poll of the last wrench was sent.
     polls : GaugePolls
-        Polls, with the last turn-round time and the count of lost replies.
+        Polls of the box, with the time from the last poll to its reply and the number of lost
+        replies.
     late_replies : int
-        Replies that came after the deadline, but before the next tick.
+        Number of replies that arrived after the deadline, but before the next tick.
     bus_errors : int
-        Readings with which the sensor reported errors on the bus.
+        Number of readings with which the sensor reported errors on the bus.
 
     Raises
     ------
@@ -75,28 +82,28 @@ class AtiCanSensor:
         self._settings = settings
         self._link = link
         self._name = f"Sensor ATI NETCANOEM (base id {settings.base_id:#04x})"
-        self._limit = settings.saturation_counts
+        self._saturation_counts = settings.saturation_counts
         self._deadline_ns = int(acquisition.deadline_us * 1e3)
-        self._waits = acquisition.mode == "same_tick"
+        self._waits_for_reply = acquisition.mode == "same_tick"
         self._lock_step = acquisition.deadline_us * rig.rate_hz > 1e6
         poll_frame = netcanoem.request(settings.base_id, netcanoem.GAUGES)
         self.polls = GaugePolls(poll_frame, self._name)
-        self._connected = False
+        self._is_connected = False
         self._subscribed_to: CanExchange | None = None
         self._inbox: dict[int, bytes] = {}
         self._restart_ticks = max(1, ceil(_RESTART_S * rig.rate_hz))
-        self._unanswered = 0
-        self._in_doubt = False
-        self._shown = b""
+        self._unanswered_ticks = 0
+        self._calibration_in_doubt = False
+        self._row_read_before = b""
         self._calibration: Calibration | None = None
         self._firmware: tuple[int, int, int] = (0, 0, 0)
-        self._status: list[str] = []
+        self._status_texts: list[str] = []
         self._status_word = 0
-        self._convert = wrench_function(((0.0,) * 6,) * 6)
-        self._previous: Answer | None = None
+        self._wrench_from_counts = wrench_function(((0.0,) * 6,) * 6)
+        self._previous_reply: PollReply | None = None
         self._previous_ns = 0
-        self._give_up_ns = 0
-        self._given_up = False
+        self._reply_deadline_ns = 0
+        self._missed_deadline = False
         self._wrench: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.wrench_stale = True
         self.wrench_saturated = False
@@ -115,35 +122,35 @@ class AtiCanSensor:
         """
         self.close()
         exchange = self._link.open()
-        self._connected = True
+        self._is_connected = True
         self.polls.open(exchange)
         try:
             self._subscribe(exchange)
             self._firmware = netcanoem.firmware(
-                self._ask("its firmware version", netcanoem.FIRMWARE)
+                self._request_reply("its firmware version", netcanoem.FIRMWARE)
             )
             self._select_calibration()
-            serial_number = self._read_serial_number()  # of the calibration, not of the box
+            serial_number = self._read_serial_number()  # belongs to the calibration, not to the box
             matrix = self._read_matrix()
-            # A wrong entry would bend every result, and the protocol has no checksum of its own.
+            # A wrong entry would falsify every result, and the protocol has no checksum of its own.
             if self._read_matrix() != matrix:
                 raise DeviceError(
                     f"{self._name}: its calibration matrix read differently the second time; "
                     "check cable and termination."
                 )
             self._calibration = self._read_scale(serial_number, matrix)
-            self._convert = wrench_function(self._calibration.wrench_per_wire_count())
+            self._wrench_from_counts = wrench_function(self._calibration.wrench_per_wire_count())
             self._evaluate(self._first_reading())
             self.polls.forget()
-            self._previous = None
-            self._unanswered = 0
-            self._in_doubt = False
+            self._previous_reply = None
+            self._unanswered_ticks = 0
+            self._calibration_in_doubt = False
         except BaseException:
             self.close()
             raise
 
     def calibration(self) -> dict[str, object]:
-        """Return identity and calibration as found, for the session file.
+        """Return identity and calibration as read from the sensor, for the session file.
 
         Raises
         ------
@@ -158,8 +165,8 @@ class AtiCanSensor:
             **self._calibration.as_dict(),
             "calibration": self._settings.calibration,
             "firmware": f"{major}.{minor}.{build}",
-            **({} if self._reports_scale else {"assumed": _ASSUMED}),
-            "status": self._status,
+            **({} if self._reports_scale else {"assumed": _ASSUMED_SCALE_TEXT}),
+            "status": self._status_texts,
             "base_id": self._settings.base_id,
         }
 
@@ -169,47 +176,47 @@ class AtiCanSensor:
         Raises
         ------
         DeviceError
-            If the bus is gone, or the sensor has restarted.
+            If the bus has failed, or the sensor has restarted.
         """
         polls = self.polls
-        if self._lock_step and not self._waits:
+        if self._lock_step and not self._waits_for_reply:
             # No time passes between two ticks: the reply to the last poll is still in preparation.
             polls.wait(time.monotonic_ns() + self._deadline_ns)
         polls.drain()
-        if not self._waits:
-            self._previous, self._previous_ns = polls.settle(), polls.sent_ns
-        elif self._given_up:
-            self.late_replies += polls.settle() is not None
-        if self._in_doubt and not self._is_the_same():
-            polls.pause()
+        if not self._waits_for_reply:
+            self._previous_reply, self._previous_ns = polls.process_replies(), polls.sent_ns
+        elif self._missed_deadline:
+            self.late_replies += polls.process_replies() is not None
+        if self._calibration_in_doubt and not self._has_same_calibration():
+            polls.register_pause()
         else:
             polls.send_or_pause()
-        self._give_up_ns = polls.sent_ns + self._deadline_ns
+        self._reply_deadline_ns = polls.sent_ns + self._deadline_ns
 
     def read_wrench(self) -> Wrench:
-        """Return the wrench in N and N·m.
+        """Return the wrench in N and N·m from the latest valid reply.
 
         Raises
         ------
         DeviceError
-            If the bus is gone or the sensor reports an error.
+            If the bus has failed or the sensor reports an error.
         """
-        if self._waits:
-            answer, sent_ns = self.polls.wait(self._give_up_ns), self.polls.sent_ns
-            self._given_up = answer is None
+        if self._waits_for_reply:
+            answer, sent_ns = self.polls.wait(self._reply_deadline_ns), self.polls.sent_ns
+            self._missed_deadline = answer is None
         else:
-            answer, sent_ns = self._previous, self._previous_ns
+            answer, sent_ns = self._previous_reply, self._previous_ns
         if answer is None:
             self.wrench_stale = True
-            self._unanswered += 1
+            self._unanswered_ticks += 1
             return self._wrench
-        if self._unanswered >= self._restart_ticks:
-            # It answers again: its calibration is verified before a reading counts.
-            self._in_doubt = True
-            self._shown = b""
+        if self._unanswered_ticks >= self._restart_ticks:
+            # The box answers again: verify its calibration before a reading counts.
+            self._calibration_in_doubt = True
+            self._row_read_before = b""
             self._inbox.clear()
-        self._unanswered = 0
-        if self._in_doubt:
+        self._unanswered_ticks = 0
+        if self._calibration_in_doubt:
             self.wrench_stale = True
             return self._wrench
         self.wrench_stale = False
@@ -217,23 +224,23 @@ class AtiCanSensor:
         return self._evaluate(answer)
 
     def health(self) -> LineHealth:
-        """Return the health of the line to the sensor, and the sensor's status word."""
+        """Return errors on the line to the sensor, and the sensor's status word."""
         errors = self.polls.lost + self.bus_errors
         return LineHealth(errors=errors, status=self._status_word)
 
     def measure(self, duration_s: float) -> dict[str, float]:
-        """Poll back to back for a while, between `connect` and the first tick.
+        """Poll the sensor continuously for a while, before the first tick; return statistics.
 
         Returns
         -------
         dict
-            ``polls_hz`` (readings a second), ``turnaround_median_s``, ``turnaround_p99_s`` (from
-            poll to reply; not a number where none came), ``lost`` (polls without a reply).
+            ``polls_hz`` (readings per second), ``turnaround_median_s`` and ``turnaround_p99_s``
+            (time from poll to reply; NaN without replies), ``lost`` (polls without a reply).
 
         Raises
         ------
         DeviceError
-            If the bus is gone or the sensor reports an error.
+            If the bus has failed or the sensor reports an error.
         """
         turnarounds_ns: list[int] = []
         lost = 0
@@ -257,46 +264,50 @@ class AtiCanSensor:
         }
 
     def close(self) -> None:
-        """Release the bus. Never raises."""
-        if self._connected:
-            self._connected = False
+        """Release the bus; never raises."""
+        if self._is_connected:
+            self._is_connected = False
             self.polls.close()
             self._link.close()
         self._calibration = None
 
     def _subscribe(self, exchange: CanExchange) -> None:
+        """Subscribe to the sensor's replies, once per exchange, and discard queued frames."""
         if exchange is not self._subscribed_to:
-            base = self._settings.base_id
+            base_id = self._settings.base_id
             self.polls.subscribe(
-                identifier(base, netcanoem.GAUGES), identifier(base, netcanoem.GAUGES_REST)
+                identifier(base_id, netcanoem.GAUGES), identifier(base_id, netcanoem.GAUGES_REST)
             )
             for opcode in REPLY_LENGTHS:
                 if opcode not in (netcanoem.GAUGES, netcanoem.GAUGES_REST):
                     store = partial(self._inbox.__setitem__, opcode)
-                    exchange.subscribe(identifier(base, opcode), store)
+                    exchange.subscribe(identifier(base_id, opcode), store)
             self._subscribed_to = exchange
         exchange.start()
 
-    def _evaluate(self, answer: Answer) -> Wrench:
+    def _evaluate(self, answer: PollReply) -> Wrench:
+        """Store status word, gauges and wrench of a reply, and return the wrench in N and N·m."""
         status, g0, g2, g4 = netcanoem.read_gauges(answer[0])
         g1, g3, g5 = netcanoem.read_gauges_rest(answer[1])
-        before, self._status_word = self._status_word, status
+        previous_status, self._status_word = self._status_word, status
         if status:
-            self._check_status(status, before)
-        limit = self._limit
+            self._check_status(status, previous_status)
+        saturation_counts = self._saturation_counts
         self.wrench_saturated = (
-            max(g0, g2, g4, g1, g3, g5) >= limit or min(g0, g2, g4, g1, g3, g5) <= -limit
+            max(g0, g2, g4, g1, g3, g5) >= saturation_counts
+            or min(g0, g2, g4, g1, g3, g5) <= -saturation_counts
         )
         self.gauges = g0, g1, g2, g3, g4, g5
-        self._wrench = wrench = self._convert(g0, g2, g4, g1, g3, g5)
+        self._wrench = wrench = self._wrench_from_counts(g0, g2, g4, g1, g3, g5)
         return wrench
 
-    def _check_status(self, status: int, before: int) -> None:
+    def _check_status(self, status: int, previous_status: int) -> None:
+        """Count bus errors in a status word, and raise on a restart or a critical status bit."""
         if status & CAN_BUS_ERROR:
             self.bus_errors += 1
-        if status & ~before & CAN_WATCHDOG_RESET:
-            raise self._restarted(f"its watchdog has reset it (status word {status:#06x})")
-        if status & CAN_CRITICAL:
+        if status & ~previous_status & CAN_WATCHDOG_RESET:
+            raise self._restart_error(f"its watchdog has reset it (status word {status:#06x})")
+        if status & CRITICAL_CAN_STATUS_BITS:
             remedy = (
                 "choose another (ati_can.calibration)"
                 if status & CAN_BAD_CALIBRATION
@@ -304,111 +315,121 @@ class AtiCanSensor:
             )
             raise DeviceError(
                 f"{self._name}: its status word {status:#06x} says that "
-                f"{'; '.join(can_status(status & CAN_CRITICAL))}; {remedy}."
+                f"{'; '.join(describe_can_status(status & CRITICAL_CAN_STATUS_BITS))}; {remedy}."
             )
 
-    def _restarted(self, how: str) -> DeviceError:
+    def _restart_error(self, cause: str) -> DeviceError:
+        """Return the error for a box that has restarted and lost its selected calibration."""
         return DeviceError(
-            f"{self._name}: {how}; it is back at calibration 0, and what it measures since is not "
-            f"measured with calibration {self._settings.calibration} (ati_can.calibration). "
+            f"{self._name}: {cause}; it is back at calibration 0, and what it measures since is "
+            f"not measured with calibration {self._settings.calibration} (ati_can.calibration). "
             "Reconnecting (rigd reset, or another rigd run) selects it again. Check the box's "
             "supply and cable; if it happens again, have the box replaced."
         )
 
-    def _is_the_same(self) -> bool:
-        """Whether a box that was silent still has the calibration that was read from it.
+    def _has_same_calibration(self) -> bool:
+        """Return whether a box that was silent still has the calibration that was read from it.
 
-        A box that was without power for a moment does not report it: bit 0 of its status is for the
-        watchdog only.
+        A box does not report a short loss of power: bit 0 of its status is only for the watchdog.
+        So row 0 of its calibration matrix is read again.
         """
         inbox, calibration = self._inbox, self._calibration
-        parts = [inbox.get(opcode, b"") for opcode in netcanoem.MATRIX_ROW_REPLIES]
-        if all(len(part) == REPLY_LENGTHS[netcanoem.MATRIX_ROW] for part in parts):
-            shown, before = b"".join(parts), self._shown
-            if calibration is None or netcanoem.matrix_row(shown) == calibration.matrix[0]:
-                self._in_doubt = False
+        row_frames = [inbox.get(opcode, b"") for opcode in netcanoem.MATRIX_ROW_REPLIES]
+        if all(len(part) == REPLY_LENGTHS[netcanoem.MATRIX_ROW] for part in row_frames):
+            row_read, earlier_row = b"".join(row_frames), self._row_read_before
+            if calibration is None or netcanoem.matrix_row(row_read) == calibration.matrix[0]:
+                self._calibration_in_doubt = False
                 return True
-            if shown == before:
-                raise self._restarted(
+            if row_read == earlier_row:
+                raise self._restart_error(
                     "it was silent for a moment and answers with another calibration matrix since"
                 )
             # A single mismatch may be a damaged reply, as at connecting.
-            self._shown = shown
+            self._row_read_before = row_read
             inbox.clear()
-        base = self._settings.base_id
-        self.polls.exchange.send(netcanoem.request(base, netcanoem.MATRIX_ROW, 0))
+        base_id = self._settings.base_id
+        self.polls.exchange.send(netcanoem.request(base_id, netcanoem.MATRIX_ROW, 0))
         return False
 
-    def _poll(self, timeout_s: float) -> Answer | None:
-        """Poll the sensor outside the cycle."""
+    def _poll(self, timeout_s: float) -> PollReply | None:
+        """Poll the sensor once outside the cycle; return the reply, or None after the timeout."""
         polls = self.polls
         polls.drain()
         polls.forget()
         polls.send()
         return polls.wait(polls.sent_ns + int(timeout_s * 1e9))
 
-    def _first_reading(self) -> Answer:
-        for _ in range(_TRIES):
+    def _first_reading(self) -> PollReply:
+        """Return the first reading after set-up, with repeated polls, or raise without a reply."""
+        for _ in range(_REQUEST_ATTEMPTS):
             answer = self._poll(_REPLY_TIMEOUT_S)
             if answer is not None:
-                self._status = can_status(netcanoem.read_gauges(answer[0])[0])
+                self._status_texts = describe_can_status(netcanoem.read_gauges(answer[0])[0])
                 return answer
-        raise self._no_reply("a reading")
+        raise self._no_reply_error("a reading")
 
-    def _ask(self, what: str, opcode: int, *arguments: int, replies: Sequence[int] = ()) -> bytes:
-        """Return the reply to a request, its frames concatenated."""
+    def _request_reply(
+        self, requested_item: str, opcode: int, *arguments: int, replies: Sequence[int] = ()
+    ) -> bytes:
+        """Send a request and return its reply frames, concatenated; repeat it if unanswered."""
         exchange, inbox = self.polls.exchange, self._inbox
-        wanted = replies or (opcode,)
+        expected = replies or (opcode,)
         frame = netcanoem.request(self._settings.base_id, opcode, *arguments)
-        for again in range(_TRIES):
+        for attempt in range(_REQUEST_ATTEMPTS):
             inbox.clear()
             exchange.send(frame)
             if exchange.wait_until(
-                lambda: all(each in inbox for each in wanted), _in(_REPLY_TIMEOUT_S)
+                lambda: all(each in inbox for each in expected), _ns_after(_REPLY_TIMEOUT_S)
             ):
-                found = [inbox[each] for each in wanted]
-                if again:
-                    exchange.wait_until(lambda: False, _in(_LATE_REPLY_S))  # all is dropped
+                received = [inbox[each] for each in expected]
+                if attempt:
+                    exchange.wait_until(lambda: False, _ns_after(_LATE_REPLY_S))  # all is dropped
                 break
         else:
-            raise self._no_reply(what)
-        for each, data in zip(wanted, found, strict=True):
+            raise self._no_reply_error(requested_item)
+        for each, data in zip(expected, received, strict=True):
             if len(data) != REPLY_LENGTHS[each]:
                 raise DeviceError(
-                    f"{self._name}: asked for {what}, it sent {len(data)} bytes instead of "
-                    f"{REPLY_LENGTHS[each]}. Check that the box is a NETCANOEM and that no other "
-                    "device uses its identifiers."
+                    f"{self._name}: asked for {requested_item}, it sent {len(data)} bytes instead "
+                    f"of {REPLY_LENGTHS[each]}. Check that the box is a NETCANOEM and that no "
+                    "other device uses its identifiers."
                 )
-        return b"".join(found)
+        return b"".join(received)
 
-    def _no_reply(self, what: str) -> DeviceError:
+    def _no_reply_error(self, requested_item: str) -> DeviceError:
+        """Return the error for a request without a complete reply."""
         return DeviceError(
-            f"{self._name}: asked for {what}, it gave no complete reply within {_REPLY_TIMEOUT_S} "
-            f"s in {_TRIES} tries. Check its power, cable and termination, can.bitrate_bit_s and "
-            "ati_can.base_id."
+            f"{self._name}: asked for {requested_item}, it gave no complete reply within "
+            f"{_REPLY_TIMEOUT_S} s in {_REQUEST_ATTEMPTS} tries. Check its power, cable and "
+            "termination, can.bitrate_bit_s and ati_can.base_id."
         )
 
     def _read_serial_number(self) -> str:
-        found = netcanoem.serial_number(self._ask("its serial number", netcanoem.SERIAL_NUMBER))
-        wanted = self._settings.serial_number
-        if not same_serial_number(wanted, found):
+        """Read the sensor's serial number, compare it with the profile, and return it."""
+        received = netcanoem.serial_number(
+            self._request_reply("its serial number", netcanoem.SERIAL_NUMBER)
+        )
+        expected = self._settings.serial_number
+        if not same_serial_number(expected, received):
             raise DeviceError(
-                f"{self._name}: its serial number is {found or 'empty'}, where the profile asks "
-                f"for {wanted} (ati_can.serial_number). Check which sensor is on the rig."
+                f"{self._name}: its serial number is {received or 'empty'}, where the profile asks "
+                f"for {expected} (ati_can.serial_number). Check which sensor is on the rig."
             )
-        return found
+        return received
 
     @property
     def _reports_scale(self) -> bool:
+        """Whether the firmware reports counts per unit and unit codes."""
         return self._firmware[:2] >= netcanoem.FIRST_FIRMWARE_WITH_SCALE
 
     def _select_calibration(self) -> None:
-        wanted = self._settings.calibration
-        what = f"calibration {wanted}"
-        selected = self._ask(what, netcanoem.SELECT_CALIBRATION, wanted)[0]
-        if selected != wanted:
+        """Select the calibration that the profile names, and check that it is valid."""
+        expected = self._settings.calibration
+        requested_item = f"calibration {expected}"
+        selected = self._request_reply(requested_item, netcanoem.SELECT_CALIBRATION, expected)[0]
+        if selected != expected:
             raise DeviceError(
-                f"{self._name}: asked for calibration {wanted}, it selected {selected}. Choose "
+                f"{self._name}: asked for calibration {expected}, it selected {selected}. Choose "
                 "one that it has (ati_can.calibration)."
             )
         # The status shows whether the selected calibration is valid.
@@ -416,10 +437,11 @@ class AtiCanSensor:
         if status & CAN_BAD_CALIBRATION:
             self._check_status(status, status)
 
-    def _read_matrix(self) -> Rows:
+    def _read_matrix(self) -> MatrixRows:
+        """Read the six rows of the calibration matrix."""
         return tuple(
             netcanoem.matrix_row(
-                self._ask(
+                self._request_reply(
                     f"row {axis} of its calibration matrix",
                     netcanoem.MATRIX_ROW,
                     axis,
@@ -429,14 +451,15 @@ class AtiCanSensor:
             for axis in range(6)
         )
 
-    def _read_scale(self, serial_number: str, matrix: Rows) -> Calibration:
+    def _read_scale(self, serial_number: str, matrix: MatrixRows) -> Calibration:
+        """Read counts per unit and unit codes, and return the complete calibration."""
         force = torque = netcanoem.COUNTS_BEFORE_SCALE
         force_unit, torque_unit = netcanoem.NEWTON, netcanoem.NEWTON_METRE
         if self._reports_scale:
             force, torque = netcanoem.counts_per_unit(
-                self._ask("its counts per unit", netcanoem.COUNTS_PER_UNIT)
+                self._request_reply("its counts per unit", netcanoem.COUNTS_PER_UNIT)
             )
-            force_unit, torque_unit = self._ask("its unit codes", netcanoem.UNIT_CODES)
+            force_unit, torque_unit = self._request_reply("its unit codes", netcanoem.UNIT_CODES)
         try:
             return Calibration(
                 serial_number=serial_number,
@@ -452,11 +475,13 @@ class AtiCanSensor:
             ) from None
 
 
-def _in(duration_s: float) -> int:
+def _ns_after(duration_s: float) -> int:
+    """Return the time in nanoseconds (``time.monotonic_ns``) after a duration from now."""
     return time.monotonic_ns() + int(duration_s * 1e9)
 
 
 def _quantile_s(sorted_ns: list[int], fraction: float) -> float:
+    """Return a quantile in seconds of sorted durations in nanoseconds; NaN if there are none."""
     if not sorted_ns:
         return float("nan")
     return sorted_ns[int(fraction * (len(sorted_ns) - 1))] * 1e-9

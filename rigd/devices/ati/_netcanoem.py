@@ -1,31 +1,40 @@
-"""The NETCANOEM protocol: requests and replies, and the polls of a box.
+"""Protocol of the NETCANOEM box on CAN: requests and replies, and the cyclic polls.
 
-An identifier is seven bits of base and four of opcode; a reply has the request's base, and the
-opcodes named here. Everything of several bytes is big-endian.
+A CAN identifier consists of seven bits of base and four of opcode. A reply has the base of the
+request, and one of the opcodes defined here. Numbers of several bytes are big-endian.
 
-A poll is answered by two frames, which `GaugePolls` brings together. The protocol has no counter:
-nothing in a reply says to which poll it belongs. So both frames are counted (`ReplyPairing` in
-`rigd.devices.canbus`), each for itself, for either may be lost or late; where it is in doubt whose
-they are, a tick is left without a poll.
+A poll is answered by two frames, which `GaugePolls` combines. The protocol has no counter: nothing
+in a reply states to which poll it belongs. So the frames of each kind are counted (`ReplyPairing`
+in `rigd.devices.canbus`), since either may be lost or late. In case of doubt one tick is run
+without a poll.
 """
 
 import time
 from struct import Struct, unpack
 
-from rigd.devices.ati._calibration import text_of
+from rigd.devices.ati._calibration import printable_text
 from rigd.devices.canbus import CanExchange, ReplyPairing
 from rigd.devices.canbus.port import pack_frame
 from rigd.devices.contracts import DeviceError
 
 GAUGES = 0x0
+"""Opcode of a poll, and of its first reply with status word and gauges 0, 2, 4."""
 GAUGES_REST = 0x1
+"""Opcode of the second reply to a poll, with gauges 1, 3, 5."""
 MATRIX_ROW = 0x2
+"""Opcode of the request for a row of the calibration matrix."""
 MATRIX_ROW_REPLIES = (0x2, 0x3, 0x4)
+"""Opcodes of the three replies with a row of the calibration matrix."""
 SERIAL_NUMBER = 0x5
+"""Opcode for the serial number."""
 SELECT_CALIBRATION = 0x6
+"""Opcode for the selection of a calibration."""
 COUNTS_PER_UNIT = 0x7
+"""Opcode for the counts per unit of force and of torque."""
 UNIT_CODES = 0x8
+"""Opcode for the codes of the units of force and torque."""
 FIRMWARE = 0xF
+"""Opcode for the version of the firmware."""
 
 REPLY_LENGTHS = {
     GAUGES: 8,
@@ -37,61 +46,61 @@ REPLY_LENGTHS = {
     UNIT_CODES: 2,
     FIRMWARE: 4,
 }
-"""Bytes in the reply of each opcode that the driver uses."""
+"""Number of data bytes in the reply with each opcode that the driver uses."""
 
 FIRST_FIRMWARE_WITH_SCALE = (3, 7)
-"""First firmware (major, minor) that reports counts per unit and unit codes."""
+"""First firmware version (major, minor) that reports counts per unit and unit codes."""
 COUNTS_BEFORE_SCALE = 1_000_000
-"""Counts per unit of force and of torque with older firmware."""
+"""Counts per unit of force and of torque with older firmware, which does not report them."""
 NEWTON, NEWTON_METRE = 2, 3
-"""Unit codes assumed for older firmware, which does not report them."""
+"""Unit codes of force and torque assumed for older firmware, which does not report them."""
 
 read_gauges = Struct(">Hhhh").unpack
-"""Status word and gauges 0, 2, 4 from the first reply to GAUGES."""
+"""Unpack status word and gauges 0, 2, 4 from the first reply to a poll."""
 read_gauges_rest = Struct(">hhh").unpack
-"""Gauges 1, 3, 5 from the second."""
+"""Unpack gauges 1, 3, 5 from the second reply to a poll."""
 
 
 def identifier(base: int, opcode: int) -> int:
-    """Return the CAN identifier of a message."""
+    """Return the CAN identifier of a message with an opcode."""
     return base << 4 | opcode
 
 
 def request(base: int, opcode: int, *arguments: int) -> bytes:
-    """Return the frame of a request, ready to send."""
+    """Return the raw CAN frame of a request."""
     return pack_frame(identifier(base, opcode), bytes(arguments))
 
 
 def matrix_row(replies: bytes) -> tuple[float, ...]:
-    """Return the six entries of three concatenated replies, two in each."""
+    """Unpack the six entries of a calibration matrix row from three concatenated replies."""
     return unpack(">6f", replies)
 
 
 def serial_number(reply: bytes) -> str:
-    """Return it as text."""
-    return text_of(reply)
+    """Decode the sensor's serial number in a reply to text."""
+    return printable_text(reply)
 
 
 def counts_per_unit(reply: bytes) -> tuple[int, int]:
-    """Return counts per unit of force and of torque."""
+    """Unpack the counts per unit of force and per unit of torque from a reply."""
     force, torque = unpack(">II", reply)
     return force, torque
 
 
 def firmware(reply: bytes) -> tuple[int, int, int]:
-    """Return major, minor and build number."""
+    """Unpack major, minor and build number of the sensor's firmware from a reply."""
     major, minor, build = unpack(">BBH", reply)
     return major, minor, build
 
 
 # Polls
 
-Answer = tuple[bytes, bytes]
-"""The data of both frames of a reading."""
+PollReply = tuple[bytes, bytes]
+"""Data of the two frames that answer a poll."""
 
 
-class _Frames:
-    """One of the two frames of a reply: the last one received, and the count."""
+class _FrameReceiver:
+    """Receiver of one of the two frames that answer a poll: its last data, and a count."""
 
     __slots__ = ("_length", "data", "replies")
 
@@ -100,38 +109,38 @@ class _Frames:
         self.data = b""
         self.replies = 0
 
-    def take(self, data: bytes) -> None:
-        """Store a frame; one of the wrong length counts as empty."""
+    def store(self, data: bytes) -> None:
+        """Count a received frame and store its data; data of the wrong length counts as empty."""
         self.replies += 1
         self.data = data if len(data) == self._length else b""
 
 
 class GaugePolls:
-    """Polls of a box, and their answers.
+    """Cyclic polls of a NETCANOEM box, and the pairing of their replies.
 
     Parameters
     ----------
     frame
-        The request, of 16 bytes.
+        Raw CAN frame of the poll.
     name
         Name of the sensor, for messages.
 
     Attributes
     ----------
     answer : tuple of bytes, or None
-        Answer to the last poll, as of the last `settle`.
+        Reply to the last poll, or None if `process_replies` has not found it yet.
     sent_ns, turnaround_ns : int
-        Time of the last poll (``time.monotonic_ns``), and time from a poll to its answer.
+        Time of the last poll (``time.monotonic_ns``), and duration from a poll to its reply.
     """
 
     __slots__ = (
         "_exchange",
-        "_first",
-        "_firsts",
+        "_first_frame",
+        "_first_pairing",
         "_frame",
         "_name",
-        "_second",
-        "_seconds",
+        "_second_frame",
+        "_second_pairing",
         "answer",
         "sent_ns",
         "turnaround_ns",
@@ -143,30 +152,30 @@ class GaugePolls:
         self.turnaround_ns = 0
         self.sent_ns = 0
         self._exchange: CanExchange | None = None
-        self._first = _Frames(REPLY_LENGTHS[GAUGES])
-        self._second = _Frames(REPLY_LENGTHS[GAUGES_REST])
-        self._firsts = ReplyPairing(self._first)
-        self._seconds = ReplyPairing(self._second)
-        self.answer: Answer | None = None
+        self._first_frame = _FrameReceiver(REPLY_LENGTHS[GAUGES])
+        self._second_frame = _FrameReceiver(REPLY_LENGTHS[GAUGES_REST])
+        self._first_pairing = ReplyPairing(self._first_frame)
+        self._second_pairing = ReplyPairing(self._second_frame)
+        self.answer: PollReply | None = None
 
     def open(self, exchange: CanExchange) -> None:
-        """Start to use an exchange."""
+        """Start to use a CAN exchange, with no reply outstanding."""
         self._exchange = exchange
         self.forget()
 
     def close(self) -> None:
-        """Stop using the exchange."""
+        """Stop using the CAN exchange."""
         self._exchange = None
         self.forget()
 
     @property
     def exchange(self) -> CanExchange:
-        """The open exchange.
+        """CAN exchange in use.
 
         Raises
         ------
         DeviceError
-            If there is none.
+            If no exchange is in use.
         """
         if self._exchange is None:
             raise DeviceError(f"{self._name}: it is not connected.")
@@ -174,51 +183,53 @@ class GaugePolls:
 
     @property
     def lost(self) -> int:
-        """Number of replies known to be lost."""
-        return max(self._firsts.lost, self._seconds.lost)
+        """Number of polls whose reply counts as lost."""
+        return max(self._first_pairing.lost, self._second_pairing.lost)
 
     def subscribe(self, first_id: int, second_id: int) -> None:
-        """Subscribe to the frames of these identifiers."""
-        self.exchange.subscribe(first_id, self._first.take)
-        self.exchange.subscribe(second_id, self._second.take)
+        """Subscribe to the two frames that answer a poll, by their CAN identifiers."""
+        self.exchange.subscribe(first_id, self._first_frame.store)
+        self.exchange.subscribe(second_id, self._second_frame.store)
 
     def drain(self) -> None:
-        """Deliver everything that has arrived."""
+        """Deliver all frames that have arrived on the bus."""
         self.exchange.drain()
 
     def send(self) -> None:
-        """Poll the sensor."""
-        self._firsts.ask()
-        self._seconds.ask()
+        """Send a poll to the sensor."""
+        self._first_pairing.register_request()
+        self._second_pairing.register_request()
         self.answer = None
         self.sent_ns = time.monotonic_ns()
         self.exchange.send(self._frame)
 
     def send_or_pause(self) -> None:
-        """Poll, or leave the poll out for one tick to restore the pairing of replies."""
-        firsts, seconds = self._firsts, self._seconds
-        if (firsts.owed or seconds.owed) and firsts.wants_pause() | seconds.wants_pause():
-            self.pause()
+        """Send a poll, or omit it in this tick to find out if missing replies are late or lost."""
+        first_pairing, second_pairing = self._first_pairing, self._second_pairing
+        if (
+            first_pairing.outstanding or second_pairing.outstanding
+        ) and first_pairing.needs_pause() | second_pairing.needs_pause():
+            self.register_pause()
         else:
             self.send()
 
-    def pause(self) -> None:
-        """Leave a tick without a poll."""
-        self._firsts.pause()
-        self._seconds.pause()
+    def register_pause(self) -> None:
+        """Register that this tick sends no poll."""
+        self._first_pairing.register_pause()
+        self._second_pairing.register_pause()
         self.answer = None
         self.sent_ns = time.monotonic_ns()
 
-    def wait(self, deadline_ns: int) -> Answer | None:
-        """Return the answer to the last poll as soon as it has come, or None at the deadline."""
+    def wait(self, deadline_ns: int) -> PollReply | None:
+        """Return the reply to the last poll as soon as it arrives, or None at the deadline."""
         if self.answer is None:
-            self.exchange.wait_until(self._have_caught_up, deadline_ns)
-        return self.settle()
+            self.exchange.wait_until(self._are_up_to_date, deadline_ns)
+        return self.process_replies()
 
-    def settle(self) -> Answer | None:
-        """Return the answer to the last poll if it has been delivered, else None."""
-        if self._firsts.settle() & self._seconds.settle():
-            first, second = self._first.data, self._second.data
+    def process_replies(self) -> PollReply | None:
+        """Return the reply to the last poll if it has been received, else None."""
+        if self._first_pairing.process_replies() & self._second_pairing.process_replies():
+            first, second = self._first_frame.data, self._second_frame.data
             if first and second:
                 self.answer = (first, second)
                 self.turnaround_ns = time.monotonic_ns() - self.sent_ns
@@ -226,9 +237,10 @@ class GaugePolls:
 
     def forget(self) -> None:
         """Reset the pairing: no reply is outstanding."""
-        self._firsts.start()
-        self._seconds.start()
+        self._first_pairing.start()
+        self._second_pairing.start()
         self.answer = None
 
-    def _have_caught_up(self) -> bool:
-        return self._firsts.has_caught_up() and self._seconds.has_caught_up()
+    def _are_up_to_date(self) -> bool:
+        """Return whether both frames of the reply to the last poll have arrived."""
+        return self._first_pairing.is_up_to_date() and self._second_pairing.is_up_to_date()

@@ -1,40 +1,52 @@
 """Protocol of a Digital F/T sensor: Modbus RTU frames for set-up, then a stream of records.
 
-A record has 13 bytes: gauges 0, 2, 4, 1, 3, 5 as big-endian int16, then the sum of these bytes in
-seven bits, with the sensor's error bit above. Nothing marks where a record begins and nothing
-counts them, and the sum also fits one of 128 false beginnings. Worse, the records of a load at
-rest are nearly alike, so that a false beginning that fits once may well fit again. Hence
+A record has 13 bytes: gauges 0, 2, 4, 1, 3, 5 as big-endian int16, then a checksum of seven bits
+(the sum of these bytes) with the sensor's error bit above. Records have neither a start mark nor a
+counter, and the checksum also fits at one of 128 wrong offsets. Moreover, the records of a constant
+load are nearly equal, so that a wrong offset that fits once may well fit again. Hence
 `RecordStream` has these rules:
 
-* after a disturbance a beginning counts only once several records in a row fit it, and these are
-  then delivered, too;
-* the beginning that held before the disturbance (or that the sensor's last message gives) has
-  precedence: most disturbances damage bytes and lose none;
-* any other beginning must be the only one that fits.
+* after a disturbance an offset is accepted only if several consecutive records fit; these records
+  are then delivered, too;
+* the offset before the disturbance (or after the sensor's last message) has precedence, since most
+  disturbances damage bytes and lose none;
+* any other offset must be the only one that fits.
 """
 
 from collections.abc import Sequence
 from struct import pack, unpack
 
 ADDRESS = 0x0A
-"""Modbus address of every such sensor."""
+"""Modbus address of every Digital F/T sensor."""
 MAX_REGISTERS = 64
-"""Largest number of registers in one request."""
+"""Largest number of registers in one read request."""
 
 STATUS_WORD = 0x001D
+"""Address of the register with the status word."""
 ACTIVE_GAINS = 0x0000
+"""Address of the first of six registers with the active amplifier gains."""
 ACTIVE_OFFSETS = 0x0006
+"""Address of the first of six registers with the active amplifier offsets."""
 
-_READ = 0x03
-_WRITE = 0x10
-_START = 0x46
-_LOCK = 0x6A
+_READ_FUNCTION = 0x03
+"""Modbus function that reads registers."""
+_WRITE_FUNCTION = 0x10
+"""Modbus function that writes registers."""
+_START_FUNCTION = 0x46
+"""Modbus function that starts the stream."""
+_LOCK_FUNCTION = 0x6A
+"""Modbus function that locks or unlocks the sensor's memory."""
 _STREAM_PARAMETER = 0x55
+"""Parameter of the function that starts the stream."""
 _UNLOCK_CODE = 0xAA
+"""Parameter that unlocks the sensor's memory."""
 _LOCK_CODE = 0x18
-_ACCEPTED = 1
+"""Parameter that locks the sensor's memory."""
+_ACCEPTED_CODE = 1
+"""Code in a reply that confirms the request."""
 _EXCEPTION_FLAG = 0x80
-_EXCEPTIONS = {
+"""Bit in the function code of a Modbus exception response."""
+_EXCEPTION_MEANINGS = {
     1: "it does not know this function",
     2: "it has no such register",
     3: "it does not accept this value",
@@ -42,30 +54,33 @@ _EXCEPTIONS = {
     5: "it needs more time",
     6: "it is busy",
 }
+"""Meanings of Modbus exception codes."""
 
 
 class BadReply(ValueError):
-    """The reply is missing, damaged or that to another request; repeat it."""
+    """Error: the reply is missing, damaged or for another request; a repetition may help."""
 
 
 class ExceptionResponse(ValueError):
-    """Modbus exception response: the sensor declines the request; a repetition does not help."""
+    """Error: the sensor refuses the request (Modbus exception); repeating it does not help."""
 
 
 # Modbus RTU frames
 
 
 def _crc_of_byte(value: int) -> int:
+    """Return the Modbus checksum of a single byte, for the table of checksums."""
     for _ in range(8):
         value = value >> 1 ^ 0xA001 if value & 1 else value >> 1
     return value
 
 
 _CRC_TABLE = tuple(map(_crc_of_byte, range(256)))
+"""Modbus checksums of all bytes."""
 
 
 def crc16(data: bytes) -> int:
-    """Return Modbus' checksum (polynomial 0xA001 reflected, start 0xFFFF)."""
+    """Return the Modbus checksum of data (polynomial 0xA001 reflected, start 0xFFFF)."""
     crc = 0xFFFF
     for byte in data:
         crc = crc >> 8 ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
@@ -73,59 +88,65 @@ def crc16(data: bytes) -> int:
 
 
 def frame(function: int, content: bytes) -> bytes:
-    """Return a whole request to the sensor, with address and checksum."""
+    """Return the bytes of a Modbus request to the sensor, with address and checksum."""
     body = bytes((ADDRESS, function)) + content
     return body + crc16(body).to_bytes(2, "little")
 
 
-START_STREAMING = frame(_START, bytes((_STREAM_PARAMETER,)))
-UNLOCK = frame(_LOCK, bytes((_UNLOCK_CODE,)))
-LOCK = frame(_LOCK, bytes((_LOCK_CODE,)))
+START_STREAMING = frame(_START_FUNCTION, bytes((_STREAM_PARAMETER,)))
+"""Request that starts the stream."""
+UNLOCK = frame(_LOCK_FUNCTION, bytes((_UNLOCK_CODE,)))
+"""Request that unlocks the sensor's memory."""
+LOCK = frame(_LOCK_FUNCTION, bytes((_LOCK_CODE,)))
+"""Request that locks the sensor's memory."""
 
 
 def read_registers(first: int, count: int) -> bytes:
-    """Return the request for some registers, at most MAX_REGISTERS."""
-    return frame(_READ, pack(">HH", first, count))
+    """Return the request that reads `count` registers, at most `MAX_REGISTERS`."""
+    return frame(_READ_FUNCTION, pack(">HH", first, count))
 
 
 def write_registers(first: int, values: Sequence[int]) -> bytes:
-    """Return the request that sets some registers."""
+    """Return the request that writes consecutive registers."""
     content = pack(f">{len(values)}H", *values)
-    return frame(_WRITE, pack(">HHB", first, len(values), len(content)) + content)
+    return frame(_WRITE_FUNCTION, pack(">HHB", first, len(values), len(content)) + content)
 
 
 def reply_length(request: bytes) -> int:
-    """Return the length of the reply to a request in bytes, unless it is an exception response."""
+    """Return the length in bytes of the reply to a request, unless it is an exception response."""
     function = request[1]
-    if function == _READ:
+    if function == _READ_FUNCTION:
         (count,) = unpack(">H", request[4:6])
         return 5 + 2 * int(count)
-    return 8 if function == _WRITE else 5
+    return 8 if function == _WRITE_FUNCTION else 5
 
 
 REFUSAL_LENGTH = 5
+"""Length in bytes of a Modbus exception response."""
 
 
 def is_refusal(reply: bytes) -> bool:
-    """Return whether the bytes received so far begin an exception response."""
+    """Return whether the bytes received so far begin a Modbus exception response."""
     return len(reply) > 1 and bool(reply[1] & _EXCEPTION_FLAG)
 
 
-def content_of(request: bytes, reply: bytes) -> bytes:
-    """Return the content of a reply; verify address, function, length, checksum and echo.
+def reply_content(request: bytes, reply: bytes) -> bytes:
+    """Check the reply to a request, and return its content without address, function and checksum.
 
     Raises
     ------
     BadReply
-        If it is not a valid reply to this request.
+        If the reply is not a valid reply to this request.
     ExceptionResponse
-        If it is valid and declines the request.
+        If the reply is valid and refuses the request.
     """
     if not reply:
         raise BadReply("no reply came")
-    wanted = REFUSAL_LENGTH if is_refusal(reply) else reply_length(request)
-    if len(reply) != wanted:
-        raise BadReply(f"{len(reply)} bytes came instead of {wanted} ({reply[:16].hex(' ')})")
+    expected_length = REFUSAL_LENGTH if is_refusal(reply) else reply_length(request)
+    if len(reply) != expected_length:
+        raise BadReply(
+            f"{len(reply)} bytes came instead of {expected_length} ({reply[:16].hex(' ')})"
+        )
     if crc16(reply):
         raise BadReply(f"the checksum of the reply is wrong ({reply[:16].hex(' ')})")
     if reply[0] != ADDRESS or reply[1] & ~_EXCEPTION_FLAG != request[1]:
@@ -133,56 +154,69 @@ def content_of(request: bytes, reply: bytes) -> bytes:
     content = reply[2:-2]
     if is_refusal(reply):
         code = content[0]
-        raise ExceptionResponse(_EXCEPTIONS.get(code, f"it declined with code {code}"))
+        raise ExceptionResponse(_EXCEPTION_MEANINGS.get(code, f"it declined with code {code}"))
     function = request[1]
-    if function == _READ and content[0] != wanted - 5:
-        raise BadReply(f"{content[0]} bytes of registers came instead of {wanted - 5}")
-    if function == _WRITE and content != request[2:6]:
+    if function == _READ_FUNCTION and content[0] != expected_length - 5:
+        raise BadReply(f"{content[0]} bytes of registers came instead of {expected_length - 5}")
+    if function == _WRITE_FUNCTION and content != request[2:6]:
         raise BadReply("it confirmed other registers than were written")
-    if function in (_LOCK, _START) and content[0] != _ACCEPTED:
+    if function in (_LOCK_FUNCTION, _START_FUNCTION) and content[0] != _ACCEPTED_CODE:
         raise ExceptionResponse(f"it declined with code {content[0]}")
-    return content[1:] if function == _READ else content
+    return content[1:] if function == _READ_FUNCTION else content
 
 
-def registers_of(content: bytes) -> tuple[int, ...]:
-    """Return the values of registers that were read."""
+def unpack_registers(content: bytes) -> tuple[int, ...]:
+    """Unpack the register values from the content of a reply."""
     return unpack(f">{len(content) // 2}H", content)
 
 
 # Record stream
 
 RECORD_SIZE = 13
+"""Size of a record in bytes."""
 RECORD_BITS = RECORD_SIZE * 11
-"""On the line: each byte with start, parity and stop bit."""
+"""Number of bits of a record on the line: each byte has a start, a parity and a stop bit."""
 SYNC_RECORDS = 6
-"""Records in a row that must fit. Less than come in a tick of 1 ms, so that one damaged record
-makes no tick go without any."""
-ERROR_BIT = 0x80
-"""Bit in the last byte of a record: the sensor's status word reports something."""
+"""Number of consecutive records that must fit after a disturbance.
 
-_SUM_AT = RECORD_SIZE - 1
-_SUM_MASK = 0x7F
+It is less than the number of records in a tick of 1 ms, so that no tick is without a record because
+of one damaged record."""
+ERROR_BIT = 0x80
+"""Bit in the last byte of a record: the sensor's status word reports an error."""
+
+_CHECKSUM_OFFSET = RECORD_SIZE - 1
+"""Offset of the checksum in a record."""
+_CHECKSUM_MASK = 0x7F
+"""Mask of the checksum in the last byte of a record."""
 _SYNC_SIZE = SYNC_RECORDS * RECORD_SIZE
+"""Number of bytes that must fit after a disturbance."""
 
 
 class RecordStream:
-    """Splits the received bytes, in chunks of any length, into records.
+    """Splitter that cuts the received bytes, in chunks of any length, into valid records.
 
     Attributes
     ----------
     synchronised : bool
-        Whether the beginning of the next record is known.
+        Whether the offset of the next record is known.
     records : int
-        Delivered so far.
+        Number of records delivered so far.
     checksum_errors : int
-        Number of times that a record did not fit where one had to begin.
+        Number of records that did not fit at the expected offset.
     dropped_bytes : int
-        Number of bytes that belonged to no record.
+        Number of discarded bytes that belonged to no record.
     pending : int
-        Bytes that are held until it is clear which record they belong to.
+        Number of bytes that wait for more bytes to complete a record.
     """
 
-    __slots__ = ("_held", "_phase", "checksum_errors", "dropped_bytes", "records", "synchronised")
+    __slots__ = (
+        "_expected_offset",
+        "_held_bytes",
+        "checksum_errors",
+        "dropped_bytes",
+        "records",
+        "synchronised",
+    )
 
     def __init__(self) -> None:
         self.records = 0
@@ -191,76 +225,82 @@ class RecordStream:
         self.start(aligned=False)
 
     def start(self, *, aligned: bool) -> None:
-        """Restart the stream.
+        """Restart the stream without received bytes; the counts continue.
 
         Parameters
         ----------
         aligned
-            Whether the next byte is probably the first of a record.
+            Whether the next byte is probably the first byte of a record.
         """
-        self._held = b""
-        self._phase = 0 if aligned else None
+        self._held_bytes = b""
+        self._expected_offset = 0 if aligned else None
         self.synchronised = False
 
     @property
     def pending(self) -> int:
-        """Bytes held back."""
-        return len(self._held)
+        """Number of bytes that wait for more bytes to complete a record."""
+        return len(self._held_bytes)
 
     def feed(self, chunk: bytes) -> bytes:
-        """Return the records in the received bytes, concatenated, oldest first."""
-        data = self._held + chunk if self._held else chunk
-        found = b""
+        """Process received bytes; return the complete valid records, concatenated, oldest first."""
+        data = self._held_bytes + chunk if self._held_bytes else chunk
+        records = b""
         while True:
             if not self.synchronised:
-                begin = self._search(data)
+                begin = self._find_first_record(data)
                 if begin is None:
                     break
                 self.dropped_bytes += begin
                 data = data[begin:]
                 self.synchronised = True
-            whole = len(data) - len(data) % RECORD_SIZE
-            good = _length_of_good(data, whole)
-            found = found + data[:good] if found else data[:good]
-            data = data[good:]
-            if good == whole:
-                self._held = data
+            whole_length = len(data) - len(data) % RECORD_SIZE
+            valid_length = _length_of_valid_records(data, whole_length)
+            records = records + data[:valid_length] if records else data[:valid_length]
+            data = data[valid_length:]
+            if valid_length == whole_length:
+                self._held_bytes = data
                 break
             self.checksum_errors += 1
             self.synchronised = False
-            self._phase = 0
-        self.records += len(found) // RECORD_SIZE
-        return found
+            self._expected_offset = 0
+        self.records += len(records) // RECORD_SIZE
+        return records
 
-    def _search(self, data: bytes) -> int | None:
-        """Return the offset of the first record; None if more bytes are needed to find it."""
-        last = len(data) - _SYNC_SIZE
-        undecided = max(0, last + 1)
-        for begin in range(last + 1):
-            if not _fits(data, begin):
+    def _find_first_record(self, data: bytes) -> int | None:
+        """Return the offset of the first record, or None if more bytes are needed to find it."""
+        last_offset = len(data) - _SYNC_SIZE
+        undecided_offset = max(0, last_offset + 1)
+        for begin in range(last_offset + 1):
+            if not _records_fit(data, begin):
                 continue
-            if self._phase is not None and (begin - self._phase) % RECORD_SIZE == 0:
+            if (
+                self._expected_offset is not None
+                and (begin - self._expected_offset) % RECORD_SIZE == 0
+            ):
                 return begin
-            if begin + _SUM_AT > last:
+            if begin + _CHECKSUM_OFFSET > last_offset:
                 # Not all candidate offsets have arrived yet.
-                undecided = min(undecided, begin)
-            elif not any(_fits(data, begin + shift) for shift in range(1, RECORD_SIZE)):
+                undecided_offset = min(undecided_offset, begin)
+            elif not any(_records_fit(data, begin + shift) for shift in range(1, RECORD_SIZE)):
                 return begin
-        self.dropped_bytes += undecided
-        self._held = data[undecided:]
-        if self._phase is not None:
-            self._phase = (self._phase - undecided) % RECORD_SIZE
+        self.dropped_bytes += undecided_offset
+        self._held_bytes = data[undecided_offset:]
+        if self._expected_offset is not None:
+            self._expected_offset = (self._expected_offset - undecided_offset) % RECORD_SIZE
         return None
 
 
-def _length_of_good(data: bytes, whole: int) -> int:
-    """Return how many bytes of ``data[:whole]`` are valid records, up to the first invalid one."""
-    for begin in range(0, whole, RECORD_SIZE):
-        if (sum(data[begin : begin + _SUM_AT]) ^ data[begin + _SUM_AT]) & _SUM_MASK:
+def _length_of_valid_records(data: bytes, whole_length: int) -> int:
+    """Return the number of bytes in ``data[:whole_length]`` before the first invalid record."""
+    for begin in range(0, whole_length, RECORD_SIZE):
+        if (
+            sum(data[begin : begin + _CHECKSUM_OFFSET]) ^ data[begin + _CHECKSUM_OFFSET]
+        ) & _CHECKSUM_MASK:
             return begin
-    return whole
+    return whole_length
 
 
-def _fits(data: bytes, begin: int) -> bool:
-    part = data[begin : begin + _SYNC_SIZE]
-    return _length_of_good(part, _SYNC_SIZE) == _SYNC_SIZE
+def _records_fit(data: bytes, begin: int) -> bool:
+    """Return whether enough consecutive records for synchronisation fit at an offset."""
+    sync_bytes = data[begin : begin + _SYNC_SIZE]
+    return _length_of_valid_records(sync_bytes, _SYNC_SIZE) == _SYNC_SIZE

@@ -1,7 +1,7 @@
-"""A Digital F/T sensor on a serial line, streaming: set up, then read record by record.
+"""Driver of a Digital F/T sensor on a serial line, whose stream is read record by record.
 
-The sensor streams several records for each tick of the loop. The profile's decimating filter and
-the calibration are one matrix, applied to the newest records in one product.
+The sensor streams several records per tick of the loop. The profile's decimating filter and the
+calibration form one matrix, by which the newest records are multiplied.
 """
 
 import time
@@ -12,51 +12,70 @@ from struct import Struct
 
 import numpy as np
 
-from rigd.devices.ati._calibration import SERIAL_CRITICAL, CalibrationBlock, serial_status
+from rigd.devices.ati._calibration import (
+    CRITICAL_SERIAL_STATUS_BITS,
+    CalibrationBlock,
+    describe_serial_status,
+)
 from rigd.devices.ati._serial_protocol import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
-from rigd.devices.ati._serial_setup import SILENCE_S, SerialLine, SerialSetup, held_back
+from rigd.devices.ati._serial_setup import (
+    SILENCE_S,
+    SerialLine,
+    SerialSetup,
+    describe_adapter_delay,
+)
 from rigd.devices.contracts import DeviceError, LineHealth, Wrench
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import SimulatorAddress
 
 _FIRST_RECORDS_TIMEOUT_S = 0.5
-# The error bit is not covered by the checksum; one flipped bit must not end a session.
-_ERRORS_IN_A_ROW = 7
-# Unread for longer than this, the kernel's 4 kB may overflow at 91 kB/s and what is left is old.
+"""Time in seconds to wait for the first valid records of the stream."""
+_MOST_ERROR_RECORDS = 7
+"""Number of consecutive records with the error bit that end a session.
+
+The checksum does not cover the error bit, and one flipped bit must not end a session."""
 _IDLE_NS = 20_000_000
+"""Time in nanoseconds without reading after which received bytes are discarded.
+
+After a longer time the kernel's buffer of 4 kB may overflow at 91 kB/s, and its content is old."""
 _GAP_PERIODS = 2.5
-"""Periods without a byte that are a gap: the stream brings several records in each."""
-_GAPS, _FEWEST_GAPS = 8, 4
-_EVEN = 1.5
-"""Largest ratio of a gap to the median gap for gaps to count as even."""
-_RECENT_NS = 500_000_000
+"""Number of periods without a byte that count as a gap; the stream has several records per
+period."""
+_STORED_GAPS, _FEWEST_EVALUATED_GAPS = 8, 4
+"""Number of the latest gaps that are stored, and smallest number that is evaluated."""
+_LARGEST_GAP_RATIO = 1.5
+"""Largest ratio of a gap to the median gap for which gaps count as equal."""
+_GAP_EVALUATION_NS = 500_000_000
+"""Time in nanoseconds for which a gap is evaluated."""
 _STEADY_TICKS = 3
-"""Ticks that bring their own records after which what is still missing counts as lost."""
+"""Number of consecutive ticks with their own records after which missing records count as lost."""
 
 _BITS_PER_BYTE = RECORD_BITS // RECORD_SIZE
-_RECORD = np.dtype([("gauges", ">i2", 6), ("check", "u1")])
+"""Number of bits on the line per byte."""
+_RECORD_LAYOUT = np.dtype([("gauges", ">i2", 6), ("check", "u1")])
+"""Layout of a record as NumPy data type."""
 
 
 class AtiSerialSensor:
-    """The sensor of a profile with a section ``ati_serial``.
+    """Driver of an ATI Digital F/T sensor on a serial line.
 
     Parameters
     ----------
     rig
         Parameters with sections ``ati_serial`` and ``acquisition``.
     simulator
-        Address of the simulated rig that replaces it, or None.
+        Address of the simulated rig that replaces the hardware, or None.
 
     Attributes
     ----------
     wrench_stale, wrench_saturated, wrench_time_ns
-        State of the last reading; the time (``time.monotonic_ns``) is when its newest record was
-        read.
+        Whether the last wrench is old, whether a gauge is saturated, and the time in nanoseconds
+        (``time.monotonic_ns``) at which the newest record of the last wrench was read.
     stream : RecordStream
-        Stream, with the counts of records and checksum errors.
+        Record stream, which counts records and checksum errors.
     status : list of str
-        Last status word of the sensor, in words; it can be read only while the sensor does not
-        stream, that is in `connect` and `close`.
+        Descriptions of the set bits of the sensor's last status word. The word can be read only
+        while the sensor does not stream, that is in `connect` and `close`.
 
     Raises
     ------
@@ -81,32 +100,32 @@ class AtiSerialSensor:
         self._period_ns = 1e9 / rig.rate_hz
         self._bytes_per_tick = settings.records_per_tick(rig.rate_hz) * RECORD_SIZE
         self._weights = settings.weights(rig.rate_hz)
-        self._limit = settings.saturation_counts
+        self._saturation_counts = settings.saturation_counts
         self._deadline_ns = int(acquisition.deadline_us * 1e3)
-        # Waiting longer for the one record that lacks would let a sensor whose clock is slow drag
-        # every tick's sampling instant along, up to the deadline. In lock-step there is no clock.
+        # Waiting longer for a single missing record would let a sensor with a slow clock delay the
+        # sampling instant of every tick, up to the deadline. In lock-step there is no clock.
         self._patience_ns = self._deadline_ns
         if not self._lock_step:
             self._patience_ns = min(self._deadline_ns, int(1e9 / settings.stream_hz))
         self._line: SerialLine | None = None
-        self._block: CalibrationBlock | None = None
-        self._operator = np.zeros((6, 6 * len(self._weights)))
+        self._calibration_block: CalibrationBlock | None = None
+        self._filter_matrix = np.zeros((6, 6 * len(self._weights)))
         self._history = b""
         self._history_size = len(self._weights) * RECORD_SIZE
         self._unpackers: dict[int, Callable[[bytes], tuple[int, ...]]] = {}
         self.stream = RecordStream()
         self.status: list[str] = []
         self._status_word = 0
-        self._errors_in_a_row = 0
-        self._arrived = 0
+        self._error_records = 0
+        self._arrived_bytes = 0
         self._arrived_ns = 0
-        self._gaps: deque[tuple[int, int]] = deque(maxlen=_GAPS)
-        """When the latest blocks came after a gap, and how long it was."""
-        # How many bytes should have come by this tick; a record or two less is not a lag.
-        self._due = 0
+        self._latest_gaps: deque[tuple[int, int]] = deque(maxlen=_STORED_GAPS)
+        """Time and length in nanoseconds of the latest gaps between arrivals."""
+        # Number of bytes that should have arrived by this tick; one or two records less are no lag.
+        self._due_bytes = 0
         self._tick_ns: int | None = None
         self._steady_ticks = 0
-        self._damages = 0
+        self._known_checksum_errors = 0
         self._missing_records = 0
         self._requested_ns = 0
         self._last_read_ns = 0
@@ -122,7 +141,7 @@ class AtiSerialSensor:
         Raises
         ------
         DeviceError
-            If the sensor is absent, not the profile's, not sound, or does not stream.
+            If the sensor is absent, differs from the profile, reports an error, or does not stream.
         """
         self.close()
         self._check_line_rate()
@@ -131,32 +150,32 @@ class AtiSerialSensor:
             setup = SerialSetup(self._line, self._settings, self._name)
             setup.stop_streaming()
             self._check_status(setup)
-            self._block = setup.read_block()
-            setup.load_amplifiers(self._block)
+            self._calibration_block = setup.read_block()
+            setup.load_amplifiers(self._calibration_block)
             self._check_status(setup)
-            rows = self._block.calibration.wrench_per_wire_count()
-            self._operator = np.kron(np.array(self._weights), np.array(rows))
+            rows = self._calibration_block.calibration.wrench_per_wire_count()
+            self._filter_matrix = np.kron(np.array(self._weights), np.array(rows))
             self._start_streaming(setup)
         except BaseException:
             self._release()
             raise
 
     def calibration(self) -> dict[str, object]:
-        """Return identity, calibration and line as found, for the session file.
+        """Return identity, calibration and line settings of the sensor, for the session file.
 
         Raises
         ------
         DeviceError
             If the sensor is not connected.
         """
-        if self._block is None or self._line is None:
+        if self._calibration_block is None or self._line is None:
             raise DeviceError(f"{self._name}: it is not connected.")
         return {
             "sensor": "ATI Digital F/T",
-            **self._block.calibration.as_dict(),
+            **self._calibration_block.calibration.as_dict(),
             "calibration": self._settings.calibration,
-            "gains": list(self._block.gains),
-            "offsets": list(self._block.offsets),
+            "gains": list(self._calibration_block.gains),
+            "offsets": list(self._calibration_block.offsets),
             "status": self.status,
             "port": self._port,
             "baud": self._settings.baud,
@@ -167,18 +186,18 @@ class AtiSerialSensor:
         }
 
     def request(self, due_ns: int) -> None:
-        """Begin the tick; the sensor streams, so nothing is sent."""
+        """Begin a tick that was due at `due_ns`; nothing is sent, because the sensor streams."""
         now_ns = self._requested_ns = time.monotonic_ns()
         periods = 1
         if self._tick_ns is not None and not self._lock_step:
             periods = max(1, round((due_ns - self._tick_ns) / self._period_ns))
         self._tick_ns = due_ns
-        self._due += periods * self._bytes_per_tick
+        self._due_bytes += periods * self._bytes_per_tick
         if now_ns - self._last_read_ns > _IDLE_NS and not self._lock_step:
-            # What has piled up is old, and perhaps full of holes: only what comes now counts.
-            self._take(self._open_line().read())
+            # Queued bytes are old and may have gaps: only bytes that arrive from now on count.
+            self._split_records(self._open_line().read())
             self._history = b""
-            self._due = self._arrived - self.stream.pending + RECORD_SIZE
+            self._due_bytes = self._arrived_bytes - self.stream.pending + RECORD_SIZE
 
     def read_wrench(self) -> Wrench:
         """Return the wrench in N and N·m: the filter over the newest records.
@@ -186,62 +205,66 @@ class AtiSerialSensor:
         Raises
         ------
         DeviceError
-            If the line is gone or the sensor reports an error.
+            If the line has failed or the sensor reports an error.
         """
         line = self._open_line()
-        new = self._take(line.read())
-        while self._arrived < self._due:
-            lacks_one = self._due - self._arrived <= RECORD_SIZE
-            patience_ns = self._patience_ns if lacks_one else self._deadline_ns
-            left_ns = self._requested_ns + patience_ns - time.monotonic_ns()
-            if left_ns <= 0:
+        new = self._split_records(line.read())
+        while self._arrived_bytes < self._due_bytes:
+            lacks_one_record = self._due_bytes - self._arrived_bytes <= RECORD_SIZE
+            patience_ns = self._patience_ns if lacks_one_record else self._deadline_ns
+            remaining_ns = self._requested_ns + patience_ns - time.monotonic_ns()
+            if remaining_ns <= 0:
                 break
-            line.wait(left_ns * 1e-9)
-            new += self._take(line.read())
+            line.wait(remaining_ns * 1e-9)
+            new += self._split_records(line.read())
         self._last_read_ns = time.monotonic_ns()
-        self.wrench_stale = self._lags(len(new)) or not new
+        self.wrench_stale = self._is_lagging(len(new)) or not new
         if self.wrench_stale:
             return self._wrench
-        gauges = self._unpack(new)
+        gauges = self._unpack_gauges(new)
         self.gauges = gauges[-6:]
-        self.wrench_saturated = max(gauges) >= self._limit or min(gauges) <= -self._limit
-        return self._filter()
+        self.wrench_saturated = (
+            max(gauges) >= self._saturation_counts or min(gauges) <= -self._saturation_counts
+        )
+        return self._filtered_wrench()
 
-    def _lags(self, new: int) -> bool:
-        """Return whether the newest record is a tick or more late, given `new` bytes of records.
+    def _is_lagging(self, new: int) -> bool:
+        """Return whether the newest record is a tick or more late; `new` counts the new bytes.
 
-        Records that are late catch up. Lost ones do not: where each of some ticks brings its own
-        and the gap stays, they count as lost. But nothing counts records: unless what was lost left
-        an incomplete one, all later records may be late by as much, and that doubt is reported.
-        Less than a tick is the drift between two clocks, or the sensor's phase.
+        Late records arrive in addition to the records of later ticks, lost records do not. If some
+        consecutive ticks bring only their own records, the missing records count as lost. Since
+        records have no counter, all later records may instead be late by as much, unless the loss
+        left an incomplete record. This doubt is reported. A lag below one tick is the drift between
+        two clocks, or the phase of the sensor.
         """
-        complete = self._arrived - self.stream.pending
-        if self._due - complete >= self._bytes_per_tick:
+        complete_bytes = self._arrived_bytes - self.stream.pending
+        if self._due_bytes - complete_bytes >= self._bytes_per_tick:
             in_step = abs(new - self._bytes_per_tick) <= RECORD_SIZE
             self._steady_ticks = self._steady_ticks + 1 if in_step else 0
             if self._steady_ticks < _STEADY_TICKS:
                 return True
-            if self.stream.checksum_errors == self._damages:
-                self._missing_records += (self._due - complete) // RECORD_SIZE
-        self._damages = self.stream.checksum_errors
+            if self.stream.checksum_errors == self._known_checksum_errors:
+                self._missing_records += (self._due_bytes - complete_bytes) // RECORD_SIZE
+        self._known_checksum_errors = self.stream.checksum_errors
         self._steady_ticks = 0
-        self._due = complete
+        self._due_bytes = complete_bytes
         return False
 
     def health(self) -> LineHealth:
         """Return the health of the line, and the status word that was read before the stream."""
         return LineHealth(
-            bits=self._arrived * _BITS_PER_BYTE,
+            bits=self._arrived_bytes * _BITS_PER_BYTE,
             bit_rate_bit_s=self._settings.baud,
             errors=self.stream.checksum_errors,
             status=self._status_word,
             doubt=self._doubt,
             doubt_count=self._doubt_count(),
-            cause=self._cause(),
+            cause=self._describe_cause(),
         )
 
     @property
     def _doubt(self) -> str:
+        """Reason why the wrench may be older than stated; empty if no records are missing."""
         if not self._missing_records:
             return ""
         return (
@@ -251,6 +274,7 @@ class AtiSerialSensor:
         )
 
     def _doubt_count(self) -> str:
+        """Return a sentence with the number of missing records; empty if none are missing."""
         missing = self._missing_records
         if not missing:
             return ""
@@ -260,34 +284,41 @@ class AtiSerialSensor:
             f"wrench is late by {late_ms:.2g} ms."
         )
 
-    def _cause(self) -> str:
-        """Report that the adapter holds records back if the latest arrived in even blocks."""
+    def _describe_cause(self) -> str:
+        """Return the message that the adapter delays records, if they arrive in regular blocks."""
         now_ns = time.monotonic_ns()
-        gaps_ns = sorted(gap for came_ns, gap in self._gaps if now_ns - came_ns < _RECENT_NS)
-        if len(gaps_ns) < _FEWEST_GAPS:
+        gaps_ns = sorted(
+            gap for arrival_ns, gap in self._latest_gaps if now_ns - arrival_ns < _GAP_EVALUATION_NS
+        )
+        if len(gaps_ns) < _FEWEST_EVALUATED_GAPS:
             return ""
-        middle_ns = gaps_ns[len(gaps_ns) // 2]
-        if not 1 / _EVEN < gaps_ns[0] / middle_ns <= gaps_ns[-1] / middle_ns < _EVEN:
+        median_ns = gaps_ns[len(gaps_ns) // 2]
+        if (
+            not 1 / _LARGEST_GAP_RATIO
+            < gaps_ns[0] / median_ns
+            <= gaps_ns[-1] / median_ns
+            < _LARGEST_GAP_RATIO
+        ):
             return ""
-        return held_back(middle_ns * 1e-9, self._port)
+        return describe_adapter_delay(median_ns * 1e-9, self._port)
 
     def measure(self, duration_s: float) -> dict[str, float]:
-        """Watch the stream for a while, between `connect` and the first tick.
+        """Receive the stream for a while and return statistics; call it before the first tick.
 
         Returns
         -------
         dict
-            ``records_hz`` (records a second), ``checksum_errors`` and ``dropped_bytes`` (counted
-            meanwhile), ``longest_gap_s`` (between arrivals: what the adapter holds back).
-            A simulated rig in lock-step streams nothing meanwhile.
+            ``records_hz`` (records per second), ``checksum_errors`` and ``dropped_bytes`` (numbers
+            in this time), ``longest_gap_s`` (longest time between arrivals, caused by the adapter).
+            A simulated rig in lock-step streams nothing in this time.
 
         Raises
         ------
         DeviceError
-            If the line is gone or the sensor reports an error.
+            If the line has failed or the sensor reports an error.
         """
         line, stream = self._open_line(), self.stream
-        self._take(line.read())
+        self._split_records(line.read())
         records, errors, dropped = stream.records, stream.checksum_errors, stream.dropped_bytes
         begin_ns = last_received_ns = now_ns = time.monotonic_ns()
         end_ns = begin_ns + int(duration_s * 1e9)
@@ -299,7 +330,7 @@ class AtiSerialSensor:
             if data or now_ns >= end_ns:
                 longest_ns = max(longest_ns, now_ns - last_received_ns)
                 last_received_ns = now_ns
-                self._take(data)
+                self._split_records(data)
         self._last_read_ns = now_ns
         return {
             "records_hz": (stream.records - records) / ((now_ns - begin_ns) * 1e-9),
@@ -309,64 +340,67 @@ class AtiSerialSensor:
         }
 
     def close(self) -> None:
-        """Stop the stream, ask the status word once more, and release the port. Never raises."""
+        """Stop the stream, read the status word once more, and release the port; never raises."""
         if self._line is not None:
             with suppress(DeviceError):
                 setup = SerialSetup(self._line, self._settings, self._name)
                 setup.stop_streaming()
-                self.status = serial_status(setup.read_status())
+                self.status = describe_serial_status(setup.read_status())
         self._release()
 
     def _release(self) -> None:
+        """Close the serial port."""
         if self._line is not None:
             self._line.close()
         self._line = None
 
     def _open_line(self) -> SerialLine:
+        """Return the open serial line, or raise if the sensor is not connected."""
         if self._line is None:
             raise DeviceError(f"{self._name}: it is not connected.")
         return self._line
 
-    def _take(self, data: bytes) -> bytes:
-        """Split the received bytes into records; return the new ones."""
+    def _split_records(self, data: bytes) -> bytes:
+        """Split received bytes into records; return the new complete records."""
         if not data:
             return data
         now_ns = time.monotonic_ns()
         gap_ns = now_ns - self._arrived_ns
         if self._arrived_ns and gap_ns > _GAP_PERIODS * self._period_ns:
-            self._gaps.append((now_ns, gap_ns))
-        self._arrived += len(data)
+            self._latest_gaps.append((now_ns, gap_ns))
+        self._arrived_bytes += len(data)
         self._arrived_ns = now_ns
         new = self.stream.feed(data)
         if new:
             if max(new[RECORD_SIZE - 1 :: RECORD_SIZE]) & ERROR_BIT:
                 self._count_errors(new)
             else:
-                self._errors_in_a_row = 0
+                self._error_records = 0
             # Before a tick's worth of records has arrived, the oldest one is repeated.
             history = self._history or new[:RECORD_SIZE] * len(self._weights)
             self._history = (history + new)[-self._history_size :]
         return new
 
-    def _filter(self) -> Wrench:
-        """Compute the wrench from the newest records."""
-        newest = np.frombuffer(self._history, _RECORD)["gauges"].astype(float)
-        fx, fy, fz, tx, ty, tz = (self._operator @ newest.ravel()).tolist()
+    def _filtered_wrench(self) -> Wrench:
+        """Compute, store and return the wrench from the newest records."""
+        newest = np.frombuffer(self._history, _RECORD_LAYOUT)["gauges"].astype(float)
+        fx, fy, fz, tx, ty, tz = (self._filter_matrix @ newest.ravel()).tolist()
         self._wrench = wrench = (fx, fy, fz, tx, ty, tz)
         self.wrench_time_ns = self._arrived_ns
         return wrench
 
     def _count_errors(self, records: bytes) -> None:
+        """Count consecutive records with the error bit, and raise if there are too many."""
         for check in records[RECORD_SIZE - 1 :: RECORD_SIZE]:
-            self._errors_in_a_row = self._errors_in_a_row + 1 if check & ERROR_BIT else 0
-            if self._errors_in_a_row >= _ERRORS_IN_A_ROW:
+            self._error_records = self._error_records + 1 if check & ERROR_BIT else 0
+            if self._error_records >= _MOST_ERROR_RECORDS:
                 raise DeviceError(
                     f"{self._name}: its records report an error. Run rigd check to read its status "
                     "word."
                 )
 
-    def _unpack(self, records: bytes) -> tuple[int, ...]:
-        """Return the gauges of some records, without the checksums."""
+    def _unpack_gauges(self, records: bytes) -> tuple[int, ...]:
+        """Return the gauge counts of some records, without the checksums."""
         n = len(records) // RECORD_SIZE
         unpack = self._unpackers.get(n)
         if unpack is None:
@@ -374,13 +408,14 @@ class AtiSerialSensor:
         return unpack(records)
 
     def _check_line_rate(self) -> None:
+        """Raise if the line is too slow for the stream, or the stream is slower than the loop."""
         settings = self._settings
-        needed = settings.stream_hz * RECORD_BITS
-        if needed > settings.baud:
+        needed_bit_s = settings.stream_hz * RECORD_BITS
+        if needed_bit_s > settings.baud:
             raise DeviceError(
-                f"{self._name}: {settings.stream_hz:g} records a second need {needed:.0f} bit/s "
-                f"on the line, more than {settings.baud} baud; change ati_serial.stream_hz or "
-                "ati_serial.baud."
+                f"{self._name}: {settings.stream_hz:g} records a second need {needed_bit_s:.0f} "
+                f"bit/s on the line, more than {settings.baud} baud; change ati_serial.stream_hz "
+                "or ati_serial.baud."
             )
         if settings.stream_hz < self._rate_hz:
             raise DeviceError(
@@ -389,41 +424,43 @@ class AtiSerialSensor:
             )
 
     def _check_status(self, setup: SerialSetup) -> None:
-        word = self._status_word = setup.read_status()
-        self.status = serial_status(word)
-        if word & SERIAL_CRITICAL:
+        """Read the status word, and raise if it has a critical bit."""
+        status_word = self._status_word = setup.read_status()
+        self.status = describe_serial_status(status_word)
+        if status_word & CRITICAL_SERIAL_STATUS_BITS:
             raise DeviceError(
-                f"{self._name}: its status word {word:#06x} says that "
-                f"{'; '.join(serial_status(word & SERIAL_CRITICAL))}. It does not measure "
-                "properly: check sensor, cable and supply."
+                f"{self._name}: its status word {status_word:#06x} says that "
+                f"{'; '.join(describe_serial_status(status_word & CRITICAL_SERIAL_STATUS_BITS))}. "
+                "It does not measure properly: check sensor, cable and supply."
             )
 
     def _start_streaming(self, setup: SerialSetup) -> None:
+        """Start the stream and wait for the first valid records, or raise."""
         line = self._open_line()
-        begun = setup.start_streaming()
+        first_bytes = setup.start_streaming()
         self._history = b""
-        self._errors_in_a_row = 0
+        self._error_records = 0
         self.stream.start(aligned=True)
-        before, first = self._arrived, self.stream.records
-        self._take(begun)
+        bytes_before, records_before = self._arrived_bytes, self.stream.records
+        self._split_records(first_bytes)
         end_ns = time.monotonic_ns() + int(_FIRST_RECORDS_TIMEOUT_S * 1e9)
         # A simulated rig in lock-step sends the first records with the first tick.
-        while not self._lock_step and self.stream.records - first < len(self._weights):
+        while not self._lock_step and self.stream.records - records_before < len(self._weights):
             if time.monotonic_ns() > end_ns:
                 raise DeviceError(
                     f"{self._name}: it was commanded to stream, but of the "
-                    f"{self._arrived - before} bytes that came in {_FIRST_RECORDS_TIMEOUT_S} s "
-                    f"only {self.stream.records - first} were sound records. Check cable, "
-                    "ati_serial.baud and ati_serial.stream_hz."
+                    f"{self._arrived_bytes - bytes_before} bytes that came in "
+                    f"{_FIRST_RECORDS_TIMEOUT_S} s only {self.stream.records - records_before} "
+                    "were sound records. Check cable, ati_serial.baud and ati_serial.stream_hz."
                 )
             line.wait(SILENCE_S)
-            self._take(line.read())
+            self._split_records(line.read())
         if self._history:
             # Value that is used if the first tick finds no new records.
-            self._filter()
+            self._filtered_wrench()
         self._last_read_ns = time.monotonic_ns()
-        self._due = self._arrived - self.stream.pending
+        self._due_bytes = self._arrived_bytes - self.stream.pending
         self._tick_ns = None
         self._steady_ticks = 0
-        self._damages = self.stream.checksum_errors
+        self._known_checksum_errors = self.stream.checksum_errors
         self._missing_records = 0

@@ -1,7 +1,7 @@
-"""The serial port of a Digital F/T sensor, and its set-up over Modbus while it does not stream.
+"""Serial port of a Digital F/T sensor, and its set-up by Modbus while it does not stream.
 
-Pyserial opens and configures the port; the loop then reads it without blocking and without
-pyserial, whose own reading costs several system calls for what is one here.
+Pyserial opens and configures the port. The loop then reads the port without blocking and without
+pyserial, which needs several system calls per read instead of one.
 """
 
 import os
@@ -16,9 +16,9 @@ import serial
 
 from rigd.devices.ati import _serial_protocol as modbus
 from rigd.devices.ati._calibration import (
-    BLOCK_REGISTERS,
+    BLOCK_LENGTH_REGISTERS,
     CalibrationBlock,
-    first_register,
+    first_block_register,
     parse_block,
     same_serial_number,
 )
@@ -26,15 +26,16 @@ from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import AtiSerial
 
 _READ_SIZE = 65_536
+"""Largest number of bytes in one read from the port."""
 
 
-def held_back(gap_s: float, port: str) -> str:
-    """Describe that an adapter holds records back, and the remedy.
+def describe_adapter_delay(gap_s: float, port: str) -> str:
+    """Return the message that a USB adapter delays records, with the remedy.
 
     Parameters
     ----------
     gap_s
-        Time between two blocks of records.
+        Time between two blocks of records in seconds.
     port
         File name of the port.
     """
@@ -49,27 +50,27 @@ def held_back(gap_s: float, port: str) -> str:
 
 
 class SerialLine:
-    """An open port: 8 data bits, even parity, one stop bit; no other process may open it meanwhile.
+    """Open serial port: 8 data bits, even parity, one stop bit; locked against other processes.
 
     Parameters
     ----------
     port
         File name of the port.
     baud
-        Bits a second; any that the adapter can make.
+        Bit rate in bit/s; any rate that the adapter supports.
     device
-        Device at the other end, for messages.
+        Name of the device at the other end, for messages.
 
     Attributes
     ----------
     low_latency : bool
-        The adapter's driver passes on at once what has arrived. A USB adapter without it may
-        hold records for 16 ms.
+        Whether the adapter's driver delivers received bytes at once. Without this mode a USB
+        adapter may delay records by 16 ms.
 
     Raises
     ------
     DeviceError
-        If it cannot be opened; the message says what to do.
+        If the port cannot be opened; the message states the remedy.
     """
 
     def __init__(self, port: str, baud: int, device: str) -> None:
@@ -89,18 +90,18 @@ class SerialLine:
         except (serial.SerialException, termios.error, OSError, ValueError) as error:
             raise DeviceError(
                 f"{device}: the serial port {port} cannot be opened at {baud} baud "
-                f"({_reason(error)}); {_remedy(error)}."
+                f"({_error_text(error)}); {_opening_remedy(error)}."
             ) from None
         self._fd = self._serial.fileno()
-        self._selectable = [self._fd]
+        self._descriptors = [self._fd]
         self.low_latency = False
-        # Not every driver offers it; pyserial then reports a value it could not set.
+        # Not every adapter's driver supports it; pyserial then raises an error.
         with suppress(ValueError, OSError, termios.error):
             self._serial.set_low_latency_mode(True)
             self.low_latency = True
 
     def read(self) -> bytes:
-        """Return all that has arrived; nothing if nothing has.
+        """Return all bytes that have arrived on the serial line; empty if there are none.
 
         Raises
         ------
@@ -114,26 +115,26 @@ class SerialLine:
             except BlockingIOError:
                 return data
             except OSError as error:
-                raise self._gone(error.strerror) from None
+                raise self._failure_error(error.strerror) from None
             if not chunk:
-                raise self._gone("hung up")
+                raise self._failure_error("hung up")
             data = data + chunk if data else chunk
 
     def write(self, data: bytes) -> None:
-        """Send some bytes; so few that they always fit into the kernel's buffer.
+        """Send a few bytes, which always fit into the kernel's buffer.
 
         Raises
         ------
         DeviceError
-            If the line is gone or does not take them.
+            If the line has failed or does not accept the bytes.
         """
         try:
             os.write(self._fd, data)
         except OSError as error:
-            raise self._gone(error.strerror) from None
+            raise self._failure_error(error.strerror) from None
 
     def wait(self, timeout_s: float) -> None:
-        """Return as soon as something may have arrived, or after the timeout.
+        """Wait until bytes may have arrived on the serial line, at most for the timeout.
 
         Raises
         ------
@@ -141,16 +142,16 @@ class SerialLine:
             If the line is gone.
         """
         try:
-            select.select(self._selectable, (), (), timeout_s)
+            select.select(self._descriptors, (), (), timeout_s)
         except OSError as error:
-            raise self._gone(error.strerror) from None
-        except ValueError as error:  # a descriptor beyond what select knows
-            raise self._gone(str(error)) from None
+            raise self._failure_error(error.strerror) from None
+        except ValueError as error:  # a file descriptor too large for select
+            raise self._failure_error(str(error)) from None
 
     def transact(self, request: bytes, length: int, timeout_s: float) -> bytes:
-        """Send a request and return the reply: `length` bytes or more, fewer if no more arrive.
+        """Send a request and return the received bytes, at least `length` unless the time is over.
 
-        Earlier bytes are discarded.
+        Bytes that arrived before the request are discarded.
         """
         self.read()
         self.write(request)
@@ -162,12 +163,12 @@ class SerialLine:
         return reply
 
     def drain(self, quiet_s: float, limit_s: float) -> bool:
-        """Discard received bytes until the line is silent.
+        """Discard received bytes until the line has been silent for `quiet_s`; return success.
 
         Returns
         -------
         bool
-            Whether the line was silent within the limit.
+            Whether the line became silent within the limit.
         """
         now = time.monotonic()
         last_received_s, end = now, now + limit_s
@@ -181,11 +182,12 @@ class SerialLine:
         return False
 
     def close(self) -> None:
-        """Release the port; harmless when repeated."""
+        """Close the serial port; harmless when repeated."""
         with suppress(OSError, termios.error):
             self._serial.close()
 
-    def _gone(self, why: str | None) -> DeviceError:
+    def _failure_error(self, why: str | None) -> DeviceError:
+        """Return the error for a port that has failed."""
         return DeviceError(
             f"{self._device}: the serial port {self._serial.port} has failed ({why}); check "
             "adapter and cable, then connect again."
@@ -193,17 +195,19 @@ class SerialLine:
 
 
 def _parity(port: str) -> str:
-    """Return even parity; but none for a pseudo-terminal, which refuses to be set to it twice."""
+    """Return the parity to set: even, but none for a pseudo-terminal, which refuses it."""
     is_pseudo = os.path.realpath(port).startswith("/dev/pts/")
     return str(serial.PARITY_NONE if is_pseudo else serial.PARITY_EVEN)
 
 
-def _reason(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
+    """Return the reason of an error in words."""
     number = error.args[0] if error.args else None
     return os.strerror(number) if isinstance(number, int) else str(error)
 
 
-def _remedy(error: Exception) -> str:
+def _opening_remedy(error: Exception) -> str:
+    """Return the remedy for a port that cannot be opened."""
     if isinstance(error, BlockingIOError) or "exclusively lock" in str(error):
         return "another program has it open: close that first"
     if isinstance(error, ValueError):
@@ -217,24 +221,31 @@ def _remedy(error: Exception) -> str:
 # Set-up over Modbus
 
 SILENCE_S = 0.002
-"""Modbus: a frame is over when the line has been silent for this long."""
+"""Silence in seconds that ends a Modbus frame."""
 
-# Anything sent while the sensor streams stops it; other drivers send 14 bytes.
-_JAM = bytes(range(1, 15))
-_JAM_TRIES = 3
-_QUIET_S = 0.05
+_STOP_BYTES = bytes(range(1, 15))
+"""Bytes that stop the stream, as any bytes do; other drivers send 14 bytes."""
+_STOP_ATTEMPTS = 3
+"""Number of attempts to stop the stream."""
+_STREAM_STOPPED_SILENCE_S = 0.05
+"""Silence in seconds after which the stream counts as stopped."""
 _DRAIN_LIMIT_S = 0.5
+"""Time in seconds to wait for silence after one attempt to stop the stream."""
 _REPLY_TIMEOUT_S = 0.3
-_TRIES = 3
-# A repeated request may be answered twice, and no reply states which registers it holds.
+"""Time in seconds to wait for the reply to one request."""
+_REQUEST_ATTEMPTS = 3
+"""Number of attempts of one request."""
 _LATE_REPLY_S = 0.5
+"""Silence in seconds to wait for after a repeated request.
+
+A repeated request may be answered twice, and no reply states which registers it holds."""
 
 
 class SerialSetup:
-    """Requests to the sensor before and after the stream.
+    """Set-up of a Digital F/T sensor by Modbus requests, before and after the stream.
 
-    Every method raises `DeviceError` if the line is gone, or the sensor does not answer or answers
-    wrongly.
+    Every method raises `DeviceError` if the line has failed, or the sensor does not answer or
+    answers wrongly.
 
     Parameters
     ----------
@@ -252,10 +263,10 @@ class SerialSetup:
         self._name = name
 
     def stop_streaming(self) -> None:
-        """Stop the stream, in whatever state the sensor is."""
-        for _ in range(_JAM_TRIES):
-            self._line.write(_JAM)
-            if self._line.drain(_QUIET_S, _DRAIN_LIMIT_S):
+        """Stop the stream, whether the sensor streams or not."""
+        for _ in range(_STOP_ATTEMPTS):
+            self._line.write(_STOP_BYTES)
+            if self._line.drain(_STREAM_STOPPED_SILENCE_S, _DRAIN_LIMIT_S):
                 return
         raise DeviceError(
             f"{self._name}: it continues to send although it was commanded to stop; switch it off "
@@ -263,43 +274,51 @@ class SerialSetup:
         )
 
     def read_status(self) -> int:
-        """Return the status word."""
-        return self._read(modbus.STATUS_WORD, 1, "report its status")[0]
+        """Read the status word of the Digital F/T sensor by Modbus, and return it."""
+        return self._read_register_values(modbus.STATUS_WORD, 1, "report its status")[0]
 
     def read_block(self) -> CalibrationBlock:
-        """Return the calibration that the profile selects; verify the serial number."""
-        number, wanted = self._settings.calibration, self._settings.serial_number
-        what = f"read out calibration {number}"
-        registers = self._read(first_register(number), BLOCK_REGISTERS, what)
+        """Read the calibration block that the profile selects, and check its serial number."""
+        number, profile_number = self._settings.calibration, self._settings.serial_number
+        action_text = f"read out calibration {number}"
+        registers = self._read_register_values(
+            first_block_register(number), BLOCK_LENGTH_REGISTERS, action_text
+        )
         try:
             block = parse_block(registers)
         except ValueError as error:
             raise DeviceError(f"{self._name}, ati_serial.calibration {number}: {error}") from None
-        found = block.calibration.serial_number
-        if not same_serial_number(wanted, found):
+        sensor_number = block.calibration.serial_number
+        if not same_serial_number(profile_number, sensor_number):
             raise DeviceError(
-                f"{self._name}: its serial number is {found or 'empty'}, where the profile asks "
-                f"for {wanted} (ati_serial.serial_number). Check which sensor is on the rig."
+                f"{self._name}: its serial number is {sensor_number or 'empty'}, where the profile "
+                f"asks for {profile_number} (ati_serial.serial_number). Check which sensor is on "
+                "the rig."
             )
         return block
 
     def load_amplifiers(self, block: CalibrationBlock) -> None:
-        """Set the amplifiers as for the calibration."""
-        self._ask(modbus.UNLOCK, "unlock its memory")
+        """Write the calibration's amplifier gains and offsets, and read them back."""
+        self._request_content(modbus.UNLOCK, "unlock its memory")
         try:
             for first, values in (
                 (modbus.ACTIVE_GAINS, block.gains),
                 (modbus.ACTIVE_OFFSETS, block.offsets),
             ):
-                self._ask(modbus.write_registers(first, values), "load gains and offsets")
+                self._request_content(
+                    modbus.write_registers(first, values), "load gains and offsets"
+                )
         finally:
-            self._ask(modbus.LOCK, "lock its memory")
-        written = tuple(chain(block.gains, block.offsets))
-        active = self._read(modbus.ACTIVE_GAINS, len(written), "report its gains and offsets")
-        if active != written:
+            self._request_content(modbus.LOCK, "lock its memory")
+        written_values = tuple(chain(block.gains, block.offsets))
+        active_values = self._read_register_values(
+            modbus.ACTIVE_GAINS, len(written_values), "report its gains and offsets"
+        )
+        if active_values != written_values:
             raise DeviceError(
-                f"{self._name}: gains and offsets read back as {active}, where {written} were "
-                "written. Switch it off and on; without them its calibration does not hold."
+                f"{self._name}: gains and offsets read back as {active_values}, where "
+                f"{written_values} were written. Switch it off and on; without them its "
+                "calibration does not hold."
             )
 
     def start_streaming(self) -> bytes:
@@ -309,38 +328,40 @@ class SerialSetup:
         length = modbus.reply_length(request)
         reply = self._line.transact(request, length, _REPLY_TIMEOUT_S)
         try:
-            modbus.content_of(request, reply[:length])
+            modbus.reply_content(request, reply[:length])
         except ValueError as error:
             raise DeviceError(f"{self._name}: it does not start streaming: {error}.") from None
         return reply[length:]
 
-    def _ask(self, request: bytes, what: str) -> bytes:
-        """Return the content of the reply to a request; repeat a request that failed."""
-        problem = ""
-        for tries in range(_TRIES):
+    def _request_content(self, request: bytes, action_text: str) -> bytes:
+        """Send a request and return the content of its reply; repeat a request that failed."""
+        last_error = ""
+        for attempt in range(_REQUEST_ATTEMPTS):
             time.sleep(SILENCE_S)
             length = modbus.reply_length(request)
             reply = self._line.transact(request, length, _REPLY_TIMEOUT_S)
-            if tries:
+            if attempt:
                 self._line.drain(_LATE_REPLY_S, 2 * _LATE_REPLY_S)
             try:
-                return modbus.content_of(request, reply)
+                return modbus.reply_content(request, reply)
             except modbus.ExceptionResponse as error:
                 raise DeviceError(
-                    f"{self._name}: asked to {what}, it refused: {error}. Check that it is a "
-                    "Digital F/T sensor, and ati_serial.calibration."
+                    f"{self._name}: asked to {action_text}, it refused: {error}. Check that it is "
+                    "a Digital F/T sensor, and ati_serial.calibration."
                 ) from None
             except modbus.BadReply as error:
-                problem = str(error)
+                last_error = str(error)
         raise DeviceError(
-            f"{self._name}: asked to {what}, it gave no usable reply in {_TRIES} tries: {problem}. "
-            "Check power, cable (A and B swapped?), ati_serial.port and ati_serial.baud."
+            f"{self._name}: asked to {action_text}, it gave no usable reply in {_REQUEST_ATTEMPTS} "
+            f"tries: {last_error}. Check power, cable (A and B swapped?), ati_serial.port and "
+            "ati_serial.baud."
         )
 
-    def _read(self, first: int, count: int, what: str) -> tuple[int, ...]:
+    def _read_register_values(self, first: int, count: int, action_text: str) -> tuple[int, ...]:
+        """Read `count` registers, in requests of at most 64."""
         registers: tuple[int, ...] = ()
         while len(registers) < count:
             chunk = min(modbus.MAX_REGISTERS, count - len(registers))
             request = modbus.read_registers(first + len(registers), chunk)
-            registers += modbus.registers_of(self._ask(request, what))
+            registers += modbus.unpack_registers(self._request_content(request, action_text))
         return registers

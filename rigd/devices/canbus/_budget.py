@@ -1,10 +1,11 @@
-"""Use of the CAN bus by a profile, before anything is connected: identifiers and bus load.
+"""Identifiers and bus load of a profile on the CAN bus, checked before anything is connected.
 
-CANopen's predefined set ties a node's identifiers to its number, and an ATI sensor takes sixteen in
-a row. Where they overlap, raw gauges are obeyed as controlword and torque, or a torque command
-resets the sensor (base 0x20 is RPDO1 of the nodes 1 to 15): no device may be talked to then.
+CANopen's predefined connection set derives a node's identifiers from its number, and an ATI sensor
+uses sixteen consecutive identifiers. If they overlap, the drive takes gauge readings as controlword
+and torque, or a torque command resets the sensor (base 0x20 is RPDO1 of the nodes 1 to 15). No
+frame may be sent then.
 
-The bus load counts every cyclic frame with the most bits that may be stuffed into it.
+The bus load counts every cyclic frame with the largest possible number of stuff bits.
 """
 
 from collections.abc import Iterator
@@ -14,18 +15,19 @@ from rigd.devices.parameters import AtiCan, RigParameters, ServoDrive
 
 # Identifiers
 
-_FREE_BASE = 0x68
-"""Base of a sensor whose identifiers the predefined set leaves free, whatever the nodes are."""
+_FREE_SENSOR_BASE = 0x68
+"""Base of an ATI sensor whose identifiers no CANopen node uses."""
 
 # CiA 301 and, for the last, CiA 305: what every CANopen device listens to.
-_OF_ALL_NODES = {
+_BROADCAST_SERVICES = {
     0x000: "NMT",
     0x080: "SYNC",
     0x100: "TIME",
     0x7E4: "LSS",
     0x7E5: "LSS",
 }
-_OF_A_NODE = {
+"""Services of CiA 301 (and CiA 305: LSS) that address all CANopen nodes, by identifier."""
+_NODE_SERVICES = {
     0x080: "EMCY",
     0x180: "TPDO1",
     0x200: "RPDO1",
@@ -39,25 +41,29 @@ _OF_A_NODE = {
     0x600: "SDO request",
     0x700: "heartbeat",
 }
+"""Services of one CANopen node by identifier, to which the node number is added."""
 
 
 def sensor_identifiers(sensor: AtiCan) -> range:
-    """Return the identifiers that an ATI sensor uses: its base with any of sixteen opcodes."""
-    first = sensor.base_id << 4
-    return range(first, first + 16)
+    """Return the range of CAN identifiers that an ATI sensor uses: its base with 16 opcodes."""
+    first_id = sensor.base_id << 4
+    return range(first_id, first_id + 16)
 
 
 def drive_identifiers(drive: ServoDrive) -> dict[int, str]:
-    """Return the services of the drive by identifier, including those that address all nodes.
+    """Return the names of the drive's CANopen services by CAN identifier.
+
+    The services that address all nodes are included, and so are PDOs that are not configured: they
+    may be enabled in the drive's factory settings.
 
     The PDOs that are not configured count too: a drive may have them on from the factory.
     """
-    own = {base + drive.node_id: what for base, what in _OF_A_NODE.items()}
-    return _OF_ALL_NODES | own
+    own_services = {base + drive.node_id: name for base, name in _NODE_SERVICES.items()}
+    return _BROADCAST_SERVICES | own_services
 
 
 def check_identifiers(rig: RigParameters) -> list[str]:
-    """Find the identifiers that two devices of a rig would use.
+    """Find CAN identifiers that two devices of a rig would use.
 
     Returns
     -------
@@ -68,6 +74,7 @@ def check_identifiers(rig: RigParameters) -> list[str]:
 
 
 def _collisions(rig: RigParameters) -> Iterator[str]:
+    """Yield a sentence with the remedy for each collision of CAN identifiers."""
     drive, sensor = rig.cia402, rig.ati_can
     if drive is not None and drive.node_id == drive.host_node_id:
         yield (
@@ -77,89 +84,105 @@ def _collisions(rig: RigParameters) -> Iterator[str]:
         )
     if drive is None or sensor is None:
         return
-    taken = drive_identifiers(drive) | {0x700 + drive.host_node_id: "host's heartbeat"}
-    mine = sensor_identifiers(sensor)
-    met = {can_id: what for can_id, what in sorted(taken.items()) if can_id in mine}
-    if met:
-        named = ", ".join(f"{can_id:#05x} ({what})" for can_id, what in met.items())
+    used_identifiers = drive_identifiers(drive) | {0x700 + drive.host_node_id: "host's heartbeat"}
+    own_identifiers = sensor_identifiers(sensor)
+    collisions = {
+        can_id: name
+        for can_id, name in sorted(used_identifiers.items())
+        if can_id in own_identifiers
+    }
+    if collisions:
+        collision_list = ", ".join(f"{can_id:#05x} ({name})" for can_id, name in collisions.items())
         yield (
-            f"ati_can.base_id = {sensor.base_id:#04x} takes the identifiers {mine[0]:#05x} to "
-            f"{mine[-1]:#05x}, of which the drive's bus uses {named} with cia402.node_id = "
-            f"{drive.node_id}; give the sensor a free base such as {_FREE_BASE:#04x}, or the "
-            "drive another node id."
+            f"ati_can.base_id = {sensor.base_id:#04x} takes the identifiers "
+            f"{own_identifiers[0]:#05x} to {own_identifiers[-1]:#05x}, of which the drive's bus "
+            f"uses {collision_list} with cia402.node_id = {drive.node_id}; give the sensor a free "
+            f"base such as {_FREE_SENSOR_BASE:#04x}, or the drive another node id."
         )
 
 
 # Bus load
 
 SYNC_LENGTH = 0
+"""Number of data bytes in a SYNC frame."""
 RPDO_LENGTH = 4
-"""Controlword and target torque."""
+"""Number of data bytes in the drive's RPDO: controlword and target torque."""
 TPDO_LENGTH = 8
-"""Statusword, position and actual torque."""
+"""Number of data bytes in the drive's TPDO: statusword, position and actual torque."""
 HEARTBEAT_LENGTH = 1
+"""Number of data bytes in a heartbeat frame."""
 REQUEST_LENGTH = 0
+"""Number of data bytes in a request to an ATI sensor."""
 REPLY_LENGTHS = (8, 6)
-"""Replies of an ATI sensor to one request: status and gauges 0, 2, 4; gauges 1, 3, 5."""
+"""Numbers of data bytes in the two replies of an ATI sensor to one request.
+
+The first contains the status word and gauges 0, 2, 4, the second gauges 1, 3, 5."""
 
 FRAME_BITS = 47
-"""Bits of a frame with an 11-bit identifier and no data: start, identifier, control, checksum,
-acknowledgement, end, and the pause of 3 bits before the next frame."""
-_STUFFED_BITS = 34
-"""Bits among these from the start to the checksum, where bits are stuffed."""
+"""Bits of a CAN frame with an 11-bit identifier and no data, without stuff bits.
+
+They are start, identifier, control, checksum, acknowledgement, end, and the interframe space of 3
+bits."""
+_STUFFABLE_BITS = 34
+"""Bits of a frame without data that are subject to bit stuffing: from the start to the checksum."""
 
 
 MAX_LOAD = 0.9
-"""Largest load of a bus or line, with the most stuffed bits: above, a frame may miss its period."""
+"""Largest permitted load of a bus or line in the worst case of bit stuffing, 0 to 1.
+
+Above it a frame may miss its period."""
 
 
 @dataclass(frozen=True, slots=True)
-class Traffic:
-    """A frame that recurs."""
+class CyclicFrame:
+    """Frame that is sent cyclically on the bus."""
 
     what: str
+    """Name of the frame."""
     can_id: int
+    """CAN identifier of the frame."""
     length: int
-    """Bytes of data."""
+    """Number of data bytes in the frame."""
     rate_hz: float
+    """Number of these frames per second."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusLoad:
-    """All recurring frames of a bus, and the bus load."""
+    """Cyclic frames of a CAN bus, and the bus load that they cause."""
 
-    traffic: tuple[Traffic, ...]
-    """The frames."""
+    traffic: tuple[CyclicFrame, ...]
+    """Cyclic frames of the bus."""
     plain: float
-    """Part of the time, 0 to 1 and beyond, if no bit had to be stuffed."""
+    """Fraction of time in which the bus is busy without stuff bits; above 1 if overloaded."""
     worst: float
-    """Load with as many stuffed bits as there can be."""
+    """Fraction of time in which the bus is busy with the largest possible number of stuff bits."""
     frames_per_s: float
-    """Frames a second, all together."""
+    """Total number of frames per second."""
 
 
 def frame_bits(length: int) -> int:
-    """Return the bits of a classical frame with an 11-bit identifier, nothing stuffed.
+    """Return the number of bits of a CAN frame with an 11-bit identifier, without stuff bits.
 
     Parameters
     ----------
     length
-        Bytes of data, 0 to 8.
+        Number of data bytes, 0 to 8.
     """
     return FRAME_BITS + 8 * length
 
 
 def worst_frame_bits(length: int) -> int:
-    """Return the bits of such a frame with the most stuffed bits its data can bring about.
+    """Return the largest number of bits of a CAN frame with `length` data bytes, with stuff bits.
 
-    After five equal bits an opposite one is stuffed, which counts as the first of the next five:
-    one in four at most, after the first.
+    After five equal bits a bit of the opposite value is inserted, which counts as the first of the
+    next five. So at most one bit is inserted per four bits, after the first bit.
     """
-    return frame_bits(length) + (_STUFFED_BITS + 8 * length - 1) // 4
+    return frame_bits(length) + (_STUFFABLE_BITS + 8 * length - 1) // 4
 
 
-def sum_up(traffic: tuple[Traffic, ...], bitrate_bit_s: float) -> BusLoad:
-    """Return the load of some frames on a bus."""
+def load_of_frames(traffic: tuple[CyclicFrame, ...], bitrate_bit_s: float) -> BusLoad:
+    """Return the load that cyclic frames cause on a bus of the given bit rate."""
     return BusLoad(
         traffic=traffic,
         plain=sum(frame_bits(t.length) * t.rate_hz for t in traffic) / bitrate_bit_s,
@@ -169,12 +192,12 @@ def sum_up(traffic: tuple[Traffic, ...], bitrate_bit_s: float) -> BusLoad:
 
 
 def bus_load(rig: RigParameters) -> BusLoad:
-    """Return the load of the bus while a session runs.
+    """Return the load of the CAN bus while a session runs.
 
     Parameters
     ----------
     rig
-        Devices without their own section are not on the bus.
+        Parameters of the rig; a device without its own section is not on the bus.
 
     Raises
     ------
@@ -191,23 +214,25 @@ def bus_load(rig: RigParameters) -> BusLoad:
     """
     if rig.can is None:
         raise ValueError("The rig has no CAN bus.")
-    traffic: list[Traffic] = []
+    traffic: list[CyclicFrame] = []
     if (drive := rig.cia402) is not None:
-        host_hz = min(rig.rate_hz, 1.0 / drive.heartbeat_period_s)
-        drive_hz = 1.0 / drive.drive_heartbeat_period_s
-        node, host = drive.node_id, drive.host_node_id
+        host_heartbeat_hz = min(rig.rate_hz, 1.0 / drive.heartbeat_period_s)
+        drive_heartbeat_hz = 1.0 / drive.drive_heartbeat_period_s
+        node_id, host_id = drive.node_id, drive.host_node_id
         traffic += [
-            Traffic("SYNC", 0x80, SYNC_LENGTH, rig.rate_hz),
-            Traffic("drive's TPDO1", 0x180 + node, TPDO_LENGTH, rig.rate_hz),
-            Traffic("drive's RPDO1", 0x200 + node, RPDO_LENGTH, rig.rate_hz),
-            Traffic("drive's heartbeat", 0x700 + node, HEARTBEAT_LENGTH, drive_hz),
-            Traffic("host's heartbeat", 0x700 + host, HEARTBEAT_LENGTH, host_hz),
+            CyclicFrame("SYNC", 0x80, SYNC_LENGTH, rig.rate_hz),
+            CyclicFrame("drive's TPDO1", 0x180 + node_id, TPDO_LENGTH, rig.rate_hz),
+            CyclicFrame("drive's RPDO1", 0x200 + node_id, RPDO_LENGTH, rig.rate_hz),
+            CyclicFrame("drive's heartbeat", 0x700 + node_id, HEARTBEAT_LENGTH, drive_heartbeat_hz),
+            CyclicFrame("host's heartbeat", 0x700 + host_id, HEARTBEAT_LENGTH, host_heartbeat_hz),
         ]
     if (sensor := rig.ati_can) is not None:
-        first = sensor.base_id << 4
-        traffic.append(Traffic("sensor's request", first, REQUEST_LENGTH, rig.rate_hz))
+        first_id = sensor.base_id << 4
+        traffic.append(CyclicFrame("sensor's request", first_id, REQUEST_LENGTH, rig.rate_hz))
         traffic += [
-            Traffic(f"sensor's reply {part + 1}", first + part, length, rig.rate_hz)
-            for part, length in enumerate(REPLY_LENGTHS)
+            CyclicFrame(
+                f"sensor's reply {reply_index + 1}", first_id + reply_index, length, rig.rate_hz
+            )
+            for reply_index, length in enumerate(REPLY_LENGTHS)
         ]
-    return sum_up(tuple(traffic), rig.can.bitrate_bit_s)
+    return load_of_frames(tuple(traffic), rig.can.bitrate_bit_s)

@@ -1,13 +1,13 @@
-"""The cyclic exchange on one port: routing of frames, and pairing of replies with requests.
+"""Cyclic exchange on one CAN port: routing of frames, and pairing of replies with requests.
 
-`CanLink` opens a bus once for all its users, `CanExchange` routes each frame to its driver.
+`CanLink` opens a bus once for all its drivers. `CanExchange` routes each frame to its driver.
 
-Replies on the bus do not say which request they answer, so `ReplyPairing` counts both. A device
-answers every request with one reply, in order. Where one is missing, the next to come may be the
-missing one, late, or the next one, the missing one being lost; and from then on there is one reply
-to each request either way. So one tick is left without a request: if no reply comes in it, none is
-on its way, and what is missing is lost. If one comes, replies are late by whole periods, and no
-reading counts until they have caught up.
+Replies on the bus do not state which request they answer, so `ReplyPairing` counts both. A device
+answers every request with one reply, in order. If a reply is missing, the next reply may be the
+missing one, late, or the reply to the next request, the missing one being lost. From then on one
+reply arrives per request in either case. Therefore one tick is run without a request. If no reply
+arrives in this tick, none is under way, and the missing reply is lost. If a reply arrives, replies
+are late by whole periods, and no reading is valid until all outstanding replies have arrived.
 """
 
 import time
@@ -20,10 +20,10 @@ from rigd.devices.canbus.port import (
     BUS_OFF,
     ERROR_FLAG,
     ERROR_MASK,
-    LENGTH_AT,
+    LENGTH_OFFSET,
     CanPort,
     open_port,
-    read_head,
+    unpack_header,
 )
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
@@ -33,140 +33,161 @@ from rigd.runtime import HeldError, HeldFile
 # Pairing of replies
 
 _STEADY_PERIODS = 3
-"""Periods with one reply each after which missing replies count as lost if no pause is possible."""
+"""Number of consecutive periods with one reply each after which missing replies count as lost.
+
+The rule applies only if no tick may be run without a request."""
 
 
-class Counter(Protocol):
-    """Counter of received replies."""
+class ReplyCounter(Protocol):
+    """Object that counts received replies, in its attribute `replies`."""
 
     replies: int
-    """Replies since the last reset to zero, regardless of their content."""
+    """Number of replies received since this was last set to zero, regardless of their content."""
 
 
 class ReplyPairing:
-    """Counts requests and their replies.
+    """Counter of requests and replies that finds out whether the last reply is to the last request.
 
     Parameters
     ----------
     inbox
-        Counter of received replies.
-    pauses
-        A tick may be left without a request. Not so with a device whose time passes with the
-        requests: there what is missing is taken for lost in the end, unproven.
+        Object that counts the received replies.
+    may_pause
+        Whether a tick may be run without a request. This is not possible with a device whose time
+        advances with the requests; missing replies then finally count as lost without proof.
 
     Attributes
     ----------
-    owed : int
-        Replies that have not come yet, to the last request or to earlier ones.
+    outstanding : int
+        Number of replies that have not arrived yet, to the last request or to earlier ones.
     lost : int
-        Replies that were assumed to be lost.
-    unproven : int
-        Lost replies that may also be late by whole periods for good.
+        Number of replies that count as lost.
+    lost_without_proof : int
+        Number of replies that count as lost without proof: instead, all later replies may be late
+        by whole periods.
     """
 
     __slots__ = (
-        "_alone",
+        "_has_request",
         "_inbox",
-        "_pauses",
-        "_received",
-        "_requested",
-        "_steady",
+        "_is_only_request",
+        "_may_pause",
+        "_replies_in_period",
+        "_steady_periods",
         "lost",
-        "owed",
-        "unproven",
+        "lost_without_proof",
+        "outstanding",
     )
 
-    def __init__(self, inbox: Counter, *, pauses: bool = True) -> None:
+    def __init__(self, inbox: ReplyCounter, *, may_pause: bool = True) -> None:
         self._inbox = inbox
-        self._pauses = pauses
+        self._may_pause = may_pause
         self.lost = 0
-        self.unproven = 0
+        self.lost_without_proof = 0
         self.start()
 
     def start(self) -> None:
         """Reset the pairing: no reply is outstanding."""
         self._inbox.replies = 0
-        self._requested = self._alone = True
-        self._received = 0
-        self._steady = 0
-        self.owed = 0
+        self._has_request = self._is_only_request = True
+        self._replies_in_period = 0
+        self._steady_periods = 0
+        self.outstanding = 0
 
-    def wants_pause(self) -> bool:
-        """Return whether the next tick makes no request; call it when all frames are delivered."""
-        if not (self.owed and self._pauses):
-            return False
-        self._take()
-        # A pause with a reply continues until all replies have arrived, or none does.
-        return self.owed > 0 and (self._received == 1 if self._requested else self._received > 0)
+    def needs_pause(self) -> bool:
+        """Return whether the next tick has to make no request.
 
-    def ask(self) -> None:
-        """Count a new request, directly before it is sent; call after all frames are delivered."""
-        self._close()
-        self._requested = True
-        self._alone = not self.owed
-        self.owed += 1
-
-    def pause(self) -> None:
-        """Count a tick without a request, directly before its latch."""
-        self._close()
-        self._requested = self._alone = False
-
-    def has_caught_up(self) -> bool:
-        """Whether the last reply is the one to the last request."""
-        return 0 < self.owed <= self._inbox.replies
-
-    def settle(self) -> bool:
-        """Count the received replies; return whether that to this tick's request is among them.
-
-        Where older ones were owed as well the next tick is the first to count: what a fault on the
-        line delays may come after what was sent later.
+        Call it after all received frames are delivered.
         """
-        return self._take() > 0 and self.owed == 0 and self._alone
+        if not (self.outstanding and self._may_pause):
+            return False
+        self._count_replies()
+        # A pause with a reply continues until all replies have arrived, or none does.
+        return self.outstanding > 0 and (
+            self._replies_in_period == 1 if self._has_request else self._replies_in_period > 0
+        )
 
-    def _close(self) -> None:
-        """End the period of the last tick."""
-        self._take()
-        if self.owed:
-            if not self._requested:
-                if not self._received:
-                    self.lost += self.owed
-                    self.owed = 0
-            elif not self._pauses:
-                self._steady = self._steady + 1 if self._received == 1 else 0
-                if self._steady >= _STEADY_PERIODS:
-                    self.lost += self.owed
-                    self.unproven += self.owed
-                    self.owed = self._steady = 0
+    def register_request(self) -> None:
+        """Count a new request, directly before it is sent.
+
+        Call it after all received frames are delivered.
+        """
+        self._end_period()
+        self._has_request = True
+        self._is_only_request = not self.outstanding
+        self.outstanding += 1
+
+    def register_pause(self) -> None:
+        """Register that the tick that begins makes no request."""
+        self._end_period()
+        self._has_request = self._is_only_request = False
+
+    def is_up_to_date(self) -> bool:
+        """Return whether all outstanding replies, up to that to the last request, have arrived."""
+        return 0 < self.outstanding <= self._inbox.replies
+
+    def process_replies(self) -> bool:
+        """Count the received replies; return whether they include that to this tick's request.
+
+        If replies to earlier requests were outstanding, too, the result is False: a faulty line may
+        deliver a delayed reply after later replies. The next tick is then the first valid one.
+        """
+        return self._count_replies() > 0 and self.outstanding == 0 and self._is_only_request
+
+    def _end_period(self) -> None:
+        """End the period of the last tick: decide whether outstanding replies count as lost."""
+        self._count_replies()
+        if self.outstanding:
+            if not self._has_request:
+                if not self._replies_in_period:
+                    self.lost += self.outstanding
+                    self.outstanding = 0
+            elif not self._may_pause:
+                self._steady_periods = (
+                    self._steady_periods + 1 if self._replies_in_period == 1 else 0
+                )
+                if self._steady_periods >= _STEADY_PERIODS:
+                    self.lost += self.outstanding
+                    self.lost_without_proof += self.outstanding
+                    self.outstanding = self._steady_periods = 0
         else:
-            self._steady = 0
-        self._received = 0
+            self._steady_periods = 0
+        self._replies_in_period = 0
 
-    def _take(self) -> int:
+    def _count_replies(self) -> int:
+        """Move newly received replies from the inbox into the counts; return their number."""
         replies, self._inbox.replies = self._inbox.replies, 0
-        self._received += replies
-        self.owed = max(0, self.owed - replies)
+        self._replies_in_period += replies
+        self.outstanding = max(0, self.outstanding - replies)
         return replies
 
 
 # Exchange
 
-Handler = Callable[[bytes], None]
+FrameHandler = Callable[[bytes], None]
+"""Function that a driver registers for frames; it is called with the data bytes of a frame."""
 
-# linux/can/error.h: class in the identifier, state of the controller in data[1].
-_CONTROLLER = 0x04
-_CONTROLLER_STATE = 1
-_PASSIVE = 0x30
-_NO_ACKNOWLEDGE = 0x20
+# linux/can/error.h: the identifier contains the class of the error, data[1] the controller's state.
+_CONTROLLER_STATE_CLASS = 0x04
+"""Class of an error frame about the controller's state."""
+_CONTROLLER_STATE_OFFSET = 1
+"""Offset of the controller's state in the data of an error frame."""
+_ERROR_PASSIVE_BITS = 0x30
+"""Bits of the controller's state that mean error-passive, in receiving or sending."""
+_NO_ACKNOWLEDGE_CLASS = 0x20
+"""Class of an error frame: no device has acknowledged a sent frame."""
 
-_FAILURES_SKIPPED = 10
-"""Failures to receive that one drain in `regardless` tolerates: an adapter may queue several."""
-_FAILURES_WAITED = 100
-"""Failures of reading after which one wait gives up."""
+_MOST_DRAIN_FAILURES = 10
+"""Most receive errors that one `drain` ignores within `ignore_errors`, since an adapter may queue
+them."""
+_MOST_WAIT_FAILURES = 100
+"""Most receive errors within one wait in `ignore_errors` before the wait ends."""
 _FAILURE_PAUSE_S = 0.001
+"""Pause in seconds after a receive error."""
 
 
 class CanExchange:
-    """Routes the frames of a port to its drivers.
+    """Exchange of frames on an open CAN port, which routes received frames to the drivers.
 
     Parameters
     ----------
@@ -176,9 +197,9 @@ class CanExchange:
     Attributes
     ----------
     error_frames : int
-        Number of disturbances that the controller reported.
+        Number of error frames that the CAN controller reported.
     bits : int
-        Bits of all frames sent and received, without stuff bits.
+        Total number of bits of all frames sent and received, without stuff bits.
     """
 
     def __init__(self, port: CanPort) -> None:
@@ -186,30 +207,33 @@ class CanExchange:
         self.bits = 0
         self._send = port.send
         self._receive = port.receive
-        self._handlers: dict[int, Handler] = {}
+        self._handlers: dict[int, FrameHandler] = {}
         self.error_frames = 0
-        self._trouble = ""
-        self._regardless = False
+        self._bus_error = ""
+        self._ignores_errors = False
 
     def send(self, frame: bytes) -> None:
-        """Send a frame of the kernel's ``struct can_frame``; raises as the port does."""
-        self._send(frame)
-        self.bits += FRAME_BITS + 8 * frame[LENGTH_AT]
+        """Send a raw frame (the kernel's ``struct can_frame``) and count its bits.
 
-    def subscribe(self, can_id: int, handler: Handler) -> None:
-        """Have a handler called with the data of each frame of this identifier.
+        Raises the errors of :meth:`CanPort.send`.
+        """
+        self._send(frame)
+        self.bits += FRAME_BITS + 8 * frame[LENGTH_OFFSET]
+
+    def subscribe(self, can_id: int, handler: FrameHandler) -> None:
+        """Register a function that receives the data of each frame with this identifier.
 
         Parameters
         ----------
         can_id
-            Identifier of 11 bits.
+            CAN identifier of 11 bits.
         handler
-            Called with the data bytes.
+            Function that is called with the data bytes of each frame.
 
         Raises
         ------
         DeviceError
-            If another driver takes these frames already.
+            If another driver has registered a function for this identifier.
         """
         if can_id in self._handlers:
             raise DeviceError(
@@ -219,41 +243,41 @@ class CanExchange:
         self._handlers[can_id] = handler
 
     def start(self) -> None:
-        """Discard queued frames, and let the port accept only subscribed identifiers."""
+        """Discard queued frames, and accept only frames with subscribed identifiers."""
         self.port.accept(self._handlers)
         while self._receive() is not None:
             pass
 
     @contextmanager
-    def regardless(self) -> Iterator[None]:
-        """Ignore errors of bus and adapter while receiving within this block.
+    def ignore_errors(self) -> Iterator[None]:
+        """Ignore errors of bus and adapter while receiving within this context.
 
-        It is for switching a drive off. An error-passive controller goes on sending, and a frame
-        that was not acknowledged is sent again; what the drive then answers has to be taken, and
-        SYNC sent, for the torque of an RPDO acts at the next one. `send` raises as ever, for the
-        frame that the bus does not take.
+        The context is needed to switch a drive off. An error-passive controller goes on sending,
+        and a frame that was not acknowledged is sent again. The drive's answers then have to be
+        received, and SYNC has to be sent, because the torque of an RPDO takes effect at the next
+        SYNC. `send` still raises if the bus does not accept a frame.
         """
-        before, self._regardless = self._regardless, True
+        previous_setting, self._ignores_errors = self._ignores_errors, True
         try:
             yield
         finally:
-            self._regardless = before
+            self._ignores_errors = previous_setting
 
     def drain(self) -> None:
-        """Deliver everything that has arrived.
+        """Deliver all frames that have arrived to their drivers, without waiting.
 
         Raises
         ------
         DeviceError
-            If the bus is gone, or its controller has switched itself off or reports that it cannot
-            send; not within `regardless`.
+            If the bus has failed, or its controller has switched itself off or reports that it
+            cannot send; not within `ignore_errors`.
         """
-        if not self._regardless:
+        if not self._ignores_errors:
             self._deliver()
-            if self._trouble:
-                raise DeviceError(self._trouble)
+            if self._bus_error:
+                raise DeviceError(self._bus_error)
             return
-        for _ in range(_FAILURES_SKIPPED):
+        for _ in range(_MOST_DRAIN_FAILURES):
             try:
                 self._deliver()
             except Exception:  # an adapter's library may raise anything
@@ -261,30 +285,31 @@ class CanExchange:
             return
 
     def _deliver(self) -> None:
+        """Deliver all frames that have arrived, and register error frames of the controller."""
         receive, handlers = self._receive, self._handlers
         while (raw := receive()) is not None:
-            can_id, length = read_head(raw)
+            can_id, length = unpack_header(raw)
             handler = handlers.get(can_id)
             if handler is not None:
                 self.bits += FRAME_BITS + 8 * length
                 handler(raw[8 : 8 + length])
             elif can_id & ERROR_FLAG:
-                self._note_error(can_id & ERROR_MASK, raw[8:16])
+                self._register_error(can_id & ERROR_MASK, raw[8:16])
 
     def wait_until(self, ready: Callable[[], bool], deadline_ns: int) -> bool:
-        """Deliver frames until `ready` returns True, or until a time of ``time.monotonic_ns``.
+        """Deliver frames until `ready` returns True or a deadline passes.
 
         Parameters
         ----------
         ready
-            Called after every frame.
+            Condition, which is checked after every delivery.
         deadline_ns
-            Time of ``time.monotonic_ns``.
+            Deadline in nanoseconds on the clock ``time.monotonic_ns``.
 
         Returns
         -------
         bool
-            Whether it is ready.
+            Whether the condition became true before the deadline.
         """
         failures = 0
         self.drain()
@@ -296,28 +321,31 @@ class CanExchange:
                 self.port.wait(left_ns * 1e-9)
             except Exception:
                 failures += 1
-                if not self._regardless:
+                if not self._ignores_errors:
                     raise
-                if failures > _FAILURES_WAITED:
-                    return False  # the adapter is gone
+                if failures > _MOST_WAIT_FAILURES:
+                    return False  # the adapter has failed
                 time.sleep(min(_FAILURE_PAUSE_S, left_ns * 1e-9))
             self.drain()
         return True
 
-    def _note_error(self, kind: int, data: bytes) -> None:
+    def _register_error(self, kind: int, data: bytes) -> None:
+        """Count an error frame of the controller, and store a message if no frame can be sent."""
         self.error_frames += 1
         if kind & BUS_OFF:
-            self._trouble = (
+            self._bus_error = (
                 f"CAN bus {self.port.name}: the controller is off the bus (bus-off) after too "
                 "many errors; check cable, termination and bit rate, then bring it up again."
             )
-        elif kind & _NO_ACKNOWLEDGE:
-            self._trouble = (
+        elif kind & _NO_ACKNOWLEDGE_CLASS:
+            self._bus_error = (
                 f"CAN bus {self.port.name}: no device acknowledges the frames sent; check cable, "
                 "termination, power and bit rate."
             )
-        elif kind & _CONTROLLER and data[_CONTROLLER_STATE] & _PASSIVE:
-            self._trouble = (
+        elif (
+            kind & _CONTROLLER_STATE_CLASS and data[_CONTROLLER_STATE_OFFSET] & _ERROR_PASSIVE_BITS
+        ):
+            self._bus_error = (
                 f"CAN bus {self.port.name}: the controller is error-passive, its frames are "
                 "disturbed; check cable and termination."
             )
@@ -327,14 +355,14 @@ class CanExchange:
 
 
 class BusLock:
-    """Lock held from opening a bus to closing it.
+    """Lock of one CAN bus against other programs, held from opening the bus to closing it.
 
     Parameters
     ----------
     bus
-        Channel of the bus, or socket of a simulated one.
+        Channel of the bus, or socket of a simulated bus.
     simulated
-        Whether the bus is simulated: each user has their own.
+        Whether the bus is simulated; the lock then concerns only processes of the same user.
     """
 
     def __init__(self, bus: str, *, simulated: bool) -> None:
@@ -342,12 +370,12 @@ class BusLock:
         self._file = HeldFile(f"bus-{bus}", everybody=not simulated)
 
     def acquire(self) -> None:
-        """Take the bus.
+        """Lock the bus, or raise if another program has locked it.
 
         Raises
         ------
         DeviceError
-            If another program has it; the message says which process.
+            If another program has locked the bus; the message states its process.
         """
         try:
             self._file.acquire("rigd")
@@ -363,19 +391,19 @@ class BusLock:
             ) from None
 
     def release(self) -> None:
-        """Release the bus; harmless when repeated."""
+        """Release the lock of the bus; harmless when repeated."""
         self._file.release()
 
 
 class CanLink:
-    """One CAN bus and the drivers of its devices.
+    """CAN bus that the drivers of its devices open together.
 
     Parameters
     ----------
     settings
-        Settings of the bus.
+        Settings of the bus in the profile.
     simulator
-        Address of the simulated rig that replaces it, or None.
+        Address of the simulated rig that replaces the bus, or None.
     """
 
     def __init__(self, settings: CanBus, simulator: SimulatorAddress | None) -> None:
@@ -388,7 +416,7 @@ class CanLink:
 
     @property
     def exchange(self) -> CanExchange:
-        """The cyclic exchange on the open bus.
+        """Cyclic exchange of frames on the open CAN bus.
 
         Raises
         ------
@@ -400,12 +428,12 @@ class CanLink:
         return self._exchange
 
     def open(self) -> CanExchange:
-        """Open the bus if it is not open yet.
+        """Open the bus for one more driver, and return its exchange.
 
         Raises
         ------
         DeviceError
-            If that fails, or another program uses it.
+            If the bus cannot be opened, or another program uses it.
         """
         if self._exchange is None:
             self._lock.acquire()
@@ -418,7 +446,7 @@ class CanLink:
         return self._exchange
 
     def close(self) -> None:
-        """Release the bus; the last of its users closes it."""
+        """Release the bus for one driver; the bus is closed after its last driver."""
         self._users = max(0, self._users - 1)
         if self._users == 0 and self._exchange is not None:
             self._exchange.port.close()

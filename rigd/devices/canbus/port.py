@@ -1,7 +1,7 @@
-"""Ports of a CAN bus: a socket of the kernel, the Unix socket of a simulated bus, or python-can.
+"""Ports to a CAN bus: a socket of the kernel, the Unix socket of a simulated bus, or python-can.
 
-All carry the kernel's ``struct can_frame``: identifier, length, up to eight bytes; 16 bytes in all.
-Classical CAN with identifiers of 11 bits is all that the rig speaks.
+All ports use the layout of the kernel's ``struct can_frame``, 16 bytes with identifier, length and
+up to eight data bytes. The rig uses only classical CAN with 11-bit identifiers.
 """
 
 import errno
@@ -21,42 +21,50 @@ if TYPE_CHECKING:
     import can
 
 FRAME_SIZE = 16
+"""Size of a raw CAN frame in bytes."""
 ERROR_FLAG = 0x2000_0000
-"""Flag in the identifier: the controller reports on itself (linux/can/error.h)."""
-LONG_FLAG = 0x8000_0000
-"""Flag in the identifier: it has 29 bits; no device of the rig sends such frames."""
+"""Flag in the identifier of an error frame, with which the controller reports its state.
+
+See linux/can/error.h."""
+EXTENDED_FLAG = 0x8000_0000
+"""Flag in the identifier of a frame with 29 identifier bits; no device of the rig sends such
+frames."""
 REMOTE_FLAG = 0x4000_0000
-"""Flag in the identifier: a request for data; no device of the rig sends such frames."""
+"""Flag in the identifier of a remote request for data; no device of the rig sends such frames."""
 ERROR_MASK = 0x1FFF_FFFF
-SFF_MASK = 0x7FF
+"""Mask of the error class in the identifier of an error frame."""
+STANDARD_ID_MASK = 0x7FF
+"""Mask of an 11-bit identifier (standard frame format)."""
 
 BUS_OFF = 0x40
 """Class of an error frame: the controller has switched itself off after too many errors."""
 _PROTOCOL_VIOLATION = 0x08
+"""Class of an error frame: a frame violated the protocol."""
 
-_FRAME = Struct("=IB3x8s")
-BUS_OFF_FRAME = _FRAME.pack(ERROR_FLAG | BUS_OFF, 8, bytes(8))
-"""Error frame with which the kernel reports bus-off."""
-DAMAGED_FRAME = _FRAME.pack(ERROR_FLAG | _PROTOCOL_VIOLATION, 8, bytes(8))
-"""Frame that replaces a damaged one; it is counted, and has no other effect."""
-LENGTH_AT = 4
+_FRAME_LAYOUT = Struct("=IB3x8s")
+"""Layout of a raw CAN frame: identifier with flags, length, data."""
+BUS_OFF_FRAME = _FRAME_LAYOUT.pack(ERROR_FLAG | BUS_OFF, 8, bytes(8))
+"""Error frame with which the kernel reports that the controller is off the bus."""
+DAMAGED_FRAME = _FRAME_LAYOUT.pack(ERROR_FLAG | _PROTOCOL_VIOLATION, 8, bytes(8))
+"""Error frame that replaces an unreadable frame; it is counted, and has no other effect."""
+LENGTH_OFFSET = 4
 """Offset of the number of data bytes in a raw frame."""
-read_head = Struct("=IB").unpack_from
-"""Identifier with flags, and length, from raw frame."""
+unpack_header = Struct("=IB").unpack_from
+"""Unpack identifier (with flags) and number of data bytes from a raw frame."""
 
 
 # Frames
 
 
 def pack_frame(can_id: int, data: bytes = b"") -> bytes:
-    """Return the 16 bytes of a frame.
+    """Return the raw frame of 16 bytes with an identifier and data.
 
     Parameters
     ----------
     can_id
-        Identifier of 11 bits.
+        CAN identifier of 11 bits.
     data
-        At most eight bytes.
+        At most eight data bytes.
 
     Raises
     ------
@@ -70,53 +78,58 @@ def pack_frame(can_id: int, data: bytes = b"") -> bytes:
     >>> len(raw), unpack_frame(raw)
     (16, (385, b'rigd'))
     """
-    if not 0 <= can_id <= SFF_MASK:
+    if not 0 <= can_id <= STANDARD_ID_MASK:
         raise ValueError(f"{can_id:#x} is not an 11-bit CAN identifier.")
     if len(data) > 8:
         raise ValueError(f"{len(data)} bytes do not fit into a CAN frame, which has 8.")
-    return _FRAME.pack(can_id, len(data), data)
+    return _FRAME_LAYOUT.pack(can_id, len(data), data)
 
 
 def unpack_frame(raw: bytes) -> tuple[int, bytes]:
-    """Return identifier (flags included) and data of 16 bytes; a length beyond 8 counts as 8."""
-    can_id, length, data = _FRAME.unpack(raw)
+    """Return identifier (with flags) and data of a raw frame; a length above 8 counts as 8."""
+    can_id, length, data = _FRAME_LAYOUT.unpack(raw)
     return can_id, data[: min(length, 8)]
 
 
 # Ports
 
-# Receive buffer for a late reader: some 200 ms of a full bus.
-_RECEIVE_BUFFER = 212_992
-# As large as the system allows: a stopped simulated rig is detected by its silence.
-_SIMULATOR_SEND_BUFFER = 4_194_304
-_CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
-_DAMAGED_IN_A_ROW = 20
-"""Frames that an adapter cannot read, without a sound one in between, that end a session."""
+_RECEIVE_BUFFER_SIZE = 212_992
+"""Size in bytes of a socket's receive buffer, for a late reader: some 200 ms of a full bus."""
+_SIMULATOR_SEND_BUFFER_SIZE = 4_194_304
+"""Size in bytes of the send buffer to a simulated rig, as large as the system allows.
+
+A stopped simulated rig is then detected by its missing replies.
+
+A simulated rig that has stopped is detected by its missing replies, not by a full buffer."""
+_CAN_RAW_ERR_FILTER = 2
+"""Number of the socket option that selects the error frames to receive (linux/can/raw.h)."""
+_MOST_DAMAGED_FRAMES = 20
+"""Number of consecutive unreadable frames of an adapter that end a session."""
 
 
 class CanPort(Protocol):
-    """One connection to a bus. Nothing here blocks, but for `wait`.
+    """Connection to a CAN bus, none of whose methods blocks except `wait`.
 
-    Whatever an adapter's driver raises leaves every method as a `DeviceError`, but for `close`,
-    which raises nothing.
+    Every error of an adapter's driver is raised as a `DeviceError`, except in `close`, which never
+    raises.
     """
 
     name: str
     """Name of the bus, for messages."""
 
     def send(self, frame: bytes) -> None:
-        """Send 16 bytes made by :func:`rigd.devices.canbus.port.pack_frame`.
+        """Send a raw frame of 16 bytes, made by :func:`rigd.devices.canbus.port.pack_frame`.
 
         Raises
         ------
         DeviceError
-            If the bus does not take it.
+            If the bus does not accept the frame.
         """
 
     def receive(self) -> bytes | None:
-        """Return the next frame that has arrived, of 16 bytes, or None.
+        """Return the next received raw frame of 16 bytes, or None if no frame has arrived.
 
-        A damaged frame is returned as an error frame.
+        An unreadable frame is returned as an error frame.
 
         Raises
         ------
@@ -125,7 +138,7 @@ class CanPort(Protocol):
         """
 
     def wait(self, timeout_s: float) -> None:
-        """Return as soon as a frame may have arrived, or after the timeout.
+        """Wait until a frame may have arrived, at most for the timeout.
 
         Raises
         ------
@@ -134,9 +147,9 @@ class CanPort(Protocol):
         """
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
-        """Accept only frames of these identifiers, and error frames of the controller.
+        """Accept only frames with these identifiers, and error frames of the controller.
 
-        None accepts all frames again.
+        If `can_ids` is None, all frames are accepted again.
 
         Raises
         ------
@@ -145,23 +158,23 @@ class CanPort(Protocol):
         """
 
     def open_bus(self) -> "can.BusABC":
-        """Return a python-can bus on this port, for set-up; closing it leaves the port open."""
+        """Return a python-can bus on this port, for set-up; closing the bus keeps the port open."""
 
     def close(self) -> None:
-        """Release the port; harmless when repeated."""
+        """Close the port to the CAN bus; harmless when repeated."""
 
 
 class SocketPort:
-    """A socket that carries ``struct can_frame``: the kernel's CAN, or the simulated bus.
+    """Port on a socket that carries ``struct can_frame``: the kernel's CAN, or the simulated bus.
 
     Parameters
     ----------
     link
-        Connected socket; it is made non-blocking.
+        Connected socket, which the port makes non-blocking.
     name
         Name of the bus, for messages.
     remedy
-        Advice for the operator where the bus is gone.
+        Advice for the operator if the bus has failed.
     """
 
     def __init__(
@@ -176,41 +189,43 @@ class SocketPort:
         self._remedy = remedy
 
     def send(self, frame: bytes) -> None:
-        """Send one frame of 16 bytes."""
+        """Send a raw frame of 16 bytes."""
         try:
             self._send(frame)
         except OSError as error:
-            raise DeviceError(self._why("takes no more frames", error)) from None
+            raise DeviceError(self._error_message("takes no more frames", error)) from None
 
     def receive(self) -> bytes | None:
-        """Return the next frame, or None."""
+        """Return the next received raw frame of 16 bytes, or None if no frame has arrived."""
         try:
             raw = self._recv(FRAME_SIZE)
         except BlockingIOError:
             return None
         except OSError as error:
-            raise DeviceError(self._why("cannot be read", error)) from None
+            raise DeviceError(self._error_message("cannot be read", error)) from None
         if len(raw) != FRAME_SIZE:
             raise DeviceError(f"CAN bus {self.name}: it was cut off; {self._remedy}.")
         return raw
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for a frame."""
+        """Wait until a frame may have arrived, at most for the timeout."""
         try:
             select.select(self._fd, (), (), timeout_s)
         except (OSError, ValueError) as error:
-            raise DeviceError(self._why("cannot be waited for", error)) from None
+            raise DeviceError(self._error_message("cannot be waited for", error)) from None
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
-        """Let the kernel filter all other identifiers; a simulated bus delivers all."""
+        """Let the kernel drop frames with other identifiers; a simulated bus drops none."""
         if self._link.family == getattr(socket, "AF_CAN", None):
-            exactly = SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
-            wanted = [(0, 0)] if can_ids is None else [(i, exactly) for i in sorted(set(can_ids))]
-            filters = b"".join(struct.pack("=II", *each) for each in wanted)
+            filter_mask = STANDARD_ID_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
+            id_filters = (
+                [(0, 0)] if can_ids is None else [(i, filter_mask) for i in sorted(set(can_ids))]
+            )
+            filters = b"".join(struct.pack("=II", *each) for each in id_filters)
             try:
                 self._link.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
             except OSError as error:
-                raise DeviceError(self._why("takes no filter", error)) from None
+                raise DeviceError(self._error_message("takes no filter", error)) from None
 
     def open_bus(self) -> "can.BusABC":
         """Return a python-can bus that sends and receives through this port."""
@@ -219,11 +234,12 @@ class SocketPort:
         return SetupBus(self)
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the port's socket."""
         with suppress(OSError):
             self._link.close()
 
-    def _why(self, what: str, error: OSError | ValueError) -> str:
+    def _error_message(self, what: str, error: OSError | ValueError) -> str:
+        """Return the message of an error of the socket, with cause and remedy."""
         reason, number = str(error), None
         if isinstance(error, OSError):
             reason, number = error.strerror or reason, error.errno
@@ -236,12 +252,12 @@ class SocketPort:
 
 
 class PythonCanPort:
-    """Adapter of python-can. It takes about three times the processor time of a socket.
+    """Port on an adapter of python-can, with about three times the processor time of a socket.
 
-    An adapter's driver says by `can.CanError` or OSError that the adapter has failed. Anything else
-    that it raises while it receives is a frame that it could not read: the parser of slcan raises
-    ValueError for a damaged line. One such frame is an error on the line, and many in a row are an
-    adapter that has failed.
+    An adapter's driver raises `can.CanError` or OSError if the adapter has failed. Any other error
+    while receiving means a frame that the driver could not read: the parser of slcan raises
+    ValueError for a damaged line. A single such frame counts as an error on the line. Many in a row
+    mean that the adapter has failed.
 
     Parameters
     ----------
@@ -259,34 +275,34 @@ class PythonCanPort:
         self._bus = bus
         self._to_message, self._from_message = to_message, from_message
         self._error = can.CanError
-        self._next: bytes | None = None
+        self._next_frame: bytes | None = None
         self._damaged_in_a_row = 0
         self.name = name
 
     def send(self, frame: bytes) -> None:
-        """Send one frame of 16 bytes."""
+        """Send a raw frame of 16 bytes."""
         try:
             self._bus.send(self._to_message(frame), timeout=0.0)
         except Exception as error:
             raise DeviceError(
-                f"CAN bus {self.name}: it takes no more frames ({_words(error)}); check cable "
+                f"CAN bus {self.name}: it takes no more frames ({_error_text(error)}); check cable "
                 "and adapter."
             ) from None
 
     def receive(self) -> bytes | None:
-        """Return the next frame, or None."""
-        if self._next is not None:
-            raw, self._next = self._next, None
+        """Return the next received raw frame of 16 bytes, or None if no frame has arrived."""
+        if self._next_frame is not None:
+            raw, self._next_frame = self._next_frame, None
             return raw
         return self._receive(0.0)
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for a frame."""
-        if self._next is None:
-            self._next = self._receive(timeout_s)
+        """Wait until a frame has arrived, at most for the timeout."""
+        if self._next_frame is None:
+            self._next_frame = self._receive(timeout_s)
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
-        """Do nothing: python-can's filters end a poll at each dropped frame, and drop errors."""
+        """Do nothing: python-can's filters end a poll at each dropped frame and drop errors."""
 
     def open_bus(self) -> "can.BusABC":
         """Return a python-can bus that sends and receives through this port."""
@@ -295,58 +311,59 @@ class PythonCanPort:
         return SetupBus(self)
 
     def close(self) -> None:
-        """Shut the adapter down."""
+        """Shut down the adapter of python-can; errors are ignored."""
         with suppress(Exception):
             self._bus.shutdown()
 
     def _receive(self, timeout_s: float) -> bytes | None:
+        """Return the next frame from the adapter, or None after the timeout."""
         try:
             message = self._bus.recv(timeout_s)
             raw = None if message is None else self._from_message(message)
         except (self._error, OSError) as error:
             raise DeviceError(
-                f"CAN bus {self.name}: it cannot be read ({_words(error)}); check cable and "
+                f"CAN bus {self.name}: it cannot be read ({_error_text(error)}); check cable and "
                 "adapter."
             ) from None
         except Exception as error:
             self._damaged_in_a_row += 1
-            if self._damaged_in_a_row < _DAMAGED_IN_A_ROW:
+            if self._damaged_in_a_row < _MOST_DAMAGED_FRAMES:
                 return DAMAGED_FRAME
             self._damaged_in_a_row = 0
             raise DeviceError(
                 f"CAN bus {self.name}: the adapter sends what is no CAN frame, "
-                f"{_DAMAGED_IN_A_ROW} times in a row ({_words(error)}); check the adapter, its "
-                "cable and its firmware."
+                f"{_MOST_DAMAGED_FRAMES} times in a row ({_error_text(error)}); check the adapter, "
+                "its cable and its firmware."
             ) from None
-        if raw is not None and not read_head(raw)[0] & ERROR_FLAG:
+        if raw is not None and not unpack_header(raw)[0] & ERROR_FLAG:
             self._damaged_in_a_row = 0
         return raw
 
 
-def _words(error: Exception) -> str:
-    """Return the text and the type of an adapter's error: some have no text."""
+def _error_text(error: Exception) -> str:
+    """Return type and text of an adapter's error, since some errors have no text."""
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
-    """Open the bus of a profile, or that of the simulated rig that replaces it.
+    """Open the CAN bus of a profile, or the bus of the simulated rig that replaces the hardware.
 
     Parameters
     ----------
     settings
-        The profile's ``[can]``.
+        Section ``[can]`` of the profile.
     simulator
-        Simulated rig that replaces the hardware; None: the bus itself.
+        Address of the simulated rig that replaces the hardware; None: open the real bus.
 
     Raises
     ------
     DeviceError
-        If there is no such bus here; the message says how to get one.
+        If the bus does not exist or cannot be opened; the message states the remedy.
     """
     name = f"{settings.channel} ({settings.interface})"
     if simulator is not None and simulator.can_socket:
         link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SIMULATOR_SEND_BUFFER)
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SIMULATOR_SEND_BUFFER_SIZE)
         try:
             link.connect(simulator.can_socket)
         except OSError as error:
@@ -366,13 +383,14 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
         )
     except Exception as error:
         raise DeviceError(
-            f"CAN bus {name}: it cannot be opened ({_words(error)}); check can.interface and "
+            f"CAN bus {name}: it cannot be opened ({_error_text(error)}); check can.interface and "
             "can.channel."
         ) from None
     return PythonCanPort(bus, name)
 
 
 def _open_socketcan(settings: CanBus) -> socket.socket:
+    """Open and bind a CAN socket of the kernel; raise with a remedy if that fails."""
     channel = settings.channel
     remedy = (
         f"bring it up with: ip link set {channel} up type can bitrate {settings.bitrate_bit_s}; "
@@ -387,7 +405,7 @@ def _open_socketcan(settings: CanBus) -> socket.socket:
             f"CAN bus {channel}: this kernel has no CAN sockets ({error.strerror}); {remedy}."
         ) from None
     try:
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_SIZE)
         link.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", ERROR_MASK))
         link.bind((channel,))
     except OSError as error:

@@ -1,7 +1,8 @@
-"""Vendor-specific objects that a profile sets: ``cia402.set_objects``.
+"""Manufacturer-specific objects that a profile sets: ``cia402.set_objects``.
 
-Each is one text, ``"3001:2 u32 2500"``: index and sub-index in hexadecimal as manuals print them,
-the type, and the value in decimal or as 0x…. They are written in pre-operational and read back.
+Each assignment is one text, ``"3001:2 u32 2500"``: index and sub-index in hexadecimal as manuals
+print them, the integer type, and the value in decimal or as 0x…. The objects are written in
+pre-operational and read back.
 """
 
 import re
@@ -10,7 +11,7 @@ from typing import Final
 
 from rigd.devices.cia402.requirements import REQUIREMENTS, ObjectAccess
 
-KINDS: Final = {
+INTEGER_RANGES: Final = {
     "u8": (0, 0xFF),
     "u16": (0, 0xFFFF),
     "u32": (0, 0xFFFF_FFFF),
@@ -18,39 +19,45 @@ KINDS: Final = {
     "i16": (-0x8000, 0x7FFF),
     "i32": (-0x8000_0000, 0x7FFF_FFFF),
 }
-"""Types, and the values that they hold."""
+"""Lowest and highest value of each integer type that an assignment may name."""
 
-_TEXT: Final = re.compile(
+_ASSIGNMENT_PATTERN: Final = re.compile(
     r"(?:0[xX])?([0-9a-fA-F]{4})(?::(?:0[xX])?([0-9a-fA-F]{1,2}))?\s+(\w+)\s+([+-]?\w+)"
 )
-_PDOS: Final = range(0x1400, 0x1C00)
-_STORED: Final = (0x1010, 0x1011, *range(0x1F50, 0x1F58))
-"""Storing and restoring of parameters, and of firmware."""
+"""Pattern of an assignment: index, optional sub-index, integer type, value."""
+_PDO_INDICES: Final = range(0x1400, 0x1C00)
+"""Indices of PDO parameters and mappings, which a profile may not set."""
+_STORAGE_INDICES: Final = (0x1010, 0x1011, *range(0x1F50, 0x1F58))
+"""Indices of objects that store or restore parameters or load firmware."""
 _SET_BY_RIGD: Final = {
     (each.index, each.sub)
     for each in REQUIREMENTS
     if each.access & (ObjectAccess.WRITE | ObjectAccess.RECEIVED)
 }
+"""Index and sub-index of each object that the driver itself writes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """One object and the value that it is to hold."""
+    """Object of the drive that the profile sets, and the value to write to it."""
 
     index: int
+    """Index of the object."""
     sub: int
-    kind: str
-    """Type of the value, one of :data:`KINDS`."""
+    """Sub-index of the object."""
+    integer_type: str
+    """Integer type of the value, one of :data:`INTEGER_RANGES`."""
     value: int
+    """Value to write."""
 
     @property
     def address(self) -> str:
-        """Return index and sub-index as text for error messages, such as "6040:00"."""
+        """Index and sub-index of the object for messages, such as "6040:0"."""
         return f"{self.index:04X}:{self.sub:X}"
 
 
 def parse_assignment(text: str) -> Assignment:
-    """Parse a text of ``cia402.set_objects``.
+    """Parse one text of ``cia402.set_objects`` into an assignment.
 
     Parameters
     ----------
@@ -60,34 +67,36 @@ def parse_assignment(text: str) -> Assignment:
     Raises
     ------
     ValueError
-        With what is wrong and the remedy, as the end of a sentence.
+        If the text is invalid; the message is the end of a sentence with error and remedy.
 
     Examples
     --------
     >>> parse_assignment("3001:2 u32 2500")
-    Assignment(index=12289, sub=2, kind='u32', value=2500)
+    Assignment(index=12289, sub=2, integer_type='u32', value=2500)
     """
-    match = _TEXT.fullmatch(text.strip())
+    match = _ASSIGNMENT_PATTERN.fullmatch(text.strip())
     if match is None:
         raise ValueError('must be index:sub, type and value, such as "3001:2 u32 2500"')
     index, sub = int(match[1], 16), int(match[2] or "0", 16)
-    kind = match[3]
-    if kind not in KINDS:
-        raise ValueError(f"has the unknown type {kind!r}; choose {', '.join(KINDS)}")
+    integer_type = match[3]
+    if integer_type not in INTEGER_RANGES:
+        raise ValueError(
+            f"has the unknown type {integer_type!r}; choose {', '.join(INTEGER_RANGES)}"
+        )
     try:
         value = int(match[4], 0)
     except ValueError:
         raise ValueError(
             f"has a value that is not a whole number ({match[4]}); write 2500, -3 or 0x9C4"
         ) from None
-    low, high = KINDS[kind]
+    low, high = INTEGER_RANGES[integer_type]
     if not low <= value <= high:
-        raise ValueError(f"has a value that {kind} does not hold ({low} to {high})")
-    if (index, sub) in _SET_BY_RIGD or index in _PDOS:
+        raise ValueError(f"has a value that {integer_type} does not hold ({low} to {high})")
+    if (index, sub) in _SET_BY_RIGD or index in _PDO_INDICES:
         raise ValueError("is an object that rigd sets itself; remove it")
-    if index in _STORED:
+    if index in _STORAGE_INDICES:
         raise ValueError(
             "would have the drive store or restore its memory at every start; do that once with "
             "the drive's own tool"
         )
-    return Assignment(index, sub, kind, value)
+    return Assignment(index, sub, integer_type, value)

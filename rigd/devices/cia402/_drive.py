@@ -1,8 +1,8 @@
-"""Driver of a CiA 402 drive: set-up, the exchange of every tick, guards, enabling and disabling.
+"""Driver of a CiA 402 drive: set-up, exchange of values in every tick, enabling and disabling.
 
-A TPDO does not say which SYNC it answers: :mod:`rigd.devices.canbus._exchange` counts both, and
-where that is in doubt a SYNC is left out. A drive that takes more than a period for its answer is
-refused by :meth:`Cia402Drive.connect` already.
+A TPDO does not state which SYNC it answers, so :mod:`rigd.devices.canbus._exchange` counts both.
+In case of doubt it omits one SYNC. :meth:`Cia402Drive.connect` refuses a drive that needs more than
+a period for its answer.
 """
 
 from collections.abc import Callable
@@ -13,21 +13,21 @@ from rigd.devices.cia402._node import Node, ReceivedFrames
 from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
-    ENABLED,
     FAULT_BIT,
     FOLLOWS_TARGET,
+    OPERATION_ENABLED_BITS,
     STATE_BITS,
     DriveState,
     NodeFrames,
-    state_of,
+    drive_state,
 )
-from rigd.devices.cia402._setup import DriveCapabilities, set_up
+from rigd.devices.cia402._setup import DriveCapabilities, set_up_drive
 from rigd.devices.cia402._standing import reset_fault
 from rigd.devices.cia402._transitions import (
     StopRequestedError,
-    TorqueFollowing,
-    left_operation,
-    step_up,
+    TorqueFollowingCheck,
+    enable_operation,
+    operation_left_error,
     switch_off,
 )
 from rigd.devices.cia402.objects import ACTUAL_TORQUE, HEARTBEAT_CONSUMER, HEARTBEAT_PRODUCER_MS
@@ -35,32 +35,34 @@ from rigd.devices.cia402.requirements import Watchdog, torque_limit_per_mille
 from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.devices.parameters import RigParameters
 
-_HALF_TURN = 1 << 31
-_ALL_COUNTS = (1 << 32) - 1
+_HALF_COUNTER_RANGE = 1 << 31
+"""Half of the range of the drive's 32-bit position counter, in counts."""
+_COUNTER_MASK = (1 << 32) - 1
+"""Mask with the 32 bits of the drive's position counter."""
 
 
 class Cia402Drive:
-    """A CiA 402 servo drive in cyclic synchronous torque mode.
+    """Driver of a CiA 402 servo drive in cyclic synchronous torque mode.
 
-    Where ``acquisition.deadline_us`` is longer than a period, the drive is a simulated one in
-    lock-step, whose time passes with the SYNCs: then every reply is waited for, a SYNC counts as
-    one period, and nothing depends on how fast this computer is.
+    If ``acquisition.deadline_us`` is longer than a period, the drive is simulated in lock-step: its
+    time advances by one period with each SYNC. The driver then waits for every reply, and nothing
+    depends on the speed of this computer.
 
     Parameters
     ----------
     rig
         Parameters with the sections ``cia402`` and ``acquisition``.
     link
-        The bus, which may be shared.
+        CAN bus of the drive, which the sensor may use, too.
 
     Attributes
     ----------
     angle_stale : bool
-        The last angle read is not the one of the SYNC it belongs to.
+        Whether `angle_rad` is older than the last SYNC, because its reply has not been received.
     angle_time_ns : int
-        ``time.monotonic_ns`` when the SYNC of the last angle was sent.
+        Time in nanoseconds (``time.monotonic_ns``) at which the SYNC of `angle_rad` was sent.
     angle_rad : float
-        The last angle, from the position at :meth:`connect`.
+        Last angle of the output shaft in radians, relative to its position at :meth:`connect`.
     """
 
     def __init__(self, rig: RigParameters, link: CanLink) -> None:
@@ -73,41 +75,41 @@ class Cia402Drive:
         self._link = link
         self._name = f"Drive (CANopen node {settings.node_id})"
         self._frames = NodeFrames(settings.node_id, settings.host_node_id)
-        self._idle = self._frames.rpdo(DISABLE_VOLTAGE, 0)
+        self._idle_rpdo = self._frames.rpdo(DISABLE_VOLTAGE, 0)
         self._inbox = ReceivedFrames(self._name, settings.sto_error_code)
-        self._same_tick = rig.acquisition.mode == "same_tick"
-        self._silence_ns = round(settings.drive_heartbeat_timeout_s * 1e9)
+        self._replies_in_same_tick = rig.acquisition.mode == "same_tick"
+        self._heartbeat_timeout_ns = round(settings.drive_heartbeat_timeout_s * 1e9)
         self._rad_per_count = rig.encoder.resolution_rad * settings.direction
         self._per_mille_per_nm = 1000 * settings.direction / rig.motor.rated_torque_nm
-        self._limit = torque_limit_per_mille(rig)
-        self._following = TorqueFollowing(
+        self._limit_per_mille = torque_limit_per_mille(rig)
+        self._torque_check = TorqueFollowingCheck(
             self._name,
             settings.torque_tolerance_percent,
             settings.torque_response_s,
             1 / rig.rate_hz,
         )
-        self._open = False
+        self._is_open = False
         self._subscribed: CanExchange | None = None
         self._node: Node | None = None
         self._capabilities: DriveCapabilities | None = None
-        self._listens = True
+        self._has_heartbeat = True
         self._has_rpdo_deadline = False
         self._enabled = False
         self._may_be_on = False
-        self._inbox.guard(FAULT_BIT, 0)
-        self._awaiting = False
+        self._inbox.require_status(FAULT_BIT, 0)
+        self._awaits_reply = False
         self._last_received_ns = 0
         self._position = 0
-        self._counts = 0
+        self._relative_counts = 0
         self.angle_rad = 0.0
         self.angle_stale = False
         self.angle_time_ns = 0
         self.off_doubt = ""
 
     def connect(self) -> None:
-        """Open the bus, verify and configure the drive, start it, and take its angle as zero.
+        """Open the bus, verify, configure and start the drive, and set its present angle to zero.
 
-        Between this and the first tick no SYNC is sent, and no heartbeat.
+        No SYNC and no heartbeat is sent between this call and the first tick.
 
         Raises
         ------
@@ -124,25 +126,25 @@ class Cia402Drive:
         self._node = None
         self._enabled = self._may_be_on = False
         self._inbox.clear()
-        self._inbox.guard(FAULT_BIT, 0)
-        capabilities = self._capabilities = set_up(exchange.port, self._rig, self._name)
+        self._inbox.require_status(FAULT_BIT, 0)
+        capabilities = self._capabilities = set_up_drive(exchange.port, self._rig, self._name)
         has_torque = capabilities.has(ACTUAL_TORQUE)
-        self._inbox.with_torque = has_torque
-        self._following.compares = has_torque
+        self._inbox.tpdo_has_torque = has_torque
+        self._torque_check.is_active = has_torque
         # Without a heartbeat of its own the drive is monitored by its TPDOs alone.
-        self._listens = capabilities.has(HEARTBEAT_PRODUCER_MS)
+        self._has_heartbeat = capabilities.has(HEARTBEAT_PRODUCER_MS)
         self._has_rpdo_deadline = capabilities.watchdog is Watchdog.RPDO_DEADLINE
         self._subscribe(exchange)
         exchange.start()
         node = self._node = Node(self._rig, exchange, self._frames, self._inbox)
-        node.go_operational(beats=self._listens)
+        node.go_operational(has_heartbeat=self._has_heartbeat)
         node.await_first_reply()
-        self._position, self._counts = self._inbox.position, 0
+        self._position, self._relative_counts = self._inbox.position, 0
         self.angle_rad = 0.0
         self.angle_stale = False
         self.angle_time_ns = node.sync_ns
-        node.pairing.settle()  # that reply is of no tick
-        self._awaiting = False
+        node.pairing.process_replies()  # the first reply belongs to no tick
+        self._awaits_reply = False
         node.resume()
 
     def identity(self) -> dict[str, object]:
@@ -151,16 +153,17 @@ class Cia402Drive:
         Returns
         -------
         dict
-            ``vendor_id``, ``product_code``, ``revision``, ``serial_number`` (None where it has
-            none), ``device_name``, ``supported_modes`` (object 6502), ``rated_torque_counts``
-            (6076) and, where the profile gives its unit, ``rated_torque_nm`` at the output shaft;
-            ``gear_ratio`` (6091) and ``encoder_step_rad`` (608F, 6092), None where it states none;
-            ``quick_stop_option`` (605A) and ``fault_reaction_option`` (605E) where it has them.
+            ``vendor_id``, ``product_code``, ``revision``, ``serial_number`` (None if the drive has
+            no such number), ``device_name``, ``supported_modes`` (object 6502),
+            ``rated_torque_counts`` (6076) and, if the profile states its unit, ``rated_torque_nm``
+            at the output shaft; ``gear_ratio`` (6091) and ``encoder_step_rad`` (608F, 6092), None
+            if the drive does not state them; ``quick_stop_option`` (605A) and
+            ``fault_reaction_option`` (605E) if the drive has them. Empty before `connect`.
         """
         return {} if self._capabilities is None else dict(self._capabilities.identity)
 
     def capabilities(self) -> DriveCapabilities | None:
-        """Return the capabilities found at :meth:`connect`, or None before."""
+        """Return the drive's capabilities found at :meth:`connect`, or None before."""
         return self._capabilities
 
     def statement(self) -> dict[str, str]:
@@ -169,20 +172,21 @@ class Cia402Drive:
         Returns
         -------
         dict
-            ``drive_identity``, ``drive_watchdog`` and ``drive_watchdog_s``; where the drive lacks
-            something that the profile accepts by name, ``drive_without``; where something replaces
-            an object, ``drive_stand_ins``; objects that the profile has set, ``drive_objects_set``.
+            ``drive_identity``, ``drive_watchdog`` and ``drive_watchdog_s``; ``drive_without`` if
+            the drive lacks a function and the profile accepts that; ``drive_stand_ins`` if
+            something replaces an absent object; ``drive_objects_set`` if the profile sets
+            manufacturer-specific objects. Empty before `connect`.
         """
         capabilities = self._capabilities
         if capabilities is None:
             return {}
-        numbers = ("vendor_id", "product_code", "revision", "serial_number")
-        facts = {
+        identity_keys = ("vendor_id", "product_code", "revision", "serial_number")
+        metadata = {
             "drive_identity": " ".join(
                 f"0x{number:X}"
                 if isinstance(number := capabilities.identity.get(key), int)
                 else "-"
-                for key in numbers
+                for key in identity_keys
             ),
             "drive_watchdog": capabilities.watchdog.value,
             "drive_watchdog_s": repr(capabilities.watchdog_s),
@@ -194,13 +198,13 @@ class Cia402Drive:
             ("drive_objects_set", capabilities.assigned),
         ):
             if texts:
-                facts[key] = "; ".join(texts)
-        return facts
+                metadata[key] = "; ".join(texts)
+        return metadata
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Bring the drive to operation enabled, at zero torque.
+        """Bring the drive to the state operation enabled, at zero torque.
 
-        Sends SYNC, RPDO and heartbeat itself, once a period; meant to be called between two ticks.
+        This method itself sends SYNC, RPDO and heartbeat once a period; call it between two ticks.
 
         Parameters
         ----------
@@ -210,15 +214,15 @@ class Cia402Drive:
         Raises
         ------
         DeviceError
-            If the drive does not reach that state; it is then disabled again.
+            If the drive does not reach the state; the driver then disables it.
         """
-        node = self._connected()
+        node = self._require_node()
         if self._enabled:
             return
-        node.refuse_alarm()
+        node.raise_if_alarmed()
         self._may_be_on = True
         try:
-            step_up(node, stop)
+            enable_operation(node, stop)
         except StopRequestedError:
             self.disable()
             return
@@ -226,128 +230,137 @@ class Cia402Drive:
             self.disable()
             raise
         self._enabled = True
-        self._following.start()
-        follows = FOLLOWS_TARGET if node.settings.follows_target_bit else 0
-        self._inbox.guard(STATE_BITS | follows, ENABLED | follows)
+        self._torque_check.start()
+        follows_target_bit = FOLLOWS_TARGET if node.settings.follows_target_bit else 0
+        self._inbox.require_status(
+            STATE_BITS | follows_target_bit, OPERATION_ENABLED_BITS | follows_target_bit
+        )
         node.resume()
 
     def latch(self, due_ns: int) -> None:
-        """Send SYNC, on which the drive latches its angle, unless one has to be left out.
+        """Send SYNC, on which the drive samples its angle, unless this tick has to omit SYNC.
 
         Parameters
         ----------
         due_ns
-            When the tick was due; heartbeats of both sides are timed by it.
+            Time in nanoseconds at which the tick was due; it times the heartbeats of both sides.
 
         Raises
         ------
         DeviceError
-            If the bus is gone.
+            If the bus has failed.
         """
-        node = self._connected()
-        if not self._same_tick:
-            self._settle_previous(node)
+        node = self._require_node()
+        if not self._replies_in_same_tick:
+            self._store_previous_reply(node)
         if self._has_rpdo_deadline and not self._enabled:
             # The drive times the RPDOs from the first on, also while no torque is commanded.
-            node.exchange.send(self._idle)
+            node.exchange.send(self._idle_rpdo)
         node.send_sync_or_pause()
-        self._awaiting = True
+        self._awaits_reply = True
         node.now_ns = node.now_ns + node.period_ns if node.lock_step else due_ns
 
     def read_angle(self) -> float:
-        """Return the angle in rad at the output shaft, from the position at :meth:`connect`.
+        """Return the angle of the output shaft in rad, relative to its position at :meth:`connect`.
 
-        The heartbeat goes out here when it is due: sent with the SYNC it would come between that
-        and the sensor's request.
+        This method also sends the heartbeat when it is due; sent in `latch`, the heartbeat would
+        delay the request to the sensor.
 
         Raises
         ------
         DeviceError
-            If the drive has reported a fault, has left the state it should be in, or is silent.
+            If the drive has reported a fault, has left the expected state, or no longer answers.
         """
-        node = self._connected()
-        if self._awaiting:
-            self._awaiting = False
-            if self._same_tick:
-                caught_up = node.pairing.has_caught_up
+        node = self._require_node()
+        if self._awaits_reply:
+            self._awaits_reply = False
+            if self._replies_in_same_tick:
+                caught_up = node.pairing.is_up_to_date
                 node.exchange.wait_until(caught_up, node.sync_ns + node.deadline_ns)
-                self._settle(node)
+                self._store_reply(node)
             node.send_heartbeat()
         inbox = self._inbox
-        if inbox.received or not self._listens:
-            inbox.received = False
+        if inbox.heartbeat_received or not self._has_heartbeat:
+            inbox.heartbeat_received = False
             self._last_received_ns = node.now_ns
         if (
             inbox.alarm
-            or inbox.strayed is not None
-            or node.now_ns - self._last_received_ns > self._silence_ns
+            or inbox.unexpected_statusword is not None
+            or node.now_ns - self._last_received_ns > self._heartbeat_timeout_ns
         ):
-            self._complain(node)
+            self._raise_drive_error(node)
         return self.angle_rad
 
     def command(self, torque_nm: float) -> float:
-        """Set the torque in N·m at the output shaft; clipped to the motor's peak torque.
+        """Send a torque command in N·m at the output shaft, clipped to the motor's peak torque.
 
-        A drive that is not enabled gets zero torque and the command to stay so.
+        A drive that is not enabled is sent zero torque and the command to stay disabled.
 
         Returns
         -------
         float
-            The torque as sent, a whole number of thousandths of the rated torque.
+            Torque as sent, in N·m, rounded to whole thousandths of the rated torque.
 
         Raises
         ------
         DeviceError
-            If the torque is not a number, or the bus is gone.
+            If the torque is not a number, or the bus has failed.
         """
-        send = self._connected().exchange.send
+        send = self._require_node().exchange.send
         if not self._enabled:
-            send(self._idle)
+            send(self._idle_rpdo)
             return 0.0
         per_mille = torque_nm * self._per_mille_per_nm
-        limit = self._limit
+        limit = self._limit_per_mille
         if not -limit <= per_mille <= limit:
             if isnan(per_mille):
                 raise DeviceError(f"{self._name}: the torque command is not a number.")
             per_mille = limit if per_mille > 0 else -limit
-        sent = round(per_mille)
-        self._following.command(sent)
-        send(self._frames.rpdo(ENABLE_OPERATION, sent))
-        return sent / self._per_mille_per_nm
+        sent_per_mille = round(per_mille)
+        self._torque_check.command(sent_per_mille)
+        send(self._frames.rpdo(ENABLE_OPERATION, sent_per_mille))
+        return sent_per_mille / self._per_mille_per_nm
 
     def health(self) -> LineHealth:
-        """Return the health of the bus, as far as its frames are sent or received here."""
+        """Return bit count, bit rate and errors of the bus, as seen by this driver."""
         if self._node is None:
             return LineHealth()
         exchange = self._node.exchange
         pairing = self._node.pairing
-        unproven = pairing.unproven
-        doubt = count = ""
-        if unproven:
-            how = "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
+        lost_without_proof = pairing.lost_without_proof
+        doubt = lost_count_text = ""
+        if lost_without_proof:
+            reason = "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
             doubt = (
                 f"{self._name}: a TPDO did not arrive, or all have been delayed by a period since, "
-                f"which is unknown {how}: angles may be older than the file states."
+                f"which is unknown {reason}: angles may be older than the file states."
             )
-            count = f"{self._name}: TPDOs that did not arrive since it was connected: {unproven}."
-        errors = exchange.error_frames + pairing.lost + self._inbox.malformed
+            lost_count_text = (
+                f"{self._name}: TPDOs that did not arrive since it was connected: "
+                f"{lost_without_proof}."
+            )
+        errors = exchange.error_frames + pairing.lost + self._inbox.malformed_frames
         return LineHealth(
-            exchange.bits, self._bit_rate_bit_s, errors, doubt=doubt, doubt_count=count
+            exchange.bits,
+            self._bit_rate_bit_s,
+            errors,
+            doubt=doubt,
+            doubt_count=lost_count_text,
         )
 
     def disable(self) -> None:
-        """Zero the torque and disable the drive. Works in every state and never raises.
+        """Zero the torque and disable the drive; works in every state and never raises.
 
-        If the statusword does not show it off within some 50 ms, the command goes by SDO as well,
-        and last the node is stopped.
+        If the statusword does not confirm it within some 50 ms, the command is also sent by SDO,
+        and finally the node is stopped.
         """
         self._enabled = False
-        self._inbox.guard(FAULT_BIT, 0)
+        self._inbox.require_status(FAULT_BIT, 0)
         node = self._node
         if node is None:
             return
         if not self._may_be_on:
-            node.send_if_possible(self._idle)
+            node.send_if_possible(self._idle_rpdo)
             return
         if switch_off(node):
             self._may_be_on = False
@@ -356,18 +369,18 @@ class Cia402Drive:
             self.off_doubt = (
                 f"{self._name}: it does not show that it is off (statusword "
                 f"0x{self._inbox.statusword:04X}); check that it is, by its STO if need be. "
-                f"{self._own_end()}"
+                f"{self._describe_watchdog()}"
             )
         node.resume()
 
     def reset_fault(self) -> str | None:
-        """Switch off and reset a fault, for the operator; the drive must then be reconnected.
+        """Switch the drive off and reset its fault; the drive must then be reconnected.
 
         Returns
         -------
         str or None
-            What the fault was, in words; None if there was none. Either way the drive has shown
-            itself off, and that it would get ready to switch on.
+            Description of the fault; None if the drive was not in fault. In both cases the drive
+            has reported that it is off, and has shown that it can get ready to switch on.
 
         Raises
         ------
@@ -381,23 +394,24 @@ class Cia402Drive:
         return reset_fault(exchange.port, self._rig, self._name)
 
     def close(self) -> None:
-        """Disable, have the drive leave operational and expect no more heartbeats; release.
+        """Disable the drive, end its monitoring of this computer's heartbeat, and release the bus.
 
-        A drive that may still be on goes on watching for heartbeats, and misses them.
+        A drive that may still have torque keeps monitoring, so that its watchdog removes the
+        torque.
         """
         self.disable()
-        self._inbox.watching = False
+        self._inbox.must_stay_operational = False
         node, self._node = self._node, None
         if node is not None and not self._may_be_on:
             node.send_if_possible(self._frames.pre_operational)
             if self._capabilities is not None and self._capabilities.watchdog is Watchdog.HEARTBEAT:
-                node.write(self._frames.forget_heartbeat, HEARTBEAT_CONSUMER, 1)
-        if self._open:
-            self._open = False
+                node.write(self._frames.end_heartbeat_monitoring, HEARTBEAT_CONSUMER, 1)
+        if self._is_open:
+            self._is_open = False
             self._link.close()
 
-    def _own_end(self) -> str:
-        """Describe what removes the torque of a drive that cannot be switched off."""
+    def _describe_watchdog(self) -> str:
+        """Describe by which watchdog a drive that cannot be switched off removes its torque."""
         capabilities = self._capabilities
         if capabilities is None or capabilities.watchdog is Watchdog.NONE:
             return "It has no watchdog that would end it by itself."
@@ -406,56 +420,61 @@ class Cia402Drive:
             f"{capabilities.watchdog_s:g} s, by its {capabilities.watchdog.value}."
         )
 
-    def _connected(self) -> Node:
+    def _require_node(self) -> Node:
+        """Return the connected node, or raise if the drive is not connected."""
         if self._node is None:
             raise DeviceError(f"{self._name}: it is not connected.")
         return self._node
 
     def _open_link(self) -> CanExchange:
-        if not self._open:
+        """Open the bus unless this driver has it open, and return its exchange."""
+        if not self._is_open:
             self._link.open()
-            self._open = True
+            self._is_open = True
         return self._link.exchange
 
     def _subscribe(self, exchange: CanExchange) -> None:
+        """Route the drive's frames to the inbox, once per exchange."""
         if self._subscribed is exchange:
             return
         self._subscribed = exchange
-        exchange.subscribe(self._frames.tpdo_id, self._inbox.take_tpdo)
-        exchange.subscribe(self._frames.emergency_id, self._inbox.take_emergency)
-        exchange.subscribe(self._frames.heartbeat_id, self._inbox.take_heartbeat)
-        exchange.subscribe(self._frames.reply_id, self._inbox.take_reply)
+        exchange.subscribe(self._frames.tpdo_id, self._inbox.store_tpdo)
+        exchange.subscribe(self._frames.emergency_id, self._inbox.store_emergency)
+        exchange.subscribe(self._frames.heartbeat_id, self._inbox.store_heartbeat)
+        exchange.subscribe(self._frames.reply_id, self._inbox.store_sdo_reply)
 
-    def _settle_previous(self, node: Node) -> None:
+    def _store_previous_reply(self, node: Node) -> None:
         """Process the reply to the previous tick's SYNC, which should have arrived."""
-        if node.lock_step and node.pairing.owed:
-            node.exchange.wait_until(node.pairing.has_caught_up, node.sync_ns + node.deadline_ns)
+        if node.lock_step and node.pairing.outstanding:
+            node.exchange.wait_until(node.pairing.is_up_to_date, node.sync_ns + node.deadline_ns)
         else:
             node.exchange.drain()
-        self._settle(node)
+        self._store_reply(node)
 
-    def _settle(self, node: Node) -> None:
-        """Store the position if it is the reply to the last SYNC."""
-        fresh = node.pairing.settle() and self._inbox.legible
-        self.angle_stale = not fresh
-        if self._enabled and fresh:
-            self._following.compare(self._inbox.torque)
-        if fresh:
+    def _store_reply(self, node: Node) -> None:
+        """Store angle and torque if the last TPDO answers the last SYNC, else mark them stale."""
+        is_fresh = node.pairing.process_replies() and self._inbox.is_last_tpdo_valid
+        self.angle_stale = not is_fresh
+        if self._enabled and is_fresh:
+            self._torque_check.compare(self._inbox.torque)
+        if is_fresh:
             position = self._inbox.position
             # The 32-bit counter wraps around.
-            self._counts += (position - self._position + _HALF_TURN & _ALL_COUNTS) - _HALF_TURN
+            self._relative_counts += (
+                position - self._position + _HALF_COUNTER_RANGE & _COUNTER_MASK
+            ) - _HALF_COUNTER_RANGE
             self._position = position
-            self.angle_rad = self._counts * self._rad_per_count
+            self.angle_rad = self._relative_counts * self._rad_per_count
             self.angle_time_ns = node.sync_ns
 
-    def _complain(self, node: Node) -> None:
-        """Raise the error of the drive, if there is one."""
-        node.refuse_alarm()
-        statusword = self._inbox.strayed
-        if statusword is not None and state_of(statusword) is not DriveState.OPERATION_ENABLED:
+    def _raise_drive_error(self, node: Node) -> None:
+        """Raise the error that explains why the drive no longer follows commands, or is silent."""
+        node.raise_if_alarmed()
+        statusword = self._inbox.unexpected_statusword
+        if statusword is not None and drive_state(statusword) is not DriveState.OPERATION_ENABLED:
             node.await_alarm()
-            node.refuse_alarm()
-            raise left_operation(self._name, statusword)
+            node.raise_if_alarmed()
+            raise operation_left_error(self._name, statusword)
         if statusword is not None:
             raise DeviceError(
                 f"{self._name}: it ignores the target torque: bit 12 of its statusword "

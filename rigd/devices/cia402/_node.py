@@ -1,4 +1,4 @@
-"""The drive as a node on the bus: start, SYNC, heartbeat, requests, and what has come from it."""
+"""CANopen node of the drive: start, SYNC, heartbeat, SDO requests, and the received frames."""
 
 import time
 from collections.abc import Callable
@@ -9,15 +9,15 @@ from rigd.devices.canbus import CanExchange, ReplyPairing
 from rigd.devices.cia402._protocol import (
     BOOT_UP,
     NMT_STATES,
-    OFF,
     OPERATIONAL,
+    TORQUE_FREE_STATES,
     DriveState,
     NodeFrames,
     describe_error,
+    drive_state,
     is_written,
     read_emergency,
     read_statusword,
-    state_of,
     unpack_short_tpdo,
     unpack_tpdo,
 )
@@ -25,195 +25,209 @@ from rigd.devices.contracts import DeviceError, wired_stop_dropped
 from rigd.devices.parameters import RigParameters
 
 _TOGGLE_BIT = 0x80
+"""Bit of a heartbeat's data that is not part of the NMT state (toggle bit of node guarding)."""
 
 
 # What has come
 
 
 class ReceivedFrames:
-    """Latest content of the drive's frames. A frame of the wrong length only counts.
+    """Latest contents of the frames received from the drive.
+
+    Frames of the wrong length are only counted.
 
     Parameters
     ----------
     name
         Name of the drive, for messages.
     sto_error_code
-        Error code of the emergency message for a dropped STO; 0 if the drive has none.
+        Error code of the drive's emergency message for a dropped STO; 0 if it sends none.
 
     Attributes
     ----------
     statusword, position, torque
-        Content of the last TPDO; position in counts, torque in 1/1000 of the rated one.
-    strayed : int or None
-        First statusword that was not as :meth:`guard` asks, in whichever TPDO it came: the drive
-        may be back in the next one.
+        Contents of the last TPDO: statusword, position in encoder counts, torque in 1/1000 of the
+        rated torque.
+    unexpected_statusword : int or None
+        First statusword that violated the requirement of :meth:`require_status`; None if there was
+        none. It is stored even if a later TPDO shows the required state again.
     replies : int
-        TPDOs since this was last set to zero, regardless of their content.
-    legible : bool
-        The last TPDO had the right length.
+        Number of TPDOs received since this was last set to zero, valid or not.
+    is_last_tpdo_valid : bool
+        Whether the last TPDO had the right length.
     nmt_state : int or None
-        NMT state in the last heartbeat.
-    received : bool
+        NMT state in the last heartbeat; None if none has been received.
+    heartbeat_received : bool
         Whether a heartbeat has arrived since this was last set to False.
-    watching : bool
-        The drive is meant to stay operational.
+    must_stay_operational : bool
+        Whether leaving the NMT state operational raises an alarm.
     alarm : str
-        Why a session has to end, as a sentence for the operator: an emergency message, a restart,
-        a drive that has left operational. The first reason stays; empty: none.
-    emergency : bool
-        An emergency message has come.
-    reply : bytes
-        The last SDO reply.
-    malformed : int
-        Frames of the wrong length.
-    with_torque : bool
-        Whether TPDOs end in the actual torque, which not every drive reports.
+        Reason to end the session, as a sentence for the operator: an emergency message, a restart,
+        or a drive that has left operational. The first reason is retained; empty if there is none.
+    emergency_received : bool
+        Whether an emergency message has been received.
+    sdo_reply : bytes
+        Data of the last SDO reply.
+    malformed_frames : int
+        Number of received frames of the wrong length.
+    tpdo_has_torque : bool
+        Whether the TPDO contains the actual torque, which not every drive reports.
     """
 
     __slots__ = (
-        "_mask",
-        "_value",
+        "_required_mask",
+        "_required_value",
         "alarm",
-        "emergency",
-        "legible",
-        "malformed",
+        "emergency_received",
+        "heartbeat_received",
+        "is_last_tpdo_valid",
+        "malformed_frames",
+        "must_stay_operational",
         "name",
         "nmt_state",
         "position",
-        "received",
         "replies",
-        "reply",
+        "sdo_reply",
         "statusword",
         "sto_error_code",
-        "strayed",
         "torque",
-        "watching",
-        "with_torque",
+        "tpdo_has_torque",
+        "unexpected_statusword",
     )
 
     def __init__(self, name: str, sto_error_code: int = 0) -> None:
         self.name = name
         self.sto_error_code = sto_error_code
-        self.malformed = 0
-        self.with_torque = True
+        self.malformed_frames = 0
+        self.tpdo_has_torque = True
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything but the number of malformed frames."""
+        """Reset the contents of all received frames, except the number of malformed frames."""
         self.statusword = 0
-        self.guard(0, 0)
+        self.require_status(0, 0)
         self.position = 0
         self.torque = 0
         self.replies = 0
-        self.legible = False
+        self.is_last_tpdo_valid = False
         self.nmt_state: int | None = None
-        self.received = False
-        self.watching = False
+        self.heartbeat_received = False
+        self.must_stay_operational = False
         self.alarm = ""
-        self.emergency = False
-        self.reply = b""
+        self.emergency_received = False
+        self.sdo_reply = b""
 
-    def guard(self, mask: int, value: int) -> None:
-        """Monitor every statusword from now on: it must have `value` in the bits of `mask`."""
-        self._mask, self._value = mask, value
-        self.strayed: int | None = None
+    def require_status(self, mask: int, value: int) -> None:
+        """Require that every statusword from now on has `value` in the bits of `mask`."""
+        self._required_mask, self._required_value = mask, value
+        self.unexpected_statusword: int | None = None
         if self.statusword & mask != value:
-            self.strayed = self.statusword
+            self.unexpected_statusword = self.statusword
 
-    def take_tpdo(self, data: bytes) -> None:
-        """Store statusword and position of a TPDO."""
+    def store_tpdo(self, data: bytes) -> None:
+        """Store statusword, position and torque of a received TPDO."""
         self.replies += 1
         try:
-            if self.with_torque:
+            if self.tpdo_has_torque:
                 self.statusword, self.position, self.torque = unpack_tpdo(data)
             else:
                 self.statusword, self.position = unpack_short_tpdo(data)
-            self.legible = True
-            if self.statusword & self._mask != self._value and self.strayed is None:
-                self.strayed = self.statusword
+            self.is_last_tpdo_valid = True
+            if (
+                self.statusword & self._required_mask != self._required_value
+                and self.unexpected_statusword is None
+            ):
+                self.unexpected_statusword = self.statusword
         except LengthError:
-            self.legible = False
-            self.malformed += 1
+            self.is_last_tpdo_valid = False
+            self.malformed_frames += 1
 
-    def take_emergency(self, data: bytes) -> None:
-        """Store an emergency message; code zero ends an earlier one."""
+    def store_emergency(self, data: bytes) -> None:
+        """Store a received emergency message as an alarm; error code zero means no error."""
         message = read_emergency(data)
         if message is None:
-            self.malformed += 1
+            self.malformed_frames += 1
             return
         code, _, vendor = message
         if code >> 8 == 0:
             return
-        self.emergency = True
+        self.emergency_received = True
         if self.alarm:
             return
         if code == self.sto_error_code:
-            shown = f" (emergency message, error code 0x{code:04X})"
-            self.alarm = str(wired_stop_dropped(self.name, shown))
+            code_text = f" (emergency message, error code 0x{code:04X})"
+            self.alarm = str(wired_stop_dropped(self.name, code_text))
         else:
-            own = f", vendor's bytes {vendor.hex(' ')}" if any(vendor) else ""
-            self.alarm = f"{self.name}: emergency message: {describe_error(code)}{own}."
+            vendor_text = f", vendor's bytes {vendor.hex(' ')}" if any(vendor) else ""
+            self.alarm = f"{self.name}: emergency message: {describe_error(code)}{vendor_text}."
 
-    def take_heartbeat(self, data: bytes) -> None:
-        """Take a heartbeat, or the message that the drive has started."""
+    def store_heartbeat(self, data: bytes) -> None:
+        """Store the NMT state of a received heartbeat; set an alarm if it is not operational."""
         if not data:
-            self.malformed += 1
+            self.malformed_frames += 1
             return
         state = data[0] & ~_TOGGLE_BIT
         self.nmt_state = state
-        self.received = True
-        if self.watching and state != OPERATIONAL and not self.alarm:
+        self.heartbeat_received = True
+        if self.must_stay_operational and state != OPERATIONAL and not self.alarm:
             if state == BOOT_UP:
-                what = "it has restarted by itself; check its supply"
+                event_text = "it has restarted by itself; check its supply"
             else:
-                words = NMT_STATES.get(state, f"state {state}")
-                what = (
-                    f"it has left operational for {words}, as it does when it misses heartbeats, "
-                    "or when another master on the bus commands it to"
+                state_name = NMT_STATES.get(state, f"state {state}")
+                event_text = (
+                    f"it has left operational for {state_name}, as it does when it misses "
+                    "heartbeats, or when another master on the bus commands it to"
                 )
-            self.alarm = f"{self.name}: {what}."
+            self.alarm = f"{self.name}: {event_text}."
 
-    def take_reply(self, data: bytes) -> None:
-        """Take an SDO reply."""
-        self.reply = data
+    def store_sdo_reply(self, data: bytes) -> None:
+        """Store the data of a received SDO reply."""
+        self.sdo_reply = data
 
 
 # The node
 
-_LONG_AGO_NS = -(1 << 62)
-_START_PATIENCE_NS = 1_000_000_000
-"""Time limit to become operational, in addition to three periods of the drive's heartbeat."""
-_FIRST_REPLY_NS = 100_000_000
-_FIRST_REPLIES = 20
-"""SYNCs on which a reply within a period is hoped for: this computer may be the slow one."""
-_WRITTEN_NS = 50_000_000
-_REASON_NS = 5_000_000
-"""How long a drive in fault has to say why."""
+_BEFORE_ANY_TIME_NS = -(1 << 62)
+"""Time in nanoseconds before any clock reading: the next heartbeat is due at once."""
+_START_TIMEOUT_NS = 1_000_000_000
+"""Time in nanoseconds to become operational, in addition to three periods of the drive's
+heartbeat."""
+_FIRST_REPLY_TIMEOUT_NS = 100_000_000
+"""Time in nanoseconds to wait for the reply to one of the first SYNCs."""
+_FIRST_REPLY_ATTEMPTS = 20
+"""Number of SYNCs among which one must be answered within a period.
+
+One late reply does not suffice to refuse the drive, since this computer may be the slow one."""
+_SDO_REPLY_TIMEOUT_NS = 50_000_000
+"""Time in nanoseconds to wait for the reply to an SDO request."""
+_EMERGENCY_TIMEOUT_NS = 5_000_000
+"""Time in nanoseconds to wait for the emergency message of a drive in fault."""
 
 
 class Node:
-    """One connection to a drive that has been set up.
+    """Connection to the CANopen node of a drive that has been set up.
 
     Parameters
     ----------
     rig
         Parameters with the sections ``cia402`` and ``acquisition``.
     exchange
-        Started exchange; it delivers the drive's frames to the inbox.
+        Started exchange, which delivers the drive's frames to the inbox.
     frames, inbox
-        Frames to the drive, and what has come from it.
+        Prepared frames to the drive, and contents of the frames received from it.
 
     Attributes
     ----------
     pairing : ReplyPairing
-        Determines whether the last TPDO answers the last SYNC.
+        Pairing of TPDOs with SYNCs: distinguishes a late TPDO from the reply to the last SYNC.
     lock_step : bool
-        The drive is a simulated one whose time passes with the SYNCs: replies are waited for, and
-        nothing is paced.
+        Whether the drive is simulated and its time advances with each SYNC. The driver then waits
+        for every reply, and does not wait for the clock.
     sync_ns : int
-        ``time.monotonic_ns`` of the last SYNC.
+        Time in nanoseconds (``time.monotonic_ns``) at which the last SYNC was sent.
     now_ns : int
-        Time by which heartbeats go: that of the ticks, or in lock-step the drive's.
+        Time in nanoseconds that times the heartbeats: of the last tick, or in lock-step the
+        drive's own time.
     """
 
     def __init__(
@@ -230,95 +244,97 @@ class Node:
         self.period_ns = round(1e9 / rig.rate_hz)
         self.deadline_ns = round(rig.acquisition.deadline_us * 1000)
         self.lock_step = self.deadline_ns > self.period_ns
-        pauses = self.settings.sync_gaps and not self.lock_step
-        self.pairing = ReplyPairing(inbox, pauses=pauses)
+        may_pause = self.settings.sync_gaps and not self.lock_step
+        self.pairing = ReplyPairing(inbox, may_pause=may_pause)
         self.sync_ns = 0
         self.now_ns = 0
         self._reset_command = f"rigd reset --profile {rig.name}"
         self._heartbeat_ns = round(self.settings.heartbeat_period_s * 1e9)
-        self._next_heartbeat_ns = _LONG_AGO_NS
+        self._next_heartbeat_ns = _BEFORE_ANY_TIME_NS
 
-    def go_operational(self, *, beats: bool = True) -> None:
-        """Start the node and wait for the heartbeat that confirms it.
+    def go_operational(self, *, has_heartbeat: bool = True) -> None:
+        """Start the drive's CANopen node and wait for the heartbeat that confirms it.
 
         Parameters
         ----------
-        beats
-            The drive has a heartbeat; without one its first TPDO has to say it.
+        has_heartbeat
+            Whether the drive sends a heartbeat; if not, its first TPDO has to confirm the start.
 
         Raises
         ------
         DeviceError
-            If none comes.
+            If the drive's heartbeat does not confirm the start in time.
         """
         inbox = self.inbox
         inbox.nmt_state = None
         self.exchange.send(self.frames.start)
-        if not beats:
-            inbox.watching = True
+        if not has_heartbeat:
+            inbox.must_stay_operational = True
             return
         period_s = self.settings.drive_heartbeat_period_s
         if self.lock_step:
-            # Its time does not pass without SYNC, not even up to its next heartbeat.
-            turns = ceil(3 * period_s * self.rate_hz)
-            while not self._is_operational() and turns > 0 and self.sync():
-                turns -= 1
+            # Without SYNC the drive's time does not advance, not even to its next heartbeat.
+            syncs_left = ceil(3 * period_s * self.rate_hz)
+            while not self._is_operational() and syncs_left > 0 and self.sync():
+                syncs_left -= 1
         else:
-            patience_ns = _START_PATIENCE_NS + round(3e9 * period_s)
+            patience_ns = _START_TIMEOUT_NS + round(3e9 * period_s)
             self.exchange.wait_until(self._is_operational, time.monotonic_ns() + patience_ns)
         if not self._is_operational():
-            reported = (
+            heartbeat_text = (
                 "no heartbeat came"
                 if inbox.nmt_state is None
                 else f"its heartbeat says {inbox.nmt_state}"
             )
             raise DeviceError(
-                f"{self.name}: it does not become operational ({reported}, {OPERATIONAL} was "
+                f"{self.name}: it does not become operational ({heartbeat_text}, {OPERATIONAL} was "
                 "expected); check its own diagnosis."
             )
-        inbox.watching = True
+        inbox.must_stay_operational = True
 
     def await_first_reply(self) -> None:
-        """Send SYNC until it is answered within a period.
+        """Send SYNC repeatedly until the drive answers within a period.
 
         Raises
         ------
         DeviceError
-            If that does not succeed, or the drive is in fault.
+            If the drive does not answer within a period, or is in fault.
         """
-        best_ns = None
-        for _ in range(_FIRST_REPLIES):
-            if not self.sync(_FIRST_REPLY_NS):
+        shortest_delay_ns = None
+        for _ in range(_FIRST_REPLY_ATTEMPTS):
+            if not self.sync(_FIRST_REPLY_TIMEOUT_NS):
                 break
             delay_ns = time.monotonic_ns() - self.sync_ns
-            best_ns = delay_ns if best_ns is None else min(best_ns, delay_ns)
+            shortest_delay_ns = (
+                delay_ns if shortest_delay_ns is None else min(shortest_delay_ns, delay_ns)
+            )
             if delay_ns <= self.period_ns or self.lock_step:
-                self.refuse_alarm()
+                self.raise_if_alarmed()
                 return
-        if best_ns is None:
+        if shortest_delay_ns is None:
             raise DeviceError(
                 f"{self.name}: it does not answer SYNC with its TPDO, although it is operational; "
                 "check its own diagnosis."
             )
         raise DeviceError(
-            f"{self.name}: it answers SYNC only after {best_ns * 1e-6:.2g} ms, more than the "
-            f"period of {self.period_ns * 1e-6:g} ms; check bit rate and adapter, or choose a "
+            f"{self.name}: it answers SYNC only after {shortest_delay_ns * 1e-6:.2g} ms, more than "
+            f"the period of {self.period_ns * 1e-6:g} ms; check bit rate and adapter, or choose a "
             "lower rig.rate_hz."
         )
 
     def send_sync(self) -> None:
-        """Send SYNC; what came before it is not an answer to it."""
+        """Send SYNC; frames that have arrived before do not count as its reply."""
         self.exchange.drain()
-        self.pairing.ask()
+        self.pairing.register_request()
         self.sync_ns = time.monotonic_ns()
         self.exchange.send(self.frames.sync)
 
     def send_sync_or_pause(self) -> None:
-        """Send SYNC, or leave it out for a tick to see which reply is whose."""
-        if self.pairing.owed:
+        """Send SYNC, or omit it in this tick to find out if a missing reply is late or lost."""
+        if self.pairing.outstanding:
             self.exchange.drain()
-            if self.pairing.wants_pause():
-                self.pairing.pause()
+            if self.pairing.needs_pause():
+                self.pairing.register_pause()
                 return
         self.send_sync()
 
@@ -329,67 +345,73 @@ class Node:
             self._next_heartbeat_ns = self.now_ns + self._heartbeat_ns
 
     def resume(self) -> None:
-        """Resume the ticks after a gap: both heartbeats restart."""
-        self._next_heartbeat_ns = _LONG_AGO_NS
-        self.inbox.received = True
+        """Restart the timing of both heartbeats after a time without ticks."""
+        self._next_heartbeat_ns = _BEFORE_ANY_TIME_NS
+        self.inbox.heartbeat_received = True
 
     def await_reply(self, patience_ns: int = 0) -> bool:
-        """Wait for a TPDO: one period or as given, in lock-step for as long as it takes."""
+        """Wait for a TPDO for the given time or one period; return whether one has arrived.
+
+        In lock-step the waiting time is the deadline of the profile.
+        """
         patience_ns = self.deadline_ns if self.lock_step else patience_ns or self.period_ns
         return self.exchange.wait_until(self._is_answered, self.sync_ns + patience_ns)
 
     def sync(self, patience_ns: int = 0) -> bool:
-        """Send SYNC and return whether it was answered."""
+        """Send SYNC, wait for its reply, and return whether a reply has arrived in time."""
         self.send_sync()
         return self.await_reply(patience_ns)
 
     def sync_if_possible(self) -> bool:
-        """Send SYNC whatever the bus reports, and return whether it was answered; never raises."""
-        with self.exchange.regardless():
-            self.exchange.drain()  # what has come is not an answer
-            self.pairing.ask()
+        """Send SYNC despite bus errors, and return whether it was answered; never raises."""
+        with self.exchange.ignore_errors():
+            self.exchange.drain()  # frames that have already arrived are no reply to this SYNC
+            self.pairing.register_request()
             self.sync_ns = time.monotonic_ns()
             return self.send_if_possible(self.frames.sync) and self.await_reply()
 
-    def await_grid(self, grid_ns: int) -> None:
-        """Wait for the next SYNC as the ticks will go on: whole periods after `grid_ns`."""
+    def sleep_until_next_period(self, sync_grid_ns: int) -> None:
+        """Sleep until the next whole period after `sync_grid_ns`, when the next SYNC is due."""
         if self.lock_step:
             return
-        wait_ns = self.period_ns - (time.monotonic_ns() - grid_ns) % self.period_ns
+        wait_ns = self.period_ns - (time.monotonic_ns() - sync_grid_ns) % self.period_ns
         time.sleep(wait_ns * 1e-9)
 
     def write(self, request: bytes, index: int, sub: int) -> bool:
-        """Send an SDO request to write, and return whether it was confirmed in time."""
+        """Send an SDO write request, and return whether the drive confirmed it in time."""
         inbox = self.inbox
-        inbox.reply = b""
-        return self._ask_if_possible(request, lambda: is_written(inbox.reply, index, sub))
+        inbox.sdo_reply = b""
+        return self._request_if_possible(request, lambda: is_written(inbox.sdo_reply, index, sub))
 
     def is_off(self) -> bool:
-        """Ask the drive for its statusword by SDO, and return whether it shows the drive off."""
+        """Read the statusword by SDO, and return whether it shows that the drive has no torque."""
         inbox = self.inbox
-        inbox.reply = b""
-        self._ask_if_possible(
-            self.frames.ask_statusword, lambda: read_statusword(inbox.reply) is not None
+        inbox.sdo_reply = b""
+        self._request_if_possible(
+            self.frames.read_statusword_request,
+            lambda: read_statusword(inbox.sdo_reply) is not None,
         )
-        statusword = read_statusword(inbox.reply)
-        return statusword is not None and state_of(statusword) in OFF
+        statusword = read_statusword(inbox.sdo_reply)
+        return statusword is not None and drive_state(statusword) in TORQUE_FREE_STATES
 
     def send_if_possible(self, frame: bytes) -> bool:
-        """Send a frame, and return whether the bus has taken it; never raises."""
+        """Send a frame, and return whether the bus accepted it; never raises."""
         try:
             self.exchange.send(frame)
-        except Exception:  # an adapter's library may raise anything, and this is the way off
+        except Exception:  # an adapter's library may raise anything; switching off must continue
             return False
         return True
 
     def await_alarm(self) -> None:
-        """Wait briefly for the emergency message of a drive that has left operation."""
+        """Wait briefly for the emergency message of a drive that has left operation enabled."""
         inbox = self.inbox
         if not inbox.alarm:
-            self.exchange.wait_until(lambda: bool(inbox.alarm), time.monotonic_ns() + _REASON_NS)
+            self.exchange.wait_until(
+                lambda: bool(inbox.alarm), time.monotonic_ns() + _EMERGENCY_TIMEOUT_NS
+            )
 
-    def refuse_alarm(self) -> None:
-        """Raise if the drive has sent an emergency message, or is in fault.
+    def raise_if_alarmed(self) -> None:
+        """Raise if the drive has sent an emergency message, has left operational, or is in fault.
 
         Raises
         ------
@@ -397,33 +419,35 @@ class Node:
             With the reason.
         """
         inbox = self.inbox
-        in_fault = state_of(inbox.statusword) in (DriveState.FAULT, DriveState.FAULT_REACTION)
+        in_fault = drive_state(inbox.statusword) in (DriveState.FAULT, DriveState.FAULT_REACTION)
         if in_fault:
             self.await_alarm()
         if not (in_fault or inbox.alarm):
             return
         reason = inbox.alarm or (
-            f'{self.name}: it is in the state "{state_of(inbox.statusword).value}" (statusword '
+            f'{self.name}: it is in the state "{drive_state(inbox.statusword).value}" (statusword '
             f"0x{inbox.statusword:04X}) and names no cause."
         )
         if in_fault:
             reason += f" Remove the cause, then: {self._reset_command}"
-        elif inbox.emergency:
+        elif inbox.emergency_received:
             # The message may be from a drive that was off; one that was on reports its state later.
             reason += (
                 f" Remove the cause; if drive or daemon are in fault then: {self._reset_command}"
             )
         raise DeviceError(reason)
 
-    def _ask_if_possible(self, request: bytes, answered: Callable[[], bool]) -> bool:
-        """Send an SDO request whatever the bus reports; return whether the answer came in time."""
-        with self.exchange.regardless():
+    def _request_if_possible(self, request: bytes, is_reply_received: Callable[[], bool]) -> bool:
+        """Send an SDO request despite bus errors; return whether the reply came in time."""
+        with self.exchange.ignore_errors():
             return self.send_if_possible(request) and self.exchange.wait_until(
-                answered, time.monotonic_ns() + _WRITTEN_NS
+                is_reply_received, time.monotonic_ns() + _SDO_REPLY_TIMEOUT_NS
             )
 
     def _is_operational(self) -> bool:
+        """Return whether the drive's last heartbeat shows the NMT state operational."""
         return self.inbox.nmt_state == OPERATIONAL
 
     def _is_answered(self) -> bool:
+        """Return whether a TPDO has arrived since the last SYNC."""
         return self.inbox.replies > 0

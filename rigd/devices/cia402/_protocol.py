@@ -1,10 +1,11 @@
-"""CANopen and CiA 402 as the driver speaks them: states, frames and error codes.
+"""Protocol of a CiA 402 drive over CANopen: drive states, frames and error codes.
 
-`DriveState` follows from the statusword; a controlword leads from one state to the next.
+The statusword encodes the `DriveState`; controlwords command transitions between the states.
 
-`NodeFrames` holds the frames of one CANopen node, to send and to read; CANopen is little-endian.
-Identifiers are those of the predefined connection set (CiA 301). Frames are packed once, except for
-the torque. Indices of objects are in :mod:`rigd.devices.cia402.objects`.
+`NodeFrames` holds the frames to one CANopen node, and the CAN identifiers of the frames from it.
+CANopen is little-endian. Identifiers are those of the predefined connection set (CiA 301). Frames
+are packed once, except for the torque. Indices of objects are in
+:mod:`rigd.devices.cia402.objects`.
 """
 
 from enum import Enum
@@ -24,7 +25,7 @@ from rigd.devices.cia402.objects import (
 
 
 class DriveState(Enum):
-    """States of a drive, in the words of messages."""
+    """State of a CiA 402 drive; the value is its name in messages."""
 
     NOT_READY = "not ready to switch on"
     SWITCH_ON_DISABLED = "switch-on disabled"
@@ -38,23 +39,29 @@ class DriveState(Enum):
 
 
 DISABLE_VOLTAGE: Final = 0x00
+"""Controlword that switches the drive off."""
 SHUTDOWN: Final = 0x06
+"""Controlword that commands the drive to ready to switch on."""
 SWITCH_ON: Final = 0x07
+"""Controlword that commands the drive to switched on."""
 ENABLE_OPERATION: Final = 0x0F
+"""Controlword that commands the drive to operation enabled."""
 FAULT_RESET: Final = 0x80
-"""Controlwords. A fault is reset by the rise of its bit."""
+"""Controlword that resets a fault, by the rise of its bit 7."""
 
 FAULT_BIT: Final = 0x0008
-"""Set in fault and in fault reaction active."""
+"""Statusword bit that is set in the states fault and fault reaction active."""
 VOLTAGE_ENABLED: Final = 0x0010
-"""The power stage is supplied; STO takes it from most drives."""
+"""Statusword bit that is set while the power stage is supplied; STO cuts the supply of most
+drives."""
 FOLLOWS_TARGET: Final = 0x1000
-"""Bit 12 in cyclic synchronous torque mode: without it the drive ignores the target torque."""
+"""Statusword bit 12 in cyclic torque mode: without it the drive ignores the target torque."""
 STATE_BITS: Final = 0x006F
-ENABLED: Final = 0x0027
-"""Statusword in operation enabled, of its state bits."""
+"""Statusword bits that encode the drive's state."""
+OPERATION_ENABLED_BITS: Final = 0x0027
+"""Value of the statusword's state bits in operation enabled."""
 
-_TABLE: Final = (
+_STATE_CODES: Final = (
     (0x4F, 0x00, DriveState.NOT_READY),
     (0x4F, 0x40, DriveState.SWITCH_ON_DISABLED),
     (0x6F, 0x21, DriveState.READY),
@@ -64,9 +71,10 @@ _TABLE: Final = (
     (0x4F, 0x0F, DriveState.FAULT_REACTION),
     (0x4F, 0x08, DriveState.FAULT),
 )
+"""Drive state by the value of masked statusword bits: mask, value, state."""
 
 
-OFF: Final = (
+TORQUE_FREE_STATES: Final = (
     DriveState.NOT_READY,
     DriveState.SWITCH_ON_DISABLED,
     DriveState.READY,
@@ -76,9 +84,9 @@ OFF: Final = (
 """States in which the motor exerts no torque."""
 
 
-def state_of(statusword: int) -> DriveState:
-    """Return the state that a statusword encodes."""
-    for mask, value, state in _TABLE:
+def drive_state(statusword: int) -> DriveState:
+    """Return the drive state that a statusword encodes."""
+    for mask, value, state in _STATE_CODES:
         if statusword & mask == value:
             return state
     return DriveState.UNKNOWN
@@ -87,41 +95,57 @@ def state_of(statusword: int) -> DriveState:
 # Frames
 
 NMT_START: Final = 0x01
+"""NMT command that brings a node to operational."""
 NMT_STOP: Final = 0x02
+"""NMT command that stops a node."""
 NMT_PRE_OPERATIONAL: Final = 0x80
+"""NMT command that brings a node to pre-operational."""
 
 BOOT_UP: Final = 0x00
+"""NMT state in the first heartbeat after the start of a node."""
 STOPPED: Final = 0x04
+"""NMT state of a stopped node, in its heartbeat."""
 OPERATIONAL: Final = 0x05
+"""NMT state of an operational node, in its heartbeat."""
 PRE_OPERATIONAL: Final = 0x7F
+"""NMT state of a pre-operational node, in its heartbeat."""
 NMT_STATES: Final = {
     BOOT_UP: "starting up",
     STOPPED: "stopped",
     OPERATIONAL: "operational",
     PRE_OPERATIONAL: "pre-operational",
 }
-"""Contents of a heartbeat."""
+"""Names of the NMT states in messages, by the value in a heartbeat."""
 
 unpack_tpdo = Struct("<Hih").unpack
-"""Statusword, position in counts, torque in 1/1000 of the rated one; ``struct.error`` if the
-length is not 8."""
-unpack_short_tpdo = Struct("<Hi").unpack
-"""The same for a drive that does not report its torque."""
-_unpack_emergency = Struct("<HB").unpack_from
-_pack_rpdo = Struct("<Hh4x").pack
-_pack_sdo = Struct("<BHBI").pack
-_unpack_sdo = Struct("<BHB4s").unpack
+"""Unpack a TPDO: statusword, position in counts, torque in 1/1000 of the rated torque.
 
-_SDO_UPLOAD: Final = 0x40
-_SDO_DOWNLOAD_2: Final = 0x2B
-_SDO_DOWNLOAD_4: Final = 0x23
-_SDO_WRITTEN: Final = 0x60
-_SDO_READ: Final = 0x40
-"""Upper three bits of an upload's answer."""
+Raises ``struct.error`` if the length is not 8 bytes."""
+unpack_short_tpdo = Struct("<Hi").unpack
+"""Unpack the TPDO of a drive that does not report its torque: statusword, position in counts."""
+_unpack_emergency = Struct("<HB").unpack_from
+"""Unpack error code and error register from the beginning of an emergency message."""
+_pack_rpdo = Struct("<Hh4x").pack
+"""Pack controlword and target torque into the data half of a raw CAN frame."""
+_pack_sdo = Struct("<BHBI").pack
+"""Pack an expedited SDO request: command, index, sub-index, value."""
+_unpack_sdo = Struct("<BHB4s").unpack
+"""Unpack an expedited SDO reply: command, index, sub-index, data."""
+
+_SDO_READ_COMMAND: Final = 0x40
+"""Command byte of an SDO request to read an object."""
+_SDO_WRITE_2_BYTES_COMMAND: Final = 0x2B
+"""Command byte of an SDO request to write 2 bytes."""
+_SDO_WRITE_4_BYTES_COMMAND: Final = 0x23
+"""Command byte of an SDO request to write 4 bytes."""
+_SDO_WRITE_REPLY: Final = 0x60
+"""Command byte of the SDO reply that confirms a write request."""
+_SDO_READ_REPLY: Final = 0x40
+"""Upper three bits of the command byte in the SDO reply to a read request."""
 
 
 class NodeFrames:
-    """Everything that is sent to one drive, as 16 bytes each.
+    """Prepared CAN frames to one drive (16 bytes each), and identifiers of the drive's frames.
 
     Parameters
     ----------
@@ -133,13 +157,14 @@ class NodeFrames:
     Attributes
     ----------
     sync, heartbeat
-        SYNC without counter; heartbeat of this computer, operational.
+        SYNC without counter; heartbeat of this computer in the NMT state operational.
     start, stop, pre_operational
-        NMT commands.
-    disable_voltage, forget_heartbeat, ask_mode, ask_statusword
-        SDO requests: 6040 = 0; 1016:1 = 0, no more heartbeat expected; read 6061; read 6041.
+        NMT commands to the drive.
+    disable_voltage, end_heartbeat_monitoring, read_mode_request, read_statusword_request
+        SDO requests: write controlword 0; end the monitoring of this computer's heartbeat (1016:1 =
+        0); read the mode (6061); read the statusword (6041).
     tpdo_id, rpdo_id, emergency_id, heartbeat_id, reply_id
-        Identifiers of the drive's frames.
+        CAN identifiers of the drive's PDOs, emergency messages, heartbeats and SDO replies.
     """
 
     def __init__(self, node_id: int, host_node_id: int) -> None:
@@ -154,21 +179,30 @@ class NodeFrames:
         self.start = pack_frame(0, bytes([NMT_START, node_id]))
         self.stop = pack_frame(0, bytes([NMT_STOP, node_id]))
         self.pre_operational = pack_frame(0, bytes([NMT_PRE_OPERATIONAL, node_id]))
-        self.disable_voltage = pack_frame(request_id, _pack_sdo(_SDO_DOWNLOAD_2, CONTROLWORD, 0, 0))
-        self.forget_heartbeat = pack_frame(
-            request_id, _pack_sdo(_SDO_DOWNLOAD_4, HEARTBEAT_CONSUMER, 1, 0)
+        self.disable_voltage = pack_frame(
+            request_id, _pack_sdo(_SDO_WRITE_2_BYTES_COMMAND, CONTROLWORD, 0, 0)
         )
-        self.ask_mode = pack_frame(request_id, _pack_sdo(_SDO_UPLOAD, MODE_DISPLAY, 0, 0))
-        self.ask_statusword = pack_frame(request_id, _pack_sdo(_SDO_UPLOAD, STATUSWORD, 0, 0))
-        self._rpdo_head = pack_frame(self.rpdo_id, bytes(4))[: FRAME_SIZE // 2]
+        self.end_heartbeat_monitoring = pack_frame(
+            request_id, _pack_sdo(_SDO_WRITE_4_BYTES_COMMAND, HEARTBEAT_CONSUMER, 1, 0)
+        )
+        self.read_mode_request = pack_frame(
+            request_id, _pack_sdo(_SDO_READ_COMMAND, MODE_DISPLAY, 0, 0)
+        )
+        self.read_statusword_request = pack_frame(
+            request_id, _pack_sdo(_SDO_READ_COMMAND, STATUSWORD, 0, 0)
+        )
+        self._rpdo_header = pack_frame(self.rpdo_id, bytes(4))[: FRAME_SIZE // 2]
 
     def rpdo(self, controlword: int, torque_per_mille: int) -> bytes:
-        """Return the RPDO with controlword and torque in 1/1000 of the rated one (i16)."""
-        return self._rpdo_head + _pack_rpdo(controlword, torque_per_mille)
+        """Return the RPDO frame with controlword and torque in 1/1000 of the rated torque (i16)."""
+        return self._rpdo_header + _pack_rpdo(controlword, torque_per_mille)
 
 
 def read_emergency(data: bytes) -> tuple[int, int, bytes] | None:
-    """Return error code, error register and the vendor's bytes, or None if it is too short."""
+    """Return error code, error register and vendor's bytes of an emergency message, or None.
+
+    The result is None if the message is too short.
+    """
     if len(data) < 3:
         return None
     code, register = _unpack_emergency(data)
@@ -176,35 +210,36 @@ def read_emergency(data: bytes) -> tuple[int, int, bytes] | None:
 
 
 def is_written(data: bytes, index: int, sub: int) -> bool:
-    """Whether an SDO reply says that an object was written."""
-    return len(data) == 8 and _unpack_sdo(data)[:3] == (_SDO_WRITTEN, index, sub)
+    """Return whether an SDO reply confirms that an object was written."""
+    return len(data) == 8 and _unpack_sdo(data)[:3] == (_SDO_WRITE_REPLY, index, sub)
 
 
 def read_mode(data: bytes) -> int | None:
-    """Return the mode of operation in an SDO reply, or None if it is not one of 6061."""
-    value = _read(data, MODE_DISPLAY)
+    """Return the mode of operation in an SDO reply, or None if the reply is not for object 6061."""
+    value = _read_reply_data(data, MODE_DISPLAY)
     return None if value is None else int.from_bytes(value[:1], "little", signed=True)
 
 
 def read_statusword(data: bytes) -> int | None:
-    """Return the statusword in an SDO reply, or None if it is not one of 6041."""
-    value = _read(data, STATUSWORD)
+    """Return the statusword in an SDO reply, or None if the reply is not for object 6041."""
+    value = _read_reply_data(data, STATUSWORD)
     return None if value is None else int.from_bytes(value[:2], "little")
 
 
-def _read(data: bytes, wanted: int) -> bytes | None:
+def _read_reply_data(data: bytes, expected_index: int) -> bytes | None:
+    """Return the data of an SDO reply to a read request, or None if it is for another object."""
     if len(data) != 8:
         return None
     command, index, sub, value = _unpack_sdo(data)
-    if (index, sub) != (wanted, 0) or command & 0xE0 != _SDO_READ:
+    if (index, sub) != (expected_index, 0) or command & 0xE0 != _SDO_READ_REPLY:
         return None
     return bytes(value)
 
 
 # Error codes
 
-# Most digits first. Classes: CiA 301; single codes: those on which vendors' manuals agree.
-_WORDS: Final = (
+# Specific codes precede classes. Classes: CiA 301; codes: those on which vendors' manuals agree.
+_ERROR_MEANINGS: Final = (
     (0xFFFF, 0x3210, "over-voltage in the DC link"),
     (0xFFFF, 0x3220, "under-voltage in the DC link"),
     (0xFFFF, 0x4210, "the device is too hot"),
@@ -243,11 +278,12 @@ _WORDS: Final = (
     (0xFF00, 0xFF00, "particular to the device: see its manual"),
     (0xF000, 0xF000, "additional function"),
 )
+"""Meanings of error codes: mask, masked value, meaning; the most specific masks come first."""
 
 
 def describe_error(code: int) -> str:
-    """Return an error code of 16 bits in words, with the code."""
-    for mask, value, words in _WORDS:
+    """Describe a 16-bit CiA 402 error code in words, followed by the code."""
+    for mask, value, meaning in _ERROR_MEANINGS:
         if code & mask == value:
-            return f"{words} (error code 0x{code:04X})"
+            return f"{meaning} (error code 0x{code:04X})"
     return f"error code 0x{code:04X}"

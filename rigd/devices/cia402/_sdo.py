@@ -1,8 +1,8 @@
-"""SDO access to the drive's objects, while no cycle runs.
+"""Read and write the drive's objects by SDO, while the control loop does not run.
 
-The canopen library does the transfers, with a thread that receives; both end with the context. An
-object's type is taken from the drive's EDS file where the profile names one, else from
-``drive.eds`` in this folder.
+The canopen library transfers the values and starts a thread that receives; both end with the
+context. An object's data type is taken from the drive's EDS file if the profile names one, else
+from ``drive.eds`` in this folder.
 """
 
 import logging
@@ -34,34 +34,44 @@ from rigd.devices.contracts import DeviceError
 from rigd.devices.eds import EdsError, read_eds
 
 EVERY_BIT = 0xFFFF_FFFF
-"""Mask of an object all of whose bits count."""
+"""Mask that selects all 32 bits of an object's value."""
 
-_EDS = Path(__file__).with_name("drive.eds")
+_DEFAULT_EDS_PATH = Path(__file__).with_name("drive.eds")
+"""EDS file with the data types of the objects that the driver uses."""
 _SDO_TIMEOUT_S = 0.5
-_SDO_TRIES = 2
+"""Time in seconds to wait for the reply to one SDO request."""
+_SDO_ATTEMPTS = 2
+"""Number of attempts of one SDO transfer."""
 _HURRIED_TIMEOUT_S = 0.05
-_LATE_REPLIES = 3
-"""Number of replies to earlier, abandoned requests that may come instead of the awaited one."""
-_QUIET_S = 0.25
-"""So long nothing comes once all replies to abandoned requests have."""
-_TIMED_OUT = "No SDO response"
+"""Time in seconds to wait for an SDO reply while the torque has to be switched off quickly."""
+_MOST_LATE_REPLIES = 3
+"""Most replies to earlier, abandoned requests that may arrive before the awaited reply."""
+_LATE_REPLY_SILENCE_S = 0.25
+"""Silence in seconds after which all replies to abandoned requests have arrived."""
+_TIMEOUT_MESSAGE_START = "No SDO response"
 """Beginning of canopen's message if no reply came; any other message means a wrong reply."""
 _RECEIVER_POLL_S = 0.02
-_ABSENT = {
+"""Interval in seconds at which canopen's receiving thread checks whether it has to end."""
+_ABSENT_OBJECT_ABORTS = {
     0x0602_0000: "no such object",
     0x0609_0011: "no such sub-index",
     0x060A_0023: "nothing behind it",
     0x0800_0024: "it has no value",
-    # What firmware says that knows no better of an object which it has not.
+    # Codes that simple firmware sends for objects that it does not have.
     0x0800_0000: "general error",
     0x0504_0001: "unknown command",
     0x0601_0000: "unsupported access",
 }
-"""SDO abort codes by which an object that is read, or written after that, counts as absent. A state
-in which it cannot be accessed (0x08000022) and an access in the wrong direction do not."""
-_WRITE_ONLY = 0x0601_0001
-_WRONG_LENGTHS = (0x0607_0010, 0x0607_0012, 0x0607_0013)
-_KINDS = {
+"""SDO abort codes that mean that the drive has no such object, with their meanings.
+
+They count when the object is read, or written after reading failed. Codes of a state in which
+the object cannot be accessed (0x08000022) and of an access in the wrong direction are not among
+them."""
+_WRITE_ONLY_ABORT = 0x0601_0001
+"""SDO abort code for reading a write-only object."""
+_WRONG_LENGTH_ABORTS = (0x0607_0010, 0x0607_0012, 0x0607_0013)
+"""SDO abort codes for a value whose length does not match the object's data type."""
+_DATA_TYPES = {
     "u8": datatypes.UNSIGNED8,
     "u16": datatypes.UNSIGNED16,
     "u32": datatypes.UNSIGNED32,
@@ -69,10 +79,11 @@ _KINDS = {
     "i16": datatypes.INTEGER16,
     "i32": datatypes.INTEGER32,
 }
+"""CANopen data type by the name of the integer type in a profile (``cia402.set_objects``)."""
 
 
 class SdoRefusal(DeviceError):
-    """The drive refused to read or write an object; carries the abort code."""
+    """Error: the drive refused to read or write an object; `code` is the SDO abort code."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -81,16 +92,16 @@ class SdoRefusal(DeviceError):
     @property
     def is_absent(self) -> bool:
         """Whether the abort code means that the drive has no such object."""
-        return self.code in _ABSENT
+        return self.code in _ABSENT_OBJECT_ABORTS
 
     @property
     def is_write_only(self) -> bool:
-        """Whether the object exists and cannot be read."""
-        return self.code == _WRITE_ONLY
+        """Whether the abort code means that the object exists but can only be written."""
+        return self.code == _WRITE_ONLY_ABORT
 
 
 class ValueNotStored(DeviceError):
-    """The drive accepted a value but reads back another one, which this error carries."""
+    """Error: an object reads another value than was written to it; `got` is the value read."""
 
     def __init__(self, message: str, got: int) -> None:
         super().__init__(message)
@@ -98,18 +109,20 @@ class ValueNotStored(DeviceError):
 
 
 class _Receiver(MessageListener):
-    """Receiver of canopen that reports no error from its thread when the bus is disconnected.
+    """Frame listener for canopen that ignores bus errors in its thread.
+
+    The next SDO request fails and reports the bus error to the caller.
 
     The next request reports the failure.
     """
 
     def on_error(self, exc: Exception) -> None:  # noqa: ARG002
-        """Let the thread continue until the network ends it."""
+        """Ignore a bus error, so that the receiving thread goes on until the network ends it."""
         time.sleep(_RECEIVER_POLL_S)
 
 
 class SdoAccess:
-    """Reading and writing of one drive's objects, as a context.
+    """Context manager that reads and writes one drive's objects by SDO.
 
     Parameters
     ----------
@@ -123,15 +136,15 @@ class SdoAccess:
 
     def __init__(self, port: CanPort, node_id: int, name: str) -> None:
         for library in ("can", "canopen"):
-            # What goes wrong is raised; without a handler they would also print it.
+            # Errors are raised; without a handler these libraries would print them, too.
             logging.getLogger(library).addHandler(logging.NullHandler())
         self._name = name
         self._bus_name = port.name
         self._node_id = node_id
-        self._node = canopen.RemoteNode(node_id, canopen.import_od(str(_EDS), node_id))
+        self._node = canopen.RemoteNode(node_id, canopen.import_od(str(_DEFAULT_EDS_PATH), node_id))
         self._node.sdo.RESPONSE_TIMEOUT = _SDO_TIMEOUT_S
-        self._node.sdo.MAX_RETRIES = _SDO_TRIES
-        port.accept(None)  # a sensor on the same bus may have narrowed it to its own frames
+        self._node.sdo.MAX_RETRIES = _SDO_ATTEMPTS
+        port.accept(None)  # a sensor on the same bus may have restricted it to its own frames
         self._network = canopen.Network(port.open_bus())
         self._network.NOTIFIER_CYCLE = _RECEIVER_POLL_S
         self._network.listeners = [_Receiver(self._network)]
@@ -143,21 +156,21 @@ class SdoAccess:
 
     def __exit__(
         self,
-        kind: type[BaseException] | None,
+        error_type: type[BaseException] | None,
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        # It reports a cut bus once more, when everything has ended.
+        # If the bus was cut, disconnecting reports that error again; nobody needs it any more.
         with suppress(Exception):
             self._network.disconnect()
 
-    def to_pre_operational(self) -> None:
-        """Bring the drive to pre-operational, and verify that it answers.
+    def enter_pre_operational(self) -> None:
+        """Command the drive to the NMT state pre-operational, and check that it answers.
 
         Raises
         ------
         DeviceError
-            If it does not.
+            If the drive does not answer.
         """
         self.request_pre_operational()
         try:
@@ -171,20 +184,20 @@ class SdoAccess:
                 f"{error} Check its supply, its node id (cia402.node_id) and bit rate{received}."
             ) from None
 
-    def use_eds(self, path: str) -> tuple[int, int]:
-        """Take objects' types from the drive's EDS file from now on.
+    def load_eds(self, path: str) -> tuple[int, int]:
+        """Load the data types of the objects from the drive's EDS file, and return its identity.
 
         Returns
         -------
         tuple of int
-            Vendor and product number in it; 0 where it states none.
+            Vendor and product number in the file; 0 for a number that it does not state.
 
         Raises
         ------
         DeviceError
-            If it cannot be read.
+            If the file cannot be read.
         """
-        return _take_types(self._node.object_dictionary, path, self._node_id)
+        return _load_integer_types(self._node.object_dictionary, path, self._node_id)
 
     def request_pre_operational(self) -> None:
         """Command the drive to pre-operational without waiting; the drive may ignore the command.
@@ -202,18 +215,18 @@ class SdoAccess:
             ) from None
 
     @contextmanager
-    def hurried(self) -> Iterator[None]:
-        """Allow each transfer one attempt of 50 ms, as needed to switch the torque off."""
+    def short_timeouts(self) -> Iterator[None]:
+        """Allow each SDO transfer in this context one attempt of 50 ms, to switch off quickly."""
         client = self._node.sdo
-        before = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
+        previous_settings = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
         client.RESPONSE_TIMEOUT, client.MAX_RETRIES = _HURRIED_TIMEOUT_S, 1
         try:
             yield
         finally:
-            client.RESPONSE_TIMEOUT, client.MAX_RETRIES = before
+            client.RESPONSE_TIMEOUT, client.MAX_RETRIES = previous_settings
 
     def read(self, index: int, sub: int = 0) -> int:
-        """Return the value of an object.
+        """Read an object by SDO and return its integer value.
 
         Raises
         ------
@@ -222,11 +235,11 @@ class SdoAccess:
         """
         value = self._transfer(index, sub, None)
         if not isinstance(value, int):
-            raise DeviceError(f"{self._name}: {self._title(index, sub)} is not a number.")
+            raise DeviceError(f"{self._name}: {self._object_name(index, sub)} is not a number.")
         return value
 
-    def read_if_there(self, index: int, sub: int = 0) -> int | None:
-        """Return the value of an object, or None where the drive has no such object.
+    def read_or_none(self, index: int, sub: int = 0) -> int | None:
+        """Read an object by SDO and return its value, or None if the drive has no such object.
 
         Raises
         ------
@@ -241,14 +254,14 @@ class SdoAccess:
             raise
 
     def read_text(self, index: int) -> str:
-        """Return a text, empty if the drive has none; as :meth:`read` otherwise."""
+        """Read a text object by SDO; return an empty text if the drive refuses to read it."""
         try:
             return str(self._transfer(index, 0, None)).strip("\0 ")
         except SdoRefusal:
             return ""
 
     def write(self, index: int, sub: int, value: int) -> None:
-        """Write an object without reading it back.
+        """Write an object by SDO without reading it back.
 
         Raises
         ------
@@ -258,7 +271,7 @@ class SdoAccess:
         self._transfer(index, sub, value)
 
     def configure(self, index: int, sub: int, value: int, mask: int = EVERY_BIT) -> None:
-        """Write an object and read it back.
+        """Write an object by SDO, read it back, and raise if the values differ.
 
         Raises
         ------
@@ -270,57 +283,63 @@ class SdoAccess:
         got = self.read(index, sub)
         if (got ^ value) & mask:
             raise ValueNotStored(
-                f"{self._name}: {self._title(index, sub)} was set to {show_value(value)} and reads "
-                f"{show_value(got)}; check with the drive's own tool why it does not keep it.",
+                f"{self._name}: {self._object_name(index, sub)} was set to {show_value(value)} "
+                f"and reads {show_value(got)}; check with the drive's own tool why it does not "
+                "keep it.",
                 got,
             )
 
     def assign(self, assignment: Assignment) -> None:
-        """Write a manufacturer-specific object and read it back; raises as :meth:`configure`."""
+        """Write a manufacturer-specific object of the profile and read it back.
+
+        Raises the same errors as :meth:`configure`.
+        """
         index, sub = assignment.index, assignment.sub
         variable = self._variable(index, sub)
-        variable.data_type = _KINDS[assignment.kind]
+        variable.data_type = _DATA_TYPES[assignment.integer_type]
         self.configure(index, sub, assignment.value)
 
     def last_emergency(self) -> int:
-        """Return the code of the last emergency message received, or 0."""
+        """Return the error code of the drive's last emergency message, or 0 if there was none."""
         log = self._node.emcy.log
         return log[-1].code if log else 0
 
     def _transfer(self, index: int, sub: int, value: int | None) -> object:
-        """Write a value, or read one."""
+        """Write `value` to an object, or read the object if `value` is None; return the value."""
         variable = SdoVariable(self._node.sdo, self._variable(index, sub))
-        what = "reading" if value is None else f"writing {show_value(value)} to"
+        action_text = "reading" if value is None else f"writing {show_value(value)} to"
         try:
-            return _ask(self._node.sdo, variable, value)
+            return _transfer_skipping_late_replies(self._node.sdo, variable, value)
         except canopen.SdoAbortedError as error:
             remedy = (
                 " Name the drive's EDS file in the profile (cia402.eds), which has its types."
-                if error.code in _WRONG_LENGTHS
+                if error.code in _WRONG_LENGTH_ABORTS
                 else ""
             )
             raise SdoRefusal(
-                f"{self._name}: it refuses {what} {self._title(index, sub)}: {error}.{remedy}",
+                f"{self._name}: it refuses {action_text} {self._object_name(index, sub)}: {error}."
+                f"{remedy}",
                 error.code,
             ) from None
         except (canopen.SdoCommunicationError, can.CanError, OSError):
             raise DeviceError(
-                f"{self._name}: no answer on CAN bus {self._bus_name} to {what} "
-                f"{self._title(index, sub)}."
+                f"{self._name}: no answer on CAN bus {self._bus_name} to {action_text} "
+                f"{self._object_name(index, sub)}."
             ) from None
         except (ObjectDictionaryError, ValueError) as error:
             raise DeviceError(
-                f"{self._name}: unusable answer to {what} {self._title(index, sub)} ({error})."
+                f"{self._name}: unusable answer to {action_text} {self._object_name(index, sub)} "
+                f"({error})."
             ) from None
 
     def _variable(self, index: int, sub: int) -> ODVariable:
-        """Return the entry of an object in the dictionary, made where it has none."""
+        """Return the dictionary entry of an object; create the entry if the dictionary has none."""
         dictionary = self._node.object_dictionary
-        known = dictionary.get_variable(index, sub)
-        if known is not None:
-            return known
+        variable_or_none = dictionary.get_variable(index, sub)
+        if variable_or_none is not None:
+            return variable_or_none
         variable = ODVariable("", index, sub)
-        variable.data_type = _KINDS[_kind_of_parameter(index, sub)]
+        variable.data_type = _DATA_TYPES[_communication_parameter_type(index, sub)]
         if index not in dictionary:
             dictionary.add_object(ODRecord(f"{index:04X}", index))
         record = dictionary[index]
@@ -329,68 +348,73 @@ class SdoAccess:
         record.add_member(variable)
         return variable
 
-    def _title(self, index: int, sub: int) -> str:
+    def _object_name(self, index: int, sub: int) -> str:
+        """Return index, sub-index and name of an object for messages."""
         name = self._variable(index, sub).name
         address = f"{index:04X}:{sub}" if sub else f"{index:04X}"
         return f"object {address}" + (f" ({name})" if name else "")
 
 
-def _ask(client: SdoClient, variable: SdoVariable, value: int | None) -> object:
-    """Read or write a value; skip late replies to abandoned requests."""
-    for left in reversed(range(_LATE_REPLIES + 1)):
+def _transfer_skipping_late_replies(
+    client: SdoClient, variable: SdoVariable, value: int | None
+) -> object:
+    """Read or write a value by SDO, and skip late replies to abandoned requests."""
+    for attempts_left in reversed(range(_MOST_LATE_REPLIES + 1)):
         try:
             if value is None:
                 return variable.raw
             variable.raw = value
             return value
         except canopen.SdoCommunicationError as error:
-            if not left or str(error).startswith(_TIMED_OUT):
+            if not attempts_left or str(error).startswith(_TIMEOUT_MESSAGE_START):
                 raise
-            # That to this request is still to come: it would be taken for that to the next one.
-            _let_pass(client)
+            # The reply to this request is still to come: it would be taken for the reply to the
+            # next request.
+            _discard_late_replies(client)
     raise AssertionError
 
 
-def _let_pass(client: SdoClient) -> None:
-    """Discard replies until no more arrive."""
-    patience_s = min(_QUIET_S, client.RESPONSE_TIMEOUT)
+def _discard_late_replies(client: SdoClient) -> None:
+    """Discard late SDO replies until none arrives for a while."""
+    patience_s = min(_LATE_REPLY_SILENCE_S, client.RESPONSE_TIMEOUT)
     with suppress(queue.Empty):
         while True:
             client.responses.get(timeout=patience_s)
 
 
-def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int]:
-    """Take the types of whole numbers from a drive's EDS file; return its identity."""
+def _load_integer_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int]:
+    """Copy integer data types from a drive's EDS file into `own`; return the drive's identity."""
     try:
-        theirs = read_eds(Path(eds), node_id)
+        drive_eds = read_eds(Path(eds), node_id)
     except EdsError as error:
         raise DeviceError(
             f"{error} Get it again from the manufacturer, or remove cia402.eds from the profile."
         ) from None
     for address in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
-        entry, mine = theirs.get(*address), own.get_variable(*address)
+        entry, own_entry = drive_eds.get(*address), own.get_variable(*address)
         if (
             entry is not None
-            and mine is not None
-            and {entry.data_type, mine.data_type} <= set(datatypes.INTEGER_TYPES)
+            and own_entry is not None
+            and {entry.data_type, own_entry.data_type} <= set(datatypes.INTEGER_TYPES)
         ):
-            mine.data_type = entry.data_type
-    return theirs.vendor_id, theirs.product_code
+            own_entry.data_type = entry.data_type
+    return drive_eds.vendor_id, drive_eds.product_code
 
 
 def _variables(entry: object) -> list[ODVariable]:
+    """Return the variables of a dictionary entry: the entry itself, or its sub-entries."""
     return [entry] if isinstance(entry, ODVariable) else list(entry.values())  # type: ignore[attr-defined]
 
 
-def _kind_of_parameter(index: int, sub: int) -> str:
-    """Return the type of a PDO's parameter or of a heartbeat consumer, by CiA 301."""
+def _communication_parameter_type(index: int, sub: int) -> str:
+    """Return the integer type by CiA 301 of a PDO's parameter or of a heartbeat consumer."""
     if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
         return {0: "u8", 1: "u32", 2: "u8"}.get(sub, "u16")
     return "u32" if sub else "u8"
 
 
 def show_value(value: object) -> str:
-    """Return a value as messages show it: large numbers in hexadecimal."""
+    """Format a value for messages: large numbers in hexadecimal."""
     if isinstance(value, int) and not -65536 < value < 65536:
         return f"0x{value:08X}"
     return str(value)

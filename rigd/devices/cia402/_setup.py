@@ -1,8 +1,8 @@
-"""Set-up of the drive, in pre-operational, before the cycle starts.
+"""Verification and configuration of the drive, in pre-operational, before the loop starts.
 
 The requirements are in :mod:`rigd.devices.cia402.requirements`. An object that holds the required
-value is not written, because it may be read-only; its row there decides what follows if it is
-absent or cannot be changed.
+value is not written, because it may be read-only. If an object is absent or cannot be changed, its
+requirement decides whether the drive is refused.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,12 @@ from rigd.devices.canbus.port import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402._assignments import parse_assignment
 from rigd.devices.cia402._sdo import EVERY_BIT, SdoAccess, SdoRefusal, ValueNotStored, show_value
-from rigd.devices.cia402._standing import command_off, require_off, still_on, wait_for
+from rigd.devices.cia402._standing import (
+    command_off,
+    describe_remaining_torque,
+    wait_for,
+    wait_until_disabled,
+)
 from rigd.devices.cia402.requirements import (
     MAY_BE_WRITE_ONLY,
     TORQUE_LIMIT,
@@ -20,17 +25,18 @@ from rigd.devices.cia402.requirements import (
     ObjectAccess,
     Requirement,
     Watchdog,
+    required_values,
     requirement,
-    wanted_values,
     watchdog,
 )
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters, ServoDrive
 
-_READ_ONLY = 0x0601_0002
-_ABORTS = {
+_READ_ONLY_ABORT = 0x0601_0002
+"""SDO abort code for writing a read-only object."""
+_ABORT_MEANINGS = {
     0x0601_0000: "unsupported access",
-    _READ_ONLY: "read-only",
+    _READ_ONLY_ABORT: "read-only",
     0x0602_0000: "no such object",
     0x0604_0041: "it cannot be mapped",
     0x0604_0042: "the PDO gets too long",
@@ -41,13 +47,17 @@ _ABORTS = {
     0x0800_0000: "general error",
     0x0800_0022: "not in this state of the device",
 }
-"""SDO abort codes in short."""
+"""Short meanings of SDO abort codes, for messages."""
 
-_MODE_PATIENCE_S = 0.3
+_MODE_TIMEOUT_S = 0.3
+"""Time in seconds to wait until the drive shows the commanded mode of operation."""
 _RATED_TORQUE_TOLERANCE = 0.02
+"""Largest difference, relative, between the rated torques of the drive and of the profile."""
 _SCALE_TOLERANCE = 0.02
-_DUPLICATE_WATCHES = 127
-"""Most entries that 1016 can have."""
+"""Largest difference, relative, between gear ratio or encoder step of the drive and of the
+profile."""
+_MOST_HEARTBEAT_CONSUMERS = 127
+"""Largest number of heartbeat consumer entries in object 1016."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +69,10 @@ class DriveCapabilities:
     identity
         Identity that the drive reports.
     watchdog, watchdog_s
-        What takes the torque off when this computer falls silent, and after how long; infinite
-        where nothing does.
+        Watchdog that removes the torque if this computer stops communicating, and its timeout in
+        seconds, which is infinite if there is no watchdog.
     lacks
-        Rows of the objects that are absent or not usable.
+        Requirements on objects that the drive lacks or that are not usable.
     assigned
         Manufacturer-specific objects that the profile has set.
     """
@@ -74,7 +84,7 @@ class DriveCapabilities:
     assigned: tuple[str, ...]
 
     def has(self, index: int, sub: int = 0) -> bool:
-        """Whether the drive has an object of the table.
+        """Return whether the drive has a usable object of the table of requirements.
 
         Parameters
         ----------
@@ -85,15 +95,15 @@ class DriveCapabilities:
 
     @property
     def accepted(self) -> tuple[str, ...]:
-        """Names under which the profile accepted that something is missing, where it is."""
+        """Names in ``cia402.accept_without`` of functions that this drive indeed lacks."""
         names = [each.accept for each in self.lacks if each.accept and each.accept != WATCHDOG]
         if self.watchdog is Watchdog.NONE:
             names.insert(0, WATCHDOG)
         return tuple(names)
 
 
-def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
-    """Verify and configure the drive; it stays pre-operational and disabled.
+def set_up_drive(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
+    """Verify and configure the drive by SDO; the drive stays pre-operational and disabled.
 
     Parameters
     ----------
@@ -112,74 +122,76 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
     Raises
     ------
     DeviceError
-        If it does not answer, is not the drive of the profile, is in fault, lacks a required
+        If the drive does not answer, is not the one of the profile, is in fault, lacks a required
         object, or rejects the configuration.
     """
     settings = rig.cia402
     assert settings is not None
-    wanted = wanted_values(rig)
+    required = required_values(rig)
     with SdoAccess(port, settings.node_id, name) as sdo:
-        # First of all, before its identity is known: a killed session may have left it turning.
+        # First, before the identity is known: a killed session may have left the motor turning.
         command_off(sdo)
-        sdo.to_pre_operational()
+        sdo.enter_pre_operational()
         command_off(sdo)
         identity = _read_identity(sdo)
         try:
-            eds_identity = sdo.use_eds(settings.eds) if settings.eds else (0, 0)
+            eds_identity = sdo.load_eds(settings.eds) if settings.eds else (0, 0)
             _check_identity(identity, settings, name, eds_identity)
         except DeviceError as error:
-            raise DeviceError(f"{error}{still_on(sdo)}") from None
-        require_off(sdo, rig, name)
-        work = _SetUp(sdo, settings, name, wanted)
-        work.assign()
-        work.check_torque(identity, rig)
-        work.check_scales(identity, rig)
-        work.configure_torque()
-        work.configure_speed()
-        work.configure_sync()
-        active = work.configure_guards()
-        work.configure_pdos(active)
-        work.check_other_objects(identity)
-        work.settle(requirement(objects.MODE))
+            raise DeviceError(f"{error}{describe_remaining_torque(sdo)}") from None
+        wait_until_disabled(sdo, rig, name)
+        configuration = _DriveConfiguration(sdo, settings, name, required)
+        configuration.assign()
+        configuration.check_rated_torque(identity, rig)
+        configuration.check_gear_and_encoder(identity, rig)
+        configuration.configure_torque()
+        configuration.configure_speed()
+        configuration.configure_sync()
+        active_watchdog = configuration.configure_watchdog()
+        configuration.configure_pdos(active_watchdog)
+        configuration.read_stop_options(identity)
+        configuration.set_object(requirement(objects.MODE))
         # Some drives show the mode only when enabled: it is checked again then.
-        wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_PATIENCE_S)
+        wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_TIMEOUT_S)
     return DriveCapabilities(
         identity,
-        active,
+        active_watchdog,
         {
             Watchdog.OWN: settings.own_watchdog_s,
             Watchdog.NONE: float("inf"),
-        }.get(active, settings.heartbeat_timeout_s),
-        tuple(work.lacks),
+        }.get(active_watchdog, settings.heartbeat_timeout_s),
+        tuple(configuration.lacks),
         settings.set_objects,
     )
 
 
 def _read_identity(sdo: SdoAccess) -> dict[str, object]:
+    """Read the drive's identity by SDO; objects that the drive lacks give None or an empty text."""
     identity: dict[str, object] = {}
     for sub, key in enumerate(("vendor_id", "product_code", "revision", "serial_number"), 1):
-        identity[key] = sdo.read_if_there(objects.IDENTITY, sub)
+        identity[key] = sdo.read_or_none(objects.IDENTITY, sub)
     identity["device_name"] = sdo.read_text(objects.DEVICE_NAME)
     identity["software_version"] = sdo.read_text(objects.SOFTWARE_VERSION)
-    identity["supported_modes"] = sdo.read_if_there(objects.SUPPORTED_MODES)
+    identity["supported_modes"] = sdo.read_or_none(objects.SUPPORTED_MODES)
     return identity
 
 
 def _check_identity(
     identity: dict[str, object], settings: ServoDrive, name: str, eds_identity: tuple[int, int]
 ) -> None:
-    vendor, product = eds_identity
-    for key, where, wanted in (
+    """Raise if the drive differs from the profile or its EDS file, or has no cyclic torque mode."""
+    eds_vendor, eds_product = eds_identity
+    for key, source, required in (
         ("vendor_id", "cia402.vendor_id", settings.vendor_id),
         ("product_code", "cia402.product_code", settings.product_code),
-        ("vendor_id", f"VendorNumber in {settings.eds}", vendor),
-        ("product_code", f"ProductNumber in {settings.eds}", product),
+        ("vendor_id", f"VendorNumber in {settings.eds}", eds_vendor),
+        ("product_code", f"ProductNumber in {settings.eds}", eds_product),
     ):
-        got = identity[key]
-        if wanted and got != wanted:
-            got_text = "nothing" if got is None else f"0x{got:08X}"
+        reported = identity[key]
+        if required and reported != required:
+            got_text = "nothing" if reported is None else f"0x{reported:08X}"
             raise DeviceError(
-                f"{name}: it is another drive: {where} is 0x{wanted:08X}, it says {got_text}. "
+                f"{name}: it is another drive: {source} is 0x{required:08X}, it says {got_text}. "
                 "Check cia402.node_id, or write into the profile what is really there."
             )
     modes = identity["supported_modes"]
@@ -190,95 +202,98 @@ def _check_identity(
         )
 
 
-class _SetUp:
-    """Set-up of one drive that is disabled; collects the objects that it lacks.
+class _DriveConfiguration:
+    """Configuration of one disabled drive, which collects the objects that the drive lacks.
 
     Parameters
     ----------
     sdo
-        The way to it.
+        SDO access to the drive.
     settings
-        Settings of the profile.
+        Settings of the drive in the profile.
     name
         Name of the drive, for messages.
-    wanted
-        Values that its objects are to hold, by index and sub-index.
+    required
+        Required values of the drive's objects, by index and sub-index.
     """
 
     def __init__(
-        self, sdo: SdoAccess, settings: ServoDrive, name: str, wanted: dict[tuple[int, int], int]
+        self, sdo: SdoAccess, settings: ServoDrive, name: str, required: dict[tuple[int, int], int]
     ) -> None:
         self._sdo = sdo
         self._settings = settings
         self._name = name
-        self._wanted = wanted
+        self._required_values = required
         self.lacks: list[Requirement] = []
 
-    def settle(self, row: Requirement, wanted: int | None = None) -> bool:
-        """Set an object to a value, and return whether the drive has the object.
+    def set_object(self, row: Requirement, required: int | None = None) -> bool:
+        """Set an object to a value, unless it has that value; return whether the object exists.
 
-        A write-only one is written and not read back, where that may be.
+        A write-only object is written and not read back, if `MAY_BE_WRITE_ONLY` lists it.
 
         Parameters
         ----------
         row
-            Row of the object in the table of requirements.
-        wanted
-            The value; the one of the table of values if it is not given.
+            Requirement on the object.
+        required
+            Value to set; None: the required value that the constructor was given.
 
         Raises
         ------
         DeviceError
             If the object is indispensable, or the drive stores a value that is not acceptable.
         """
-        if wanted is None:
-            wanted = self._wanted[row.index, row.sub]
+        if required is None:
+            required = self._required_values[row.index, row.sub]
         try:
-            found = self._sdo.read_if_there(row.index, row.sub)
+            present_value = self._sdo.read_or_none(row.index, row.sub)
         except SdoRefusal as refusal:
             if not (refusal.is_write_only and row.index in MAY_BE_WRITE_ONLY):
                 raise
-            self._sdo.write(row.index, row.sub, wanted)
+            self._sdo.write(row.index, row.sub, required)
             return True
-        if found == wanted:
+        if present_value == required:
             return True
         try:
-            self._sdo.configure(row.index, row.sub, wanted)
+            self._sdo.configure(row.index, row.sub, required)
         except ValueNotStored as not_stored:
-            found = not_stored.got
-            why: DeviceError = not_stored
+            present_value = not_stored.got
+            error: DeviceError = not_stored
         except SdoRefusal as refusal:
-            if found is None and refusal.is_absent:
-                self._do_without(row)
+            if present_value is None and refusal.is_absent:
+                self._record_missing_object(row)
                 return False
-            if found is None:
+            if present_value is None:
                 raise
-            why = DeviceError(
-                f"{self._name}: object {row.address} ({row.name}) is {show_value(found)}, needed "
-                f"is {show_value(wanted)}, and it refuses to change it (abort code "
-                f"0x{refusal.code:08X}: {_words(refusal)}). {row.sentence}"
+            error = DeviceError(
+                f"{self._name}: object {row.address} ({row.name}) is {show_value(present_value)}, "
+                f"needed is {show_value(required)}, and it refuses to change it (abort code "
+                f"0x{refusal.code:08X}: {_abort_meaning(refusal)}). {row.sentence}"
             )
         else:
             return True
-        if row.fit.allows(found, wanted):
+        if row.value_rule.allows(present_value, required):
             return True
-        if row.accept == TORQUE_LIMIT and found >= wanted and self._accepts(row):
-            self._do_without(row)
+        if row.accept == TORQUE_LIMIT and present_value >= required and self._accepts(row):
+            self._record_missing_object(row)
             return False
-        raise why
+        raise error
 
     def assign(self) -> None:
-        """Set the manufacturer-specific objects that the profile names."""
+        """Write the manufacturer-specific objects that ``cia402.set_objects`` names."""
         for text in self._settings.set_objects:
             try:
                 self._sdo.assign(parse_assignment(text))
             except (DeviceError, ValueError) as error:
                 raise DeviceError(f'{error} (cia402.set_objects: "{text}")') from None
 
-    def check_torque(self, identity: dict[str, object], rig: RigParameters) -> None:
-        """Compare the rated torque of the drive with that of the profile."""
+    def check_rated_torque(self, identity: dict[str, object], rig: RigParameters) -> None:
+        """Raise if the drive's rated torque differs from that of the profile by more than 2 %.
+
+        The rated torque is added to `identity`.
+        """
         settings = self._settings
-        counts = self._sdo.read_if_there(objects.RATED_TORQUE)
+        counts = self._sdo.read_or_none(objects.RATED_TORQUE)
         identity["rated_torque_counts"] = counts
         row = requirement(objects.RATED_TORQUE)
         if counts is None:
@@ -299,135 +314,149 @@ class _SetUp:
                 "torque would be wrong by that ratio. Correct the profile or the drive."
             )
 
-    def check_scales(self, identity: dict[str, object], rig: RigParameters) -> None:
-        """Compare gear and encoder step with the profile's, as far as the drive states them.
+    def check_gear_and_encoder(self, identity: dict[str, object], rig: RigParameters) -> None:
+        """Raise if the drive's gear ratio or encoder step differs from the profile's by over 2 %.
+
+        Only values that the drive states are compared. Both are added to `identity`.
 
         Raises
         ------
         DeviceError
             If they differ by more than 2 %.
         """
-        gear = self._ratio(objects.GEAR_RATIO)
-        increments = self._ratio(objects.ENCODER_RESOLUTION)
-        units = self._ratio(objects.FEED_CONSTANT)
+        gear = self._read_ratio(objects.GEAR_RATIO)
+        increments = self._read_ratio(objects.ENCODER_RESOLUTION)
+        feed = self._read_ratio(objects.FEED_CONSTANT)
         stated_gear = self._settings.gear_ratio
         identity["gear_ratio"] = gear
-        if gear is not None and not _is_near(gear, stated_gear):
+        if gear is not None and not _is_ratio_equal(gear, stated_gear):
             raise DeviceError(
                 f"{self._name}: its gear (object 6091) is {gear:.5g} turns of the motor in one of "
                 f"the output shaft, cia402.gear_ratio says {stated_gear:.5g}. Correct the profile "
                 "or the drive."
             )
-        # Units of the position in a turn of the output shaft: increments, unless the drive has a
-        # feed constant that makes them others.
+        # Position units per revolution of the output shaft: encoder increments, unless the drive
+        # has a feed constant that defines other units.
         increments_a_turn = None if increments is None else increments * (gear or stated_gear)
-        turns = [turn for turn in (units, increments_a_turn) if turn is not None]
-        identity["encoder_step_rad"] = tau / turns[0] if turns else None
+        turn_units = [units for units in (feed, increments_a_turn) if units is not None]
+        identity["encoder_step_rad"] = tau / turn_units[0] if turn_units else None
         step_rad = rig.encoder.resolution_rad
-        if not turns or any(_is_near(tau / turn, step_rad) for turn in turns):
+        if not turn_units or any(_is_ratio_equal(tau / units, step_rad) for units in turn_units):
             return
-        gear_objects = "6092" if units is not None else "608F" if gear is None else "608F and 6091"
+        gear_objects = "6092" if feed is not None else "608F" if gear is None else "608F and 6091"
         raise DeviceError(
-            f"{self._name}: its encoder step (object {gear_objects}) is {tau / turns[0]:.4g} rad "
-            f"at the output shaft ({turns[0]:.6g} steps a turn), encoder.resolution_rad says "
-            f"{step_rad:.4g} rad; every angle, speed and limit would be wrong by the ratio "
-            f"{tau / turns[0] / step_rad:.3g}. Correct the profile or the drive."
+            f"{self._name}: its encoder step (object {gear_objects}) is {tau / turn_units[0]:.4g} "
+            f"rad at the output shaft ({turn_units[0]:.6g} steps a turn), encoder.resolution_rad "
+            f"says {step_rad:.4g} rad; every angle, speed and limit would be wrong by the ratio "
+            f"{tau / turn_units[0] / step_rad:.3g}. Correct the profile or the drive."
         )
 
-    def _ratio(self, index: int) -> float | None:
-        """Return the ratio of an object's two numbers; None where it states none.
+    def _read_ratio(self, index: int) -> float | None:
+        """Return an object's sub-index 1 divided by its sub-index 2, or None if not stated.
+
+        A ratio of 1 to 1 counts as not stated, since drives that were never configured have that
+        value.
 
         Drives that were never set up for it have it as 1 to 1.
         """
         try:
-            above = self._sdo.read_if_there(index, 1)
-            below = self._sdo.read_if_there(index, 2)
+            numerator = self._sdo.read_or_none(index, 1)
+            denominator = self._sdo.read_or_none(index, 2)
         except SdoRefusal:
             return None
-        if above is None or below is None or above <= 0 or below <= 0 or above == below == 1:
+        if (
+            numerator is None
+            or denominator is None
+            or numerator <= 0
+            or denominator <= 0
+            or numerator == denominator == 1
+        ):
             return None
-        return above / below
+        return numerator / denominator
 
     def configure_torque(self) -> None:
-        """Configure the torque limit, and clear offsets that add to the target torque."""
-        self.settle(requirement(objects.MAX_TORQUE))
+        """Set the torque limits, and clear the torque offset and the polarity."""
+        self.set_object(requirement(objects.MAX_TORQUE))
         for index in objects.TORQUE_LIMITS:
-            if self._sdo.read_if_there(index) is not None:
-                self.settle(requirement(index))
-        self._clear(requirement(objects.TORQUE_OFFSET))
-        self._clear(requirement(objects.POLARITY))
+            if self._sdo.read_or_none(index) is not None:
+                self.set_object(requirement(index))
+        self._clear_object(requirement(objects.TORQUE_OFFSET))
+        self._clear_object(requirement(objects.POLARITY))
 
     def configure_speed(self) -> None:
-        """Configure the speed limit, which bounds the effect of a constant torque."""
+        """Set the drive's speed limit, which bounds the effect of a constant torque."""
         if self._settings.max_speed_rad_s == 0:
             return
         row = requirement(objects.MAX_SPEED_RPM)
-        if not self.settle(row):
+        if not self.set_object(row):
             raise DeviceError(
                 f"{self._name}: it has no object {row.address} ({row.name}). {row.sentence}"
             )
 
     def configure_sync(self) -> None:
-        """Configure SYNC: its period, no window, no counter."""
+        """Set the SYNC period, and clear the SYNC window and counter."""
         sdo = self._sdo
-        cob_id = sdo.read_if_there(objects.SYNC_COB_ID)
+        cob_id = sdo.read_or_none(objects.SYNC_COB_ID)
         row = requirement(objects.SYNC_COB_ID)
-        if cob_id is not None and cob_id & ~objects.PDO_DISABLED != self._wanted[row.index, 0]:
-            self.settle(row)
-        if sdo.read_if_there(objects.SYNC_OVERFLOW):
+        if (
+            cob_id is not None
+            and cob_id & ~objects.PDO_DISABLED != self._required_values[row.index, 0]
+        ):
+            self.set_object(row)
+        if sdo.read_or_none(objects.SYNC_OVERFLOW):
             # It may be changed only while the period is 0 (CiA 301).
-            if sdo.read_if_there(objects.SYNC_PERIOD_US):
-                self.settle(requirement(objects.SYNC_PERIOD_US), 0)
-            self._clear(requirement(objects.SYNC_OVERFLOW))
-        self._clear(requirement(objects.SYNC_WINDOW_US))
-        self.settle(requirement(objects.SYNC_PERIOD_US))
+            if sdo.read_or_none(objects.SYNC_PERIOD_US):
+                self.set_object(requirement(objects.SYNC_PERIOD_US), 0)
+            self._clear_object(requirement(objects.SYNC_OVERFLOW))
+        self._clear_object(requirement(objects.SYNC_WINDOW_US))
+        self.set_object(requirement(objects.SYNC_PERIOD_US))
         for sub in (1, 2):
-            self.settle(requirement(objects.INTERPOLATION_TIME, sub))
+            self.set_object(requirement(objects.INTERPOLATION_TIME, sub))
 
-    def configure_guards(self) -> Watchdog:
-        """Set the drive's reaction to this computer's silence, and its own heartbeat.
+    def configure_watchdog(self) -> Watchdog:
+        """Set up the drive's watchdog over this computer, and the drive's own heartbeat.
 
         Returns
         -------
         Watchdog
-            Watchdog that is active.
+            Kind of watchdog that is active.
         """
         settings, sdo = self._settings, self._sdo
         deadline = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         heartbeat = self._configure_heartbeat_consumer()
-        has_deadline = sdo.read_if_there(deadline.index, deadline.sub) is not None
-        active = watchdog(
+        has_deadline = sdo.read_or_none(deadline.index, deadline.sub) is not None
+        active_watchdog = watchdog(
             heartbeat=heartbeat, rpdo_deadline=has_deadline, own=settings.own_watchdog_s > 0
         )
         row = requirement(objects.HEARTBEAT_CONSUMER, 1)
         if not heartbeat:
             self.lacks.append(row)
-        if active is Watchdog.NONE and not self._accepts(row):
-            raise DeviceError(f"{self._name}: {row.missing()}")
-        if active in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
+        if active_watchdog is Watchdog.NONE and not self._accepts(row):
+            raise DeviceError(f"{self._name}: {row.refusal_reason()}")
+        if active_watchdog in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
             # The drive's own watchdog acts as its manufacturer defines, whatever is set here.
-            self.settle(requirement(objects.ABORT_OPTION))
+            self.set_object(requirement(objects.ABORT_OPTION))
         row = requirement(objects.COMMUNICATION_ERROR, 1)
-        if not self.settle(row) and settings.communication_error_option:
+        if not self.set_object(row) and settings.communication_error_option:
             raise DeviceError(
                 f"{self._name}: it has no object {row.address} ({row.name}), so that it goes "
                 "pre-operational on a lost connection; set cia402.communication_error_option = 0."
             )
-        self.settle(requirement(objects.HEARTBEAT_PRODUCER_MS))
+        self.set_object(requirement(objects.HEARTBEAT_PRODUCER_MS))
         row = requirement(objects.EMERGENCY_COB_ID)
-        if sdo.read_if_there(row.index) not in (None, self._wanted[row.index, 0]):
-            self.settle(row)
-        return active
+        if sdo.read_or_none(row.index) not in (None, self._required_values[row.index, 0]):
+            self.set_object(row)
+        return active_watchdog
 
-    def configure_pdos(self, active: Watchdog) -> None:
-        """Map one PDO each way and switch all others off."""
+    def configure_pdos(self, active_watchdog: Watchdog) -> None:
+        """Map one RPDO and one TPDO, and disable all other PDOs."""
         settings, sdo = self._settings, self._sdo
         for communication in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
-            _disable_others(sdo, communication)
+            _disable_unused_pdos(sdo, communication)
         entries: tuple[int, ...] = objects.TPDO_ENTRIES
         row = requirement(objects.ACTUAL_TORQUE)
-        if sdo.read_if_there(objects.ACTUAL_TORQUE) is None and self._accepts(row):
-            self._do_without(row)
+        if sdo.read_or_none(objects.ACTUAL_TORQUE) is None and self._accepts(row):
+            self._record_missing_object(row)
             entries = entries[:-1]
         self._configure_pdo(
             objects.TPDO_COMMUNICATION,
@@ -440,64 +469,65 @@ class _SetUp:
             objects.RPDO_COMMUNICATION,
             0,
             objects.RPDO_ENTRIES,
-            {objects.EVENT_TIMER: deadline_ms} if active is Watchdog.RPDO_DEADLINE else {},
+            {objects.EVENT_TIMER: deadline_ms} if active_watchdog is Watchdog.RPDO_DEADLINE else {},
         )
 
-    def check_other_objects(self, identity: dict[str, object]) -> None:
-        """Check the objects that are only read."""
+    def read_stop_options(self, identity: dict[str, object]) -> None:
+        """Read the options for quick stop and fault reaction, and add them to `identity`."""
         for key, index in (
             ("quick_stop_option", objects.QUICK_STOP_OPTION),
             ("fault_reaction_option", objects.FAULT_REACTION_OPTION),
         ):
-            value = self._sdo.read_if_there(index)
+            value = self._sdo.read_or_none(index)
             if value is not None:
                 identity[key] = value
 
     def _accepts(self, row: Requirement) -> bool:
+        """Return whether the profile accepts a drive that lacks an object."""
         return row.accept in self._settings.accept_without
 
-    def _do_without(self, row: Requirement) -> None:
-        """Record a missing object if it is dispensable.
+    def _record_missing_object(self, row: Requirement) -> None:
+        """Record that the drive lacks an object, or raise if the object is indispensable.
 
         Raises
         ------
         DeviceError
-            If it is indispensable.
+            If the object is indispensable.
         """
-        reason = row.missing(self._settings.accept_without)
+        reason = row.refusal_reason(self._settings.accept_without)
         if reason:
             raise DeviceError(f"{self._name}: {reason}")
         self.lacks.append(row)
 
-    def _clear(self, row: Requirement) -> None:
-        """Set an object to 0 if the drive has it; raise if rigd does not set it."""
-        found = self._sdo.read_if_there(row.index, row.sub)
-        if not found:
+    def _clear_object(self, row: Requirement) -> None:
+        """Set an object to 0 if the drive has it; raise if rigd may not write to it."""
+        present_value = self._sdo.read_or_none(row.index, row.sub)
+        if not present_value:
             return
         if ObjectAccess.WRITE in row.access:
-            self.settle(row, 0)
+            self.set_object(row, 0)
             return
         raise DeviceError(
-            f"{self._name}: object {row.address} ({row.name}) is 0x{found:02X}, not 0. "
+            f"{self._name}: object {row.address} ({row.name}) is 0x{present_value:02X}, not 0. "
             f"{row.sentence}"
         )
 
     def _configure_heartbeat_consumer(self) -> bool:
-        """Configure the monitoring of this computer's heartbeat; return whether there is one."""
+        """Make the drive monitor this computer's heartbeat; return whether it can do that."""
         settings, sdo = self._settings, self._sdo
         index, host = objects.HEARTBEAT_CONSUMER, settings.host_node_id
-        wanted = host << 16 | round(settings.heartbeat_timeout_s * 1000)
-        found = sdo.read_if_there(index, 1)
-        if found != wanted:
-            # One node twice is refused (0x06040043): what was stored before goes first.
-            for sub in range(2, min(sdo.read_if_there(index) or 0, _DUPLICATE_WATCHES) + 1):
-                stored = sdo.read_if_there(index, sub)
-                if stored is not None and stored >> 16 & 0x7F == host:
+        required = host << 16 | round(settings.heartbeat_timeout_s * 1000)
+        present_value = sdo.read_or_none(index, 1)
+        if present_value != required:
+            # A second entry for one node is refused (0x06040043): clear stored entries first.
+            for sub in range(2, min(sdo.read_or_none(index) or 0, _MOST_HEARTBEAT_CONSUMERS) + 1):
+                stored_value = sdo.read_or_none(index, sub)
+                if stored_value is not None and stored_value >> 16 & 0x7F == host:
                     sdo.configure(index, sub, 0)
             try:
-                sdo.configure(index, 1, wanted)
+                sdo.configure(index, 1, required)
             except SdoRefusal as refusal:
-                if refusal.is_absent or refusal.code == _READ_ONLY:
+                if refusal.is_absent or refusal.code == _READ_ONLY_ABORT:
                     return False
                 raise
         return True
@@ -509,47 +539,48 @@ class _SetUp:
         entries: tuple[int, ...],
         parameters: dict[int, int],
     ) -> None:
-        """Map entries into a PDO; one that has them already is not written.
+        """Map objects into a PDO and enable it; nothing is written if the PDO already is as needed.
 
         Parameters
         ----------
         communication
-            Index of its communication parameters; those of its mapping are 0x200 further.
+            Index of the PDO's communication parameters; the index of its mapping is 0x200 higher.
         flags
-            Further bits of its COB-ID.
+            Additional bits of the PDO's COB-ID.
         entries
-            Objects that it carries, as mapping entries.
+            Mapping entries of the objects that the PDO carries.
         parameters
-            Further sub-indices of the communication parameters, and what they are to hold where
-            the drive has them and they are not 0, or are wanted.
+            Required values of further communication parameters by sub-index; a parameter that the
+            drive does not have is skipped.
         """
         sdo, mapping = self._sdo, communication + 0x200
-        can_id = self._wanted[communication, 1] | flags
-        transmission = self._wanted[communication, 2]
+        can_id = self._required_values[communication, 1] | flags
+        transmission_type = self._required_values[communication, 2]
         cob_id_bits = EVERY_BIT & ~objects.NO_REMOTE_REQUEST
-        mapped = self._reads(mapping, (len(entries), *entries))
-        typed = sdo.read_if_there(communication, 2) == transmission
-        identified = sdo.read_if_there(communication, 1)
-        others = {
+        is_mapped = self._holds_values(mapping, (len(entries), *entries))
+        has_transmission_type = sdo.read_or_none(communication, 2) == transmission_type
+        cob_id_found = sdo.read_or_none(communication, 1)
+        other_parameters = {
             sub: value
             for sub, value in parameters.items()
-            if sdo.read_if_there(communication, sub) not in (None, value)
+            if sdo.read_or_none(communication, sub) not in (None, value)
         }
-        right = identified is not None and not (identified ^ can_id) & cob_id_bits
-        if right and mapped and typed and not others:
+        has_cob_id = cob_id_found is not None and not (cob_id_found ^ can_id) & cob_id_bits
+        if has_cob_id and is_mapped and has_transmission_type and not other_parameters:
             return
         sdo.configure(communication, 1, can_id | objects.PDO_DISABLED, cob_id_bits)
-        if not mapped:
-            self._map(communication, mapping, entries)
-        if not typed:
-            sdo.configure(communication, 2, transmission)
-        for sub, value in others.items():
-            self.settle(requirement(communication, sub), value)
+        if not is_mapped:
+            self._write_mapping(communication, mapping, entries)
+        if not has_transmission_type:
+            sdo.configure(communication, 2, transmission_type)
+        for sub, value in other_parameters.items():
+            self.set_object(requirement(communication, sub), value)
         sdo.configure(communication, 1, can_id, cob_id_bits)
 
-    def _map(self, communication: int, mapping: int, entries: tuple[int, ...]) -> None:
+    def _write_mapping(self, communication: int, mapping: int, entries: tuple[int, ...]) -> None:
+        """Write the mapping entries of a disabled PDO."""
         sdo = self._sdo
-        what = "RPDO1" if communication == objects.RPDO_COMMUNICATION else "TPDO1"
+        pdo_name = "RPDO1" if communication == objects.RPDO_COMMUNICATION else "TPDO1"
         try:
             sdo.configure(mapping, 0, 0)
         except SdoRefusal as refusal:
@@ -560,33 +591,36 @@ class _SetUp:
             except SdoRefusal as refusal:
                 row = requirement(entry >> 16)
                 if refusal.is_absent:
-                    raise DeviceError(f"{self._name}: {row.missing()}") from None
+                    raise DeviceError(f"{self._name}: {row.refusal_reason()}") from None
                 raise DeviceError(
-                    f"{self._name}: it does not take object {row.address} ({row.name}) into {what} "
-                    f"(abort code 0x{refusal.code:08X}: {_words(refusal)}). {row.sentence}"
+                    f"{self._name}: it does not take object {row.address} ({row.name}) into "
+                    f"{pdo_name} (abort code 0x{refusal.code:08X}: {_abort_meaning(refusal)}). "
+                    f"{row.sentence}"
                 ) from None
         sdo.configure(mapping, 0, len(entries))
 
-    def _reads(self, index: int, values: tuple[int, ...]) -> bool:
-        """Whether sub-indices 0 and on of an object read as given."""
-        return all(self._sdo.read_if_there(index, sub) == value for sub, value in enumerate(values))
+    def _holds_values(self, index: int, values: tuple[int, ...]) -> bool:
+        """Return whether sub-indices 0, 1, 2, … of an object hold the given values."""
+        return all(self._sdo.read_or_none(index, sub) == value for sub, value in enumerate(values))
 
 
-def _is_near(stated: float, wanted: float) -> bool:
-    return abs(stated - wanted) <= _SCALE_TOLERANCE * wanted
+def _is_ratio_equal(stated: float, required: float) -> bool:
+    """Return whether a ratio that the drive states agrees with the profile's within 2 %."""
+    return abs(stated - required) <= _SCALE_TOLERANCE * required
 
 
-def _disable_others(sdo: SdoAccess, communication: int) -> None:
-    """Disable the PDOs that the rig does not use, as many as the drive has."""
-    for later in range(1, objects.PDO_COUNT_AT_MOST):
-        cob_id = sdo.read_if_there(communication + later, 1)
+def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:
+    """Disable all PDOs of the drive except the first, which the rig uses."""
+    for pdo_offset in range(1, objects.MOST_PDO_COUNT):
+        cob_id = sdo.read_or_none(communication + pdo_offset, 1)
         if cob_id is None:
-            # Beyond those that CiA 301 sets beforehand there are no gaps.
-            if later >= objects.PDO_COUNT:
+            # Above the PDOs that CiA 301 predefines, indices are used without gaps.
+            if pdo_offset >= objects.PREDEFINED_PDO_COUNT:
                 return
         elif not cob_id & objects.PDO_DISABLED:
-            sdo.configure(communication + later, 1, cob_id | objects.PDO_DISABLED)
+            sdo.configure(communication + pdo_offset, 1, cob_id | objects.PDO_DISABLED)
 
 
-def _words(refusal: SdoRefusal) -> str:
-    return _ABORTS.get(refusal.code, "see CiA 301")
+def _abort_meaning(refusal: SdoRefusal) -> str:
+    """Return the short meaning of the abort code of a refusal."""
+    return _ABORT_MEANINGS.get(refusal.code, "see CiA 301")

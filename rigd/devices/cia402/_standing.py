@@ -1,7 +1,7 @@
-"""Fault reset without the loop: switch the drive off, reset it, and check that it becomes ready.
+"""Fault reset while the loop does not run: switch off, reset, check that the drive gets ready.
 
-Everything goes by SDO, which a drive answers in each NMT state but stopped. Whether the motor has
-torque is what the statusword says, never what was commanded.
+All commands are sent by SDO, which a drive answers in every NMT state except stopped. Whether the
+motor has torque is decided by the statusword, never by what was commanded.
 """
 
 import time
@@ -14,35 +14,38 @@ from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
     FAULT_BIT,
     FAULT_RESET,
-    OFF,
     SHUTDOWN,
+    TORQUE_FREE_STATES,
     VOLTAGE_ENABLED,
     DriveState,
     describe_error,
-    state_of,
+    drive_state,
 )
 from rigd.devices.cia402._sdo import SdoAccess, SdoRefusal
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 
-_POLL_S = 0.01
-_OFF_S = 0.2
-"""Time from the first command after which a drive that answers but has torque is an error."""
-_SILENT_S = 1.0
-"""How long a drive that answers nothing at all is waited for."""
+_STATE_POLL_S = 0.01
+"""Interval in seconds between two readings of the drive's state."""
+_SWITCH_OFF_TIMEOUT_S = 0.2
+"""Time in seconds within which a drive that answers has to report that it is off."""
+_FIRST_ANSWER_TIMEOUT_S = 1.0
+"""Time in seconds to wait for any answer of a drive that has not answered yet."""
 
 
-_PRESS_STO = (
+_PRESS_STO_ADVICE = (
     "the motor may still turn: press the wired stop (STO) and keep clear of the beam, then switch "
     "the drive off and on"
 )
+"""Advice in messages about a drive that is not known to be off."""
 
 
 def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
-    """Switch the drive off, check that it is, reset its fault, and check that it would get ready.
+    """Switch the drive off, reset its fault, and check that it can get ready to switch on.
 
-    No torque on any way. The drive is left pre-operational and disabled. Its watch over our
-    heartbeat is taken away only after its statusword has shown it off.
+    The motor has no torque at any time. The drive is left pre-operational and disabled. Its
+    monitoring of this computer's heartbeat is cleared only after its statusword has shown that it
+    is off.
 
     Parameters
     ----------
@@ -56,7 +59,7 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     Returns
     -------
     str or None
-        What the fault was, in words; None if there was none.
+        Description of the fault; None if the drive was not in fault.
 
     Raises
     ------
@@ -67,104 +70,107 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     settings = rig.cia402
     assert settings is not None
     with SdoAccess(port, settings.node_id, name) as sdo:
-        _see_off(sdo, name)
-        sdo.to_pre_operational()
+        _confirm_off(sdo, name)
+        sdo.enter_pre_operational()
         with suppress(SdoRefusal):
             # No heartbeat is sent now, whose absence would be the next fault.
             sdo.write(objects.HEARTBEAT_CONSUMER, 1, 0)
         patience_s = settings.enable_timeout_s
-        fault = _reset(sdo, name, patience_s) if _in_fault(sdo) else None
-        _see_ready(sdo, name, patience_s, fault, f"rigd reset --profile {rig.name}")
+        fault = _reset_reported_fault(sdo, name, patience_s) if _in_fault(sdo) else None
+        _confirm_ready(sdo, name, patience_s, fault, f"rigd reset --profile {rig.name}")
     return fault
 
 
 def command_off(sdo: SdoAccess) -> None:
-    """Send controlword 0 and ignore the answer; never raises."""
-    # An adapter's library may raise anything, and this is the way off.
-    with suppress(Exception), sdo.hurried():
+    """Command the drive to switch off (controlword 0) and ignore its answer; never raises."""
+    # An adapter's library may raise anything; switching off must continue.
+    with suppress(Exception), sdo.short_timeouts():
         sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
 
 
-def require_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
-    """Wait until a drive that was commanded off is disabled.
+def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
+    """Wait until a drive that was commanded off is disabled, or raise.
 
     Raises
     ------
     DeviceError
-        If it is in fault, or stays in another state.
+        If the drive is in fault, or stays in another state.
     """
     settings = rig.cia402
     assert settings is not None
-    ends = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
-    wait_for(lambda: _state(sdo) in ends, settings.enable_timeout_s)
+    end_states = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
+    wait_for(lambda: _read_state(sdo) in end_states, settings.enable_timeout_s)
     statusword = sdo.read(objects.STATUSWORD)
-    state = state_of(statusword)
+    state = drive_state(statusword)
     if state is DriveState.SWITCH_ON_DISABLED:
         return
     if statusword & FAULT_BIT:
         raise DeviceError(
-            f"{name}: it is in fault: {_fault(sdo)}. Remove the cause, then: rigd reset --profile "
-            f"{rig.name}"
+            f"{name}: it is in fault: {_describe_fault(sdo)}. Remove the cause, then: rigd reset "
+            f"--profile {rig.name}"
         )
-    remedy = "switch it off and on" if state in OFF else _PRESS_STO
+    remedy = "switch it off and on" if state in TORQUE_FREE_STATES else _PRESS_STO_ADVICE
     raise DeviceError(
         f'{name}: expected in the state "{DriveState.SWITCH_ON_DISABLED.value}", it is in '
         f'"{state.value}" (statusword 0x{statusword:04X}); {remedy}.'
     )
 
 
-def still_on(sdo: SdoAccess) -> str:
-    """Describe a drive that was commanded off and does not report it; empty if it does."""
+def describe_remaining_torque(sdo: SdoAccess) -> str:
+    """Return a warning that a drive that was commanded off still has torque, or an empty text.
+
+    The text is empty if the drive reports that it is off, or does not answer.
+    """
     try:
         statusword = sdo.read(objects.STATUSWORD)
     except DeviceError:
         return ""
-    state = state_of(statusword)
-    if state in OFF:
+    state = drive_state(statusword)
+    if state in TORQUE_FREE_STATES:
         return ""
-    return f' It is in "{state.value}" (statusword 0x{statusword:04X}): {_PRESS_STO}.'
+    return f' It is in "{state.value}" (statusword 0x{statusword:04X}): {_PRESS_STO_ADVICE}.'
 
 
-def wait_for(reached: Callable[[], bool], patience_s: float) -> bool:
+def wait_for(condition: Callable[[], bool], patience_s: float) -> bool:
     """Poll a condition, at least twice, and return whether it became true in time."""
     deadline = time.monotonic() + patience_s
-    while not reached():
+    while not condition():
         if time.monotonic() > deadline:
-            return reached()
-        time.sleep(_POLL_S)
+            return condition()
+        time.sleep(_STATE_POLL_S)
     return True
 
 
-def _see_off(sdo: SdoAccess, name: str) -> None:
+def _confirm_off(sdo: SdoAccess, name: str) -> None:
     """Command the drive off, from any state, until its statusword confirms it.
 
     Raises
     ------
     DeviceError
-        If it does not show it within 0.2 s, or does not answer.
+        If the drive does not report that it is off within 0.2 s, or does not answer.
     """
-    began = time.monotonic()
+    start_s = time.monotonic()
     statusword: int | None = None
-    requested = False
-    with sdo.hurried():
+    is_requested = False
+    with sdo.short_timeouts():
         while True:
             command_off(sdo)
-            if not requested:
+            if not is_requested:
                 # A drive whose node was stopped answers again; another may ignore it.
                 with suppress(Exception):
                     sdo.request_pre_operational()
-                    requested = True
+                    is_requested = True
             with suppress(Exception):
                 statusword = sdo.read(objects.STATUSWORD)
-                if state_of(statusword) in OFF:
+                if drive_state(statusword) in TORQUE_FREE_STATES:
                     return
-            patience_s = _SILENT_S if statusword is None else _OFF_S
-            if time.monotonic() - began > patience_s:
+            patience_s = _FIRST_ANSWER_TIMEOUT_S if statusword is None else _SWITCH_OFF_TIMEOUT_S
+            if time.monotonic() - start_s > patience_s:
                 break
-            time.sleep(_POLL_S)
+            time.sleep(_STATE_POLL_S)
     if statusword is None:
         try:
-            sdo.to_pre_operational()  # patiently, and it names what else is on the bus
+            sdo.enter_pre_operational()  # with the normal timeout; its error names other nodes
             sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
             statusword = sdo.read(objects.STATUSWORD)
         except Exception as error:
@@ -173,78 +179,82 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
                 f"{cause} It has not shown that it is off: keep clear of the beam, and press the "
                 "wired stop (STO) if anything moves."
             ) from None
-        if state_of(statusword) in OFF:
+        if drive_state(statusword) in TORQUE_FREE_STATES:
             return
     raise DeviceError(
-        f"{name}: it was commanded to switch off and has not done so within {_OFF_S:g} s: it is in "
-        f'"{state_of(statusword).value}" (statusword 0x{statusword:04X}); {_PRESS_STO}. Its watch '
-        "over the heartbeat (object 1016) was left as it was."
+        f"{name}: it was commanded to switch off and has not done so within "
+        f'{_SWITCH_OFF_TIMEOUT_S:g} s: it is in "{drive_state(statusword).value}" (statusword '
+        f"0x{statusword:04X}); {_PRESS_STO_ADVICE}. Its watch over the heartbeat (object 1016) was "
+        "left as it was."
     )
 
 
-def _reset(sdo: SdoAccess, name: str, patience_s: float) -> str:
-    """Reset the fault of a drive, and return what it was."""
-    fault = _fault(sdo)
+def _reset_reported_fault(sdo: SdoAccess, name: str, patience_s: float) -> str:
+    """Reset the drive's fault and return its description; raise if the fault persists."""
+    fault = _describe_fault(sdo)
     for controlword in (DISABLE_VOLTAGE, FAULT_RESET):
         sdo.write(objects.CONTROLWORD, 0, controlword)
-    gone = wait_for(lambda: _state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
+    is_reset = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
     sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
-    if not gone:
+    if not is_reset:
         raise DeviceError(
-            f"{name}: the fault cannot be reset: {_fault(sdo)}. It is in the state "
-            f'"{_state(sdo).value}"; remove the cause, or switch the drive off and on.'
+            f"{name}: the fault cannot be reset: {_describe_fault(sdo)}. It is in the state "
+            f'"{_read_state(sdo).value}"; remove the cause, or switch the drive off and on.'
         )
     return fault
 
 
-def _see_ready(
+def _confirm_ready(
     sdo: SdoAccess, name: str, patience_s: float, fault: str | None, command: str
 ) -> None:
-    """Check that the drive gets to ready to switch on, where it has no torque yet, and back.
+    """Check that the drive can get ready to switch on (without torque), and disable it again.
 
     Raises
     ------
     DeviceError
-        If it does not: a session could not be started.
+        If the drive does not get ready, so that no session could be started.
     """
     with suppress(SdoRefusal):
         sdo.write(objects.CONTROLWORD, 0, SHUTDOWN)
-    ready = wait_for(lambda: _state(sdo) is DriveState.READY, patience_s)
+    is_ready = wait_for(lambda: _read_state(sdo) is DriveState.READY, patience_s)
     statusword = sdo.read(objects.STATUSWORD)
     sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
-    disabled = wait_for(lambda: _state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
-    if ready and disabled:
+    is_disabled = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
+    if is_ready and is_disabled:
         return
-    done = f"its fault is reset ({fault})" if fault else "it is not in fault"
-    state = state_of(statusword)
-    if ready:
+    progress_text = f"its fault is reset ({fault})" if fault else "it is not in fault"
+    state = drive_state(statusword)
+    if is_ready:
         raise DeviceError(
-            f'{name}: {done}; it got ready and is now in "{_state(sdo).value}", not in '
-            f'"{DriveState.SWITCH_ON_DISABLED.value}"; switch it off and on.'
+            f'{name}: {progress_text}; it got ready and is now in "{_read_state(sdo).value}", not '
+            f'in "{DriveState.SWITCH_ON_DISABLED.value}"; switch it off and on.'
         )
     if statusword & FAULT_BIT:
         raise DeviceError(
-            f"{name}: {done}; when it was commanded to get ready it went to fault: {_fault(sdo)}. "
-            f"Remove the cause, then: {command}"
+            f"{name}: {progress_text}; when it was commanded to get ready it went to fault: "
+            f"{_describe_fault(sdo)}. Remove the cause, then: {command}"
         )
-    supplied = "is there" if statusword & VOLTAGE_ENABLED else "is not there"
+    supply_text = "is there" if statusword & VOLTAGE_ENABLED else "is not there"
     raise DeviceError(
-        f"{name}: {done}, and it is disabled, but it does not get ready: on that command it stays "
-        f'in "{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply {supplied}). '
-        f"STO is open or the motor supply is off; release or switch it on, then: {command}"
+        f"{name}: {progress_text}, and it is disabled, but it does not get ready: on that command "
+        f'it stays in "{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply '
+        f"{supply_text}). STO is open or the motor supply is off; release or switch it on, then: "
+        f"{command}"
     )
 
 
 def _in_fault(sdo: SdoAccess) -> bool:
+    """Return whether the drive's statusword, read by SDO, shows a fault."""
     return bool(sdo.read(objects.STATUSWORD) & FAULT_BIT)
 
 
-def _state(sdo: SdoAccess) -> DriveState:
-    return state_of(sdo.read(objects.STATUSWORD))
+def _read_state(sdo: SdoAccess) -> DriveState:
+    """Read the drive's statusword by SDO and return the state that it shows."""
+    return drive_state(sdo.read(objects.STATUSWORD))
 
 
-def _fault(sdo: SdoAccess) -> str:
-    """Return in words why the drive is in fault."""
+def _describe_fault(sdo: SdoAccess) -> str:
+    """Return a description of the cause of the drive's fault."""
     try:
         code = sdo.read(objects.ERROR_CODE)
     except SdoRefusal:

@@ -1,4 +1,4 @@
-"""Transitions of the drive: up to operation enabled, down again, and unexpected ones."""
+"""State transitions of the drive: to operation enabled, back to off, and unexpected ones."""
 
 import time
 from collections.abc import Callable
@@ -11,69 +11,75 @@ from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
     FOLLOWS_TARGET,
-    OFF,
     SHUTDOWN,
     SWITCH_ON,
+    TORQUE_FREE_STATES,
     VOLTAGE_ENABLED,
     DriveState,
+    drive_state,
     read_mode,
-    state_of,
 )
 from rigd.devices.cia402.objects import CONTROLWORD, CYCLIC_TORQUE
 from rigd.devices.contracts import DeviceError, wired_stop_dropped
 
-_OTHER_COMMANDER: Final = (
+_OTHER_SENDER: Final = (
     "a command came over the bus that this computer did not give (a corrupt frame, a second master)"
 )
-_CHECK_THE_BUS: Final = "check the bus cable, its termination, and what else is connected to it"
+"""Part of a message: another sender on the bus may have commanded the drive."""
+_CHECK_BUS_ADVICE: Final = "check the bus cable, its termination, and what else is connected to it"
+"""Part of a message: advice to check the bus."""
 
 
 # Why a drive has left operation
 
 
-def left_operation(name: str, statusword: int) -> DeviceError:
-    """Return the error of an enabled drive that is not in operation enabled any more.
+def operation_left_error(name: str, statusword: int) -> DeviceError:
+    """Return the error for a drive that has left operation enabled without a command.
 
     Parameters
     ----------
     name
         Name of the drive, for messages.
     statusword
-        Last statusword; it shows no fault, and no emergency message explains it.
+        Last statusword, which shows no fault; no emergency message explains it either.
     """
-    state = state_of(statusword)
-    left = (
+    state = drive_state(statusword)
+    transition = (
         f'it has left "{DriveState.OPERATION_ENABLED.value}" for "{state.value}" '
         f"(statusword 0x{statusword:04X})"
     )
     if state is DriveState.SWITCH_ON_DISABLED:
-        # It has lost its supply there, mostly; a command leaves that on.
+        # The usual cause is a lost motor supply; a bus command would leave the supply on.
         supplied = bool(statusword & VOLTAGE_ENABLED)
-        hint = ", and its bit 4 says that the supply is there, which indicates such a command"
-        dropped = wired_stop_dropped(
-            name,
-            f", or the motor's supply failed, or {_OTHER_COMMANDER}: {left}"
-            f"{hint if supplied else ''}",
+        supply_hint = (
+            ", and its bit 4 says that the supply is there, which indicates such a command"
         )
-        return DeviceError(f"{dropped} If nobody pressed it, {_CHECK_THE_BUS}.")
+        sto_error = wired_stop_dropped(
+            name,
+            f", or the motor's supply failed, or {_OTHER_SENDER}: {transition}"
+            f"{supply_hint if supplied else ''}",
+        )
+        return DeviceError(f"{sto_error} If nobody pressed it, {_CHECK_BUS_ADVICE}.")
     if state in (DriveState.READY, DriveState.SWITCHED_ON):
-        return DeviceError(f"{name}: {left}: {_OTHER_COMMANDER}; {_CHECK_THE_BUS}.")
+        return DeviceError(f"{name}: {transition}: {_OTHER_SENDER}; {_CHECK_BUS_ADVICE}.")
     return DeviceError(
-        f"{name}: {left}, by itself or because {_OTHER_COMMANDER}; check STO, supply and its "
-        f"own diagnosis. If these show nothing, {_CHECK_THE_BUS}."
+        f"{name}: {transition}, by itself or because {_OTHER_SENDER}; check STO, supply and its "
+        f"own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
     )
 
 
-_TICKS = 10
-"""Ticks in a row; a single lost command is repeated by the next."""
+_MOST_DEVIATING_TICKS = 10
+"""Number of consecutive ticks with a wrong torque that raise an error.
+
+A single lost command is no error, since the next tick repeats it."""
 
 
-class TorqueFollowing:
-    """Compares actual torques with commands, in 1/1000 of the rated torque.
+class TorqueFollowingCheck:
+    """Check that the drive's actual torque follows the commands, in 1/1000 of the rated torque.
 
-    A TPDO may be made before or after the drive takes over the command of the tick before, so it is
-    compared with the last two. Where the drive measures its torque, that follows the command with a
-    lag of first order; the commands are then filtered alike before they are compared.
+    The drive may sample its torque before or after it applies the command of the previous tick, so
+    the torque is compared with the last two commands. If the drive measures its torque, the torque
+    follows the command with a first-order lag; the commands are then filtered by the same lag.
 
     Parameters
     ----------
@@ -82,86 +88,91 @@ class TorqueFollowing:
     tolerance_percent
         Tolerance in percent of the rated torque; 0 disables the comparison.
     response_s
-        Time constant of that lag; 0 for a drive that reports the commanded torque.
+        Time constant of the lag in seconds; 0 for a drive that reports the commanded torque.
     period_s
-        Time between two commands.
+        Time between two commands in seconds.
 
     Attributes
     ----------
-    compares : bool
-        Whether the drive reports its torque.
+    is_active : bool
+        Whether the drive reports its torque, so that the check is active.
     """
 
     def __init__(
         self, name: str, tolerance_percent: float, response_s: float = 0.0, period_s: float = 1e-3
     ) -> None:
         self._name = name
-        self._tolerance = 10.0 * tolerance_percent
+        self._tolerance_per_mille = 10.0 * tolerance_percent
         # Fraction of a step that a command reaches after one period.
         self._step_fraction = 1.0 - exp(-period_s / response_s) if response_s else 1.0
-        self.compares = True
+        self.is_active = True
         self.start()
 
     def start(self) -> None:
-        """Start with a drive whose commanded torque is zero."""
-        self._commanded = 0
-        self._last = 0.0
-        self._before = 0.0
-        self._departed = 0
+        """Restart the check of the torque, for a drive whose commanded torque is zero."""
+        self._commanded_per_mille = 0
+        self._last_per_mille = 0.0
+        self._previous_per_mille = 0.0
+        self._deviating_ticks = 0
 
     def command(self, per_mille: int) -> None:
-        """Note the torque that is commanded."""
-        self._commanded = per_mille
-        before = self._before = self._last
-        self._last = before + self._step_fraction * (per_mille - before)
+        """Register the commanded torque of this tick, in 1/1000 of the rated torque."""
+        self._commanded_per_mille = per_mille
+        previous_per_mille = self._previous_per_mille = self._last_per_mille
+        self._last_per_mille = previous_per_mille + self._step_fraction * (
+            per_mille - previous_per_mille
+        )
 
     def compare(self, actual_per_mille: int) -> None:
-        """Compare the drive's torque with the last commands.
+        """Raise if the actual torque, in 1/1000 of the rated torque, differs from the commands.
 
         Raises
         ------
         DeviceError
-            If they have differed for too many ticks in a row.
+            If the torque has differed from the commands for too many consecutive ticks.
         """
-        tolerance = self._tolerance
+        tolerance = self._tolerance_per_mille
         if (
-            abs(actual_per_mille - self._last) <= tolerance
-            or abs(actual_per_mille - self._before) <= tolerance
+            abs(actual_per_mille - self._last_per_mille) <= tolerance
+            or abs(actual_per_mille - self._previous_per_mille) <= tolerance
             or not tolerance
-            or not self.compares
+            or not self.is_active
         ):
-            self._departed = 0
+            self._deviating_ticks = 0
             return
-        self._departed += 1
-        if self._departed >= _TICKS:
+        self._deviating_ticks += 1
+        if self._deviating_ticks >= _MOST_DEVIATING_TICKS:
             raise DeviceError(
                 f"{self._name}: it exerts {actual_per_mille / 10:g} % of the rated torque (object "
-                f"6077) where {self._commanded / 10:g} % were commanded, for {_TICKS} ticks; "
-                "commands are lost, or the drive limits them. Check its diagnosis and "
-                "cia402.torque_tolerance_percent; where it measures this torque, check "
-                "cia402.torque_response_s."
+                f"6077) where {self._commanded_per_mille / 10:g} % were commanded, for "
+                f"{_MOST_DEVIATING_TICKS} ticks; commands are lost, or the drive limits them. "
+                "Check its diagnosis and cia402.torque_tolerance_percent; where it measures this "
+                "torque, check cia402.torque_response_s."
             )
 
 
 # Up and down
 
-_STEPS_UP = (
+_ENABLING_STEPS = (
     (SHUTDOWN, DriveState.READY),
     (SWITCH_ON, DriveState.SWITCHED_ON),
     (ENABLE_OPERATION, DriveState.OPERATION_ENABLED),
 )
-_SILENT_TURNS = 10
-_SILENT_TURNS_IN_LOCK_STEP = 3
-"""SYNCs in a row without an answer after which stepping up gives up."""
-_SWITCH_OFF_NS = 50_000_000
+"""Controlwords that enable the drive in steps, each with the state that the drive then reaches."""
+_MOST_UNANSWERED_SYNCS = 10
+"""Number of consecutive unanswered SYNCs after which enabling fails."""
+_MOST_UNANSWERED_SYNCS_IN_LOCK_STEP = 3
+"""Number of consecutive unanswered SYNCs after which enabling fails, for a drive in lock-step."""
+_SWITCH_OFF_TIMEOUT_NS = 50_000_000
+"""Time in nanoseconds within which the drive has to confirm that it is off."""
 
 
 class StopRequestedError(Exception):
-    """The operator requested a stop while the drive was being enabled."""
+    """Error: the operator requested a stop while the drive was being enabled."""
 
 
-def step_up(node: Node, stop: Callable[[], bool]) -> None:
-    """Bring the drive to operation enabled; RPDO, SYNC and heartbeat go out once a period.
+def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
+    """Bring the drive to operation enabled; send RPDO, SYNC and heartbeat once a period.
 
     Parameters
     ----------
@@ -175,29 +186,29 @@ def step_up(node: Node, stop: Callable[[], bool]) -> None:
     StopRequestedError
         If `stop` returned True. The drive may be enabled then.
     DeviceError
-        If a step takes longer than ``cia402.enable_timeout_s``, the drive then ignores the torque,
-        or is in another mode. It may be enabled then.
+        If a step takes longer than ``cia402.enable_timeout_s``, or the enabled drive ignores the
+        target torque or is in another mode of operation. It may be enabled then.
     """
     inbox = node.inbox
-    grid_ns = node.sync_ns
-    for controlword, state in _STEPS_UP:
+    sync_grid_ns = node.sync_ns
+    for controlword, state in _ENABLING_STEPS:
 
-        def stuck(state: DriveState = state) -> str:
+        def describe_failure(state: DriveState = state) -> str:
             return (
                 f'it does not get to "{state.value}" and stays in '
-                f'"{state_of(inbox.statusword).value}" (statusword 0x{inbox.statusword:04X}); '
+                f'"{drive_state(inbox.statusword).value}" (statusword 0x{inbox.statusword:04X}); '
                 "check STO, motor supply and its own diagnosis"
             )
 
-        def reached(state: DriveState = state) -> bool:
-            return state_of(inbox.statusword) is state
+        def is_reached(state: DriveState = state) -> bool:
+            return drive_state(inbox.statusword) is state
 
-        _turn_until(node, controlword, grid_ns, reached, stuck, stop)
+        _send_controlword_until(node, controlword, sync_grid_ns, is_reached, describe_failure, stop)
     if node.settings.follows_target_bit:
-        _turn_until(
+        _send_controlword_until(
             node,
             ENABLE_OPERATION,
-            grid_ns,
+            sync_grid_ns,
             lambda: inbox.statusword & FOLLOWS_TARGET != 0,
             lambda: (
                 "it is enabled and ignores the target torque: bit 12 of its statusword "
@@ -206,51 +217,51 @@ def step_up(node: Node, stop: Callable[[], bool]) -> None:
             ),
             stop,
         )
-    _check_mode(node, grid_ns, stop)
+    _check_mode(node, sync_grid_ns, stop)
 
 
 def switch_off(node: Node) -> bool:
-    """Zero the torque and disable the drive. Never raises.
+    """Zero the torque and disable the drive; never raises.
 
     Returns
     -------
     bool
-        Whether the drive has shown it in its statusword. If not, its node has been stopped, as far
-        as it takes frames at all.
+        Whether the drive's statusword has shown that it is off. If not, the command to stop its
+        node has been sent.
     """
     if _switch_off_by_pdo(node):
         return True
-    # That the drive has taken the command by SDO does not say that it has followed it.
+    # A confirmed SDO request does not mean that the drive has executed the command.
     if node.write(node.frames.disable_voltage, CONTROLWORD, 0):
-        give_up_ns = time.monotonic_ns() + _SWITCH_OFF_NS
-        while time.monotonic_ns() < give_up_ns:
+        deadline_ns = time.monotonic_ns() + _SWITCH_OFF_TIMEOUT_NS
+        while time.monotonic_ns() < deadline_ns:
             if node.is_off():
                 return True
     node.send_if_possible(node.frames.stop)
     return False
 
 
-def _check_mode(node: Node, grid_ns: int, stop: Callable[[], bool]) -> None:
-    """Ask the enabled drive for its mode: before, some drives do not show it."""
+def _check_mode(node: Node, sync_grid_ns: int, stop: Callable[[], bool]) -> None:
+    """Check that the enabled drive is in cyclic torque mode; some drives show it only then."""
     inbox, frames, send = node.inbox, node.frames, node.exchange.send
     mode: int | None = None
 
     def in_cyclic_torque() -> bool:
         nonlocal mode
-        mode_read = read_mode(inbox.reply)
+        mode_read = read_mode(inbox.sdo_reply)
         if mode_read is None:
             return False
-        mode, inbox.reply = mode_read, b""
+        mode, inbox.sdo_reply = mode_read, b""
         if mode != CYCLIC_TORQUE:
-            send(frames.ask_mode)
+            send(frames.read_mode_request)
         return mode == CYCLIC_TORQUE
 
-    inbox.reply = b""
-    send(frames.ask_mode)
-    _turn_until(
+    inbox.sdo_reply = b""
+    send(frames.read_mode_request)
+    _send_controlword_until(
         node,
         ENABLE_OPERATION,
-        grid_ns,
+        sync_grid_ns,
         in_cyclic_torque,
         lambda: (
             f"its mode of operation (object 6061) is {mode}, not {CYCLIC_TORQUE} (cyclic "
@@ -260,55 +271,57 @@ def _check_mode(node: Node, grid_ns: int, stop: Callable[[], bool]) -> None:
     )
 
 
-def _turn_until(
+def _send_controlword_until(
     node: Node,
     controlword: int,
-    grid_ns: int,
-    reached: Callable[[], bool],
-    stuck: Callable[[], str],
+    sync_grid_ns: int,
+    is_reached: Callable[[], bool],
+    describe_failure: Callable[[], str],
     stop: Callable[[], bool],
 ) -> None:
-    """Send a controlword with zero torque, period by period, until the drive follows."""
+    """Send a controlword with zero torque once a period until `is_reached` returns True."""
     frame = node.frames.rpdo(controlword, 0)
     timeout_s = node.settings.enable_timeout_s
-    limit = _SILENT_TURNS_IN_LOCK_STEP if node.lock_step else _SILENT_TURNS
-    silent = 0
+    limit = _MOST_UNANSWERED_SYNCS_IN_LOCK_STEP if node.lock_step else _MOST_UNANSWERED_SYNCS
+    unanswered_syncs = 0
     for _ in range(ceil(timeout_s * node.rate_hz)):
         if stop():
             raise StopRequestedError
         node.exchange.send(frame)
-        node.await_grid(grid_ns)
+        node.sleep_until_next_period(sync_grid_ns)
         node.now_ns += node.period_ns
         node.send_sync()
         node.send_heartbeat()
-        answered = node.await_reply()
-        node.refuse_alarm()
-        if answered and reached():
+        is_answered = node.await_reply()
+        node.raise_if_alarmed()
+        if is_answered and is_reached():
             return
-        silent = 0 if answered else silent + 1
-        if silent >= limit:
+        unanswered_syncs = 0 if is_answered else unanswered_syncs + 1
+        if unanswered_syncs >= limit:
             raise DeviceError(
                 f"{node.name}: it has stopped answering SYNC while being enabled; check its supply "
                 "and the cable."
             )
-    raise DeviceError(f"{node.name}: {stuck()} (cia402.enable_timeout_s = {timeout_s:g} s).")
+    raise DeviceError(
+        f"{node.name}: {describe_failure()} (cia402.enable_timeout_s = {timeout_s:g} s)."
+    )
 
 
 def _switch_off_by_pdo(node: Node) -> bool:
-    """Return whether the statusword showed the drive off; never raises."""
-    idle = node.frames.rpdo(DISABLE_VOLTAGE, 0)
+    """Command the drive off by RPDO; return whether its statusword confirmed it; never raises."""
+    idle_rpdo = node.frames.rpdo(DISABLE_VOLTAGE, 0)
     started_ns = time.monotonic_ns()
-    while time.monotonic_ns() - started_ns <= _SWITCH_OFF_NS:
-        # At SYNC the torque of the RPDO takes effect, and the statusword is read.
-        taken = node.send_if_possible(idle)
-        answered = node.sync_if_possible()
-        # The drive may take its time, for a ramp, and must not miss the loop meanwhile.
+    while time.monotonic_ns() - started_ns <= _SWITCH_OFF_TIMEOUT_NS:
+        # At SYNC the drive applies the torque of the RPDO, and samples its statusword.
+        is_sent = node.send_if_possible(idle_rpdo)
+        is_answered = node.sync_if_possible()
+        # The drive may need time for a ramp; meanwhile it must not miss this computer's heartbeat.
         node.now_ns += node.period_ns
         with suppress(Exception):  # an adapter's library may raise anything
             node.send_heartbeat()
-        if answered and state_of(node.inbox.statusword) in OFF:
+        if is_answered and drive_state(node.inbox.statusword) in TORQUE_FREE_STATES:
             return True
-        if not taken:
-            break  # the bus is gone
-        node.await_grid(node.sync_ns)
+        if not is_sent:
+            break  # the bus has failed
+        node.sleep_until_next_period(node.sync_ns)
     return False

@@ -1,11 +1,11 @@
-"""Requirements on a drive's object dictionary: one table for set-up, EDS files and docs.
+"""Requirements on a drive's object dictionary, in one table for set-up, EDS check and documents.
 
 An object is *core* if no session is possible without it, and *optional* if something else replaces
 it. An optional object may be read-only if it holds an allowed value (:class:`AllowedValue`). If
-nothing replaces it by itself, the profile has to accept its absence by name
+there is no automatic replacement, the profile has to accept that the object is missing
 (``cia402.accept_without``), or the drive is refused.
 
-Imports nothing but the indices, so that a program which only reads an EDS file can use it.
+The module imports only the indices, so that a program that only reads an EDS file can use it.
 """
 
 from collections.abc import Collection
@@ -21,28 +21,35 @@ if TYPE_CHECKING:
     from rigd.devices.parameters import RigParameters, ServoDrive
 
 WATCHDOG: Final = "watchdog"
+"""Name in ``cia402.accept_without`` for a drive without a watchdog over this computer."""
 TORQUE_LIMIT: Final = "torque_limit"
+"""Name in ``cia402.accept_without`` for a drive without a configurable torque limit."""
 ABORT_OPTION: Final = "abort_option"
+"""Name in ``cia402.accept_without`` for a drive without a configurable abort connection option."""
 TORQUE_FEEDBACK: Final = "torque_feedback"
+"""Name in ``cia402.accept_without`` for a drive that does not report its actual torque."""
 ACCEPTABLE: Final = (WATCHDOG, TORQUE_LIMIT, ABORT_OPTION, TORQUE_FEEDBACK)
-"""Names of what a profile may accept that its drive lacks."""
+"""Names in ``cia402.accept_without`` of the functions that a drive may lack."""
 
 
 class ObjectAccess(Flag):
-    """Kind of access to an object."""
+    """Ways in which the driver accesses an object: by SDO or in a PDO."""
 
     READ = auto()
-    """Read by SDO."""
+    """The object is read by SDO."""
     WRITE = auto()
-    """Written by SDO, in pre-operational, unless the object already holds what is needed."""
+    """The object is written by SDO in pre-operational, unless it already holds the required
+    value."""
     SENT = auto()
-    """Mapped into the drive's TPDO (an EDS has PDOMapping = 1, access ro, rw or rwr)."""
+    """The object is mapped into the drive's TPDO (in an EDS: PDOMapping = 1, access ro, rw or
+    rwr)."""
     RECEIVED = auto()
-    """Mapped into the drive's RPDO (PDOMapping = 1, access rw, rww or wo)."""
+    """The object is mapped into the drive's RPDO (in an EDS: PDOMapping = 1, access rw, rww or
+    wo)."""
 
 
 class Watchdog(Enum):
-    """Watchdog in the drive that takes the torque off when this computer falls silent."""
+    """Watchdog by which the drive removes the torque if this computer stops communicating."""
 
     HEARTBEAT = "heartbeat consumer (1016:1)"
     RPDO_DEADLINE = "deadline of the RPDO (1400:5)"
@@ -51,14 +58,14 @@ class Watchdog(Enum):
 
 
 def watchdog(*, heartbeat: bool, rpdo_deadline: bool, own: bool) -> Watchdog:
-    """Return the watchdog that is active, the best one first.
+    """Return the kind of watchdog that a drive uses: the most reliable one that it has.
 
     Parameters
     ----------
     heartbeat, rpdo_deadline
-        Whether the drive has 1016:1, and 1400:5.
+        Whether the drive has the objects 1016:1 and 1400:5.
     own
-        Whether the profile states the time of the drive's own one.
+        Whether the profile states the timeout of a manufacturer-specific watchdog.
     """
     if heartbeat:
         return Watchdog.HEARTBEAT
@@ -68,33 +75,33 @@ def watchdog(*, heartbeat: bool, rpdo_deadline: bool, own: bool) -> Watchdog:
 
 
 class AllowedValue(Enum):
-    """Rule for the value of an object that cannot be written."""
+    """Rule by which the value of a read-only object is accepted."""
 
     EQUAL = "exactly"
-    """The required value."""
+    """The object holds the required value."""
     AT_LEAST = "at least"
-    """A limit of at least the required value."""
+    """The object is a limit, and holds at least the required value."""
     EQUAL_OR_UNUSED = "exactly, or 0"
-    """The required value, or 0: not used."""
+    """The object holds the required value, or 0, which means that the drive does not use it."""
     ANY = "any"
-    """It is only read."""
+    """Every value is accepted, because the object is only read."""
 
-    def allows(self, found: int, wanted: int) -> bool:
-        """Return whether a value is allowed where another one is required.
+    def allows(self, value: int, required_value: int) -> bool:
+        """Return whether this rule accepts the value that an object holds.
 
         Parameters
         ----------
-        found, wanted
-            Value that the object holds, and the required one.
+        value, required_value
+            Value that the object holds, and value that is required.
         """
         if self in (AllowedValue.EQUAL, AllowedValue.EQUAL_OR_UNUSED):
-            return found == wanted or (self is AllowedValue.EQUAL_OR_UNUSED and found == 0)
-        return self is AllowedValue.ANY or found >= wanted
+            return value == required_value or (self is AllowedValue.EQUAL_OR_UNUSED and value == 0)
+        return self is AllowedValue.ANY or value >= required_value
 
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """One object, or one sub-index of it.
+    """Requirement on one object, or on one sub-index of it, in the drive's object dictionary.
 
     Attributes
     ----------
@@ -103,20 +110,21 @@ class Requirement:
     name
         Name in CiA 301 or 402.
     core
-        No session without it.
+        Whether no session is possible without the object.
     access
-        Kind of access to it.
+        How the driver accesses the object.
     stand_in
-        Replacement where it is absent; empty where there is none.
+        What replaces the object if it is absent; empty if nothing does.
     sentence
-        Consequence and remedy where it is absent or cannot be used, for the operator.
-    fit
-        Values that it may hold where it cannot be written.
+        Consequence and remedy if the object is absent or unusable, for the operator.
+    value_rule
+        Rule for the value of the object if it is read-only.
     accept
-        Name under which ``cia402.accept_without`` has to accept its absence; empty where it does
-        not have to. (For 1016:1 only if no other :class:`Watchdog` is active.)
-    zero
-        Has to read 0 where it is there: something that a drive may hold from before.
+        Name in ``cia402.accept_without`` that permits a drive without the object; empty if no
+        permission is needed. (For 1016:1 only if no other :class:`Watchdog` is active.)
+    must_be_zero
+        Whether the object has to read 0 if the drive has it, since the drive may have stored
+        another value in earlier use.
     """
 
     index: int
@@ -126,17 +134,17 @@ class Requirement:
     access: ObjectAccess
     stand_in: str = ""
     sentence: str = ""
-    fit: AllowedValue = AllowedValue.EQUAL
+    value_rule: AllowedValue = AllowedValue.EQUAL
     accept: str = ""
-    zero: bool = False
+    must_be_zero: bool = False
 
     @property
     def address(self) -> str:
-        """Index and sub-index as messages show them: ``6072`` or ``1016:1``."""
+        """Index and sub-index of the object as messages show them: ``6072`` or ``1016:1``."""
         return f"{self.index:04X}:{self.sub}" if self.sub else f"{self.index:04X}"
 
-    def missing(self, accepted: Collection[str] = ()) -> str:
-        """Return why a drive without it is refused, as a sentence; empty if it is not.
+    def refusal_reason(self, accepted: Collection[str] = ()) -> str:
+        """Return the reason to refuse a drive without this object; empty if it is accepted.
 
         Parameters
         ----------
@@ -151,43 +159,55 @@ class Requirement:
         return f"it has no object {self.address} ({self.name}). {self.sentence}{remedy}"
 
 
-_R, _W = ObjectAccess.READ, ObjectAccess.WRITE
-_NOT_USABLE: Final = "Without it the drive cannot be used: check whether its firmware offers it."
-_DYNAMIC: Final = (
+_READ_ACCESS, _WRITE_ACCESS = ObjectAccess.READ, ObjectAccess.WRITE
+_DRIVE_NOT_USABLE: Final = (
+    "Without it the drive cannot be used: check whether its firmware offers it."
+)
+_PDO_MAPPING_NEEDED: Final = (
     "Its PDOs must be mappable as rigd needs them, or be mapped so already: RPDO1 with "
     "controlword and target torque, TPDO1 with statusword, position and actual torque."
 )
-_FROM_BEFORE: Final = "Set it to 0 with the drive's own tool, and store that."
+_CLEAR_STORED_VALUE: Final = "Set it to 0 with the drive's own tool, and store that."
 
-CORE: Final = (
+CORE_REQUIREMENTS: Final = (
     Requirement(
         objects.CONTROLWORD,
         0,
         "Controlword",
         True,
-        _W | ObjectAccess.RECEIVED,
-        sentence=_NOT_USABLE,
+        _WRITE_ACCESS | ObjectAccess.RECEIVED,
+        sentence=_DRIVE_NOT_USABLE,
     ),
     Requirement(
-        objects.STATUSWORD, 0, "Statusword", True, _R | ObjectAccess.SENT, sentence=_NOT_USABLE
+        objects.STATUSWORD,
+        0,
+        "Statusword",
+        True,
+        _READ_ACCESS | ObjectAccess.SENT,
+        sentence=_DRIVE_NOT_USABLE,
     ),
     Requirement(
         objects.MODE,
         0,
         "Modes of operation",
         True,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         sentence="It must accept 10, cyclic synchronous torque mode.",
     ),
     Requirement(
-        objects.MODE_DISPLAY, 0, "Modes of operation display", True, _R, sentence=_NOT_USABLE
+        objects.MODE_DISPLAY,
+        0,
+        "Modes of operation display",
+        True,
+        _READ_ACCESS,
+        sentence=_DRIVE_NOT_USABLE,
     ),
     Requirement(
         objects.POSITION,
         0,
         "Position actual value",
         True,
-        _R | ObjectAccess.SENT,
+        _READ_ACCESS | ObjectAccess.SENT,
         sentence="The loop runs on it.",
     ),
     Requirement(
@@ -203,61 +223,100 @@ CORE: Final = (
         0,
         "Supported drive modes",
         True,
-        _R,
+        _READ_ACCESS,
         sentence="Its bit 9 must say that the drive has cyclic synchronous torque mode.",
     ),
-    Requirement(objects.RPDO_COMMUNICATION, 1, "COB-ID of RPDO1", True, _R | _W, sentence=_DYNAMIC),
+    Requirement(
+        objects.RPDO_COMMUNICATION,
+        1,
+        "COB-ID of RPDO1",
+        True,
+        _READ_ACCESS | _WRITE_ACCESS,
+        sentence=_PDO_MAPPING_NEEDED,
+    ),
     Requirement(
         objects.RPDO_COMMUNICATION,
         2,
         "Transmission type of RPDO1",
         True,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         sentence="It must be 1 (at_sync) or 255 (on_arrival), as cia402.torque_delivery says.",
     ),
-    Requirement(objects.RPDO_MAPPING, 0, "Mapping of RPDO1", True, _R | _W, sentence=_DYNAMIC),
-    Requirement(objects.TPDO_COMMUNICATION, 1, "COB-ID of TPDO1", True, _R | _W, sentence=_DYNAMIC),
+    Requirement(
+        objects.RPDO_MAPPING,
+        0,
+        "Mapping of RPDO1",
+        True,
+        _READ_ACCESS | _WRITE_ACCESS,
+        sentence=_PDO_MAPPING_NEEDED,
+    ),
+    Requirement(
+        objects.TPDO_COMMUNICATION,
+        1,
+        "COB-ID of TPDO1",
+        True,
+        _READ_ACCESS | _WRITE_ACCESS,
+        sentence=_PDO_MAPPING_NEEDED,
+    ),
     Requirement(
         objects.TPDO_COMMUNICATION,
         2,
         "Transmission type of TPDO1",
         True,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         sentence="It must be 1: an angle at every SYNC.",
     ),
-    Requirement(objects.TPDO_MAPPING, 0, "Mapping of TPDO1", True, _R | _W, sentence=_DYNAMIC),
+    Requirement(
+        objects.TPDO_MAPPING,
+        0,
+        "Mapping of TPDO1",
+        True,
+        _READ_ACCESS | _WRITE_ACCESS,
+        sentence=_PDO_MAPPING_NEEDED,
+    ),
 )
-"""No session without one of these. Mapping entries 1600 and 1A00 sub 1 and on go with sub 0."""
+"""Requirements on objects without which no session is possible.
 
-OPTIONAL: Final = (
+Rows for sub-index 0 of the mappings 1600 and 1A00 stand for the entries from sub-index 1 on,
+too."""
+
+OPTIONAL_REQUIREMENTS: Final = (
     # Identity and texts: reported, and compared only if the profile states them.
     Requirement(
         objects.IDENTITY,
         1,
         "Vendor-ID",
         False,
-        _R,
+        _READ_ACCESS,
         "nothing: cia402.vendor_id = 0",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
     ),
     Requirement(
         objects.IDENTITY,
         2,
         "Product code",
         False,
-        _R,
+        _READ_ACCESS,
         "nothing: cia402.product_code = 0",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
     ),
-    Requirement(objects.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=AllowedValue.ANY),
+    Requirement(
+        objects.DEVICE_NAME,
+        0,
+        "Device name",
+        False,
+        _READ_ACCESS,
+        "no name",
+        value_rule=AllowedValue.ANY,
+    ),
     Requirement(
         objects.ERROR_CODE,
         0,
         "Error code",
         False,
-        _R,
+        _READ_ACCESS,
         "the emergency message",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
     ),
     # SYNC.
     Requirement(
@@ -265,7 +324,7 @@ OPTIONAL: Final = (
         0,
         "COB-ID SYNC",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "0x080, the default of CiA 301",
     ),
     Requirement(
@@ -273,7 +332,7 @@ OPTIONAL: Final = (
         0,
         "Communication cycle period",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "transmission type 1: the drive goes by the SYNCs that come",
         "It must be the period of rig.rate_hz in microseconds, or 0.",
         AllowedValue.EQUAL_OR_UNUSED,
@@ -283,27 +342,27 @@ OPTIONAL: Final = (
         0,
         "Synchronous window length",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "no window",
-        f"A torque that comes later than it is dropped. {_FROM_BEFORE}",
-        zero=True,
+        f"A torque that comes later than it is dropped. {_CLEAR_STORED_VALUE}",
+        must_be_zero=True,
     ),
     Requirement(
         objects.SYNC_OVERFLOW,
         0,
         "Synchronous counter overflow value",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "a SYNC without counter",
-        f"rigd sends SYNC without a counter. {_FROM_BEFORE}",
-        zero=True,
+        f"rigd sends SYNC without a counter. {_CLEAR_STORED_VALUE}",
+        must_be_zero=True,
     ),
     Requirement(
         objects.INTERPOLATION_TIME,
         1,
         "Interpolation time period value",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the SYNC: each torque holds until the next",
         "With 60C2:2 it has to be the period of rig.rate_hz.",
     ),
@@ -312,17 +371,17 @@ OPTIONAL: Final = (
         2,
         "Interpolation time index",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the SYNC: each torque holds until the next",
         "With 60C2:1 it has to be the period of rig.rate_hz.",
     ),
-    # Who watches over whom.
+    # Monitoring of this computer by the drive, and of the drive by this computer.
     Requirement(
         objects.HEARTBEAT_CONSUMER,
         1,
         "Consumer heartbeat time",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the deadline of the RPDO (1400:5), or the drive's own watchdog (cia402.own_watchdog_s)",
         "Nothing in the drive would remove the torque if this computer stops communicating. If the "
         "drive has its own watchdog, set that up and state its time: cia402.own_watchdog_s.",
@@ -333,7 +392,7 @@ OPTIONAL: Final = (
         objects.EVENT_TIMER,
         "Event timer of RPDO1",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the heartbeat consumer (1016:1), which comes first",
     ),
     Requirement(
@@ -341,7 +400,7 @@ OPTIONAL: Final = (
         0,
         "Abort connection option code",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "",
         "The drive's reaction to the loss of this computer is then manufacturer-specific: see its "
         "manual, and test it at a low torque by pulling the cable. If it has a suitable value, "
@@ -353,7 +412,7 @@ OPTIONAL: Final = (
         1,
         "Error behaviour on communication error",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the default of CiA 301: to pre-operational",
         "It must be cia402.communication_error_option.",
     ),
@@ -362,7 +421,7 @@ OPTIONAL: Final = (
         0,
         "Producer heartbeat time",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "the TPDO of every SYNC, and limits.stale_ticks_in_a_row",
         "It must be cia402.drive_heartbeat_period_s in milliseconds.",
     ),
@@ -371,7 +430,7 @@ OPTIONAL: Final = (
         0,
         "COB-ID EMCY",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "0x080 + node id, the default of CiA 301",
         "Its emergency messages would not be received.",
     ),
@@ -381,7 +440,7 @@ OPTIONAL: Final = (
         0,
         "Max torque",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "a manufacturer-specific limit, set by cia402.set_objects (maxon EPOS4: 3001:2), the speed "
         "limit 6080, and the cut to motor.peak_torque_nm in this program",
         "The drive then has no limit of its own for the torque that rigd could set. Set the one "
@@ -394,7 +453,7 @@ OPTIONAL: Final = (
             0,
             name,
             False,
-            _R | _W,
+            _READ_ACCESS | _WRITE_ACCESS,
             "Max torque (6072)",
             "It cuts torques that the profile allows: raise it with the drive's own tool, or lower "
             "motor.peak_torque_nm.",
@@ -411,21 +470,21 @@ OPTIONAL: Final = (
         0,
         "Torque offset",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "none is added",
-        f"The drive adds it to every torque. {_FROM_BEFORE}",
-        zero=True,
+        f"The drive adds it to every torque. {_CLEAR_STORED_VALUE}",
+        must_be_zero=True,
     ),
     Requirement(
         objects.RATED_TORQUE,
         0,
         "Motor rated torque",
         False,
-        _R,
+        _READ_ACCESS,
         "motor.rated_torque_nm alone: cia402.rated_torque_unit_nm = 0",
         "What 1000 thousandths of torque are cannot be compared with the profile: set "
         "cia402.rated_torque_unit_nm = 0, and measure it (rigd identify motor).",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
     ),
     *(
         Requirement(
@@ -433,9 +492,9 @@ OPTIONAL: Final = (
             sub,
             name,
             False,
-            _R,
+            _READ_ACCESS,
             "the probing move before the first session (docs/safety.md)",
-            fit=AllowedValue.ANY,
+            value_rule=AllowedValue.ANY,
         )
         for index, sub, name in (
             (objects.ENCODER_RESOLUTION, 1, "Encoder increments"),
@@ -451,10 +510,10 @@ OPTIONAL: Final = (
         0,
         "Torque actual value",
         False,
-        _R | ObjectAccess.SENT,
+        _READ_ACCESS | ObjectAccess.SENT,
         "",
         "Torque commands that are lost, or cut by the drive, would not be noticed.",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
         accept=TORQUE_FEEDBACK,
     ),
     Requirement(
@@ -462,49 +521,56 @@ OPTIONAL: Final = (
         0,
         "Max motor speed",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "nothing: cia402.max_speed_rad_s = 0, and a longer worst travel in rigd check",
         "The drive has no limit of its own for the speed: set cia402.max_speed_rad_s = 0, and see "
         "what rigd check then says of the worst travel.",
     ),
-    # What a drive may hold from before.
+    # Values that a drive may have stored in earlier use.
     Requirement(
         objects.TPDO_COMMUNICATION,
         objects.INHIBIT_TIME,
         "Inhibit time of TPDO1",
         False,
-        _R | _W,
+        _READ_ACCESS | _WRITE_ACCESS,
         "no inhibit time",
-        f"It keeps back angles that SYNC asks for. {_FROM_BEFORE}",
-        zero=True,
+        f"It keeps back angles that SYNC asks for. {_CLEAR_STORED_VALUE}",
+        must_be_zero=True,
     ),
     Requirement(
         objects.POLARITY,
         0,
         "Polarity",
         False,
-        _R,
+        _READ_ACCESS,
         "no polarity",
         "It turns the position, the speed or the torque round: turned alone, one of them makes the "
-        f"loop run away. {_FROM_BEFORE} The direction of the axis is cia402.direction.",
-        zero=True,
+        f"loop run away. {_CLEAR_STORED_VALUE} The direction of the axis is cia402.direction.",
+        must_be_zero=True,
     ),
     Requirement(
-        objects.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=AllowedValue.ANY
+        objects.QUICK_STOP_OPTION,
+        0,
+        "Quick stop option code",
+        False,
+        _READ_ACCESS,
+        "–",
+        value_rule=AllowedValue.ANY,
     ),
     Requirement(
         objects.FAULT_REACTION_OPTION,
         0,
         "Fault reaction option code",
         False,
-        _R,
+        _READ_ACCESS,
         "–",
-        fit=AllowedValue.ANY,
+        value_rule=AllowedValue.ANY,
     ),
 )
-"""Objects that something else can replace."""
+"""Requirements on objects that something else can replace."""
 
-REQUIREMENTS: Final = CORE + OPTIONAL
+REQUIREMENTS: Final = CORE_REQUIREMENTS + OPTIONAL_REQUIREMENTS
+"""All requirements on the drive's object dictionary."""
 
 MAY_BE_WRITE_ONLY: Final = (
     objects.MODE,
@@ -515,14 +581,17 @@ MAY_BE_WRITE_ONLY: Final = (
     objects.MAX_TORQUE,
     objects.MAX_SPEED_RPM,
 )
-"""Objects that are set whatever they held before, so that one that cannot be read is written and
-not verified. (6060 is write-only in the first editions of CiA 402; 6061 shows the mode.)"""
+"""Indices of objects that are written without verification if they cannot be read.
+
+They are set whatever they held before. (6060 is write-only in the first editions of CiA 402; 6061
+shows the mode.)"""
 
 _BY_ADDRESS: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
+"""Requirement by index and sub-index."""
 
 
 def requirement(index: int, sub: int = 0) -> Requirement:
-    """Return the row of an object.
+    """Return the requirement on the drive's object at an index and sub-index.
 
     Parameters
     ----------
@@ -532,24 +601,26 @@ def requirement(index: int, sub: int = 0) -> Requirement:
     Raises
     ------
     KeyError
-        If rigd asks nothing of it.
+        If there is no requirement on this object.
     """
     return _BY_ADDRESS[index, sub]
 
 
-_ROUNDING = 1e-9
+_ROUNDING_TOLERANCE = 1e-9
+"""Tolerance for rounding errors of floating-point numbers, relative."""
 
 
-def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
-    """Return what objects are to hold whatever the profile says, by index and sub-index.
+def profile_independent_values(node_id: int) -> dict[tuple[int, int], int]:
+    """Return the required object values that do not depend on the profile, by index and sub-index.
 
     Parameters
     ----------
     node_id
-        Node number of the drive. It is added to all predefined identifiers (CiA 301) but SYNC's.
+        Node number of the drive. The predefined CAN identifiers (CiA 301) contain it, except that
+        of SYNC.
     """
     return {
-        **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.zero},
+        **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.must_be_zero},
         (objects.MODE, 0): objects.CYCLIC_TORQUE,
         (objects.SYNC_COB_ID, 0): objects.SYNC_ID,
         (objects.EMERGENCY_COB_ID, 0): 0x080 + node_id,
@@ -559,11 +630,11 @@ def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
     }
 
 
-def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
-    """Return what the set-up has the drive's objects hold, by index and sub-index.
+def required_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
+    """Return the values that the set-up writes to the drive's objects, by index and sub-index.
 
-    Only what the set-up asks the drive about, such as which watchdog it has, is not among it; nor
-    is what follows from a value that the profile does not know.
+    Values that depend on what the drive reports, such as its kind of watchdog, are not included,
+    nor are values that follow from a setting that is unknown in the profile.
 
     Parameters
     ----------
@@ -581,7 +652,7 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     period_us = sync_period_us(rig.rate_hz)
     value, exponent = interpolation_time(rig.rate_hz)
     unknown = unknown_values(rig)
-    wanted = fixed_values(settings.node_id) | {
+    required_value = profile_independent_values(settings.node_id) | {
         (objects.RPDO_COMMUNICATION, 2): objects.AT_EVERY_SYNC if at_sync else objects.ON_ARRIVAL,
         (objects.SYNC_PERIOD_US, 0): period_us,
         (objects.INTERPOLATION_TIME, 1): value,
@@ -591,24 +662,24 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
         (objects.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
     }
     if not {"motor.peak_torque_nm", "motor.rated_torque_nm"}.intersection(unknown):
-        limit = torque_limit_per_mille(rig)
-        limiting = (objects.MAX_TORQUE, *objects.TORQUE_LIMITS)
-        wanted |= {(index, 0): limit for index in limiting}
+        limit_per_mille = torque_limit_per_mille(rig)
+        limit_indices = (objects.MAX_TORQUE, *objects.TORQUE_LIMITS)
+        required_value |= {(index, 0): limit_per_mille for index in limit_indices}
     if settings.max_speed_rad_s > 0 and "cia402.gear_ratio" not in unknown:
-        wanted[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
-    return wanted
+        required_value[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
+    return required_value
 
 
 def sync_period_us(rate_hz: float) -> int:
-    """Return the period in whole microseconds, for object 1006.
+    """Return the period of the loop in whole microseconds, for object 1006.
 
     Raises
     ------
     DeviceError
-        If it is none.
+        If the period is not a whole number of microseconds.
     """
     period_us = 1e6 / rate_hz
-    if abs(period_us - round(period_us)) > _ROUNDING * period_us:
+    if abs(period_us - round(period_us)) > _ROUNDING_TOLERANCE * period_us:
         from rigd.devices.contracts import DeviceError  # which loads numpy
 
         raise DeviceError(
@@ -619,18 +690,18 @@ def sync_period_us(rate_hz: float) -> int:
 
 
 def interpolation_time(rate_hz: float) -> tuple[int, int]:
-    """Return value (1 to 255) and power of ten in s of the period, for object 60C2.
+    """Return the loop's period as value (1 to 255) and power of ten in s, for object 60C2.
 
-    Milliseconds come first: some drives take nothing else.
+    Milliseconds are tried first, because some drives accept no other unit.
 
     Raises
     ------
     DeviceError
-        If there is no such pair.
+        If no such pair represents the period.
     """
     for exponent in (-3, -4, -5, -6, -2, -1, 0):
         value = 10.0**-exponent / rate_hz
-        if 0.5 < value < 255.5 and abs(value - round(value)) <= _ROUNDING * value:
+        if 0.5 < value < 255.5 and abs(value - round(value)) <= _ROUNDING_TOLERANCE * value:
             return round(value), exponent
     from rigd.devices.contracts import DeviceError
 
@@ -641,11 +712,13 @@ def interpolation_time(rate_hz: float) -> tuple[int, int]:
 
 
 def torque_limit_per_mille(rig: "RigParameters") -> int:
-    """Return the peak torque in 1/1000 of the rated torque, rounded down, within 16 bits."""
+    """Return the motor's peak torque in 1/1000 of its rated torque, rounded down, at most 32767."""
     motor = rig.motor
-    return min(int(1000 * motor.peak_torque_nm / motor.rated_torque_nm + _ROUNDING), 32767)
+    return min(
+        int(1000 * motor.peak_torque_nm / motor.rated_torque_nm + _ROUNDING_TOLERANCE), 32767
+    )
 
 
 def max_speed_rpm(settings: "ServoDrive") -> int:
-    """Return the speed limit in turns of the motor a minute, rounded up, for object 6080."""
-    return ceil(settings.max_speed_rad_s * settings.gear_ratio * 60 / tau - _ROUNDING)
+    """Return the motor's speed limit in revolutions per minute, rounded up, for object 6080."""
+    return ceil(settings.max_speed_rad_s * settings.gear_ratio * 60 / tau - _ROUNDING_TOLERANCE)

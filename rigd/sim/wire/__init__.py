@@ -1,8 +1,8 @@
-"""The simulated rig on the wire: nodes that speak CANopen, NETCANOEM and Modbus RTU.
+"""Simulated rig on a CAN bus and serial line, with nodes for CANopen, NETCANOEM and Modbus RTU.
 
-Offers the process of ``rigd simulate`` (`run_simulator`), its options (`SimulatorOptions`) and
-faults to inject while it runs (`parse_fault`, `inject`). Protocols are implemented again here, not
-shared with the drivers, so that an error in one shows against the other.
+`run_simulator` is the process of ``rigd simulate``, `SimulatorOptions` its options; `parse_fault`
+and `inject` inject faults while it runs. The protocols are implemented independently of the
+drivers, so that an error in one implementation is found by the other.
 """
 
 import lazy_loader as lazy

@@ -1,19 +1,21 @@
-"""The simulated ATI sensor behind a NETCANOEM box: it answers requests, and sends nothing else.
+"""Simulated ATI sensor with a NETCANOEM box, which only answers requests.
 
-Requests and replies use one range of sixteen identifiers, base · 16 + opcode; everything on the
-wire is big-endian. Behaviour that is not documented for the box is defined here:
+Requests and replies use sixteen consecutive identifiers, base · 16 + opcode. Numbers are
+big-endian. The following behaviour, which is not documented for the box, is defined here:
 
-* a request with an unknown opcode, of another length, or with an index that cannot be (axis or
-  diagnostic channel above 5, calibration above 15, base above 0x7F) gets no reply;
+* a request with an unknown opcode, a wrong length or an invalid index (axis or diagnostic channel
+  above 5, calibration above 15, base above 0x7F) gets no reply;
 * after power-up or a reset calibration 0 is active; after a reset, by request or by its watchdog,
   bit 0 of the status is set as well, up to the next power-up;
-* a calibration that is not in the box is selected and echoed all the same, but from then on bit 6
-  of the status is set and the matrix reads as not-a-number, as erased memory does; serial number,
+* a calibration that is not in the box is selected and confirmed nevertheless, but from then on bit
+6
+  of the status is set and the matrix reads as not-a-number, like erased memory; serial number,
   units and counts do not depend on the calibration;
 * counts per unit and units are reported from firmware 3.7 on, the diagnostic channels from 3.8 on;
   older firmware does not answer these requests;
-* a new base is acknowledged under the old one and holds from the next power-up on; a new bit rate
-  is acknowledged and changes nothing here, where there is none.
+* a new base is acknowledged with the old one and is used from the next power-up on; a new bit rate
+is
+  acknowledged and has no effect, since the simulated bus has no bit rate.
 """
 
 from collections.abc import Callable, Collection
@@ -30,55 +32,73 @@ from rigd.sim.wire._ati_gauges import (
     AtiGauges,
 )
 
-_STATUS_AND_EVEN = Struct(">H3h").pack
-_ODD = Struct(">3h").pack
-_ELEMENTS = Struct(">2f").pack
-_COUNTS = Struct(">2I").pack
-_WORD = Struct(">H").pack
-_FIRMWARE = Struct(">BBH").pack
+_pack_status_and_even_gauges = Struct(">H3h").pack
+"""Pack status word and gauges 0, 2, 4."""
+_pack_odd_gauges = Struct(">3h").pack
+"""Pack gauges 1, 3, 5."""
+_pack_matrix_entries = Struct(">2f").pack
+"""Pack two entries of the matrix."""
+_pack_counts_per_unit = Struct(">2I").pack
+"""Pack the counts per unit of force and torque."""
+_pack_word = Struct(">H").pack
+"""Pack a 16-bit word."""
+_pack_firmware = Struct(">BBH").pack
+"""Pack major, minor and build number of the firmware."""
 
-_WATCHDOG_RESET = 1 << 0
-_BAD_CALIBRATION = 1 << 6
-_ANY_ERROR = 1 << 15
+_WATCHDOG_RESET_BIT = 1 << 0
+"""Status bit: the watchdog has reset the box."""
+_BAD_CALIBRATION_BIT = 1 << 6
+"""Status bit: the active calibration is bad."""
+_ANY_ERROR_BIT = 1 << 15
+"""Status bit that is set if any other is set."""
 _ERASED_ROW = (float("nan"),) * 6
-_DIAGNOSTICS = (32768, 0, 21450, 43690, 32771, 12)
-"""Mid of the gauges' supply, unused, thermistor, power, excitation, ground: raw ADC values."""
-_FIRST_WITH_COUNTS = (3, 7)
-"""Older firmware knows no request for counts per unit, which are 1 000 000 each, or for units."""
-_FIRST_WITH_DIAGNOSTICS = (3, 8)
+"""Row of the matrix of a calibration that is not in the box."""
+_DIAGNOSTIC_VALUES = (32768, 0, 21450, 43690, 32771, 12)
+"""Raw ADC values of the diagnostic channels.
+
+They are middle of the gauges' supply, unused, thermistor, power, excitation, ground."""
+_FIRST_FIRMWARE_WITH_COUNTS = (3, 7)
+"""First firmware (major, minor) that reports counts per unit and unit codes.
+
+Older firmware has 1 000 000 counts per unit."""
+_FIRST_FIRMWARE_WITH_DIAGNOSTICS = (3, 8)
+"""First firmware (major, minor) that reports the diagnostic channels."""
 
 
 class AtiCanNode:
-    """A NETCANOEM box with a sensor.
+    """Simulated NETCANOEM box with a sensor, on the simulated CAN bus.
 
     Parameters
     ----------
     rig
-        With a section ``ati_can``: base, serial number (FT12345 if empty) and calibration.
-    simulated
-        Simulated sensor: one reading for each request.
+        Parameters of the rig with a section ``ati_can``: base, serial number (FT12345 if empty) and
+        calibration.
+    simulated_rig
+        Simulated rig, whose sensor takes one reading per request.
     send
-        Takes identifier and data of a reply.
+        Function that sends a reply with identifier and data.
     log
-        Called ``log("sensor", what, **values)`` when the box is set or reset.
+        Function that is called as ``log("sensor", what, **values)`` when the box is configured or
+        reset.
     firmware
-        Major, minor, build; before 3.7 the box reports neither counts per unit nor units.
+        Major, minor and build number of the firmware; before 3.7 the box reports neither counts per
+        unit nor units.
     calibrations
-        Indices that hold a calibration; the profile's alone if not given.
+        Indices of the calibrations in the box; None: only that of the profile.
     counts_per_unit
-        Per N and per N·m; 1 000 000 each with a firmware before 3.7.
+        Counts per N and per N·m; 1 000 000 each with a firmware before 3.7.
 
     Attributes
     ----------
     gauges : AtiGauges
-        The calibration that is served.
+        Gauges of the sensor, with its calibration matrix.
     frozen : bool
-        Whether the box neither answers nor receives.
+        Whether the box neither receives nor answers.
     saturate : int or None
-        This gauge reads ±32767.
+        Number of a gauge that reads ±32767; None: none.
     status_bits : int
-        Set in the status word on top of what the box finds itself; bit 15 follows. They stay
-        until they are taken away, a reset notwithstanding.
+        Bits set in the status word in addition to those that the box sets itself; bit 15 follows.
+        They remain until they are cleared, even after a reset.
 
     Raises
     ------
@@ -89,7 +109,7 @@ class AtiCanNode:
     def __init__(
         self,
         rig: RigParameters,
-        simulated: SimulatedRig,
+        simulated_rig: SimulatedRig,
         send: Callable[[int, bytes], None],
         log: Callable[..., None],
         *,
@@ -103,19 +123,19 @@ class AtiCanNode:
                 "The profile has no section [ati_can], which the simulated sensor on CAN needs; "
                 "copy it from a profile that has one."
             )
-        reports_counts = firmware[:2] >= _FIRST_WITH_COUNTS
+        reports_counts = firmware[:2] >= _FIRST_FIRMWARE_WITH_COUNTS
         self.gauges = AtiGauges(rig.sensor, counts_per_unit if reports_counts else COUNTS_PER_UNIT)
         self.frozen = False
         self.saturate: int | None = None
         self.status_bits = 0
-        self._measure = simulated.sensor.measure
+        self._measure = simulated_rig.sensor.measure
         self._send = send
         self._log = log
         self._firmware = firmware
         self._calibrations = (
             {settings.calibration} if calibrations is None else frozenset(calibrations)
         )
-        self._active = 0
+        self._active_calibration = 0
         self._was_reset = False
         self._base = self._next_base = settings.base_id
         serial_number = settings.serial_number or SERIAL_NUMBER
@@ -133,11 +153,11 @@ class AtiCanNode:
         if reports_counts:
             self._requests[0x7] = (0, self._read_counts_per_unit)
             self._requests[0x8] = (0, self._read_units)
-        if firmware[:2] >= _FIRST_WITH_DIAGNOSTICS:
+        if firmware[:2] >= _FIRST_FIRMWARE_WITH_DIAGNOSTICS:
             self._requests[0x9] = (1, self._read_diagnostic)
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Receive a frame."""
+        """Process a received CAN frame: answer a valid request."""
         if can_id >> 4 != self._base or self.frozen:
             return
         request = self._requests.get(can_id & 0xF)
@@ -145,70 +165,80 @@ class AtiCanNode:
             request[1](data)
 
     def tick(self, now_s: float) -> None:
-        """Nothing here takes time: the box only answers."""
+        """Do nothing: the box only answers requests."""
 
     def reset(self) -> None:
-        """Restart, by its watchdog or on request."""
-        self._active = 0
+        """Restart the box, by its watchdog or on request."""
+        self._active_calibration = 0
         self._was_reset = True
         self._log("sensor", "reset")
 
     def power_cycle(self) -> None:
-        """Simulate a power cycle."""
-        self._active = 0
+        """Restart the box as after a loss of power."""
+        self._active_calibration = 0
         self._was_reset = False
         self._base = self._next_base
         self._log("sensor", "power-up", base_id=self._base)
 
     def _reply(self, opcode: int, data: bytes) -> None:
+        """Send the reply to a request, with an opcode."""
         self._send(self._base << 4 | opcode, data)
 
     def _read_gauges(self, _: bytes) -> None:
+        """Answer a poll with two frames: status word and gauges."""
         g0, g1, g2, g3, g4, g5 = self.gauges.read((self._measure(),), self.saturate)[0].tolist()
         status = self.status_bits & 0xFFFF
         if self._was_reset:
-            status |= _WATCHDOG_RESET
-        if self._active not in self._calibrations:
-            status |= _BAD_CALIBRATION
+            status |= _WATCHDOG_RESET_BIT
+        if self._active_calibration not in self._calibrations:
+            status |= _BAD_CALIBRATION_BIT
         if status:
-            status |= _ANY_ERROR
-        self._reply(0x0, _STATUS_AND_EVEN(status, g0, g2, g4))
-        self._reply(0x1, _ODD(g1, g3, g5))
+            status |= _ANY_ERROR_BIT
+        self._reply(0x0, _pack_status_and_even_gauges(status, g0, g2, g4))
+        self._reply(0x1, _pack_odd_gauges(g1, g3, g5))
 
     def _read_matrix_row(self, data: bytes) -> None:
+        """Answer a request for a row of the calibration matrix with three frames."""
         axis = data[0]
         if axis > 5:
             return
-        known = self._active in self._calibrations
-        row = self.gauges.matrix[axis].tolist() if known else _ERASED_ROW
+        is_known = self._active_calibration in self._calibrations
+        row = self.gauges.matrix[axis].tolist() if is_known else _ERASED_ROW
         for opcode, first in ((0x2, 0), (0x3, 2), (0x4, 4)):
-            self._reply(opcode, _ELEMENTS(row[first], row[first + 1]))
+            self._reply(opcode, _pack_matrix_entries(row[first], row[first + 1]))
 
     def _read_serial_number(self, _: bytes) -> None:
+        """Answer a request for the serial number."""
         self._reply(0x5, self._serial_number)
 
     def _set_calibration(self, data: bytes) -> None:
+        """Select a calibration by its index, and confirm it."""
         index = data[0]
         if index > 15:
             return
-        self._active = index
+        self._active_calibration = index
         self._log("sensor", "calibration set", index=index, present=index in self._calibrations)
         self._reply(0x6, data)
 
     def _read_counts_per_unit(self, _: bytes) -> None:
-        self._reply(0x7, _COUNTS(*self.gauges.counts_per_unit))
+        """Answer a request for the counts per unit of force and torque."""
+        self._reply(0x7, _pack_counts_per_unit(*self.gauges.counts_per_unit))
 
     def _read_units(self, _: bytes) -> None:
+        """Answer a request for the unit codes of force and torque."""
         self._reply(0x8, bytes((UNIT_NEWTON, UNIT_NEWTON_METRE)))
 
     def _read_diagnostic(self, data: bytes) -> None:
-        if data[0] < len(_DIAGNOSTICS):
-            self._reply(0x9, _WORD(_DIAGNOSTICS[data[0]]))
+        """Answer a request for the raw value of a diagnostic channel."""
+        if data[0] < len(_DIAGNOSTIC_VALUES):
+            self._reply(0x9, _pack_word(_DIAGNOSTIC_VALUES[data[0]]))
 
     def _reset(self, _: bytes) -> None:
+        """Reset the box on request."""
         self.reset()
 
     def _set_base(self, data: bytes) -> None:
+        """Store a new identifier base for the next power-up, and confirm it."""
         if data[0] > 0x7F:
             return
         self._reply(0xD, b"")
@@ -216,8 +246,10 @@ class AtiCanNode:
         self._log("sensor", "base identifier set", base_id=data[0])
 
     def _set_baud(self, data: bytes) -> None:
+        """Confirm a new bit rate, which has no effect here."""
         self._log("sensor", "baud set", divisor=data[0], bitrate_bit_s=2_000_000 / (data[0] + 1))
         self._reply(0xE, b"")
 
     def _read_firmware(self, _: bytes) -> None:
-        self._reply(0xF, _FIRMWARE(*self._firmware))
+        """Answer a request for the version of the firmware."""
+        self._reply(0xF, _pack_firmware(*self._firmware))

@@ -1,4 +1,4 @@
-"""The strain gauges of the simulated ATI sensor: what its calibration matrix has to undo."""
+"""Strain gauges of the simulated ATI sensor, which measure a wrench."""
 
 from collections.abc import Sequence
 
@@ -7,21 +7,23 @@ from numpy.typing import NDArray
 
 from rigd.devices.contracts import Wrench
 from rigd.devices.parameters import WrenchSensorSettings
-from rigd.sim import Stuck
+from rigd.sim import StuckReadings
 
 COUNTS_PER_UNIT = (1_000_000, 1_000_000)
-"""Per N and per N·m, as both sensors of this family that are documented state them."""
+"""Counts per N and per N·m, as documented for two sensors of this family."""
 WIRE_ORDER = (0, 2, 4, 1, 3, 5)
-"""Order in which both protocols send the gauges."""
+"""Number of the gauge at each position, in the order in which both protocols send them."""
 UNIT_NEWTON, UNIT_NEWTON_METRE = 2, 3
+"""ATI's unit codes of force in N and of torque in N·m."""
 PART_NUMBER = "SI-20-1"
+"""Part number of the simulated sensor."""
 SERIAL_NUMBER = "FT12345"
-"""Serial number where the profile asks for none."""
+"""Serial number of the simulated sensor if the profile states none."""
 
-# Counts of each gauge (row) under the full range of fx, fy, fz, tx, ty, tz. Three beams carry two
-# gauges each: the even ones feel the forces across the axis and the torque about it, the odd ones
-# the rest; a few per cent of everything else leak in, as on a real sensor. A row's magnitudes add
-# up to 24 000 to 27 600: no load within the range saturates a gauge, bias included.
+# Three beams carry two gauges each. The even gauges measure the forces across the axis and the
+# torque about it, the odd gauges the other components, with a few per cent of crosstalk as on a
+# real sensor. The magnitudes of a row add up to 24 000 to 27 600, so that no load within the range
+# saturates a gauge, bias included.
 _COUNTS_AT_FULL_RANGE = (
     (6860, 2500, 410, -350, 270, 17200),
     (310, -260, 8310, 2150, 12540, -380),
@@ -30,37 +32,42 @@ _COUNTS_AT_FULL_RANGE = (
     (-1270, -7190, 330, 390, -310, 17440),
     (380, 300, 8410, 9790, -8190, 340),
 )
-_BIAS = (612, -1043, 385, 871, -724, 198)
-_LOWEST, _HIGHEST = -32768, 32767
-_SATURATED = 32767
+"""Counts of each gauge (row) under the full range of fx, fy, fz, tx, ty, tz."""
+_BIAS_COUNTS = (612, -1043, 385, 871, -724, 198)
+"""Counts of each gauge without load."""
+_LOWEST_COUNTS, _HIGHEST_COUNTS = -32768, 32767
+"""Range of a gauge in counts."""
+_SATURATED_COUNTS = 32767
+"""Magnitude in counts of a gauge that a fault saturates."""
 
 
 class AtiGauges:
-    """Six gauges under a wrench.
+    """Six strain gauges under a wrench, with the calibration matrix that inverts them.
 
-    A gauge is ``round(M⁻¹ · (wrench · counts per unit)) + bias``, with M as it goes over the wire,
-    in single precision; beyond 16 bits it saturates.
+    The counts are ``round(M⁻¹ · (wrench · counts per unit)) + bias``, with the calibration matrix M
+    in single precision, as it is transmitted. They saturate at 16 bits.
 
     Parameters
     ----------
     sensor
-        Sensor whose range fixes the gauges' sensitivity.
+        Sensor whose range determines the gauges' sensitivity.
     counts_per_unit
-        Per N and per N·m: the scale of the matrix.
+        Counts per N and per N·m, which scale the matrix.
 
     Attributes
     ----------
     matrix : (6, 6) float32
-        From gauges to fx, fy, fz, tx, ty, tz, times the counts per unit. Not symmetric, no entry
-        zero; each axis divided by its range, its condition number is 3.3.
+        Calibration matrix from gauge counts to fx, fy, fz, tx, ty, tz times the counts per unit. It
+        is not symmetric and has no zero entry. With each axis divided by its range, its condition
+        number is 3.3.
     counts_per_unit : tuple of int
-        Counts per unit of force and torque, as given.
+        Counts per N and per N·m.
     quantisation : (6,) float64
-        What the rounding of the gauges does at most to each axis, in N and N·m. With the range and
-        resolution of the Mini40 SI-20-1 it is less than half the resolution on every axis, and one
-        count of one gauge is less than that too.
+        Largest error of each axis by the rounding of the gauges, in N and N·m. With the range and
+        resolution of the Mini40 SI-20-1 it is less than half the resolution on every axis, and so
+        is the effect of one count of one gauge.
     stuck : tuple of int and Stuck, or None
-        Number of a gauge that has failed, and what it shows.
+        Number of a gauge that has failed, and replacement for its readings.
     """
 
     def __init__(
@@ -73,31 +80,31 @@ class AtiGauges:
         matrix = self.matrix.astype(np.float64)
         self.quantisation: NDArray[np.float64] = 0.5 * np.abs(matrix).sum(axis=1) / counts
         # For wrenches in rows.
-        self._per_unit = np.ascontiguousarray((np.linalg.inv(matrix) * counts).T)
-        self.stuck: tuple[int, Stuck] | None = None
-        self._bias = np.array(_BIAS, dtype=np.float64)
+        self._counts_per_wrench = np.ascontiguousarray((np.linalg.inv(matrix) * counts).T)
+        self.stuck: tuple[int, StuckReadings] | None = None
+        self._bias = np.array(_BIAS_COUNTS, dtype=np.float64)
 
     def read(self, wrenches: Sequence[Wrench], saturated: int | None = None) -> NDArray[np.int16]:
-        """Return the gauges, 0 to 5, under each wrench.
+        """Return the counts of gauges 0 to 5 under each wrench.
 
         Parameters
         ----------
         wrenches
-            fx, fy, fz (N), tx, ty, tz (N·m).
+            Wrenches: fx, fy, fz in N, tx, ty, tz in N·m.
         saturated
-            A gauge that reads ±32767, with the sign it has anyway; or None.
+            Number of a gauge that reads ±32767, with the sign of its reading; or None.
 
         Returns
         -------
         (n, 6) int16
         """
-        gauges: NDArray[np.float64] = np.array(wrenches) @ self._per_unit
+        gauges: NDArray[np.float64] = np.array(wrenches) @ self._counts_per_wrench
         np.rint(gauges, out=gauges)
         gauges += self._bias
-        np.minimum(gauges, _HIGHEST, out=gauges)
-        np.maximum(gauges, _LOWEST, out=gauges)
+        np.minimum(gauges, _HIGHEST_COUNTS, out=gauges)
+        np.maximum(gauges, _LOWEST_COUNTS, out=gauges)
         if saturated is not None:
-            gauges[:, saturated] = np.copysign(_SATURATED, gauges[:, saturated])
+            gauges[:, saturated] = np.copysign(_SATURATED_COUNTS, gauges[:, saturated])
         if self.stuck is not None:
             number, stuck = self.stuck
             gauges[:, number] = [stuck(value) for value in gauges[:, number].tolist()]

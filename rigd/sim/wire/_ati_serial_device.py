@@ -1,19 +1,20 @@
-"""The simulated ATI Digital F/T sensor on a serial line: Modbus RTU for set-up, then a stream.
+"""Simulated ATI Digital F/T sensor on a serial line: Modbus RTU for set-up, then a stream.
 
-Behaviour that is not documented for the sensor is defined here:
+The following behaviour, which is not documented for the sensor, is defined here:
 
-* frames for another address, with a wrong checksum, or of other bytes get no answer;
-* a request is whole as soon as its length is reached and its checksum holds; one that is still
-  incomplete after 50 ms of silence is forgotten (a real line forgets after 3.5 characters, which
-  no pseudo-terminal can be held to);
-* starting the stream, or the lock, with another parameter than the documented ones is answered with
-  0 instead of 1;
-* polled gauges (input registers 0 to 5) come in their natural order;
+* frames for another address, with a wrong checksum, or of other bytes get no answer; * a request is
+complete as soon as its length is reached and its checksum is right; a request that is
+  still incomplete after 50 ms of silence is discarded (a real sensor discards it after 3.5
+  characters, which a pseudo-terminal cannot reproduce);
+* a request to start the stream or to lock, with an undocumented parameter, is answered with 0
+instead
+  of 1;
+* polled gauges (input registers 0 to 5) are in their natural order;
 * gains and offsets are zero after power-up; writing them while locked is an illegal address.
 
-While it streams the sensor answers nothing; bytes sent to it are only counted, and 14 of them end
-the stream. A gauge whose gain or offset is not the one of its calibration reads the end of its
-range, -32768, whatever the load.
+While the sensor streams it answers nothing. Bytes sent to it are only counted, and 14 bytes end the
+stream. A gauge whose gain or offset differs from its calibration reads the end of its range,
+-32768, whatever the load.
 """
 
 import math
@@ -37,65 +38,98 @@ from rigd.sim.wire._ati_gauges import (
 )
 
 _ADDRESS = 0x0A
-_READ_HOLDING, _READ_INPUT, _WRITE = 0x03, 0x04, 0x10
-_STREAM, _LOCK = 0x46, 0x6A
-_START_STREAM, _UNLOCKED, _LOCKED = 0x55, 0xAA, 0x18
+"""Modbus address of the sensor."""
+_READ_HOLDING_FUNCTION, _READ_INPUT_FUNCTION, _WRITE_FUNCTION = 0x03, 0x04, 0x10
+"""Modbus functions: read holding registers, read input registers, write registers."""
+_STREAM_FUNCTION, _LOCK_FUNCTION = 0x46, 0x6A
+"""Functions of the sensor that start the stream, and lock or unlock its memory."""
+_START_STREAM_PARAMETER, _UNLOCK_PARAMETER, _LOCK_PARAMETER = 0x55, 0xAA, 0x18
+"""Documented parameters of the functions for stream and lock."""
 _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE = 1, 2, 3
-_EXCEPTION = 0x80
-_MOST_READ, _MOST_WRITTEN = 125, 123
+"""Modbus exception codes."""
+_EXCEPTION_BIT = 0x80
+"""Bit in the function code of a Modbus exception response."""
+_MOST_REGISTERS_READ, _MOST_REGISTERS_WRITTEN = 125, 123
+"""Largest number of registers in one request to read, and in one to write."""
 
-_GAINS, _OFFSETS = range(0x06), range(0x06, 0x0C)
-_SESSION_ID, _STATUS, _BAUD_IS_STORED, _BAUD = 0x0C, 0x1D, 0x1E, 0x1F
-_BAUDS = (1_250_000, 19_200, 115_200)
+_GAIN_REGISTERS, _OFFSET_REGISTERS = range(0x06), range(0x06, 0x0C)
+"""Addresses of the registers with the gauges' gains, and with their offsets."""
+_SESSION_ID_REGISTER, _STATUS_REGISTER, _BAUD_IS_STORED_REGISTER, _BAUD_REGISTER = (
+    0x0C,
+    0x1D,
+    0x1E,
+    0x1F,
+)
+"""Addresses of further holding registers."""
+_BAUD_RATES_BIT_S = (1_250_000, 19_200, 115_200)
+"""Bit rates in bit/s by the value of the baud register."""
 _POLLED_GAUGES = 6
-_DIAGNOSTICS = 0x27
+"""Number of input registers with polled gauges, from address 0 on."""
+_DIAGNOSTICS_REGISTER = 0x27
+"""Address of the first input register with a diagnostic value."""
 _DIAGNOSTIC_VALUES = (32768, 21450, 43690, 32771, 12, 30102)
-_CALIBRATIONS, _CALIBRATION_SIZE, _CALIBRATION_COUNT = 0x00E3, 192, 16
-_ERASED = 0xFFFF
+"""Values of the diagnostic input registers."""
+_CALIBRATIONS_REGISTER, _CALIBRATION_SIZE, _CALIBRATION_COUNT = 0x00E3, 192, 16
+"""Address of the first calibration block, registers per block, and number of blocks."""
+_ERASED_REGISTER = 0xFFFF
+"""Value of a register of an empty calibration block."""
 
 _CALIBRATION_TIME = "2019/06/21 14:05:37"
+"""Time of calibration in the calibration block."""
 _GAUGE_GAINS = (553, 561, 547, 572, 558, 543)
+"""Gains of the gauges in the calibration block."""
 _GAUGE_OFFSETS = (32411, 33107, 31996, 34210, 32788, 33545)
-_CALIBRATION = Struct(">8s32s4s20s36f2B6f2i6H6H")
+"""Offsets of the gauges in the calibration block."""
+_CALIBRATION_LAYOUT = Struct(">8s32s4s20s36f2B6f2i6H6H")
+"""Layout of a calibration block."""
 
-_JAM_LENGTH = 14
+_STOP_BYTE_COUNT = 14
+"""Number of received bytes that end the stream."""
 _SILENCE_S = 0.05
+"""Silence in seconds after which an incomplete request is discarded."""
 _LONGEST_FRAME = 256
+"""Longest Modbus frame in bytes."""
 _RECORD_SIZE = 13
-_UNSET_GAUGE = -32768
-_RECORD_ERROR = 0x80
+"""Size of a record of the stream in bytes."""
+_UNSET_GAUGE_COUNTS = -32768
+"""Reading of a gauge whose gain or offset differs from the calibration."""
+_RECORD_ERROR_BIT = 0x80
+"""Error bit in the last byte of a record."""
 
-_REGISTERS = Struct(">2H").unpack
+_unpack_register_range = Struct(">2H").unpack
+"""Unpack address of the first register and number of registers from a request."""
 
 
 class AtiSerialDevice:
-    """A Digital F/T sensor at the far end of a line of bytes.
+    """Simulated Digital F/T sensor at the end of a serial line.
 
     Parameters
     ----------
     rig
-        With a section ``ati_serial``: serial number (FT12345 if empty), the calibration block that
-        is filled (the fifteen others read 0xFFFF), and the baud register after power-up.
-    simulated
-        What is measured. A streamed period is the newest records its sensor has taken; none are
-        drawn for the stream.
+        Parameters of the rig with a section ``ati_serial``: serial number (FT12345 if empty),
+        number of the filled calibration block (the fifteen others read 0xFFFF), and the baud
+        register after power-up.
+    simulated_rig
+        Simulated rig, whose sensor measures. The stream sends the newest readings that the sensor
+        has taken in a period, without new ones.
     write
-        Takes the bytes of an answer, or of one period's records.
+        Function that sends the bytes of an answer, or the records of one period.
     log
-        Called ``log("sensor", what, **values)`` when the sensor is set, starts or stops.
+        Function that is called as ``log("sensor", what, **values)`` when the sensor is configured,
+        starts or stops.
 
     Attributes
     ----------
     gauges : AtiGauges
-        The calibration that is served.
+        Gauges of the sensor, with its calibration matrix.
     streaming : bool
-        Whether `emit` writes records.
+        Whether the sensor streams, so that `emit` writes records.
     frozen : bool
-        Whether the sensor neither writes nor receives.
+        Whether the sensor neither receives nor writes.
     saturate : int or None
-        This gauge reads ±32767.
+        Number of a gauge that reads ±32767; None: none.
     status_bits : int
-        The status word; if any is set, so is the error bit of every record.
+        Status word; if any bit is set, so is the error bit of every record.
 
     Raises
     ------
@@ -106,7 +140,7 @@ class AtiSerialDevice:
     def __init__(
         self,
         rig: RigParameters,
-        simulated: SimulatedRig,
+        simulated_rig: SimulatedRig,
         write: Callable[[bytes], None],
         log: Callable[..., None],
     ) -> None:
@@ -121,162 +155,192 @@ class AtiSerialDevice:
         self.frozen = False
         self.saturate: int | None = None
         self.status_bits = 0
-        self._sensor = simulated.sensor
-        self._records_per_period = simulated.records_per_period
+        self._sensor = simulated_rig.sensor
+        self._records_per_period = simulated_rig.records_per_period
         self._write = write
         self._log = log
         self._unlocked = False
-        self._at_power_up = _power_up(settings, self.gauges, rig.sensor.range)
-        self._holding = dict(self._at_power_up)
-        self._unset = list(range(6))
-        """Gauges whose gain or offset is not the calibration's."""
-        self._partial = b""
-        self._received = False
+        self._power_up_registers = _holding_registers_at_power_up(
+            settings, self.gauges, rig.sensor.range
+        )
+        self._holding_registers = dict(self._power_up_registers)
+        self._unset_gauges = list(range(6))
+        """Numbers of the gauges whose gain or offset differs from the calibration."""
+        self._incomplete_request = b""
+        self._has_received = False
         self._silent_since_s = math.inf
-        self._jam = 0
+        self._bytes_while_streaming = 0
 
     def receive(self, data: bytes) -> None:
-        """Receive bytes from the line, in chunks of any length; answer at once."""
+        """Process received bytes, in chunks of any length; answer complete requests at once."""
         if self.frozen:
             return
-        self._received = True
-        received = self._partial + data
+        self._has_received = True
+        received = self._incomplete_request + data
         while received and not self.streaming:
-            request, rest = _next_request(received)
+            request, remaining = _next_request(received)
             if request is None:
-                self._partial = rest
+                self._incomplete_request = remaining
                 return
             self._answer(request)
-            received = rest
-        self._partial = b""
+            received = remaining
+        self._incomplete_request = b""
         if not self.streaming:
             return
-        self._jam += len(received)
-        if self._jam >= _JAM_LENGTH:
+        self._bytes_while_streaming += len(received)
+        if self._bytes_while_streaming >= _STOP_BYTE_COUNT:
             self.streaming = False
             self._log("sensor", "stream stopped")
 
     def reset(self) -> None:
-        """Restart by itself: it streams no more, and remembers no set-up."""
+        """Restart the sensor as by its own watchdog: it stops streaming and loses its set-up."""
         self.streaming = self._unlocked = False
-        self._holding = dict(self._at_power_up)
-        self._unset = list(range(6))
-        self._partial = b""
-        self._jam = 0
+        self._holding_registers = dict(self._power_up_registers)
+        self._unset_gauges = list(range(6))
+        self._incomplete_request = b""
+        self._bytes_while_streaming = 0
         self._log("sensor", "restart")
 
     def power_cycle(self) -> None:
-        """Simulate a power cycle, which equals a reset here."""
+        """Restart the sensor as after a loss of power; it equals `reset` here."""
         self.reset()
 
     def tick(self, now_s: float) -> None:
-        """Forget an incomplete request when the line has been silent for long."""
-        if self._received:
-            self._received = False
+        """Discard an incomplete request when the line has been silent for long enough."""
+        if self._has_received:
+            self._has_received = False
             self._silent_since_s = now_s
         elif now_s - self._silent_since_s > _SILENCE_S:
-            self._partial = b""
+            self._incomplete_request = b""
 
     def emit(self) -> None:
-        """Write the records of the past period in one block."""
+        """Write the records of the past period in one block, if the sensor streams."""
         if not self.streaming or self.frozen:
             return
-        wrenches = self._newest()
+        wrenches = self._newest_wrenches()
         if not wrenches:
             return
-        gauges = self._read(wrenches).take(WIRE_ORDER, axis=1)
+        gauges = self._read_gauges(wrenches).take(WIRE_ORDER, axis=1)
         records = np.empty((len(wrenches), _RECORD_SIZE), dtype=np.uint8)
         records[:, :12] = gauges.astype(">i2").view(np.uint8)
         checksums = records[:, :12].sum(axis=1, dtype=np.uint8) & 0x7F
-        records[:, 12] = checksums | _RECORD_ERROR if self.status_bits else checksums
+        records[:, 12] = checksums | _RECORD_ERROR_BIT if self.status_bits else checksums
         self._write(records.tobytes())
 
-    def _newest(self) -> list[Wrench]:
+    def _newest_wrenches(self) -> list[Wrench]:
+        """Return the wrenches of the past period: the newest readings, or a new one per period."""
         if self._records_per_period == 1:
             return [self._sensor.measure()]
         return list(self._sensor.records)[-self._records_per_period :]
 
-    def _read(self, wrenches: list[Wrench]) -> NDArray[np.int16]:
+    def _read_gauges(self, wrenches: list[Wrench]) -> NDArray[np.int16]:
+        """Return the gauge counts under wrenches; unset gauges read the end of their range."""
         gauges = self.gauges.read(wrenches, self.saturate)
-        if self._unset:
-            gauges[:, self._unset] = _UNSET_GAUGE
+        if self._unset_gauges:
+            gauges[:, self._unset_gauges] = _UNSET_GAUGE_COUNTS
         return gauges
 
     def _answer(self, request: bytes) -> None:
+        """Answer a complete request, by the requested data or an exception response."""
         function, body = request[1], request[2:-2]
-        handle = {
-            _READ_HOLDING: self._read_holding,
-            _READ_INPUT: self._read_input,
-            _WRITE: self._write_registers,
-            _STREAM: self._start_stream,
-            _LOCK: self._set_lock,
+        answer_request = {
+            _READ_HOLDING_FUNCTION: self._read_holding,
+            _READ_INPUT_FUNCTION: self._read_input,
+            _WRITE_FUNCTION: self._write_registers,
+            _STREAM_FUNCTION: self._start_stream,
+            _LOCK_FUNCTION: self._set_lock,
         }.get(function)
-        answer = _ILLEGAL_FUNCTION if handle is None else handle(body)
+        answer = _ILLEGAL_FUNCTION if answer_request is None else answer_request(body)
         if isinstance(answer, int):
-            function, answer = function | _EXCEPTION, bytes((answer,))
+            function, answer = function | _EXCEPTION_BIT, bytes((answer,))
         frame = bytes((_ADDRESS, function)) + answer
         self._write(frame + _checksum(frame).to_bytes(2, "little"))
 
     def _read_holding(self, body: bytes) -> bytes | int:
-        self._holding[_STATUS] = self.status_bits & 0xFFFF
-        return _select(self._holding, body)
+        """Return the answer to a request for holding registers, or an exception code."""
+        self._holding_registers[_STATUS_REGISTER] = self.status_bits & 0xFFFF
+        return _answer_with_registers(self._holding_registers, body)
 
     def _read_input(self, body: bytes) -> bytes | int:
-        inputs = dict(enumerate(_DIAGNOSTIC_VALUES, start=_DIAGNOSTICS))
-        first, _ = _REGISTERS(body)
+        """Return the answer to a request for input registers, or an exception code."""
+        inputs = dict(enumerate(_DIAGNOSTIC_VALUES, start=_DIAGNOSTICS_REGISTER))
+        first, _ = _unpack_register_range(body)
         if first < _POLLED_GAUGES:
-            newest = self._newest()[-1:] or [self._sensor.measure()]
-            inputs.update(enumerate(self._read(newest)[0].astype(np.uint16).tolist()))
-        return _select(inputs, body)
+            newest = self._newest_wrenches()[-1:] or [self._sensor.measure()]
+            inputs.update(enumerate(self._read_gauges(newest)[0].astype(np.uint16).tolist()))
+        return _answer_with_registers(inputs, body)
 
     def _write_registers(self, body: bytes) -> bytes | int:
-        first, count = _REGISTERS(body[:4])
+        """Write registers; return the content of the answer, or an exception code."""
+        first, count = _unpack_register_range(body[:4])
         data = body[5:]
-        if not 1 <= count <= _MOST_WRITTEN or len(data) != 2 * count:
+        if not 1 <= count <= _MOST_REGISTERS_WRITTEN or len(data) != 2 * count:
             return _ILLEGAL_VALUE
         values = dict(enumerate(np.frombuffer(data, ">u2").tolist(), start=first))
-        writable = {_SESSION_ID, _BAUD_IS_STORED, _BAUD}
+        writable = {_SESSION_ID_REGISTER, _BAUD_IS_STORED_REGISTER, _BAUD_REGISTER}
         if self._unlocked:
-            writable.update(_GAINS, _OFFSETS)
+            writable.update(_GAIN_REGISTERS, _OFFSET_REGISTERS)
         if not values.keys() <= writable:
             return _ILLEGAL_ADDRESS
-        if values.get(_BAUD, 0) >= len(_BAUDS) or values.get(_BAUD_IS_STORED, 0) > 1:
+        if (
+            values.get(_BAUD_REGISTER, 0) >= len(_BAUD_RATES_BIT_S)
+            or values.get(_BAUD_IS_STORED_REGISTER, 0) > 1
+        ):
             return _ILLEGAL_VALUE
-        self._holding.update(values)
-        self._unset = [
+        self._holding_registers.update(values)
+        self._unset_gauges = [
             gauge
             for gauge in range(6)
-            if self._holding[_GAINS[gauge]] != _GAUGE_GAINS[gauge]
-            or self._holding[_OFFSETS[gauge]] != _GAUGE_OFFSETS[gauge]
+            if self._holding_registers[_GAIN_REGISTERS[gauge]] != _GAUGE_GAINS[gauge]
+            or self._holding_registers[_OFFSET_REGISTERS[gauge]] != _GAUGE_OFFSETS[gauge]
         ]
         self._log("sensor", "registers written", first=first, values=list(values.values()))
         return body[:4]
 
     def _start_stream(self, body: bytes) -> bytes | int:
-        if body[0] != _START_STREAM:
+        """Start the stream of records; return the content of the answer."""
+        if body[0] != _START_STREAM_PARAMETER:
             return b"\x00"
         self.streaming = True
-        self._jam = 0
+        self._bytes_while_streaming = 0
         self._log("sensor", "stream started")
-        if self._unset:
-            self._log("sensor", "gains and offsets not loaded", gauges=self._unset)
+        if self._unset_gauges:
+            self._log("sensor", "gains and offsets not loaded", gauges=self._unset_gauges)
         return b"\x01"
 
     def _set_lock(self, body: bytes) -> bytes | int:
-        if body[0] not in (_UNLOCKED, _LOCKED):
+        """Lock or unlock the sensor's storage; return the content of the answer."""
+        if body[0] not in (_UNLOCK_PARAMETER, _LOCK_PARAMETER):
             return b"\x00"
-        self._unlocked = body[0] == _UNLOCKED
+        self._unlocked = body[0] == _UNLOCK_PARAMETER
         self._log("sensor", "storage unlocked" if self._unlocked else "storage locked")
         return b"\x01"
 
 
-def _power_up(settings: AtiSerial, gauges: AtiGauges, ratings: tuple[float, ...]) -> dict[int, int]:
-    """Return the holding registers as they are after power-up."""
-    holding = dict.fromkeys((*_GAINS, *_OFFSETS, _SESSION_ID, _STATUS, _BAUD_IS_STORED), 0)
-    holding[_BAUD] = _BAUDS.index(settings.baud) if settings.baud in _BAUDS else 0
+def _holding_registers_at_power_up(
+    settings: AtiSerial, gauges: AtiGauges, ratings: tuple[float, ...]
+) -> dict[int, int]:
+    """Return the values of the holding registers after power-up, by address."""
+    holding = dict.fromkeys(
+        (
+            *_GAIN_REGISTERS,
+            *_OFFSET_REGISTERS,
+            _SESSION_ID_REGISTER,
+            _STATUS_REGISTER,
+            _BAUD_IS_STORED_REGISTER,
+        ),
+        0,
+    )
+    holding[_BAUD_REGISTER] = (
+        _BAUD_RATES_BIT_S.index(settings.baud) if settings.baud in _BAUD_RATES_BIT_S else 0
+    )
     size = _CALIBRATION_SIZE * _CALIBRATION_COUNT
-    holding.update(dict.fromkeys(range(_CALIBRATIONS, _CALIBRATIONS + size), _ERASED))
-    content = _CALIBRATION.pack(
+    holding.update(
+        dict.fromkeys(
+            range(_CALIBRATIONS_REGISTER, _CALIBRATIONS_REGISTER + size), _ERASED_REGISTER
+        )
+    )
+    content = _CALIBRATION_LAYOUT.pack(
         (settings.serial_number or SERIAL_NUMBER).encode("ascii", "replace"),
         PART_NUMBER.encode("ascii"),
         b"",
@@ -289,15 +353,15 @@ def _power_up(settings: AtiSerial, gauges: AtiGauges, ratings: tuple[float, ...]
         *_GAUGE_GAINS,
         *_GAUGE_OFFSETS,
     ).ljust(2 * _CALIBRATION_SIZE, b"\0")
-    block = _CALIBRATIONS + (settings.calibration - 1) * _CALIBRATION_SIZE
-    holding.update(enumerate(np.frombuffer(content, ">u2").tolist(), start=block))
+    block_register = _CALIBRATIONS_REGISTER + (settings.calibration - 1) * _CALIBRATION_SIZE
+    holding.update(enumerate(np.frombuffer(content, ">u2").tolist(), start=block_register))
     return holding
 
 
-def _select(registers: dict[int, int], body: bytes) -> bytes | int:
-    """Return the answer to a request to read registers, or the exception."""
-    first, count = _REGISTERS(body)
-    if not 1 <= count <= _MOST_READ:
+def _answer_with_registers(registers: dict[int, int], body: bytes) -> bytes | int:
+    """Return the answer to a request for registers, or an exception code."""
+    first, count = _unpack_register_range(body)
+    if not 1 <= count <= _MOST_REGISTERS_READ:
         return _ILLEGAL_VALUE
     addresses = range(first, first + count)
     if not all(map(registers.__contains__, addresses)):
@@ -306,49 +370,52 @@ def _select(registers: dict[int, int], body: bytes) -> bytes | int:
 
 
 def _next_request(received: bytes) -> tuple[bytes | None, bytes]:
-    """Find the first whole request in what came in.
+    """Return the first complete request in received bytes, and the remaining bytes.
 
-    Every byte that could be the address is tried, so that noise before a request, even one that
-    resembles the start of another, is skipped without loss.
+    Every byte that could be the address is tried. So noise before a request is skipped without
+    loss, even noise that resembles the start of another request.
 
     Returns
     -------
     request, rest
-        The request with its checksum, or None; and what is left: behind the request, or from where
-        one may have begun.
+        Request with its checksum, or None if there is none. Bytes after the request, or from the
+        first position at which a request may have begun.
     """
-    begun = len(received)
+    possible_start = len(received)
     start = received.find(_ADDRESS)
     while start >= 0:
-        there = len(received) - start
+        available = len(received) - start
         length = _request_length(received, start)
-        if length <= there:
+        if length <= available:
             if _checksum(received[start : start + length]) == 0:
                 return received[start : start + length], received[start + length :]
-        elif there < _LONGEST_FRAME:
-            begun = min(begun, start)
+        elif available < _LONGEST_FRAME:
+            possible_start = min(possible_start, start)
         start = received.find(_ADDRESS, start + 1)
-    return None, received[begun:]
+    return None, received[possible_start:]
 
 
 def _request_length(received: bytes, start: int) -> int:
-    """Return how long the request from `start` is: more than there is if that is not known yet."""
-    there = len(received) - start
-    unknown = there + 1
-    if there < 4:
-        return unknown
+    """Return the length of the request at `start`; if unknown, a length that exceeds the data."""
+    available = len(received) - start
+    unknown_length = available + 1
+    if available < 4:
+        return unknown_length
     function = received[start + 1]
-    if function in (_READ_HOLDING, _READ_INPUT):
+    if function in (_READ_HOLDING_FUNCTION, _READ_INPUT_FUNCTION):
         return 8
-    if function in (_STREAM, _LOCK):
+    if function in (_STREAM_FUNCTION, _LOCK_FUNCTION):
         return 5
-    if function == _WRITE:
-        return 9 + received[start + 6] if there > 6 else unknown
+    if function == _WRITE_FUNCTION:
+        return 9 + received[start + 6] if available > 6 else unknown_length
     # A request with an unknown function ends where its checksum holds.
-    return unknown if there > _LONGEST_FRAME or _checksum(received[start:]) else there
+    return (
+        unknown_length if available > _LONGEST_FRAME or _checksum(received[start:]) else available
+    )
 
 
 def _checksum_table() -> tuple[int, ...]:
+    """Return the Modbus checksums of all bytes."""
     table = []
     for byte in range(256):
         crc = byte
@@ -358,12 +425,13 @@ def _checksum_table() -> tuple[int, ...]:
     return tuple(table)
 
 
-_TABLE = _checksum_table()
+_CHECKSUM_TABLE = _checksum_table()
+"""Modbus checksums of all bytes."""
 
 
 def _checksum(frame: bytes) -> int:
-    """Return the checksum of Modbus RTU; of a frame that ends with its own it is zero."""
+    """Return the Modbus RTU checksum of a frame; it is 0 for a frame with a valid checksum."""
     crc = 0xFFFF
     for byte in frame:
-        crc = crc >> 8 ^ _TABLE[(crc ^ byte) & 0xFF]
+        crc = crc >> 8 ^ _CHECKSUM_TABLE[(crc ^ byte) & 0xFF]
     return crc

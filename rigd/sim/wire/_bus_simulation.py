@@ -1,7 +1,7 @@
-"""Bus simulation: the rig between its lines, with nodes, clock and faults, but no input or output.
+"""Bus simulation: the simulated rig with its nodes, clock and faults, without sockets.
 
-Input is passed in with its time of arrival; output of the nodes goes through two callables. So the
-same `BusSimulation` runs behind sockets and in a test.
+Frames and bytes are passed in with their time of arrival. The output of the nodes is passed to two
+callables. So the same `BusSimulation` runs with sockets and in a test.
 """
 
 import heapq
@@ -15,9 +15,9 @@ from rigd.beam.realisation import RealisationError
 from rigd.devices.canbus.port import BUS_OFF_FRAME, pack_frame, unpack_frame
 from rigd.devices.obstacles import Obstacle, ObstacleError
 from rigd.devices.parameters import RigParameters
-from rigd.sim import SimulatedRig, Stuck
+from rigd.sim import SimulatedRig, StuckReadings
 from rigd.sim.wire._faults import (
-    DISTURBANCES,
+    DISTURBANCE_KINDS,
     LINE_KINDS,
     SERIAL,
     EventLog,
@@ -27,222 +27,238 @@ from rigd.sim.wire._faults import (
     disturbance_of,
 )
 
-_MEMORY_SYNCS = 256
-"""SYNCs over which the grid's phase is averaged: a single late one hardly moves it."""
-_READY_IN_S = 0.5
-"""Time until an obstacle is there in real time, longer than the rig takes to make ready for it."""
-_FORGET_PERIODS = 100
-"""Periods of silence after which the next SYNC may come from another host with its own phase."""
-_PATIENCE_NS = 5_000_000_000
+_AVERAGED_SYNCS = 256
+"""Number of SYNCs over which the phase of the tick grid is averaged.
+
+A single late SYNC then hardly changes the phase."""
+_OBSTACLE_LEAD_TIME_S = 0.5
+"""Time in seconds until an injected obstacle is present in real time.
+
+It is longer than the preparation of the obstacle takes."""
+_NEW_PHASE_PERIODS = 100
+"""Number of periods without SYNC after which the next SYNC may have a new phase (another host)."""
+_LOCK_STEP_WAIT_NS = 5_000_000_000
+"""Time in nanoseconds that simulated time waits for a SYNC in lock-step."""
 
 
 # Clocks
 
 
 class WallClock:
-    """Whole periods of wall time, on a grid that follows the SYNC.
+    """Clock of a simulated rig in real time, whose tick grid follows the received SYNCs.
 
-    A SYNC marks the tick nearest to it, whether it is up to half a period early or late. A tick
-    whose SYNC has not come half a period after it passes without. The grid follows the mean phase
-    of the last SYNCs, so that it need not know when the host's loop started.
+    A SYNC belongs to the nearest tick, up to half a period earlier or later. A tick without SYNC
+    until half a period later passes without it. The grid follows the mean phase of the last SYNCs,
+    so that it does not need to know when the host's loop started.
 
     Parameters
     ----------
     period_ns
-        Length of a period.
+        Duration of a period in nanoseconds.
     now_ns
-        Time of tick 0, on a clock that never steps back.
+        Time of tick 0 in nanoseconds, on a monotonic clock.
 
     Attributes
     ----------
     tick : int
-        Tick of the simulated rig.
+        Number of the present tick of the simulated rig.
     """
 
     def __init__(self, period_ns: float, now_ns: int) -> None:
         self._period_ns = period_ns
         self._origin_ns = float(now_ns)
-        self._followed = 0
+        self._averaged_syncs = 0
         self._last_sync = 0
         self.tick = 0
 
     @property
     def due_ns(self) -> int:
-        """Until when the SYNC of the next tick may come."""
+        """Time in nanoseconds until which the SYNC of the next tick may arrive."""
         return round(self._origin_ns + (self.tick + 1.5) * self._period_ns)
 
     @property
-    def idle(self) -> bool:
-        """No SYNC has come for a long time."""
-        return self._followed == 0 or self.tick - self._last_sync > _FORGET_PERIODS
+    def is_idle(self) -> bool:
+        """Whether no SYNC has been received yet, or none in the last 100 periods."""
+        return self._averaged_syncs == 0 or self.tick - self._last_sync > _NEW_PHASE_PERIODS
 
     def sync(self, now_ns: float) -> int:
-        """Return how many periods pass with a SYNC at this time: one, but for irregular ones."""
+        """Process a SYNC received at `now_ns`; return the number of elapsed periods, normally 1."""
         elapsed = (now_ns - self._origin_ns) / self._period_ns
         nearest = round(elapsed)
-        if nearest - self._last_sync > _FORGET_PERIODS:
-            self._followed = 0
-        self._followed = min(self._followed + 1, _MEMORY_SYNCS)
+        if nearest - self._last_sync > _NEW_PHASE_PERIODS:
+            self._averaged_syncs = 0
+        self._averaged_syncs = min(self._averaged_syncs + 1, _AVERAGED_SYNCS)
         self._last_sync = nearest
-        self._origin_ns += (elapsed - nearest) * self._period_ns / self._followed
-        return self._pass_to(nearest)
+        self._origin_ns += (elapsed - nearest) * self._period_ns / self._averaged_syncs
+        return self._advance_to(nearest)
 
     def elapse(self, now_ns: int) -> int:
-        """Return how many periods pass without a SYNC, because theirs did not come in time."""
-        return self._pass_to(int((now_ns - self._origin_ns) / self._period_ns - 0.5))
+        """Return the number of periods that have elapsed until `now_ns` without a SYNC in time."""
+        return self._advance_to(int((now_ns - self._origin_ns) / self._period_ns - 0.5))
 
-    def _pass_to(self, tick: int) -> int:
-        passed = max(0, tick - self.tick)
-        self.tick += passed
-        return passed
+    def _advance_to(self, tick: int) -> int:
+        """Advance the clock to a tick, and return the number of elapsed periods."""
+        elapsed_periods = max(0, tick - self.tick)
+        self.tick += elapsed_periods
+        return elapsed_periods
 
 
 class LockStep:
-    """One period per SYNC; simulated time waits for the next one.
+    """Clock of a simulated rig in lock-step: each SYNC advances it by one period.
 
-    It does not wait forever: five seconds after the last SYNC, and at once where no client is left
-    who could send one, time goes on by the wall clock, so that a drive notices a dead host. Before
-    the first SYNC it goes on too.
+    It does not wait for ever. Five seconds after the last SYNC, and at once if no client is
+    connected any more, time continues by the wall clock, so that a drive notices a dead host. Time
+    also runs by the wall clock before the first SYNC.
 
     Parameters
     ----------
     period_ns
-        Length of a period.
+        Duration of a period in nanoseconds.
     now_ns
-        Wall time, on a clock that never steps back.
+        Present time in nanoseconds, on a monotonic clock.
     """
 
-    idle = True
+    is_idle = True
 
     def __init__(self, period_ns: float, now_ns: int) -> None:
         self._period_ns = period_ns
-        self._halted_until_ns = float(now_ns)
+        self._waiting_until_ns = float(now_ns)
 
     @property
     def due_ns(self) -> int:
-        """When a period passes without a SYNC."""
-        return round(self._halted_until_ns + self._period_ns)
+        """Time in nanoseconds at which the next period elapses without a SYNC."""
+        return round(self._waiting_until_ns + self._period_ns)
 
     def sync(self, now_ns: float) -> int:
-        """Return how many periods pass with a SYNC: always one."""
-        self._halted_until_ns = now_ns + _PATIENCE_NS
+        """Process a SYNC received at `now_ns`; return the number of elapsed periods, always 1."""
+        self._waiting_until_ns = now_ns + _LOCK_STEP_WAIT_NS
         return 1
 
     def elapse(self, now_ns: int) -> int:
-        """Return how many periods pass by the wall clock."""
-        passed = max(0, int((now_ns - self._halted_until_ns) / self._period_ns))
-        self._halted_until_ns += passed * self._period_ns
-        return passed
+        """Return the number of periods that have elapsed by the wall clock without a SYNC."""
+        elapsed_periods = max(0, int((now_ns - self._waiting_until_ns) / self._period_ns))
+        self._waiting_until_ns += elapsed_periods * self._period_ns
+        return elapsed_periods
 
-    def left_alone(self, now_ns: int) -> None:
-        """End the waiting: no client is connected any more."""
-        self._halted_until_ns = min(self._halted_until_ns, now_ns)
+    def stop_waiting(self, now_ns: int) -> None:
+        """Stop waiting for a SYNC, since no client is connected any more."""
+        self._waiting_until_ns = min(self._waiting_until_ns, now_ns)
 
 
 # Nodes and frames
 
-_SYNC = 0x80
-_SYNC_HEAD = pack_frame(_SYNC)[:4]
+_SYNC_ID = 0x80
+"""CAN identifier of SYNC."""
+_SYNC_ID_BYTES = pack_frame(_SYNC_ID)[:4]
+"""First bytes of a raw SYNC frame: its identifier."""
 _HIGHEST_ID = 0x7FF
+"""Highest 11-bit CAN identifier."""
 _RECORD_SIZE = 13
-_WORDS_ON_CAN = ("id",)
-_WORDS_ON_SERIAL = ("bytes",)
-_CAN_BYTES = 8
-_TRAITS = {
+"""Size in bytes of a record on the serial line."""
+_CAN_ONLY_KEYS = ("id",)
+"""Keys of a fault that make sense only on the CAN bus."""
+_SERIAL_ONLY_KEYS = ("bytes",)
+"""Keys of a fault that make sense only on the serial line."""
+_MOST_CAN_DATA_BYTES = 8
+"""Largest number of data bytes of a CAN frame."""
+_DRIVE_ATTRIBUTES = {
     "no_pre_operational": "stays_operational",
-    "no_bit_12": "never_follows",
-    "no_watch": "watchless",
+    "no_bit_12": "never_sets_bit_12",
+    "no_watch": "ignores_silent_host",
 }
-"""Traits that a fault may give the drive, and the attribute of each."""
+"""Attribute of the simulated drive that a kind of fault sets to True."""
 
 
 class SimulatedNode(Protocol):
-    """A device on the simulated CAN bus."""
+    """Device on the simulated CAN bus."""
 
     frozen: bool
+    """Whether the device neither sends nor receives."""
 
     def reset(self) -> None:
-        """Restart by itself."""
+        """Restart the device, as by its own watchdog."""
 
     def power_cycle(self) -> None:
-        """Start as when its power comes back."""
+        """Restart the device as after a loss of power."""
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Receive a frame."""
+        """Process a CAN frame that the device has received."""
 
     def tick(self, now_s: float) -> None:
-        """Let simulated time pass."""
+        """Advance the device to the simulated time `now_s`, in seconds."""
 
 
 class SerialDevice(Protocol):
-    """A device at the far end of a serial line."""
+    """Device at the end of a simulated serial line."""
 
     frozen: bool
+    """Whether the device neither sends nor receives."""
 
     def reset(self) -> None:
-        """Restart by itself."""
+        """Restart the device, as by its own watchdog."""
 
     def power_cycle(self) -> None:
-        """Start as when its power comes back."""
+        """Restart the device as after a loss of power."""
 
     def receive(self, data: bytes) -> None:
-        """Receive bytes from the host."""
+        """Process bytes that the device has received from the host."""
 
     def emit(self) -> None:
-        """Send what a period brings by itself."""
+        """Send the bytes that the device streams in a period."""
 
     def tick(self, now_s: float) -> None:
-        """Let simulated time pass."""
+        """Advance the device to the simulated time `now_s`, in seconds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Standing:
-    """A fault that overrides an attribute of a device."""
+class _AttributeOverride:
+    """Active fault that overrides an attribute of a device, and the attribute's normal value."""
 
     fault: Fault
     device: Any
     attribute: str
     value: object
-    normal: object
+    normal_value: object
 
 
 class BusSimulation:
-    """Moves the rig on, and carries frames between host and nodes.
+    """Simulated rig with its lines, which transfers frames between host and nodes.
 
     Parameters
     ----------
-    rig, simulated
-        Parameters of the rig, and the plant with its devices.
+    rig, simulated_rig
+        Parameters of the rig, and simulated plant with its devices.
     lock_step
-        One period per SYNC, instead of wall time.
+        Whether each SYNC advances the rig by one period, instead of wall time.
     now_ns
-        Wall time, on a clock that never steps back.
+        Present time in nanoseconds, on a monotonic clock.
     send
-        Takes a frame for the hosts on the CAN bus, and which of them sent it (None: a node).
+        Function that sends a frame to the hosts on the CAN bus; its second argument is the host
+        that sent the frame, or None for a node.
     write
-        Takes bytes for the host on the serial line.
+        Function that sends bytes to the host on the serial line.
     cut, mend
-        Cuts the "bus" or the line of the "sensor", and puts it together again.
+        Functions that interrupt and reconnect the "bus" or the line of the "sensor".
     log
-        Takes the events; its time is set here.
+        Log of the events, whose time this class sets.
 
     Attributes
     ----------
     periods : int
-        Simulated time since the start. In lock-step the nodes' time goes on while the rig itself
-        waits for a host, so that they can be set up.
+        Simulated time since the start, in periods. In lock-step the nodes' time continues while the
+        rig itself waits for a host, so that the nodes can be set up.
     moved : int
-        Periods by which the rig itself moved.
+        Number of periods by which the rig itself has advanced.
     syncs : int
-        SYNCs received.
+        Number of received SYNCs.
     bus_off : bool
-        Whether the host's controller is off the bus: no frames pass in either direction.
+        Whether the host's controller is off the bus, so that no frames pass in either direction.
     """
 
     def __init__(
         self,
         rig: RigParameters,
-        simulated: SimulatedRig,
+        simulated_rig: SimulatedRig,
         *,
         lock_step: bool,
         now_ns: int,
@@ -252,222 +268,236 @@ class BusSimulation:
         mend: Callable[[str], None],
         log: EventLog,
     ) -> None:
-        self._simulated = simulated
+        self._simulated_rig = simulated_rig
         self._period_s = 1 / rig.rate_hz
         self._period_ns = 1e9 / rig.rate_hz
         self._lock_step = lock_step
         self.clock = (LockStep if lock_step else WallClock)(self._period_ns, now_ns)
         self._now_ns = float(now_ns)
-        self._send = send
-        self._write = write
-        self._cut = cut
-        self._mend = mend
+        self._send_to_hosts = send
+        self._write_to_host = write
+        self._interrupt = cut
+        self._reconnect = mend
         self._log = log
         self._nodes: dict[str, SimulatedNode] = {}
-        self._serial: SerialDevice | None = None
-        self._owed = False
+        self._serial_device: SerialDevice | None = None
+        self._advance_is_due = False
         self._lines = {
-            "host": FaultyLine("host", self._from_host, self._postpone, log),
-            "drive": FaultyLine("drive", partial(self._from_node, "drive"), self._postpone, log),
-            "sensor": FaultyLine("sensor", partial(self._from_node, "sensor"), self._postpone, log),
+            "host": FaultyLine("host", self._deliver_from_host, self._schedule_delivery, log),
+            "drive": FaultyLine(
+                "drive", partial(self._deliver_from_node, "drive"), self._schedule_delivery, log
+            ),
+            "sensor": FaultyLine(
+                "sensor", partial(self._deliver_from_node, "sensor"), self._schedule_delivery, log
+            ),
         }
-        self._unheard: deque[tuple[str, int, bytes]] = deque()
-        self._emitting = False
-        self._order = 0
+        self._undelivered_frames: deque[tuple[str, int, bytes]] = deque()
+        self._is_streaming = False
+        self._action_count = 0
         self.bus_off = False
-        self._postponed: list[tuple[float, int, Callable[[], None]]] = []
-        self._planned: list[tuple[float, int, Callable[[], None]]] = []
-        self._awaiting_drive: list[Fault] = []
-        self._standing: list[_Standing] = []
+        self._delayed_deliveries: list[tuple[float, int, Callable[[], None]]] = []
+        self._scheduled_actions: list[tuple[float, int, Callable[[], None]]] = []
+        self._faults_after_enabling: list[Fault] = []
+        self._overrides: list[_AttributeOverride] = []
         self._cut_lines: dict[str, Fault] = {}
         self._obstacles: list[tuple[Fault, Obstacle]] = []
         self._enabled_s: float | None = None
         self.periods = 0
-        self.moved = 0
+        self.rig_periods = 0
         self.syncs = 0
 
     @property
     def now_s(self) -> float:
-        """Simulated time since the start."""
+        """Simulated time since the start in seconds."""
         return self.periods * self._period_s
 
     def wait_s(self, now_ns: int, longest_s: float) -> float:
-        """Return how long nothing has to be done if nothing comes in, up to the longest wait."""
-        due_ns = float("inf") if self.clock.idle else float(self.clock.due_ns)
-        if self._postponed and not self._lock_step:
-            due_ns = min(due_ns, self._postponed[0][0])
+        """Return the time in seconds until something is due without input, at most `longest_s`."""
+        due_ns = float("inf") if self.clock.is_idle else float(self.clock.due_ns)
+        if self._delayed_deliveries and not self._lock_step:
+            due_ns = min(due_ns, self._delayed_deliveries[0][0])
         return min(longest_s, max(0.0, (due_ns - now_ns) * 1e-9))
 
     @property
     def disturbed(self) -> list[str]:
-        """Senders whose next frames a fault may hit."""
+        """Names of the senders whose next frames a fault may affect."""
         return [sender for sender, line in self._lines.items() if line.disturbed]
 
-    def can_port(self, sender: str) -> Callable[[int, bytes], None]:
-        """Return what a node on the bus sends with."""
+    def can_sender(self, sender: str) -> Callable[[int, bytes], None]:
+        """Return the function by which a node sends frames on the simulated CAN bus."""
         return self._lines[sender].send
 
-    def serial_port(self) -> Callable[[bytes], None]:
-        """Return what a sensor on a serial line writes with."""
+    def serial_writer(self) -> Callable[[bytes], None]:
+        """Return the function by which a sensor writes to the serial line."""
         return self._write_serial
 
-    def join(self, name: str, node: SimulatedNode) -> None:
-        """Put a node on the bus."""
+    def add_node(self, name: str, node: SimulatedNode) -> None:
+        """Connect a node to the simulated CAN bus."""
         self._nodes[name] = node
 
-    def join_serial(self, device: SerialDevice) -> None:
-        """Put the sensor on the serial line."""
-        self._serial = device
-        self._lines["sensor"] = FaultyLine("sensor", self._to_serial, self._postpone, self._log)
+    def add_serial_device(self, device: SerialDevice) -> None:
+        """Connect the simulated sensor to the simulated serial line."""
+        self._serial_device = device
+        self._lines["sensor"] = FaultyLine(
+            "sensor", self._deliver_to_serial_host, self._schedule_delivery, self._log
+        )
 
     def step(self) -> None:
-        """Advance the rig to the tick of a SYNC; the drive calls it at each one received."""
-        if self._owed:
-            self._owed = False
-            self._move()
+        """Advance the rig by the period of a SYNC, which the drive reports as received."""
+        if self._advance_is_due:
+            self._advance_is_due = False
+            self._advance_rig()
 
-    def hear(self, frames: list[bytes], origin: object, now_ns: int) -> None:
-        """Process frames of a host, in order, that were read at this time.
+    def receive_frames(self, frames: list[bytes], origin: object, now_ns: int) -> None:
+        """Process frames of a host, in order, that were read at a time in nanoseconds.
 
-        Frames that were read together were not sent together: after a pause of this process there
-        may be several SYNCs, which were sent a period apart.
+        Frames that are read together may have been sent at different times: after a pause of this
+        process there may be several SYNCs, which were sent a period apart.
         """
         self._now_ns = now_ns
-        syncs = sum(frame.startswith(_SYNC_HEAD) for frame in frames)
-        if not syncs and self.clock.idle:
+        syncs = sum(frame.startswith(_SYNC_ID_BYTES) for frame in frames)
+        if not syncs and self.clock.is_idle:
             self.elapse(now_ns)
         sent_ns = now_ns - (syncs - 1) * self._period_ns
         for frame in frames:
             can_id, data = unpack_frame(frame)
-            if can_id == _SYNC:
+            if can_id == _SYNC_ID:
                 self._sync(data, origin, sent_ns)
                 sent_ns += self._period_ns
             elif can_id <= _HIGHEST_ID:
                 self._lines["host"].send(can_id, data, origin)
 
-    def hear_serial(self, data: bytes) -> None:
-        """Process bytes of the host on the serial line."""
-        if self._serial is not None:
-            self._serial.receive(data)
+    def receive_serial(self, data: bytes) -> None:
+        """Pass bytes of the host on the serial line to the simulated sensor."""
+        if self._serial_device is not None:
+            self._serial_device.receive(data)
 
     def elapse(self, now_ns: int) -> None:
-        """Advance the time without a SYNC; frames received before must be processed first."""
+        """Advance the time without a SYNC; frames received before must already be processed."""
         self._now_ns = now_ns
         for _ in range(self.clock.elapse(now_ns)):
-            self._pass_period()
-        if self._postponed and not self._lock_step:
-            self._run_due(self._postponed, now_ns)
+            self._run_period()
+        if self._delayed_deliveries and not self._lock_step:
+            self._run_due(self._delayed_deliveries, now_ns)
 
-    def left_alone(self, now_ns: int) -> None:
-        """Note that no host is connected any more."""
+    def stop_waiting(self, now_ns: int) -> None:
+        """Stop waiting for a SYNC, since no host is connected any more."""
         if isinstance(self.clock, LockStep):
-            self.clock.left_alone(now_ns)
+            self.clock.stop_waiting(now_ns)
 
     def inject(self, fault: Fault) -> None:
-        """Inject a fault, now or at its time.
+        """Begin a fault now, or schedule it for its time.
 
         Raises
         ------
         FaultError
-            If this rig cannot have it.
+            If the fault is not possible on this rig.
         """
-        self._check(fault)
+        self._check_fault(fault)
         if fault.after_s is None:
-            self._begin(fault)
+            self._begin_fault(fault)
         elif self._enabled_s is None:
-            self._awaiting_drive.append(fault)
+            self._faults_after_enabling.append(fault)
         else:
-            self._plan(self._enabled_s + fault.after_s, partial(self._begin, fault))
+            self._schedule(self._enabled_s + fault.after_s, partial(self._begin_fault, fault))
 
     def _sync(self, data: bytes, origin: object, now_ns: float) -> None:
+        """Process a SYNC: advance clock, rig and nodes, and deliver the SYNC."""
         self.syncs += 1
         periods = self.clock.sync(now_ns)
         for _ in range(periods - 1):
-            self._pass_period()
-        self._owed = periods > 0
-        self._lines["host"].send(_SYNC, data, origin)
-        self.step()  # the rig moves even if it was not received
+            self._run_period()
+        self._advance_is_due = periods > 0
+        self._lines["host"].send(_SYNC_ID, data, origin)
+        self.step()  # the rig advances even if the drive has not received the SYNC
         if periods:
-            self._let_nodes_act()
+            self._run_nodes()
 
-    def _pass_period(self) -> None:
-        # In lock-step a rig whose drive is off waits for its host.
-        if not self._lock_step or self._simulated.plant.enabled:
-            self._move()
+    def _run_period(self) -> None:
+        """Advance time and nodes by a period, and the rig unless it waits for its host."""
+        # In lock-step, a rig waits for its host while its drive is off.
+        if not self._lock_step or self._simulated_rig.plant.enabled:
+            self._advance_rig()
         else:
             self.periods += 1
             self._log.time_s = self.now_s
-        self._let_nodes_act()
+        self._run_nodes()
 
-    def _move(self) -> None:
-        self._simulated.advance(1)
+    def _advance_rig(self) -> None:
+        """Advance the rig by one period, and send the records of the serial sensor."""
+        self._simulated_rig.advance(1)
         self.periods += 1
-        self.moved += 1
+        self.rig_periods += 1
         self._log.time_s = self.now_s
-        # Before the drive answers: a host that has its answer finds the records too.
-        if self._serial is not None:
-            self._emitting = True
-            self._serial.emit()
-            self._emitting = False
+        # Before the drive answers, so that a host with its answer also finds the records.
+        if self._serial_device is not None:
+            self._is_streaming = True
+            self._serial_device.emit()
+            self._is_streaming = False
 
-    def _let_nodes_act(self) -> None:
-        """Run the due actions of the nodes, and begin the due faults."""
-        if self._serial is not None:
-            self._serial.tick(self.now_s)
+    def _run_nodes(self) -> None:
+        """Run the due actions of the nodes, and begin or end the due faults."""
+        if self._serial_device is not None:
+            self._serial_device.tick(self.now_s)
         for node in self._nodes.values():
             node.tick(self.now_s)
-        self._let_hear()
-        if self._enabled_s is None and self._simulated.plant.enabled:
+        self._deliver_to_nodes()
+        if self._enabled_s is None and self._simulated_rig.plant.enabled:
             self._enabled_s = self.now_s
-            for fault in self._awaiting_drive:
+            for fault in self._faults_after_enabling:
                 self.inject(fault)
-        if self._planned:
-            self._run_due(self._planned, self.now_s)
-        if self._postponed and self._lock_step:
-            self._run_due(self._postponed, self.periods * self._period_ns)
+        if self._scheduled_actions:
+            self._run_due(self._scheduled_actions, self.now_s)
+        if self._delayed_deliveries and self._lock_step:
+            self._run_due(self._delayed_deliveries, self.periods * self._period_ns)
 
-    # The ways of what is sent.
+    # Delivery of frames and bytes.
 
-    def _from_host(self, can_id: int, data: bytes, origin: object) -> None:
+    def _deliver_from_host(self, can_id: int, data: bytes, origin: object) -> None:
+        """Deliver a frame of a host to the other hosts and to the nodes."""
         if self.bus_off:
             return
-        self._send(pack_frame(can_id, data), origin)
+        self._send_to_hosts(pack_frame(can_id, data), origin)
         for node in self._nodes.values():
             node.receive(can_id, data)
-        self._let_hear()
+        self._deliver_to_nodes()
 
-    def _from_node(self, sender: str, can_id: int, data: bytes, _: object) -> None:
+    def _deliver_from_node(self, sender: str, can_id: int, data: bytes, _: object) -> None:
+        """Deliver a frame of a node to the hosts, and queue it for the other nodes."""
         if not self.bus_off:
-            self._send(pack_frame(can_id, data), None)
-        self._unheard.append((sender, can_id, data))
+            self._send_to_hosts(pack_frame(can_id, data), None)
+        self._undelivered_frames.append((sender, can_id, data))
 
-    def _let_hear(self) -> None:
-        """Deliver the nodes' frames to each other after their present actions."""
-        while self._unheard:
-            sender, can_id, data = self._unheard.popleft()
+    def _deliver_to_nodes(self) -> None:
+        """Deliver queued frames of nodes to the other nodes, after their present actions."""
+        while self._undelivered_frames:
+            sender, can_id, data = self._undelivered_frames.popleft()
             for name, node in self._nodes.items():
                 if name != sender:
                     node.receive(can_id, data)
 
     def _write_serial(self, data: bytes) -> None:
+        """Send bytes of the sensor over the serial line, record by record if a fault acts on it."""
         line = self._lines["sensor"]
-        if self._emitting and line.disturbed:  # record by record
-            for at in range(0, len(data), _RECORD_SIZE):
-                line.send(SERIAL, data[at : at + _RECORD_SIZE])
+        if self._is_streaming and line.disturbed:  # record by record
+            for offset in range(0, len(data), _RECORD_SIZE):
+                line.send(SERIAL, data[offset : offset + _RECORD_SIZE])
         else:
             line.send(SERIAL, data)
 
-    def _to_serial(self, _: int, data: bytes, __: object) -> None:
-        self._write(data)
+    def _deliver_to_serial_host(self, _: int, data: bytes, __: object) -> None:
+        """Pass bytes of the simulated sensor that the line has not dropped to the host."""
+        self._write_to_host(data)
 
     # Faults.
 
-    def _check(self, fault: Fault) -> None:
+    def _check_fault(self, fault: Fault) -> None:
+        """Raise if a fault is not possible on this rig."""
         values = fault.values
         device = values.get("device", values.get("from", "drive"))
         if fault.kind in ("saturate", "status") or values.get("what") in ("sensor", "gauge"):
             device = "sensor"
-        on_serial = self._serial is not None and device == "sensor"
+        on_serial = self._serial_device is not None and device == "sensor"
         if device in ("drive", "sensor") and device not in self._nodes and not on_serial:
             raise FaultError(f"Fault '{fault}': this rig has no {device} on its lines.")
         if fault.kind == "cut" and device == "sensor" and not on_serial:
@@ -475,133 +505,155 @@ class BusSimulation:
                 f"Fault '{fault}': this rig's sensor has no serial line; use "
                 "freeze,device=sensor, or cut for the whole bus."
             )
-        for word in _WORDS_ON_CAN if on_serial else _WORDS_ON_SERIAL:
-            if word in values:
+        for key in _CAN_ONLY_KEYS if on_serial else _SERIAL_ONLY_KEYS:
+            if key in values:
                 raise FaultError(
-                    f"Fault '{fault}': {word} is for a sensor on "
+                    f"Fault '{fault}': {key} is for a sensor on "
                     f"{'CAN' if on_serial else 'a serial line'}, which this one is not."
                 )
-        if fault.kind == "corrupt" and not on_serial and int(values["byte"]) >= _CAN_BYTES:
+        if (
+            fault.kind == "corrupt"
+            and not on_serial
+            and int(values["byte"]) >= _MOST_CAN_DATA_BYTES
+        ):
             raise FaultError(
                 f"Fault '{fault}': byte={values['byte']} has no effect; a CAN frame has at most "
-                f"the bytes 0 to {_CAN_BYTES - 1}."
+                f"the bytes 0 to {_MOST_CAN_DATA_BYTES - 1}."
             )
 
-        if fault.kind in DISTURBANCES:
+        if fault.kind in DISTURBANCE_KINDS:
             try:
-                self._simulated.check(disturbance_of(fault, 0.0))
+                self._simulated_rig.check_disturbance(disturbance_of(fault, 0.0))
             except (ObstacleError, RealisationError) as error:
                 raise FaultError(f"Fault '{fault}': {error}") from None
 
-    def _begin(self, fault: Fault) -> None:
+    def _begin_fault(self, fault: Fault) -> None:
+        """Begin an injected fault now: change the device, line or rig that it concerns."""
         self._log("simulator", "fault", fault=str(fault))
         values: dict[str, Any] = dict(fault.values)
-        sensor: Any = self._serial or self._nodes.get("sensor")
+        sensor: Any = self._serial_device or self._nodes.get("sensor")
         drive: Any = self._nodes.get("drive")
         if fault.kind in LINE_KINDS:
             self._lines[values["from"]].add(fault)
         elif fault.kind == "freeze":
-            self._stand(fault, drive if values["device"] == "drive" else sensor, "frozen", True)
+            self._override_attribute(
+                fault, drive if values["device"] == "drive" else sensor, "frozen", True
+            )
         elif fault.kind == "saturate":
-            self._stand(fault, sensor, "saturate", values["gauge"])
+            self._override_attribute(fault, sensor, "saturate", values["gauge"])
         elif fault.kind == "stuck":
-            self._get_stuck(fault, sensor)
+            self._begin_stuck_readings(fault, sensor)
         elif fault.kind == "status":
-            self._stand(fault, sensor, "status_bits", values["bits"])
+            self._override_attribute(fault, sensor, "status_bits", values["bits"])
         elif fault.kind == "emcy":
             drive.emergency(values["code"], values["register"], bytes(5))
         elif fault.kind == "sto":
-            self._stand(fault, drive, "sto_dropped", True)
+            self._override_attribute(fault, drive, "sto_dropped", True)
         elif fault.kind == "busoff":
-            self._send(BUS_OFF_FRAME, None)
-            self._stand(fault, self, "bus_off", True)
+            self._send_to_hosts(BUS_OFF_FRAME, None)
+            self._override_attribute(fault, self, "bus_off", True)
         elif fault.kind == "jump":
             drive.angle_offset_counts += values["counts"]
         elif fault.kind == "object":
-            drive.state_object(values["index"], values["sub"], values.get("value"))
+            drive.override_object(values["index"], values["sub"], values.get("value"))
         elif fault.kind in ("restart", "power_cycle"):
             device = drive if values["device"] == "drive" else sensor
             (device.reset if fault.kind == "restart" else device.power_cycle)()
         elif fault.kind == "lag":
-            self._stand(fault, drive, "torque_lag_s", 1e-3 * values["ms"])
-        elif fault.kind in _TRAITS:
-            self._stand(fault, drive, _TRAITS[fault.kind], True)
-        elif fault.kind in DISTURBANCES:
-            now_s = self._simulated.plant.elapsed_s + (0.0 if self._lock_step else _READY_IN_S)
+            self._override_attribute(fault, drive, "torque_lag_s", 1e-3 * values["ms"])
+        elif fault.kind in _DRIVE_ATTRIBUTES:
+            self._override_attribute(fault, drive, _DRIVE_ATTRIBUTES[fault.kind], True)
+        elif fault.kind in DISTURBANCE_KINDS:
+            now_s = self._simulated_rig.plant.elapsed_s + (
+                0.0 if self._lock_step else _OBSTACLE_LEAD_TIME_S
+            )
             disturbance = disturbance_of(fault, now_s)
-            self._simulated.meet(disturbance, wait=self._lock_step)
+            self._simulated_rig.add_disturbance(disturbance, wait=self._lock_step)
             if isinstance(disturbance, Obstacle):
                 self._obstacles.append((fault, disturbance))
         elif fault.kind == "end":
-            self._end(values.get("fault"))
+            self._end_faults(values.get("fault"))
         else:
             self._cut_lines[values["device"]] = fault
-            self._cut(values["device"])
-        self._let_hear()
+            self._interrupt(values["device"])
+        self._deliver_to_nodes()
 
-    def _get_stuck(self, fault: Fault, sensor: Any) -> None:  # noqa: ANN401
-        """Make encoder, sensor or one gauge repeat its readings."""
-        stuck = Stuck(int(fault.values.get("every", 0)))
-        what = fault.values["what"]
-        if what == "encoder":
-            self._stand(fault, self._simulated, "stuck_encoder", stuck)
-        elif what == "sensor":
-            self._stand(fault, self._simulated.sensor, "stuck", stuck)
+    def _begin_stuck_readings(self, fault: Fault, sensor: Any) -> None:  # noqa: ANN401
+        """Make the encoder, the sensor or one gauge repeat its readings."""
+        stuck = StuckReadings(int(fault.values.get("every", 0)))
+        stuck_device = fault.values["what"]
+        if stuck_device == "encoder":
+            self._override_attribute(fault, self._simulated_rig, "stuck_encoder", stuck)
+        elif stuck_device == "sensor":
+            self._override_attribute(fault, self._simulated_rig.sensor, "stuck", stuck)
         else:
-            self._stand(fault, sensor.gauges, "stuck", (int(fault.values["gauge"]), stuck))
+            self._override_attribute(
+                fault, sensor.gauges, "stuck", (int(fault.values["gauge"]), stuck)
+            )
 
-    def _stand(self, fault: Fault, device: Any, attribute: str, value: object) -> None:  # noqa: ANN401
-        """Let a fault override an attribute of a device until it ends."""
-        others = [s for s in self._standing if (s.device, s.attribute) == (device, attribute)]
-        normal = others[0].normal if others else getattr(device, attribute)
-        standing = _Standing(fault, device, attribute, value, normal)
-        self._standing.append(standing)
+    def _override_attribute(self, fault: Fault, device: Any, attribute: str, value: object) -> None:  # noqa: ANN401
+        """Let a fault override an attribute of a device until the fault ends."""
+        other_overrides = [
+            s for s in self._overrides if (s.device, s.attribute) == (device, attribute)
+        ]
+        normal_value = (
+            other_overrides[0].normal_value if other_overrides else getattr(device, attribute)
+        )
+        override = _AttributeOverride(fault, device, attribute, value, normal_value)
+        self._overrides.append(override)
         setattr(device, attribute, value)
         if "for" in fault.values:
             end_s = self.now_s + float(fault.values["for"])
-            self._plan(end_s, partial(self._end_one, standing))
+            self._schedule(end_s, partial(self._end_override, override))
 
-    def _end_one(self, standing: "_Standing") -> None:
-        """Reset the attribute to the value of the latest remaining fault, or to normal."""
-        if standing not in self._standing:  # it was ended before its time
+    def _end_override(self, override: "_AttributeOverride") -> None:
+        """End an overriding fault: restore the value of the latest remaining one, or the normal."""
+        if override not in self._overrides:  # it was ended before its scheduled end
             return
-        self._standing.remove(standing)
-        value = standing.normal
-        for other in self._standing:
-            if (other.device, other.attribute) == (standing.device, standing.attribute):
+        self._overrides.remove(override)
+        value = override.normal_value
+        for other in self._overrides:
+            if (other.device, other.attribute) == (override.device, override.attribute):
                 value = other.value
-        setattr(standing.device, standing.attribute, value)
-        self._log("simulator", "fault over", fault=str(standing.fault))
+        setattr(override.device, override.attribute, value)
+        self._log("simulator", "fault over", fault=str(override.fault))
 
-    def _end(self, kind: str | None) -> None:
-        """End all faults of a kind, or all there are."""
+    def _end_faults(self, kind: str | None) -> None:
+        """End all faults of a kind, or all faults if it is None."""
         for line in self._lines.values():
-            for ended in line.end(kind):
-                self._log("simulator", "fault over", fault=ended)
-        for standing in [s for s in self._standing if kind in (None, s.fault.kind)]:
-            self._end_one(standing)
+            for ended_kind in line.end(kind):
+                self._log("simulator", "fault over", fault=ended_kind)
+        for override in [s for s in self._overrides if kind in (None, s.fault.kind)]:
+            self._end_override(override)
         if kind in (None, "obstacle"):
             obstacles, self._obstacles = self._obstacles, []
             for fault, obstacle in obstacles:
-                self._simulated.end(obstacle)
+                self._simulated_rig.remove_obstacle(obstacle)
                 self._log("simulator", "fault over", fault=str(fault))
         if kind in (None, "cut"):
             cut, self._cut_lines = self._cut_lines, {}
             for device, fault in cut.items():
-                self._mend(device)
+                self._reconnect(device)
                 self._log("simulator", "fault over", fault=str(fault))
 
-    def _plan(self, when_s: float, action: Callable[[], None]) -> None:
-        self._order += 1
-        # Half a period of tolerance: the end of an interval must not depend on rounding.
-        heapq.heappush(self._planned, (when_s - 0.5 * self._period_s, self._order, action))
+    def _schedule(self, when_s: float, action: Callable[[], None]) -> None:
+        """Schedule an action at a simulated time in seconds since the start."""
+        self._action_count += 1
+        # Half a period of tolerance, so that the end of an interval does not depend on rounding.
+        heapq.heappush(
+            self._scheduled_actions, (when_s - 0.5 * self._period_s, self._action_count, action)
+        )
 
-    def _postpone(self, delay_s: float, action: Callable[[], None]) -> None:
-        self._order += 1
+    def _schedule_delivery(self, delay_s: float, action: Callable[[], None]) -> None:
+        """Schedule the delivery of a delayed frame; in real time by the wall clock."""
+        self._action_count += 1
         now_ns = self.periods * self._period_ns if self._lock_step else self._now_ns
-        heapq.heappush(self._postponed, (now_ns + delay_s * 1e9, self._order, action))
+        heapq.heappush(
+            self._delayed_deliveries, (now_ns + delay_s * 1e9, self._action_count, action)
+        )
 
     def _run_due(self, queue: list[tuple[float, int, Callable[[], None]]], now: float) -> None:
+        """Run the actions of a queue that are due at a time, and deliver the nodes' frames."""
         while queue and queue[0][0] <= now:
             heapq.heappop(queue)[2]()
-        self._let_hear()
+        self._deliver_to_nodes()

@@ -1,8 +1,8 @@
 """Services of a simulated CANopen node: emergency messages, heartbeats, PDOs.
 
-PDOs are mapped as the node's dictionary says. A mapping is turned into one :class:`struct.Struct`
-and a list of readers whenever it changes, so that a PDO costs a few microseconds when it comes or
-goes.
+PDOs are mapped as the node's dictionary states. A changed mapping is compiled to one
+:class:`struct.Struct` and a list of readers, so that receiving or sending a PDO takes only a few
+microseconds.
 """
 
 import math
@@ -15,27 +15,30 @@ from rigd.sim.wire._object_dictionary import Abort, AbortCode, Entry, ObjectDict
 
 # Emergency messages
 
-_FRAME = Struct("<HB5s")
-_GENERIC = 0x01
-_HISTORY = 8
+_EMERGENCY_LAYOUT = Struct("<HB5s")
+"""Layout of an emergency message: error code, error register, vendor's bytes."""
+_GENERIC_ERROR_BIT = 0x01
+"""Generic bit of the error register."""
+_HISTORY_LENGTH = 8
+"""Number of error codes in the error history."""
 
 
 class Emergencies:
-    """Emergency messages: present errors, and the history.
+    """Emergency messages of a node: active errors and error history.
 
     Parameters
     ----------
     objects
-        Gets the objects 1001, 1003 and 1014.
+        Dictionary to which the objects 1001, 1003 and 1014 are added.
     node_id
-        Number of the node.
+        Node number.
     send
-        Takes identifier and data of an EMCY message, where one may be sent.
+        Function that sends an emergency message with identifier and data.
 
     Attributes
     ----------
     active : dict
-        Active error codes, and their bits in the error register.
+        Bits in the error register by active error code.
     """
 
     def __init__(
@@ -44,20 +47,22 @@ class Emergencies:
         self._send = send
         self.active: dict[int, int] = {}
         self._history: list[int] = []
-        objects.add(0x1001, Entry("B", access="ro", mapping="t", live=self._register))
-        count = Entry("B", live=lambda: len(self._history), high=0, wrote=self._history.clear)
+        objects.add(0x1001, Entry("B", access="ro", mapping="t", read_value=self._register))
+        count = Entry(
+            "B", read_value=lambda: len(self._history), high=0, after_write=self._history.clear
+        )
         objects.add(0x1003, count)
-        for sub in range(1, _HISTORY + 1):
-            objects.add(0x1003, Entry("I", access="ro", live=self._past(sub)), sub)
+        for sub in range(1, _HISTORY_LENGTH + 1):
+            objects.add(0x1003, Entry("I", access="ro", read_value=self._history_reader(sub)), sub)
         self._cob_id = objects.add(0x1014, Entry("I", 0x80 + node_id, check=self._check_cob_id))
 
     def reset(self) -> None:
-        """Forget all, as at power-on."""
+        """Clear active errors and error history, as at power-on."""
         self.active.clear()
         self._history.clear()
 
     def report(self, code: int, register: int, vendor: bytes = b"") -> bool:
-        """Register an error and send its message, unless it is active already.
+        """Register an error and send its message, unless the error is active already.
 
         Parameters
         ----------
@@ -66,39 +71,43 @@ class Emergencies:
         register
             Bits of the error in the error register; the generic bit is added.
         vendor
-            Up to five bytes of the message.
+            Up to five vendor-specific bytes of the message.
 
         Returns
         -------
         bool
-            Whether it is new.
+            Whether the error was not active before.
         """
         if code in self.active:
             return False
-        self.active[code] = register | _GENERIC
+        self.active[code] = register | _GENERIC_ERROR_BIT
         self._history.insert(0, code)
-        del self._history[_HISTORY:]
+        del self._history[_HISTORY_LENGTH:]
         self._transmit(code, vendor)
         return True
 
     def clear(self, *codes: int) -> None:
-        """Clear errors, and send a message if any of them was active."""
-        gone = [code for code in codes if self.active.pop(code, None) is not None]
-        if gone:
+        """Clear error codes, and send an emergency message if any of them was active."""
+        cleared = [code for code in codes if self.active.pop(code, None) is not None]
+        if cleared:
             self._transmit(0, b"")
 
     def _transmit(self, code: int, vendor: bytes) -> None:
-        if not self._cob_id.value & DISABLED:
-            frame = _FRAME.pack(code, self._register(), vendor[:5])
+        """Send an emergency message, unless object 1014 disables it."""
+        if not self._cob_id.value & COB_ID_DISABLED:
+            frame = _EMERGENCY_LAYOUT.pack(code, self._register(), vendor[:5])
             self._send(self._cob_id.value & 0x7FF, frame)
 
     def _register(self) -> int:
+        """Return the error register: the bits of all active errors."""
         register = 0
         for bits in self.active.values():
             register |= bits
         return register
 
-    def _past(self, sub: int) -> Callable[[], int]:
+    def _history_reader(self, sub: int) -> Callable[[], int]:
+        """Return the function that reads an entry of the error history."""
+
         def read() -> int:
             if sub > len(self._history):
                 raise Abort(AbortCode.NO_DATA)
@@ -107,48 +116,51 @@ class Emergencies:
         return read
 
     def _check_cob_id(self, value: int) -> None:
-        standing = self._cob_id.value
+        """Raise `Abort` if object 1014 may not be set to a value now."""
+        present_value = self._cob_id.value
         if value & 0x7FFF_F800 or not is_free_id(value & 0x7FF):
             raise Abort(AbortCode.VALUE)
-        if not (standing | value) & DISABLED and (standing ^ value) & 0x7FF:
+        if not (present_value | value) & COB_ID_DISABLED and (present_value ^ value) & 0x7FF:
             raise Abort(AbortCode.STATE)
 
 
 # Heartbeats
 
-WATCHES = 2
-_TOLERANCE_S = 1e-9
+DEFAULT_MONITOR_COUNT = 2
+"""Number of heartbeats that a node can monitor, without a device file."""
+_TIME_TOLERANCE_S = 1e-9
+"""Tolerance in seconds for rounding errors of times."""
 
 
 class HeartbeatProducer:
-    """Determines when the node's own heartbeat is due, by object 1017."""
+    """Schedule of the node's own heartbeat, by object 1017."""
 
     def __init__(self, objects: ObjectDictionary) -> None:
-        self._period_ms = objects.add(0x1017, Entry("H", wrote=self.restart))
+        self._period_ms = objects.add(0x1017, Entry("H", after_write=self.restart))
         self.restart()
 
     def restart(self) -> None:
-        """Have the next one sent at once."""
+        """Make the next heartbeat due at once."""
         self._due_s: float | None = None
 
     def is_due(self, now_s: float) -> bool:
-        """Whether to send one now; the next is due a period later."""
+        """Return whether a heartbeat is due, and schedule the next one a period later."""
         period_s = 1e-3 * self._period_ms.value
-        if not period_s or (self._due_s is not None and now_s < self._due_s - _TOLERANCE_S):
+        if not period_s or (self._due_s is not None and now_s < self._due_s - _TIME_TOLERANCE_S):
             return False
         next_s = (now_s if self._due_s is None else self._due_s) + period_s
-        # What a late call missed is not made up.
+        # Heartbeats that a late call has missed are not made up for.
         self._due_s = next_s if next_s > now_s else now_s + period_s
         return True
 
 
-class HeartbeatWatch:
-    """One entry of object 1016: it starts with the first heartbeat that comes.
+class HeartbeatMonitor:
+    """Monitor of one heartbeat by an entry of object 1016, active after the first heartbeat.
 
     Attributes
     ----------
     lost : bool
-        The heartbeat has been missing for longer than its time.
+        Whether the heartbeat has been missing for longer than its timeout.
     """
 
     def __init__(self, entry: Entry) -> None:
@@ -156,80 +168,88 @@ class HeartbeatWatch:
         self.restart()
 
     def restart(self) -> None:
-        """Wait for the first heartbeat again."""
+        """Restart the monitoring: wait for the first heartbeat of the node again."""
         self.lost = False
         self._last_s: float | None = None
 
     @property
     def node_id(self) -> int:
-        """Number of the watched node; 0 for none."""
-        return _watched(self._entry.value)
+        """Number of the monitored node; 0 for none."""
+        return _monitored_node(self._entry.value)
 
-    def beat(self, now_s: float) -> None:
-        """Take a heartbeat."""
+    def register_heartbeat(self, now_s: float) -> None:
+        """Register a received heartbeat at a time in seconds."""
         self._last_s = now_s
         self.lost = False
 
     def check(self, now_s: float) -> bool:
-        """Return whether the heartbeat has just been lost."""
+        """Return whether the monitored heartbeat has been lost since the last check."""
         timeout_s = 1e-3 * (self._entry.value & 0xFFFF)
         if self.lost or not timeout_s or self._last_s is None:
             return False
-        self.lost = now_s - self._last_s > timeout_s + _TOLERANCE_S
+        self.lost = now_s - self._last_s > timeout_s + _TIME_TOLERANCE_S
         return self.lost
 
 
-def _watched(value: int) -> int:
+def _monitored_node(value: int) -> int:
+    """Return the number of the monitored node in a value of object 1016; 0 for none."""
     return value >> 16 & 0x7F if value & 0xFFFF else 0
 
 
-def add_watches(
-    objects: ObjectDictionary, count: int, restarted: Callable[[], None]
-) -> list[HeartbeatWatch]:
-    """Add object 1016, and return the watches that its entries set.
+def add_heartbeat_monitors(
+    objects: ObjectDictionary, count: int, on_restart: Callable[[], None]
+) -> list[HeartbeatMonitor]:
+    """Add object 1016 to a dictionary, and return the heartbeat monitors of its entries.
 
     Parameters
     ----------
     objects
-        Gets the object.
+        Dictionary to which the object is added.
     count
-        Number of nodes that can be watched; with 0 there is no such object.
-    restarted
-        Called after a watch was set again, and so is not lost.
+        Number of nodes that can be monitored; with 0 the object is not added.
+    on_restart
+        Function that is called after an entry was set, which restarts its monitoring.
     """
     entries = {sub: Entry("I") for sub in range(1, count + 1)}
-    watches = [HeartbeatWatch(entry) for entry in entries.values()]
+    monitors = [HeartbeatMonitor(entry) for entry in entries.values()]
 
     def check(entry: Entry, value: int) -> None:
         if value >> 24 or value >> 16 > 0x7F:
             raise Abort(AbortCode.VALUE)
-        others = {_watched(other.value) for other in entries.values() if other is not entry}
-        if _watched(value) and _watched(value) in others:
+        other_nodes = {
+            _monitored_node(other.value) for other in entries.values() if other is not entry
+        }
+        if _monitored_node(value) and _monitored_node(value) in other_nodes:
             raise Abort(AbortCode.INCOMPATIBLE)
 
-    def restart(watch: HeartbeatWatch) -> None:
-        watch.restart()
-        restarted()
+    def restart(monitor: HeartbeatMonitor) -> None:
+        monitor.restart()
+        on_restart()
 
-    for entry, watch in zip(entries.values(), watches, strict=True):
+    for entry, monitor in zip(entries.values(), monitors, strict=True):
         entry.check = partial(check, entry)
-        entry.wrote = partial(restart, watch)
+        entry.after_write = partial(restart, monitor)
     if entries:
         objects.add_record(0x1016, entries)
-    return watches
+    return monitors
 
 
 # PDOs
 
-DISABLED = 0x8000_0000
-MAX_ENTRIES = 8
-_MAX_BITS = 64
+COB_ID_DISABLED = 0x8000_0000
+"""Bit in the COB-ID of a PDO or emergency message that disables it."""
+MAX_MAPPING_ENTRIES = 8
+"""Largest number of objects in a PDO."""
+_MOST_PDO_BITS = 64
+"""Largest length of a PDO in bits."""
 _LAST_SYNC_TYPE = 240
+"""Largest transmission type of a synchronous PDO."""
 _EVENT_TYPES = (254, 255)
+"""Transmission types of event-driven PDOs."""
 
 
 def is_free_id(can_id: int) -> bool:
-    """Whether an identifier of 11 bits may be given to a PDO, to SYNC or to EMCY (CiA 301)."""
+    """Return whether an 11-bit identifier may be given to a PDO, SYNC or EMCY (CiA 301)."""
     return not (
         can_id <= 0x07F
         or can_id > 0x6FF
@@ -241,36 +261,37 @@ def is_free_id(can_id: int) -> bool:
 
 
 class Pdo:
-    """Communication and mapping parameters of one PDO.
+    """PDO of a node: its communication and mapping parameters.
 
     Parameters
     ----------
     objects
-        The dictionary that gets the parameters, and that holds what is mapped.
+        Dictionary to which the parameters are added, and which contains the mapped objects.
     communication, mapping
         Indices of the parameters, such as 1400 and 1600.
     direction
-        "r" or "t": what entries must allow in `Entry.mapping`.
+        "r" or "t", which mapped entries must have in `Entry.mapping`.
     cob_id
-        COB-ID at power-on, with `DISABLED` or not.
-    mapped
-        At power-on: index << 16 | sub-index << 8 | bits.
+        COB-ID at power-on, with or without `COB_ID_DISABLED`.
+    default_mapping
+        Mapping at power-on; each entry is index << 16 | sub-index << 8 | bits.
     slots
-        Largest number of entries.
+        Largest number of mapped objects.
     changed
-        Called after identifier, type or mapping have changed.
+        Function that is called after identifier, type or mapping have changed.
 
     Attributes
     ----------
     can_id : int
-        Identifier in use; -1 while the PDO is off or empty.
+        CAN identifier; -1 while the PDO is disabled or empty.
     size : int
-        Bytes of the PDO.
+        Size of the PDO in bytes.
     entries : list of Entry
-        Objects that it carries.
+        Mapped objects.
     """
 
     direction = ""
+    """Letter of the direction, "r" or "t"."""
 
     def __init__(
         self,
@@ -278,64 +299,67 @@ class Pdo:
         communication: int,
         mapping: int,
         cob_id: int,
-        mapped: tuple[int, ...],
+        default_mapping: tuple[int, ...],
         slots: int,
         changed: Callable[[], None],
     ) -> None:
         self._objects = objects
         self._changed = changed
-        self._cob_id = Entry("I", cob_id, check=self._check_cob_id, wrote=self._rebuild)
-        self._type = Entry("B", 255, check=_check_type, wrote=self._rebuild)
+        self._cob_id = Entry("I", cob_id, check=self._check_cob_id, after_write=self._rebuild)
+        self._type = Entry("B", 255, check=_check_transmission_type, after_write=self._rebuild)
         self._inhibit = Entry("H", check=self._check_inhibit)
         self._timer = Entry("H")
         objects.add_record(
             communication, {1: self._cob_id, 2: self._type, 3: self._inhibit, 5: self._timer}
         )
-        self._count = Entry("B", len(mapped), check=self._check_count, wrote=self._rebuild)
+        self._count = Entry(
+            "B", len(default_mapping), check=self._check_count, after_write=self._rebuild
+        )
         objects.add(mapping, self._count)
         self._slots = [
             objects.add(mapping, Entry("I", value, check=self._check_slot), sub)
-            for sub, value in enumerate((mapped + (0,) * slots)[:slots], 1)
+            for sub, value in enumerate((default_mapping + (0,) * slots)[:slots], 1)
         ]
         self.can_id = -1
         self.size = 0
         self.entries: list[Entry] = []
         self._struct = Struct("<")
-        self.forget()
+        self.reset_exchange()
 
     def compile(self) -> None:
-        """Rebuild the mapping from the dictionary."""
+        """Rebuild the PDO's mapping from the object dictionary."""
         slots = self._slots[: self._count.value]
         try:
-            self.entries = [self._mapped(slot.value) for slot in slots]
-        except Abort:  # at power-on: a device's file may map what it says cannot be mapped
+            self.entries = [self._mapped_entry(slot.value) for slot in slots]
+        except Abort:  # a device's file may map objects at power-on that it declares unmappable
             self.entries = []
         self._struct = Struct("<" + "".join(entry.kind for entry in self.entries))
         self.size = self._struct.size
-        on = self.entries and not self._cob_id.value & DISABLED
-        self.can_id = self._cob_id.value & 0x7FF if on else -1
-        self.forget()
+        is_enabled = self.entries and not self._cob_id.value & COB_ID_DISABLED
+        self.can_id = self._cob_id.value & 0x7FF if is_enabled else -1
+        self.reset_exchange()
 
-    def forget(self) -> None:
-        """Reset: nothing has been received or sent yet."""
+    def reset_exchange(self) -> None:
+        """Reset the state: nothing has been received or sent yet."""
         raise NotImplementedError
 
     @property
     def is_synchronous(self) -> bool:
-        """Whether it belongs to the SYNC."""
+        """Whether the PDO is synchronous with SYNC."""
         return self._type.value <= _LAST_SYNC_TYPE
 
     def _rebuild(self) -> None:
+        """Rebuild the mapping after a parameter was written, and report the change."""
         self.compile()
         self._changed()
 
-    def _mapped(self, value: int) -> Entry:
-        """Return the entry a mapping names.
+    def _mapped_entry(self, value: int) -> Entry:
+        """Return the entry of the dictionary that a mapping entry names.
 
         Raises
         ------
         Abort
-            If it does not exist, does not go into this PDO, or has another length.
+            If the object does not exist, cannot be mapped into this PDO, or has another length.
         """
         entry = self._objects.find(value >> 16, value >> 8 & 0xFF)
         if self.direction not in entry.mapping or entry.bits != value & 0xFF:
@@ -343,119 +367,129 @@ class Pdo:
         return entry
 
     def _check_cob_id(self, value: int) -> None:
-        was_on = not self._cob_id.value & DISABLED
+        """Raise `Abort` if the COB-ID may not be set to a value now."""
+        was_enabled = not self._cob_id.value & COB_ID_DISABLED
         if value & 0x3FFF_F800 or not is_free_id(value & 0x7FF):
             raise Abort(AbortCode.VALUE)
-        if was_on and not value & DISABLED and (value ^ self._cob_id.value) & 0x7FF:
+        if was_enabled and not value & COB_ID_DISABLED and (value ^ self._cob_id.value) & 0x7FF:
             raise Abort(AbortCode.STATE)
 
     def _check_inhibit(self, value: int) -> None:  # noqa: ARG002
-        if not self._cob_id.value & DISABLED:
+        """Raise `Abort` if the inhibit time may not be set now."""
+        if not self._cob_id.value & COB_ID_DISABLED:
             raise Abort(AbortCode.STATE)
 
     def _check_slot(self, value: int) -> None:
-        if not self._cob_id.value & DISABLED or self._count.value:
+        """Raise `Abort` if a mapping entry may not be set to a value now."""
+        if not self._cob_id.value & COB_ID_DISABLED or self._count.value:
             raise Abort(AbortCode.STATE)
         if value:
-            self._mapped(value)
+            self._mapped_entry(value)
 
     def _check_count(self, value: int) -> None:
-        if not self._cob_id.value & DISABLED:
+        """Raise `Abort` if the number of mapped objects may not be set to a value now."""
+        if not self._cob_id.value & COB_ID_DISABLED:
             raise Abort(AbortCode.STATE)
         if value > len(self._slots):
             raise Abort(AbortCode.PDO_LENGTH)
-        if sum(self._mapped(slot.value).bits for slot in self._slots[:value]) > _MAX_BITS:
+        if (
+            sum(self._mapped_entry(slot.value).bits for slot in self._slots[:value])
+            > _MOST_PDO_BITS
+        ):
             raise Abort(AbortCode.PDO_LENGTH)
 
 
 class ReceivePdo(Pdo):
-    """A PDO that the node receives.
+    """PDO that the node receives (RPDO).
 
     Attributes
     ----------
     pending : bytes or None
-        Received, and waiting for the next SYNC.
+        Received data that takes effect at the next SYNC; None if there is none.
     received_s : float or None
-        Time of the last one; None before the first.
+        Time in seconds at which the last PDO was received; None before the first.
     applied : bool
-        Whether one has taken effect.
+        Whether a received PDO has taken effect.
     """
 
     direction = "r"
 
-    def forget(self) -> None:
-        """Discard the received data."""
+    def reset_exchange(self) -> None:
+        """Discard the data of received PDOs."""
         self.pending: bytes | None = None
         self.received_s: float | None = None
         self.applied = False
 
     @property
     def deadline_s(self) -> float:
-        """How long the next one may take, from sub-index 5; 0 for any time."""
+        """Longest time in seconds until the next PDO, from sub-index 5; 0 for no deadline."""
         return 1e-3 * self._timer.value
 
     def apply(self, data: bytes) -> None:
-        """Store the values, all of them before any takes effect; what is out of range is left."""
+        """Store all values of a received PDO, then run their effects; skip values out of range."""
         for entry, value in zip(self.entries, self._struct.unpack(data), strict=True):
             with suppress(Abort):
-                entry.put(value)
+                entry.store_integer(value)
         self.applied = True
         for entry in self.entries:
-            if entry.wrote is not None:
-                entry.wrote()
+            if entry.after_write is not None:
+                entry.after_write()
 
 
 class TransmitPdo(Pdo):
-    """A PDO that the node sends."""
+    """PDO that the node sends (TPDO)."""
 
     direction = "t"
 
     def compile(self) -> None:
-        """Rebuild the mapping from the dictionary."""
+        """Rebuild the PDO's mapping from the object dictionary, and its list of readers."""
         super().compile()
-        self._readers: list[Callable[[], int]] = [entry.live or entry.get for entry in self.entries]
+        self._readers: list[Callable[[], int]] = [
+            entry.read_value or entry.get for entry in self.entries
+        ]
 
-    def forget(self) -> None:
-        """Start as on entering operational: every event is news."""
+    def reset_exchange(self) -> None:
+        """Reset the state as on entering operational: the next event sends the PDO."""
         self._syncs = 0
         self._last: bytes | None = None
         self._sent_s = -math.inf
 
     def build(self) -> bytes:
-        """Return the values as they are now."""
+        """Return the PDO's data with the present values."""
         return self._struct.pack(*[read() for read in self._readers])
 
-    def at_sync(self, now_s: float) -> bytes | None:
-        """Return what is to be sent at this SYNC, or None.
+    def data_at_sync(self, now_s: float) -> bytes | None:
+        """Return the data to send at a SYNC, or None if nothing is to be sent.
 
-        Some drives keep their inhibit time with the SYNC too, and so does this one. It begins when
-        the PDO has gone, a little after its SYNC: one SYNC later than that comes too early.
+        As in some real drives, the inhibit time also applies to synchronous PDOs. It begins when
+        the PDO has been sent, a little after its SYNC.
         """
         if self._inhibit.value:
             if now_s - self._sent_s < 1e-4 * self._inhibit.value + 1e-9:
                 return None
-            data = self._of_sync()
+            data = self._data_by_transmission_type()
             if data is not None:
                 self._sent_s = now_s
             return data
-        return self._of_sync()
+        return self._data_by_transmission_type()
 
-    def _of_sync(self) -> bytes | None:
-        every = self._type.value
-        if every == 1:
+    def _data_by_transmission_type(self) -> bytes | None:
+        """Return the data to send at a SYNC by the transmission type, or None."""
+        transmission_type = self._type.value
+        if transmission_type == 1:
             return self.build()
-        if every == 0:
+        if transmission_type == 0:
             data = self.build()
             changed, self._last = data != self._last, data
             return data if changed else None
         self._syncs += 1
-        if self._syncs < every:
+        if self._syncs < transmission_type:
             return None
         self._syncs = 0
         return self.build()
 
-    def at_event(self, now_s: float) -> bytes | None:
-        """Return what is to be sent by now as values have changed or the timer ran out, or None."""
+    def data_at_event(self, now_s: float) -> bytes | None:
+        """Return the data to send because values have changed or the timer has expired, or None."""
         data = self.build()
         age_s = now_s - self._sent_s
         timer_s = 1e-3 * self._timer.value
@@ -468,6 +502,7 @@ class TransmitPdo(Pdo):
         return data
 
 
-def _check_type(value: int) -> None:
+def _check_transmission_type(value: int) -> None:
+    """Raise `Abort` if a transmission type is not supported."""
     if value > _LAST_SYNC_TYPE and value not in _EVENT_TYPES:
         raise Abort(AbortCode.VALUE)

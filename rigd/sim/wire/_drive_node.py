@@ -1,8 +1,8 @@
-"""The simulated drive: a CANopen node by CiA 301 and CiA 402 that pushes the simulated plant.
+"""Simulated drive: a CANopen node by CiA 301 and CiA 402 that drives the simulated plant.
 
-It supports one mode, cyclic synchronous torque. It has no velocity loop, so what a real drive does
-by a ramp (quick stop, fault reaction) is here a coasting shaft: the torque goes to zero and the
-drive off at once, and only the state follows later.
+It supports only the cyclic synchronous torque mode. It has no velocity loop: where a real drive
+decelerates by a ramp (quick stop, fault reaction), the shaft coasts. The torque is zero and the
+plant's drive off at once, and only the state follows later.
 """
 
 import math
@@ -15,14 +15,14 @@ from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 from rigd.sim import SimulatedRig
 from rigd.sim.wire._canopen_services import (
-    DISABLED,
-    MAX_ENTRIES,
-    WATCHES,
+    COB_ID_DISABLED,
+    DEFAULT_MONITOR_COUNT,
+    MAX_MAPPING_ENTRIES,
     Emergencies,
     HeartbeatProducer,
     ReceivePdo,
     TransmitPdo,
-    add_watches,
+    add_heartbeat_monitors,
 )
 from rigd.sim.wire._drive_objects import (
     CYCLIC_SYNCHRONOUS_TORQUE,
@@ -30,7 +30,7 @@ from rigd.sim.wire._drive_objects import (
     PdsState,
     PdsStateMachine,
     add_drive_objects,
-    follow_file,
+    adopt_device_file,
     peak_per_mille,
 )
 from rigd.sim.wire._object_dictionary import ObjectDictionary, SdoServer
@@ -39,36 +39,54 @@ if TYPE_CHECKING:
     from rigd.sim.wire._object_dictionary import DeviceFile
 
 Log = Callable[..., None]
+"""Function that logs an event of the drive, with values by name."""
 
 SYNC_TIMEOUT_PERIODS = 30
-"""Default number of periods without a SYNC after which a drive in operation faults: more than a
-host may miss by its profile, and less than its heartbeat timeout. Real drives differ from 2
-upwards."""
+"""Default number of periods without a SYNC after which a drive in operation goes to fault.
+
+It is more than a host may omit by its profile, and less than the host's heartbeat timeout. Real
+drives have values from 2 upwards."""
 
 # Error codes of CiA 301 and 402.
-_CONNECTION_ENDED = 0x8100
-_HEARTBEAT_LOST = 0x8130
-_PDO_TOO_SHORT = 0x8210
-_PDO_TOO_LONG = 0x8220
-_SYNC_LENGTH = 0x8240
-_RPDO_TIMEOUT = 0x8250
-_SYNC_LOST = 0x8700
-_GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of the error register
+_CONNECTION_ENDED_CODE = 0x8100
+"""Error code: the connection to the host has ended."""
+_HEARTBEAT_LOST_CODE = 0x8130
+"""Error code: the heartbeat of a monitored node is missing."""
+_PDO_TOO_SHORT_CODE = 0x8210
+"""Error code: a received PDO is too short."""
+_PDO_TOO_LONG_CODE = 0x8220
+"""Error code: a received PDO is too long."""
+_SYNC_LENGTH_CODE = 0x8240
+"""Error code: SYNC has the wrong length."""
+_RPDO_TIMEOUT_CODE = 0x8250
+"""Error code: an RPDO has missed its deadline."""
+_SYNC_LOST_CODE = 0x8700
+"""Error code: SYNC is missing."""
+_GENERIC_ERROR_BIT, _COMMUNICATION_ERROR_BIT = 0x01, 0x10  # bits of the error register
 
-_VOLTAGE_AND_REMOTE, _REMOTE = 0x0210, 0x0200
-_WARNING, _STANDING, _INTERNAL_LIMIT, _FOLLOWS = 0x0080, 0x0400, 0x0800, 0x1000
-_HALT = 0x0100
-_OPERATE = 0x8F, 0x0F
-"""Mask and value of the controlword that leaves operation enabled as it is."""
+_VOLTAGE_AND_REMOTE_BITS, _REMOTE_BIT = 0x0210, 0x0200
+_WARNING_BIT, _TARGET_REACHED_BIT, _INTERNAL_LIMIT_BIT, _FOLLOWS_TARGET_BIT = (
+    0x0080,
+    0x0400,
+    0x0800,
+    0x1000,
+)
+_HALT_BIT = 0x0100
+"""Controlword bit that halts the motor."""
+_UNCHANGED_OPERATION = 0x8F, 0x0F
+"""Mask and value of a controlword that changes nothing in operation enabled."""
 
 _LAST_COMMUNICATION_INDEX, _LAST_INDEX = 0x1FFF, 0xFFFF
-_PDOS = 4
-_LAST_PDO = 0x1FF
-_TOLERANCE_S = 1e-9
+_DEFAULT_PDO_COUNT = 4
+"""Number of PDOs per direction, without a device file."""
+_LAST_PDO_OFFSET = 0x1FF
+"""Largest offset of a PDO's index from that of the first PDO."""
+_TIME_TOLERANCE_S = 1e-9
+"""Tolerance in seconds for rounding errors of times."""
 
 
 class Nmt(IntEnum):
-    """NMT state, as a heartbeat states it."""
+    """NMT state of a CANopen node, with its value in a heartbeat."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -77,74 +95,73 @@ class Nmt(IntEnum):
 
 
 class DriveNode:
-    """A CiA 402 drive on the simulated bus.
+    """Simulated CiA 402 drive on the simulated CAN bus.
 
-    Single-threaded: it acts within `receive` and `tick` only. It boots in the first of these
-    calls.
+    The class is single-threaded: it acts only within `receive` and `tick`. It boots in the first of
+    these calls.
 
     Parameters
     ----------
     rig
-        Parameters with a section [cia402].
-    simulated
-        Plant that the drive pushes and measures.
+        Parameters of the rig with a section [cia402].
+    simulated_rig
+        Simulated rig whose plant the drive moves and measures.
     advance
-        Moves the simulated rig on to this SYNC. It is called at each valid SYNC, in every state,
-        frozen or not: simulated time goes on.
+        Function that advances the simulated rig to this SYNC. It is called at each valid SYNC, in
+        every state, frozen or not, because simulated time goes on.
     send
-        Takes identifier and data of a frame.
+        Function that sends a frame with identifier and data.
     log
-        Takes the source "drive", what happened, and values by name. It is the witness of torque
-        and drive: "torque" with torque_nm and enabled at every change of either.
+        Function that logs an event, with the source "drive", the event and values by name. It
+        records the torque: event "torque" with torque_nm and enabled at every change of either.
     sync_timeout_s
-        After how long without a SYNC a drive in operation faults; by default
-        `SYNC_TIMEOUT_PERIODS` of its SYNC period.
+        Time in seconds without a SYNC after which a drive in operation goes to fault; by default
+        `SYNC_TIMEOUT_PERIODS` SYNC periods.
     file
-        Device file of the drive that it simulates: it has the objects of that one, with types,
-        access rights, limits and values at power-on, and no others.
+        Device file of the drive to simulate. The drive then has exactly the objects of this file,
+        with their types, access rights, limits and values at power-on.
 
     Attributes
     ----------
     frozen : bool
-        It receives and sends nothing, as if its plug were out; its own watchdogs go on.
+        Whether the drive receives and sends nothing, as if unplugged; its watchdogs continue.
     torque_lag_s : float
-        Time constant with which its actual torque (6077) follows what it exerts, as one that is
-        measured and filtered does; 0 shows it at once. The profile's ``torque_response_s``, until
-        it is set.
+        Time constant in seconds with which the actual torque (6077) follows the exerted torque, as
+        if it were measured and filtered; 0: at once. Initially the profile's ``torque_response_s``.
     stays_operational : bool
-        It does not take the NMT command to pre-operational.
-    never_follows : bool
-        Its statusword has no bit 12, which says that the drive follows its target; by the
-        profile's ``follows_target_bit``, until it is set.
-    watchless : bool
-        It does not notice that its host is silent: no heartbeat, SYNC or RPDO is missed.
+        Whether the drive ignores the NMT command to pre-operational.
+    never_sets_bit_12 : bool
+        Whether the drive never sets bit 12 of its statusword, which means that it follows the
+        target. Initially as the profile's ``follows_target_bit`` states.
+    ignores_silent_host : bool
+        Whether the drive ignores missing heartbeats, SYNCs and RPDOs.
     angle_offset_counts : int
-        Added to the position: an encoder that jumped.
+        Offset added to the position in counts, as of an encoder that has jumped.
     sto_dropped : bool
-        The wired stop is pressed: it removes the torque at once, and the drive stays off for as
-        long as it lasts. The drive goes to fault with the profile's ``sto_error_code``, or where
-        there is none to switch on disabled.
+        Whether the wired stop (STO) is dropped. It removes the torque at once, and the drive stays
+        off while it is dropped. The drive goes to fault with the profile's ``sto_error_code``, or
+        to switch on disabled if there is no such code.
 
     Raises
     ------
     DeviceError
-        If the profile has no section [cia402], or nothing to count angles in.
+        If the profile has no section [cia402], or no encoder resolution.
 
     Notes
     -----
-    A SYNC in NMT operational first lets a waiting RPDO take effect, then calls `advance`, then
-    sends the TPDOs. Since the plant's own delay covers the whole way of a torque, a torque that
-    comes in after SYNC k and takes effect at SYNC k + 1 is handed over while the plant is still at
-    tick k.
+    At a SYNC in the NMT state operational, first a pending RPDO takes effect, then `advance` is
+    called, and then the TPDOs are sent. The plant's own delay covers the whole path of a torque. So
+    a torque that arrives after SYNC k and takes effect at SYNC k + 1 is passed to the plant while
+    the plant is still at tick k.
 
-    Before it calls `tick` the owner has to hand over the frames that came before that time, else a
-    pause of the owner appears as a silent host.
+    Before the owner calls `tick`, it has to pass the frames that arrived before that time.
+    Otherwise a pause of the owner would have the same effect as a silent host.
     """
 
     def __init__(
         self,
         rig: RigParameters,
-        simulated: SimulatedRig,
+        simulated_rig: SimulatedRig,
         advance: Callable[[], None],
         send: Callable[[int, bytes], None],
         log: Log,
@@ -161,12 +178,12 @@ class DriveNode:
         self.frozen = False
         self.angle_offset_counts = 0
         self.torque_lag_s = rig.cia402.torque_response_s
-        self.never_follows = not rig.cia402.follows_target_bit
-        self.stays_operational = self.watchless = False
+        self.never_sets_bit_12 = not rig.cia402.follows_target_bit
+        self.stays_operational = self.ignores_silent_host = False
         self._sto_dropped = False
         self._sto_error_code = rig.cia402.sto_error_code
-        self._simulated = simulated
-        self._plant = simulated.plant
+        self._simulated_rig = simulated_rig
+        self._plant = simulated_rig.plant
         self._advance = advance
         self._send = send
         self._log = partial(log, "drive")
@@ -186,56 +203,60 @@ class DriveNode:
         self._measured_per_mille = 0.0
         self._measured_at_s = 0.0
         self._mode = NO_MODE
-        self._limited = self._following = self._too_fast = False
+        self._is_limited = self._follows_target = self._is_too_fast = False
 
         objects = self._objects = ObjectDictionary()
-        own = self._own = add_drive_objects(
+        entries = self._entries = add_drive_objects(
             objects, rig.motor, rig.cia402, rig.rate_hz, rig.encoder.resolution_rad
         )
         self._emergencies = Emergencies(objects, node_id, self._send_emergency)
         self._producer = HeartbeatProducer(objects)
-        watches = WATCHES if file is None else file.subs(0x1016)
-        self._watches = add_watches(objects, watches, self._forgive_heartbeats)
+        monitor_count = DEFAULT_MONITOR_COUNT if file is None else file.sub_index_count(0x1016)
+        self._heartbeat_monitors = add_heartbeat_monitors(
+            objects, monitor_count, self._clear_heartbeat_error
+        )
         self._receive_pdos = [
-            ReceivePdo(objects, *pdo, self._arm)
-            for pdo in _pdos(0x1400, 0x200 + node_id, 0x6040, file)
+            ReceivePdo(objects, *pdo, self._rebuild_tables)
+            for pdo in _pdo_parameters(0x1400, 0x200 + node_id, 0x6040, file)
         ]
         self._transmit_pdos = [
-            TransmitPdo(objects, *pdo, self._arm)
-            for pdo in _pdos(0x1800, 0x180 + node_id, 0x6041, file)
+            TransmitPdo(objects, *pdo, self._rebuild_tables)
+            for pdo in _pdo_parameters(0x1800, 0x180 + node_id, 0x6041, file)
         ]
-        self._sdo = SdoServer(objects, partial(self._transmit, 0x580 + node_id), self._wrote)
+        self._sdo = SdoServer(
+            objects, partial(self._transmit, 0x580 + node_id), self._log_sdo_write
+        )
 
-        own.sync_cob_id.wrote = own.sync_overflow.wrote = self._arm
-        own.controlword.wrote = self._on_controlword
-        own.statusword.live = self._statusword
-        own.mode.wrote = self._on_mode
-        own.mode_display.live = own.mode.get
-        own.position.live = self._position
-        own.velocity.live = self._velocity
-        own.actual_torque.live = self._actual_torque
+        entries.sync_cob_id.after_write = entries.sync_overflow.after_write = self._rebuild_tables
+        entries.controlword.after_write = self._on_controlword
+        entries.statusword.read_value = self._statusword
+        entries.mode.after_write = self._on_mode
+        entries.mode_display.read_value = entries.mode.get
+        entries.position.read_value = self._position
+        entries.velocity.read_value = self._velocity
+        entries.actual_torque.read_value = self._actual_torque
         for entry in (
-            own.target_torque,
-            own.torque_offset,
-            own.max_torque,
-            own.positive_limit,
-            own.negative_limit,
+            entries.target_torque,
+            entries.torque_offset,
+            entries.max_torque,
+            entries.positive_limit,
+            entries.negative_limit,
         ):
-            entry.wrote = self._refresh_torque
-        self._machine = PdsStateMachine(
-            own.quick_stop_option,
-            own.fault_option,
-            entered=self._entered,
-            may_switch_on=lambda: self._is_guarded() and not self._sto_dropped,
-            may_enable=lambda: self._nmt is Nmt.OPERATIONAL and self._is_guarded(),
+            entry.after_write = self._refresh_torque
+        self._state_machine = PdsStateMachine(
+            entries.quick_stop_option,
+            entries.fault_option,
+            on_state_change=self._on_state_change,
+            may_switch_on=lambda: self._has_all_heartbeats() and not self._sto_dropped,
+            may_enable=lambda: self._nmt is Nmt.OPERATIONAL and self._has_all_heartbeats(),
             may_reset=self._may_reset,
         )
         if file is not None:
-            follow_file(objects, file)
-        self._compile()
+            adopt_device_file(objects, file)
+        self._rebuild_pdos()
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Receive a frame."""
+        """Process a CAN frame that the simulated drive has received."""
         if self._nmt is Nmt.INITIALISING:
             self._boot()
         if can_id == self._sync_id:
@@ -246,48 +267,48 @@ class DriveNode:
                 handler(data)
 
     def tick(self, now_s: float) -> None:
-        """Let time pass: watchdogs, heartbeat, ramps, PDOs on events.
+        """Advance the drive to a simulated time: watchdogs, heartbeat, ramps, event-driven PDOs.
 
         Parameters
         ----------
         now_s
-            On the simulator's clock, at least once a millisecond.
+            Simulated time in seconds; it advances by at most a millisecond per call.
         """
         self._now_s = now_s
         if self._nmt is Nmt.INITIALISING:
             self._boot()
-        if not self.watchless:
-            self._watch_heartbeats(now_s)
-            self._watch_sync(now_s)
-            self._watch_rpdos(now_s)
-        self._machine.tick(now_s)
+        if not self.ignores_silent_host:
+            self._check_heartbeats(now_s)
+            self._check_sync(now_s)
+            self._check_rpdos(now_s)
+        self._state_machine.tick(now_s)
         if self._producer.is_due(now_s):
             self._transmit(0x700 + self._node_id, bytes([self._nmt]))
         if self._nmt is Nmt.OPERATIONAL and not self.frozen:
             for pdo in self._event_tpdos:
-                data = pdo.at_event(now_s)
+                data = pdo.data_at_event(now_s)
                 if data is not None:
                     self._transmit(pdo.can_id, data)
 
     def emergency(self, code: int, register: int, vendor: bytes) -> None:
-        """Put the drive in fault with an error code, error register bits, and vendor's bytes."""
+        """Bring the drive to fault with error code, bits of the error register, vendor's bytes."""
         self._fail(code, register, vendor)
 
     def reset(self) -> None:
-        """Restart by itself: it boots, and remembers nothing."""
+        """Restart the drive as by its own watchdog, with the values at power-on."""
         self._boot()
 
     def power_cycle(self) -> None:
-        """Simulate a power cycle, which equals a reset here."""
+        """Restart the drive as after a loss of power; it equals `reset` here."""
         self.reset()
 
-    def state_object(self, index: int, sub: int, value: int | None) -> None:
-        """Set an object to another value, or make it absent."""
-        self._objects.override(index, sub, value)
+    def override_object(self, index: int, sub: int, value: int | None) -> None:
+        """Set an object to another value, or make it absent if `value` is None."""
+        self._objects.override_entry(index, sub, value)
 
     @property
     def sto_dropped(self) -> bool:
-        """Whether the wired stop is pressed."""
+        """Whether the wired stop (STO) is dropped; it can be set."""
         return self._sto_dropped
 
     @sto_dropped.setter
@@ -297,30 +318,31 @@ class DriveNode:
         if not dropped:
             return
         if self._sto_error_code:
-            self._fail(self._sto_error_code, _GENERIC)
+            self._fail(self._sto_error_code, _GENERIC_ERROR_BIT)
         else:
-            self._machine.disable_voltage()
+            self._state_machine.disable_voltage()
 
     # NMT ---------------------------------------------------------------------------------------
 
     def _boot(self, last: int = _LAST_INDEX) -> None:
-        """Start with the power-on values of all objects, or of those up to an index."""
+        """Start the node: set objects up to index `last` to their values at power-on."""
         self._log("nmt", state="initialising")
         if last == _LAST_INDEX:
             self._emergencies.reset()
-            self._machine.start()
+            self._state_machine.start()
         self._nmt = Nmt.INITIALISING
         self._sync_alive = False
         self._objects.reset(last)
         self._on_mode()
-        self._compile()
+        self._rebuild_pdos()
         self._sdo.reset()
-        for watch in self._watches:
-            watch.restart()
+        for monitor in self._heartbeat_monitors:
+            monitor.restart()
         self._transmit(0x700 + self._node_id, bytes([Nmt.INITIALISING]))
         self._enter_nmt(Nmt.PRE_OPERATIONAL)
 
     def _on_nmt(self, data: bytes) -> None:
+        """Process an NMT command: start, stop, pre-operational or reset."""
         if len(data) != 2 or data[1] not in (0, self._node_id):
             return
         command = data[0]
@@ -338,76 +360,79 @@ class DriveNode:
             self._boot(_LAST_COMMUNICATION_INDEX)
 
     def _enter_nmt(self, state: Nmt) -> None:
+        """Change the NMT state, and discard pending transfers and PDOs."""
         if state is self._nmt:
             return
         self._nmt = state
         self._sync_alive = False
         self._sdo.reset()
         for pdo in (*self._receive_pdos, *self._transmit_pdos):
-            pdo.forget()
+            pdo.reset_exchange()
         self._log("nmt", state=state.name.lower().replace("_", "-"))
 
     def _end_connection(self) -> None:
-        """Leave operation before the NMT state changes: no target can come any more."""
-        if self._machine.state is not PdsState.OPERATION_ENABLED:
+        """Leave operation enabled before the NMT state changes, as the abort option says."""
+        if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
-        option = self._own.abort_option.value
+        option = self._entries.abort_option.value
         if option == 1:
-            self._fail(_CONNECTION_ENDED, _COMMUNICATION)
+            self._fail(_CONNECTION_ENDED_CODE, _COMMUNICATION_ERROR_BIT)
         elif option == 3:
-            self._machine.quick_stop()
+            self._state_machine.quick_stop()
         else:
-            self._machine.disable_voltage()
+            self._state_machine.disable_voltage()
 
     # Frames ------------------------------------------------------------------------------------
 
     def _on_sync(self, data: bytes) -> None:
-        operational = self._nmt is Nmt.OPERATIONAL and not self.frozen
+        """Process a SYNC: apply pending RPDOs, advance the rig, send TPDOs."""
+        is_operational = self._nmt is Nmt.OPERATIONAL and not self.frozen
         if len(data) != self._sync_length:
-            if operational:
-                self._report(_SYNC_LENGTH, _COMMUNICATION, bytes([len(data)]))
+            if is_operational:
+                self._report(_SYNC_LENGTH_CODE, _COMMUNICATION_ERROR_BIT, bytes([len(data)]))
             return
-        if operational:
+        if is_operational:
             if self._emergencies.active:
-                self._clear(_SYNC_LENGTH)
+                self._clear(_SYNC_LENGTH_CODE)
             self._last_sync_s = self._now_s
-            revived, self._sync_alive = not self._sync_alive, True
+            is_first_sync, self._sync_alive = not self._sync_alive, True
             for rpdo in self._sync_rpdos:
                 pending = rpdo.pending
                 if pending is not None:
                     rpdo.pending = None
                     rpdo.apply(pending)
-            if revived:
+            if is_first_sync:
                 self._refresh_torque()
         self._advance()
         if self.torque_lag_s:
             self._measure_torque()
-        if operational:
-            limit_rad_s = self._own.max_speed_rpm.value * self._rad_s_per_rpm
-            too_fast = not -limit_rad_s <= self._plant.velocity_rad_s <= limit_rad_s
-            if too_fast or self._too_fast:
-                self._too_fast = too_fast
+        if is_operational:
+            limit_rad_s = self._entries.max_speed_rpm.value * self._rad_s_per_rpm
+            is_too_fast = not -limit_rad_s <= self._plant.velocity_rad_s <= limit_rad_s
+            if is_too_fast or self._is_too_fast:
+                self._is_too_fast = is_too_fast
                 self._refresh_torque()
             for tpdo in self._sync_tpdos:
-                sample = tpdo.at_sync(self._now_s)
-                if sample is not None:
-                    self._transmit(tpdo.can_id, sample)
+                tpdo_data = tpdo.data_at_sync(self._now_s)
+                if tpdo_data is not None:
+                    self._transmit(tpdo.can_id, tpdo_data)
 
     def _on_rpdo(self, pdo: ReceivePdo, data: bytes) -> None:
+        """Process a received RPDO: check its length, and apply it now or at the next SYNC."""
         if self._nmt is not Nmt.OPERATIONAL:
             return
         if len(data) < pdo.size:
             vendor = bytes([len(data), pdo.size])
-            if self._machine.state is PdsState.OPERATION_ENABLED:
-                self._fail(_PDO_TOO_SHORT, _COMMUNICATION, vendor)
+            if self._state_machine.state is PdsState.OPERATION_ENABLED:
+                self._fail(_PDO_TOO_SHORT_CODE, _COMMUNICATION_ERROR_BIT, vendor)
             else:
-                self._report(_PDO_TOO_SHORT, _COMMUNICATION, vendor)
+                self._report(_PDO_TOO_SHORT_CODE, _COMMUNICATION_ERROR_BIT, vendor)
             return
-        if len(data) > pdo.size:  # the first bytes count (CiA 301)
-            self._report(_PDO_TOO_LONG, _COMMUNICATION, bytes([len(data), pdo.size]))
+        if len(data) > pdo.size:  # the first bytes are used (CiA 301)
+            self._report(_PDO_TOO_LONG_CODE, _COMMUNICATION_ERROR_BIT, bytes([len(data), pdo.size]))
             data = data[: pdo.size]
         elif self._emergencies.active:
-            self._clear(_PDO_TOO_SHORT, _PDO_TOO_LONG)
+            self._clear(_PDO_TOO_SHORT_CODE, _PDO_TOO_LONG_CODE)
         pdo.received_s = self._now_s
         if pdo.is_synchronous:
             pdo.pending = data
@@ -415,65 +440,73 @@ class DriveNode:
             pdo.apply(data)
 
     def _on_sdo(self, data: bytes) -> None:
+        """Process an SDO request, unless the node is stopped."""
         if self._nmt is not Nmt.STOPPED:
             self._sdo.receive(data)
 
     def _on_heartbeat(self, node_id: int, data: bytes) -> None:
+        """Process the heartbeat of another node."""
         if len(data) != 1 or data[0] & 0x7F == Nmt.INITIALISING:  # a boot-up is not a heartbeat
             return
-        for watch in self._watches:
-            if watch.node_id == node_id:
-                watch.beat(self._now_s)
+        for monitor in self._heartbeat_monitors:
+            if monitor.node_id == node_id:
+                monitor.register_heartbeat(self._now_s)
         if self._emergencies.active:
-            self._forgive_heartbeats()
+            self._clear_heartbeat_error()
 
     def _transmit(self, can_id: int, data: bytes) -> None:
+        """Send a frame unless the drive is frozen."""
         if not self.frozen:
             self._send(can_id, data)
 
-    def _wrote(self, index: int, sub: int, value: int | str) -> None:
+    def _log_sdo_write(self, index: int, sub: int, value: int | str) -> None:
+        """Log a successful SDO write."""
         self._log("sdo write", index=f"{index:04X}", sub=sub, value=value)
 
-    def _compile(self) -> None:
+    def _rebuild_pdos(self) -> None:
+        """Rebuild the mappings of all PDOs from the dictionary."""
         for pdo in (*self._receive_pdos, *self._transmit_pdos):
             pdo.compile()
-        self._arm()
+        self._rebuild_tables()
 
-    def _arm(self) -> None:
-        """Build the table of identifiers, and the list of synchronous PDOs."""
-        self._sync_id = self._own.sync_cob_id.value
-        self._sync_length = 1 if self._own.sync_overflow.value else 0
-        active = [pdo for pdo in self._receive_pdos if pdo.can_id >= 0]
-        self._sync_rpdos = [pdo for pdo in active if pdo.is_synchronous]
-        target = self._own.target_torque
-        self._target_pdos = [pdo for pdo in active if any(e is target for e in pdo.entries)]
-        sending = [pdo for pdo in self._transmit_pdos if pdo.can_id >= 0]
-        self._sync_tpdos = [pdo for pdo in sending if pdo.is_synchronous]
-        self._event_tpdos = [pdo for pdo in sending if not pdo.is_synchronous]
+    def _rebuild_tables(self) -> None:
+        """Rebuild the table of frame handlers by identifier, and the lists of PDOs."""
+        self._sync_id = self._entries.sync_cob_id.value
+        self._sync_length = 1 if self._entries.sync_overflow.value else 0
+        active_rpdos = [pdo for pdo in self._receive_pdos if pdo.can_id >= 0]
+        self._sync_rpdos = [pdo for pdo in active_rpdos if pdo.is_synchronous]
+        target_entry = self._entries.target_torque
+        self._target_pdos = [
+            pdo for pdo in active_rpdos if any(e is target_entry for e in pdo.entries)
+        ]
+        active_tpdos = [pdo for pdo in self._transmit_pdos if pdo.can_id >= 0]
+        self._sync_tpdos = [pdo for pdo in active_tpdos if pdo.is_synchronous]
+        self._event_tpdos = [pdo for pdo in active_tpdos if not pdo.is_synchronous]
         handlers: dict[int, Callable[[bytes], None]] = {
             0x700 + node_id: partial(self._on_heartbeat, node_id) for node_id in range(1, 128)
         }
-        handlers.update({pdo.can_id: partial(self._on_rpdo, pdo) for pdo in active})
+        handlers.update({pdo.can_id: partial(self._on_rpdo, pdo) for pdo in active_rpdos})
         handlers[0x600 + self._node_id] = self._on_sdo
         handlers[0x000] = self._on_nmt
         self._handlers = handlers
 
     # Watchdogs and errors ----------------------------------------------------------------------
 
-    def _watch_heartbeats(self, now_s: float) -> None:
-        for watch in self._watches:
-            if not watch.check(now_s):
+    def _check_heartbeats(self, now_s: float) -> None:
+        """React to heartbeats that have just been lost, as the options in the dictionary say."""
+        for monitor in self._heartbeat_monitors:
+            if not monitor.check(now_s):
                 continue
-            option, state = self._own.abort_option.value, self._machine.state
+            option, state = self._entries.abort_option.value, self._state_machine.state
             if option == 1 and state not in (PdsState.READY, PdsState.SWITCH_ON_DISABLED):
-                self._machine.fail()
+                self._state_machine.fail()
             elif option == 3:
-                self._machine.quick_stop()
+                self._state_machine.quick_stop()
             elif option:
-                self._machine.disable_voltage()
-            self._log("heartbeat lost", node_id=watch.node_id)
-            self._report(_HEARTBEAT_LOST, _COMMUNICATION, bytes([watch.node_id]))
-            reaction = self._own.communication_error.value
+                self._state_machine.disable_voltage()
+            self._log("heartbeat lost", node_id=monitor.node_id)
+            self._report(_HEARTBEAT_LOST_CODE, _COMMUNICATION_ERROR_BIT, bytes([monitor.node_id]))
+            reaction = self._entries.communication_error.value
             if reaction == 2:
                 self._end_connection()
                 self._enter_nmt(Nmt.STOPPED)
@@ -481,57 +514,67 @@ class DriveNode:
                 self._end_connection()
                 self._enter_nmt(Nmt.PRE_OPERATIONAL)
 
-    def _watch_sync(self, now_s: float) -> None:
+    def _check_sync(self, now_s: float) -> None:
+        """Go to fault if SYNC has been missing for too long in operation enabled."""
         if not self._sync_alive:
             return
-        timeout_s = self._sync_timeout_s or SYNC_TIMEOUT_PERIODS * self._own.sync_period_s
-        if now_s - self._last_sync_s > timeout_s + _TOLERANCE_S:
+        timeout_s = self._sync_timeout_s or SYNC_TIMEOUT_PERIODS * self._entries.sync_period_s
+        if now_s - self._last_sync_s > timeout_s + _TIME_TOLERANCE_S:
             self._sync_alive = False
-            if self._machine.state is PdsState.OPERATION_ENABLED:
-                self._fail(_SYNC_LOST, _COMMUNICATION)
+            if self._state_machine.state is PdsState.OPERATION_ENABLED:
+                self._fail(_SYNC_LOST_CODE, _COMMUNICATION_ERROR_BIT)
                 self._log("sync lost", timeout_s=timeout_s)
 
-    def _watch_rpdos(self, now_s: float) -> None:
-        if self._machine.state is not PdsState.OPERATION_ENABLED:
+    def _check_rpdos(self, now_s: float) -> None:
+        """Go to fault if an RPDO has missed its deadline in operation enabled."""
+        if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
         for number, pdo in enumerate(self._receive_pdos, 1):
             deadline_s = pdo.deadline_s
             if (
                 deadline_s
                 and pdo.received_s is not None
-                and now_s - pdo.received_s > deadline_s + _TOLERANCE_S
+                and now_s - pdo.received_s > deadline_s + _TIME_TOLERANCE_S
             ):
-                self._fail(_RPDO_TIMEOUT, _COMMUNICATION, bytes([number]))
+                self._fail(_RPDO_TIMEOUT_CODE, _COMMUNICATION_ERROR_BIT, bytes([number]))
                 self._log("rpdo lost", number=number, deadline_s=deadline_s)
                 return
 
-    def _forgive_heartbeats(self) -> None:
-        if not any(watch.lost for watch in self._watches):
-            self._clear(_HEARTBEAT_LOST)
+    def _clear_heartbeat_error(self) -> None:
+        """Clear the heartbeat error if no monitored heartbeat is missing any more."""
+        if not any(monitor.lost for monitor in self._heartbeat_monitors):
+            self._clear(_HEARTBEAT_LOST_CODE)
 
-    def _is_guarded(self) -> bool:
-        """Whether no watched heartbeat is missing that the drive would have to stop for."""
-        return not (self._own.abort_option.value and any(watch.lost for watch in self._watches))
+    def _has_all_heartbeats(self) -> bool:
+        """Return whether no missing heartbeat forbids operation."""
+        return not (
+            self._entries.abort_option.value
+            and any(monitor.lost for monitor in self._heartbeat_monitors)
+        )
 
     def _may_reset(self) -> bool:
-        allowed = self._is_guarded() and not self._sto_dropped
+        """Return whether a fault may be reset, and log the attempt."""
+        allowed = self._has_all_heartbeats() and not self._sto_dropped
         self._log("fault reset", accepted=allowed)
         return allowed
 
     def _fail(self, code: int, register: int, vendor: bytes = b"") -> None:
-        self._machine.fail()
+        """Bring the simulated drive to fault, and report an error code by an emergency message."""
+        self._state_machine.fail()
         self._report(code, register, vendor)
 
     def _report(self, code: int, register: int, vendor: bytes = b"") -> None:
+        """Report an error by an emergency message, unless it is active already."""
         if self._emergencies.report(code, register, vendor):
-            self._own.error_code.value = code
+            self._entries.error_code.value = code
 
     def _clear(self, *codes: int) -> None:
-        """Clear errors whose cause is gone; those of a fault stay until its reset."""
-        if self._machine.state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
+        """Clear errors whose cause has ended; errors of a fault remain until its reset."""
+        if self._state_machine.state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
             self._emergencies.clear(*codes)
 
     def _send_emergency(self, can_id: int, data: bytes) -> None:
+        """Log an emergency message, and send it if the NMT state allows."""
         sent = self._nmt in (Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL) and not self.frozen
         self._log(
             "emcy",
@@ -546,54 +589,72 @@ class DriveNode:
     # Drive -------------------------------------------------------------------------------------
 
     def _on_controlword(self) -> None:
-        word = self._own.controlword.value
-        mask, operate = _OPERATE
-        if self._machine.state is not PdsState.OPERATION_ENABLED or word & mask != operate:
-            self._machine.control(word)
+        """Process a changed controlword."""
+        controlword = self._entries.controlword.value
+        mask, unchanged_value = _UNCHANGED_OPERATION
+        if (
+            self._state_machine.state is not PdsState.OPERATION_ENABLED
+            or controlword & mask != unchanged_value
+        ):
+            self._state_machine.control(controlword)
         self._refresh_torque()
 
     def _on_mode(self) -> None:
-        if self._own.mode.value != self._mode:
-            self._mode = self._own.mode.value
+        """Process a changed mode of operation."""
+        if self._entries.mode.value != self._mode:
+            self._mode = self._entries.mode.value
             self._log("mode", mode=self._mode)
             self._refresh_torque()
 
-    def _entered(self, left: PdsState) -> None:
-        state = self._machine.state
-        if left is PdsState.OPERATION_ENABLED:
+    def _on_state_change(self, previous_state: PdsState) -> None:
+        """Process a change of the drive's state: switch the plant on or off, and log it."""
+        state = self._state_machine.state
+        if previous_state is PdsState.OPERATION_ENABLED:
             self._plant.disable()
             self._per_mille = 0
-            self._limited = self._following = False
+            self._is_limited = self._follows_target = False
             self._log("torque", torque_nm=0.0, enabled=False)
         self._log("state", state=state.label)
         if state is PdsState.OPERATION_ENABLED:
             self._plant.enable()
             self._log("torque", torque_nm=0.0, enabled=True)
             self._refresh_torque()
-        elif left is PdsState.FAULT:
-            self._own.error_code.value = 0
-            standing = {_HEARTBEAT_LOST} if any(watch.lost for watch in self._watches) else set()
-            self._emergencies.clear(*(self._emergencies.active.keys() - standing))
+        elif previous_state is PdsState.FAULT:
+            self._entries.error_code.value = 0
+            remaining = (
+                {_HEARTBEAT_LOST_CODE}
+                if any(monitor.lost for monitor in self._heartbeat_monitors)
+                else set()
+            )
+            self._emergencies.clear(*(self._emergencies.active.keys() - remaining))
 
     def _refresh_torque(self) -> None:
         """Pass the torque that follows from the dictionary to the plant, if it has changed."""
-        if self._machine.state is not PdsState.OPERATION_ENABLED:
+        if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
-        own = self._own
-        self._following = (
+        entries = self._entries
+        self._follows_target = (
             self._sync_alive
-            and own.mode.value == CYCLIC_SYNCHRONOUS_TORQUE
-            and not own.controlword.value & _HALT
+            and entries.mode.value == CYCLIC_SYNCHRONOUS_TORQUE
+            and not entries.controlword.value & _HALT_BIT
             and (not self._target_pdos or any(pdo.applied for pdo in self._target_pdos))
         )
-        wanted = own.target_torque.value + own.torque_offset.value if self._following else 0
-        limit = min(own.max_torque.value, self._peak_per_mille)
-        high = min(limit, abs(own.positive_limit.value))
-        low = -min(limit, abs(own.negative_limit.value))  # some drives have it with its sign
-        per_mille = low if wanted < low else min(wanted, high)
-        if self._too_fast and per_mille * self._direction * self._plant.velocity_rad_s > 0:
+        target_per_mille = (
+            entries.target_torque.value + entries.torque_offset.value if self._follows_target else 0
+        )
+        limit_per_mille = min(entries.max_torque.value, self._peak_per_mille)
+        highest_per_mille = min(limit_per_mille, abs(entries.positive_limit.value))
+        lowest_per_mille = -min(
+            limit_per_mille, abs(entries.negative_limit.value)
+        )  # some drives state a negative limit
+        per_mille = (
+            lowest_per_mille
+            if target_per_mille < lowest_per_mille
+            else min(target_per_mille, highest_per_mille)
+        )
+        if self._is_too_fast and per_mille * self._direction * self._plant.velocity_rad_s > 0:
             per_mille = 0
-        self._limited = per_mille != wanted
+        self._is_limited = per_mille != target_per_mille
         if per_mille != self._per_mille:
             self._per_mille = per_mille
             torque_nm = per_mille * self._nm_per_mille
@@ -601,57 +662,68 @@ class DriveNode:
             self._log("torque", torque_nm=torque_nm, enabled=True)
 
     def _statusword(self) -> int:
-        state = self._machine.state
-        word = state.bits | (_REMOTE if self._sto_dropped else _VOLTAGE_AND_REMOTE)
+        """Return the present statusword."""
+        state = self._state_machine.state
+        statusword = state.bits | (_REMOTE_BIT if self._sto_dropped else _VOLTAGE_AND_REMOTE_BITS)
         if state is PdsState.OPERATION_ENABLED:
-            if self._following:
-                word |= 0 if self.never_follows else _FOLLOWS
-            elif self._own.controlword.value & _HALT and self._is_at_rest():
-                word |= _STANDING
-            if self._limited:
-                word |= _INTERNAL_LIMIT
+            if self._follows_target:
+                statusword |= 0 if self.never_sets_bit_12 else _FOLLOWS_TARGET_BIT
+            elif self._entries.controlword.value & _HALT_BIT and self._is_at_rest():
+                statusword |= _TARGET_REACHED_BIT
+            if self._is_limited:
+                statusword |= _INTERNAL_LIMIT_BIT
         elif state is PdsState.QUICK_STOP and self._is_at_rest():
-            word |= _STANDING
+            statusword |= _TARGET_REACHED_BIT
         if self._emergencies.active and state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
-            word |= _WARNING
-        return word
+            statusword |= _WARNING_BIT
+        return statusword
 
     def _is_at_rest(self) -> bool:
-        """Whether the shaft turns by less than a count a second."""
+        """Return whether the shaft turns by less than one count per second."""
         return abs(self._plant.velocity_rad_s) < self._resolution_rad
 
     def _position(self) -> int:
-        steps = round(self._simulated.read_angle() / self._resolution_rad)
+        """Return the position in encoder counts as a 32-bit integer."""
+        steps = round(self._simulated_rig.read_angle() / self._resolution_rad)
         counts = steps * self._direction + self.angle_offset_counts
         return (counts + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
 
     def _measure_torque(self) -> None:
+        """Update the filtered torque that the drive reports as measured."""
         elapsed_s, self._measured_at_s = self._now_s - self._measured_at_s, self._now_s
         fraction = -math.expm1(-elapsed_s / self.torque_lag_s)
         self._measured_per_mille += fraction * (self._per_mille - self._measured_per_mille)
 
     def _actual_torque(self) -> int:
+        """Return the reported torque in 1/1000 of the rated torque."""
         return round(self._measured_per_mille) if self.torque_lag_s else self._per_mille
 
     def _velocity(self) -> int:
+        """Return the speed in encoder counts per second as a 32-bit integer."""
         counts = round(self._plant.velocity_rad_s / self._resolution_rad) * self._direction
         return max(-0x8000_0000, min(counts, 0x7FFF_FFFF))
 
 
-def _pdos(
-    communication: int, cob_id: int, word: int, file: "DeviceFile | None"
+def _pdo_parameters(
+    communication: int, cob_id: int, first_mapped_index: int, file: "DeviceFile | None"
 ) -> Iterator[tuple[int, int, int, tuple[int, ...], int]]:
-    """Yield the PDOs of one direction: both indices, identifier, mapping and room for entries.
+    """Yield index of parameters and mapping, COB-ID, mapping and number of slots of each PDO.
 
-    The first carries one word. Of a drive with a file there are those that the file has; only the
-    first four have identifiers beforehand.
+    By default the first PDO carries one object of 16 bits, the others none. With a device file, the
+    PDOs are those of the file. Only the first four have predefined identifiers.
     """
-    numbers: Iterable[int] = range(_PDOS)
+    numbers: Iterable[int] = range(_DEFAULT_PDO_COUNT)
     if file is not None:
-        numbers = file.numbers(communication, communication + _LAST_PDO)
+        numbers = file.present_offsets(communication, communication + _LAST_PDO_OFFSET)
     for number in numbers:
         mapping = communication + 0x200 + number
-        slots = MAX_ENTRIES if file is None else file.subs(mapping)
-        given = cob_id + 0x100 * number if number < _PDOS else 0
-        mapped = () if number else (word << 16 | 16,)
-        yield communication + number, mapping, given | (DISABLED if number else 0), mapped, slots
+        slots = MAX_MAPPING_ENTRIES if file is None else file.sub_index_count(mapping)
+        default_cob_id = cob_id + 0x100 * number if number < _DEFAULT_PDO_COUNT else 0
+        default_mapping = () if number else (first_mapped_index << 16 | 16,)
+        yield (
+            communication + number,
+            mapping,
+            default_cob_id | (COB_ID_DISABLED if number else 0),
+            default_mapping,
+            slots,
+        )

@@ -1,7 +1,8 @@
 """Object dictionary and state machine of the simulated drive (CiA 402).
 
-The dictionary holds what the drive has besides PDOs and errors. Torques are in 1/1000 of the rated
-torque, positions in encoder counts at the output shaft, both in the drive's own direction.
+The dictionary contains the drive's objects except those of PDOs and errors. Torques are in 1/1000
+of the rated torque, positions in encoder counts at the output shaft, both in the drive's own
+direction.
 """
 
 import math
@@ -23,13 +24,20 @@ if TYPE_CHECKING:
 # State machine
 
 RAMP_S = 0.05
-"""How long a ramp lasts. In a torque mode there is nothing to ramp: the shaft coasts meanwhile."""
+"""Duration of a ramp in seconds, during which the shaft coasts in a torque mode."""
 
-_SWITCH_ON, _ENABLE_VOLTAGE, _NO_QUICK_STOP, _ENABLE_OPERATION = 0x01, 0x02, 0x04, 0x08
-_FAULT_RESET = 0x80
+_SWITCH_ON_BIT, _ENABLE_VOLTAGE_BIT, _NO_QUICK_STOP_BIT, _ENABLE_OPERATION_BIT = (
+    0x01,
+    0x02,
+    0x04,
+    0x08,
+)
+"""Controlword bits 0 to 3 of CiA 402; the third is 0 for a quick stop."""
+_FAULT_RESET_BIT = 0x80
+"""Controlword bit whose rise resets a fault."""
 
-_STAY_IN_QUICK_STOP = 5
-"""Values of 605A from this one on keep the drive in quick stop."""
+_FIRST_STAYING_OPTION = 5
+"""Smallest value of object 605A for which the drive stays in quick stop active."""
 
 
 class PdsState(Enum):
@@ -49,41 +57,42 @@ class PdsState(Enum):
         self.bits = bits
 
 
-_POWERED = (
+_POWERED_STATES = (
     PdsState.READY,
     PdsState.SWITCHED_ON,
     PdsState.OPERATION_ENABLED,
     PdsState.QUICK_STOP,
 )
+"""States of the power drive system that a command can leave to switch on disabled."""
 
 
 class PdsStateMachine:
-    """States and transitions of the power drive system.
+    """State machine of the power drive system (CiA 402).
 
     Parameters
     ----------
     quick_stop_option, fault_option
-        Objects 605A and 605E.
-    entered
-        Called with the state left after each change; `state` is then the new one.
+        Entries of the objects 605A and 605E.
+    on_state_change
+        Function that is called after each change with the previous state; `state` is the new one.
     may_switch_on
-        Called before the first step up from switch on disabled.
+        Function that returns whether the drive may leave switch on disabled.
     may_enable
-        Called before operation is enabled.
+        Function that returns whether operation may be enabled.
     may_reset
-        Called at a fault reset; True if no cause of the fault persists.
+        Function that returns whether a fault may be reset, because no cause persists.
 
     Attributes
     ----------
     state : PdsState
-        The present one.
+        Present state.
     """
 
     def __init__(
         self,
         quick_stop_option: Entry,
         fault_option: Entry,
-        entered: Callable[[PdsState], None],
+        on_state_change: Callable[[PdsState], None],
         may_switch_on: Callable[[], bool],
         may_enable: Callable[[], bool],
         may_reset: Callable[[], bool],
@@ -91,7 +100,7 @@ class PdsStateMachine:
         self.state = PdsState.NOT_READY
         self._quick_stop_option = quick_stop_option
         self._fault_option = fault_option
-        self._entered = entered
+        self._on_state_change = on_state_change
         self._may_switch_on = may_switch_on
         self._may_enable = may_enable
         self._may_reset = may_reset
@@ -99,41 +108,41 @@ class PdsStateMachine:
         self._ramp_since_s: float | None = None
 
     def start(self) -> None:
-        """Go through the self-test after power-on or a reset."""
+        """Pass through the self-test after power-on or a reset, to switch on disabled."""
         self._reset_bit = 0
         self._enter(PdsState.NOT_READY)
         self._enter(PdsState.SWITCH_ON_DISABLED)
 
-    def control(self, word: int) -> None:
+    def control(self, controlword: int) -> None:
         """Process a controlword."""
-        reset_bit = word & _FAULT_RESET
-        rising, self._reset_bit = reset_bit and not self._reset_bit, reset_bit
+        reset_bit = controlword & _FAULT_RESET_BIT
+        is_rising, self._reset_bit = reset_bit and not self._reset_bit, reset_bit
         if self.state is PdsState.FAULT:
-            if rising and self._may_reset():
+            if is_rising and self._may_reset():
                 self._enter(PdsState.SWITCH_ON_DISABLED)
-        elif not word & _ENABLE_VOLTAGE:
+        elif not controlword & _ENABLE_VOLTAGE_BIT:
             self.disable_voltage()
-        elif not word & _NO_QUICK_STOP:
+        elif not controlword & _NO_QUICK_STOP_BIT:
             self.quick_stop()
-        elif not word & _SWITCH_ON:
+        elif not controlword & _SWITCH_ON_BIT:
             self._shut_down(reset_bit)
         else:
-            self._switch_on(word, reset_bit)
+            self._switch_on(controlword, reset_bit)
 
     def disable_voltage(self) -> None:
-        """Switch the power off, whatever is going on; a fault stays one."""
-        if self.state in _POWERED:
+        """Switch the drive's power off, from any state except fault."""
+        if self.state in _POWERED_STATES:
             self._enter(PdsState.SWITCH_ON_DISABLED)
 
     def quick_stop(self) -> None:
-        """Stop out of operation; out of the states below it, switch the power off."""
+        """Perform a quick stop in operation enabled; in other states switch the power off."""
         if self.state is PdsState.OPERATION_ENABLED and self._quick_stop_option.value:
             self._enter(PdsState.QUICK_STOP)
         elif self.state is not PdsState.QUICK_STOP:
             self.disable_voltage()
 
     def fail(self) -> None:
-        """Go to fault, by the fault reaction."""
+        """Change to the state fault, by the fault reaction."""
         if self.state in (PdsState.FAULT, PdsState.FAULT_REACTION):
             return
         self._enter(PdsState.FAULT_REACTION)
@@ -141,7 +150,7 @@ class PdsStateMachine:
             self._enter(PdsState.FAULT)
 
     def tick(self, now_s: float) -> None:
-        """Complete transitions that take time."""
+        """Complete transitions that take time, at the simulated time `now_s` in seconds."""
         if self.state not in (PdsState.QUICK_STOP, PdsState.FAULT_REACTION):
             return
         if self._ramp_since_s is None:
@@ -150,61 +159,73 @@ class PdsStateMachine:
             return
         if self.state is PdsState.FAULT_REACTION:
             self._enter(PdsState.FAULT)
-        elif self._quick_stop_option.value < _STAY_IN_QUICK_STOP:
+        elif self._quick_stop_option.value < _FIRST_STAYING_OPTION:
             self._enter(PdsState.SWITCH_ON_DISABLED)
 
     def _shut_down(self, reset_bit: int) -> None:
+        """Change to ready to switch on, if the present state allows that."""
         if self.state is PdsState.SWITCH_ON_DISABLED:
             if not reset_bit and self._may_switch_on():
                 self._enter(PdsState.READY)
         elif self.state in (PdsState.SWITCHED_ON, PdsState.OPERATION_ENABLED):
             self._enter(PdsState.READY)
 
-    def _switch_on(self, word: int, reset_bit: int) -> None:
+    def _switch_on(self, controlword: int, reset_bit: int) -> None:
         """Switch on, enable operation or disable it; upwards only while bit 7 is 0."""
-        enable = word & _ENABLE_OPERATION
-        if self.state is PdsState.OPERATION_ENABLED and not enable:
+        enable_bit = controlword & _ENABLE_OPERATION_BIT
+        if self.state is PdsState.OPERATION_ENABLED and not enable_bit:
             self._enter(PdsState.SWITCHED_ON)
         if reset_bit:
             return
         if self.state is PdsState.READY:
             self._enter(PdsState.SWITCHED_ON)
-        stopped = (
+        is_quick_stopped = (
             self.state is PdsState.QUICK_STOP
-            and self._quick_stop_option.value >= _STAY_IN_QUICK_STOP
+            and self._quick_stop_option.value >= _FIRST_STAYING_OPTION
         )
-        if enable and (self.state is PdsState.SWITCHED_ON or stopped) and self._may_enable():
+        if (
+            enable_bit
+            and (self.state is PdsState.SWITCHED_ON or is_quick_stopped)
+            and self._may_enable()
+        ):
             self._enter(PdsState.OPERATION_ENABLED)
 
     def _enter(self, state: PdsState) -> None:
-        left, self.state = self.state, state
+        """Change to a state of the power drive system, and report the change."""
+        previous_state, self.state = self.state, state
         self._ramp_since_s = None
-        if left is not state:
-            self._entered(left)
+        if previous_state is not state:
+            self._on_state_change(previous_state)
 
 
 # Object dictionary
 
 NO_MODE, CYCLIC_SYNCHRONOUS_TORQUE = 0, 10
+"""Values of the mode of operation that the drive supports."""
 
 _DEVICE_TYPE = 0x0002_0192  # a servo drive, by CiA 402
 _VENDOR_ID, _PRODUCT_CODE, _REVISION, _SERIAL_NUMBER = 0x5249_4744, 0x402, 0x0001_0000, 1
+"""Identity of the simulated drive, unless the profile states one."""
 _DEVICE_NAME = b"simulated servo drive"
+"""Device name of the simulated drive."""
 _SOFTWARE_VERSION = b"1"
 _SUPPORTED_MODES = 1 << (CYCLIC_SYNCHRONOUS_TORQUE - 1)
+"""Value of object 6502: the drive supports only cyclic synchronous torque."""
 
-_SUPPORTED_INDEX, _TARGET_INDEX = 0x6502, 0x6071
-_IDENTITY = 0x1018
-_IN_SERVICE = (0x6076, 0x608F, 0x6091)
-"""Set when a drive is commissioned for its motor: no file contains it."""
-_ZERO_MEANS_UNKNOWN = (0x6072, 0x6080, 0x60E0, 0x60E1)
-"""Limits; with one of zero no drive would turn."""
+_SUPPORTED_MODES_INDEX, _TARGET_TORQUE_INDEX = 0x6502, 0x6071
+_IDENTITY_INDEX = 0x1018
+_COMMISSIONED_INDICES = (0x6076, 0x608F, 0x6091)
+"""Indices of objects that are set when a drive is commissioned, so that no file has their
+values."""
+_LIMIT_INDICES = (0x6072, 0x6080, 0x60E0, 0x60E1)
+"""Indices of limits for which 0 in a file means not stated, since no drive would turn with it."""
 
-_ENCODER_TURNS, _MOST_TURNS = 1000, 1000
-"""Turns of the motor that object 608F states its increments for, and most turns in 6091."""
+_ENCODER_REVOLUTIONS, _LARGEST_GEAR_REVOLUTIONS = 1000, 1000
+"""Motor revolutions to which object 608F refers, and largest number of revolutions in 6091."""
 _TORQUE_UNIT_NM = 1e-3
-"""Unit of object 6076 where the profile does not state one."""
+"""Unit of object 6076 in N·m if the profile does not state one."""
 _MAX_SPEED_RPM = 20_000
+"""Speed limit of the simulated drive at power-on in revolutions per minute."""
 
 # 605A without the options that stop by a current or voltage limit.
 _QUICK_STOP_OPTIONS = (0, 1, 2, 5, 6)
@@ -212,7 +233,7 @@ _QUICK_STOP_OPTIONS = (0, 1, 2, 5, 6)
 
 @dataclass(frozen=True, slots=True)
 class DriveObjects:
-    """The entries that the drive itself works with, by their names in CiA 301 and 402."""
+    """Entries of the objects that the simulated drive uses, by their names in CiA 301 and 402."""
 
     sync_cob_id: Entry
     sync_period_us: Entry
@@ -240,19 +261,19 @@ class DriveObjects:
 
     @property
     def sync_period_s(self) -> float:
-        """Period of the SYNC: 1006, or where that is 0 the interpolation time 60C2."""
+        """Period of SYNC in seconds: object 1006, or the interpolation time 60C2 if that is 0."""
         if self.sync_period_us.value:
             return 1e-6 * self.sync_period_us.value
         return float(self.interpolation_value.value * 10.0**self.interpolation_exponent.value)
 
 
 def rated_torque_counts(motor: Motor, drive: ServoDrive) -> int:
-    """Return object 6076: the rated torque at the motor's shaft.
+    """Return the rated torque at the motor shaft in counts of object 6076.
 
     Raises
     ------
     DeviceError
-        If it is less than one count.
+        If the torque is less than one count, or has more than 32 bits.
     """
     unit_nm = drive.rated_torque_unit_nm or _TORQUE_UNIT_NM
     counts = round(motor.rated_torque_nm / drive.gear_ratio / unit_nm)
@@ -266,7 +287,7 @@ def rated_torque_counts(motor: Motor, drive: ServoDrive) -> int:
 
 
 def peak_per_mille(motor: Motor) -> int:
-    """Return the peak torque in 1/1000 of the rated torque, rounded down."""
+    """Return the motor's peak torque in 1/1000 of its rated torque, rounded down."""
     return min(math.floor(1000 * motor.peak_torque_nm / motor.rated_torque_nm + 1e-9), 0x7FFF)
 
 
@@ -277,7 +298,7 @@ def add_drive_objects(
     rate_hz: float,
     resolution_rad: float,
 ) -> DriveObjects:
-    """Add the objects, at their power-on values, and return those the drive works with."""
+    """Add the drive's objects with their values at power-on; return those that the drive uses."""
 
     def add(index: int, entry: Entry) -> Entry:
         return objects.add(index, entry)
@@ -301,23 +322,23 @@ def add_drive_objects(
     communication_error = Entry("B", high=2)
     objects.add_record(0x1029, {1: communication_error})
 
-    peak = peak_per_mille(motor)
+    peak_torque_per_mille = peak_per_mille(motor)
     add(0x605B, Entry("h", 0, low=0, high=1))
     add(0x605C, Entry("h", 0, low=0, high=1))
     add(0x6076, Entry("I", rated_torque_counts(motor, drive), "ro"))
-    supported = add(_SUPPORTED_INDEX, Entry("I", _SUPPORTED_MODES, "ro"))
+    supported_modes = add(_SUPPORTED_MODES_INDEX, Entry("I", _SUPPORTED_MODES, "ro"))
 
     def check_mode(value: int) -> None:
-        if value != NO_MODE and not (value > 0 and supported.value >> (value - 1) & 1):
+        if value != NO_MODE and not (value > 0 and supported_modes.value >> (value - 1) & 1):
             raise Abort(AbortCode.VALUE)
 
-    gear = Fraction(drive.gear_ratio).limit_denominator(_MOST_TURNS)
-    increments = round(_ENCODER_TURNS * math.tau / resolution_rad / drive.gear_ratio)
-    scales = {
-        0x608F: (increments, _ENCODER_TURNS),
+    gear = Fraction(drive.gear_ratio).limit_denominator(_LARGEST_GEAR_REVOLUTIONS)
+    increments = round(_ENCODER_REVOLUTIONS * math.tau / resolution_rad / drive.gear_ratio)
+    ratios_by_index = {
+        0x608F: (increments, _ENCODER_REVOLUTIONS),
         0x6091: (gear.numerator, gear.denominator),
     }
-    for index, ratio in scales.items():
+    for index, ratio in ratios_by_index.items():
         objects.add_record(index, {sub: Entry("I", n, "ro") for sub, n in enumerate(ratio, 1)})
 
     interpolation = {1: Entry("B", max(1, round(1e3 / rate_hz)), low=1)}
@@ -339,57 +360,61 @@ def add_drive_objects(
         position=add(0x6064, Entry("i", 0, "ro", "t")),
         velocity=add(0x606C, Entry("i", 0, "ro", "t")),
         target_torque=add(0x6071, Entry("h", 0, mapping="rt")),
-        max_torque=add(0x6072, Entry("H", peak, mapping="rt")),
+        max_torque=add(0x6072, Entry("H", peak_torque_per_mille, mapping="rt")),
         actual_torque=add(0x6077, Entry("h", 0, "ro", "t")),
         max_speed_rpm=add(0x6080, Entry("I", _MAX_SPEED_RPM)),
         torque_offset=add(0x60B2, Entry("h", 0, mapping="rt")),
         interpolation_value=interpolation[1],
         interpolation_exponent=interpolation[2],
-        positive_limit=add(0x60E0, Entry("H", peak, mapping="rt")),
-        negative_limit=add(0x60E1, Entry("H", peak, mapping="rt")),
+        positive_limit=add(0x60E0, Entry("H", peak_torque_per_mille, mapping="rt")),
+        negative_limit=add(0x60E1, Entry("H", peak_torque_per_mille, mapping="rt")),
     )
 
 
-def follow_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
-    """Use the objects of a drive's file, and their values at power-on.
+def adopt_device_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
+    """Restrict the dictionary to the objects of a drive's file, with their values at power-on.
 
-    Values that the file does not state are as without one: rated torque, limits of zero, and
-    identity. A file that does not state the modes is taken to mean cyclic synchronous torque if it
-    has a target torque.
+    Values that the file does not state remain as without a file: rated torque, limits of zero, and
+    identity. If the file does not state the supported modes, cyclic synchronous torque is assumed
+    if the file has a target torque.
 
     Raises
     ------
     DeviceError
-        If the file's type of the rated torque cannot hold this motor's.
+        If the data type of object 6076 in the file cannot hold the motor's rated torque.
     """
-    rated = objects[0x6076, 0].value
-    own = set(_IN_SERVICE)
-    own |= {
+    rated_counts = objects[0x6076, 0].value
+    unchanged_indices = set(_COMMISSIONED_INDICES)
+    unchanged_indices |= {
         index
-        for index in (*_ZERO_MEANS_UNKNOWN, _SUPPORTED_INDEX)
-        if (described := file.entries.get((index, 0))) is not None and not described.default
+        for index in (*_LIMIT_INDICES, _SUPPORTED_MODES_INDEX)
+        if (description := file.entries.get((index, 0))) is not None and not description.default
     }
-    if not any(file.entries[key].default for key in file.entries if key[0] == _IDENTITY and key[1]):
-        own.add(_IDENTITY)
-    objects.follow(file.entries, own)
-    if (_SUPPORTED_INDEX, 0) in file.entries and _SUPPORTED_INDEX in own:
-        supported = objects[_SUPPORTED_INDEX, 0]
-        supported.value = supported.default = (
-            _SUPPORTED_MODES if (_TARGET_INDEX, 0) in file.entries else 0
+    if not any(
+        file.entries[key].default for key in file.entries if key[0] == _IDENTITY_INDEX and key[1]
+    ):
+        unchanged_indices.add(_IDENTITY_INDEX)
+    objects.adopt_file_entries(file.entries, unchanged_indices)
+    if (_SUPPORTED_MODES_INDEX, 0) in file.entries and _SUPPORTED_MODES_INDEX in unchanged_indices:
+        supported_modes = objects[_SUPPORTED_MODES_INDEX, 0]
+        supported_modes.value = supported_modes.default = (
+            _SUPPORTED_MODES if (_TARGET_TORQUE_INDEX, 0) in file.entries else 0
         )
-    if (0x6076, 0) in file.entries and objects[0x6076, 0].value != rated:
+    if (0x6076, 0) in file.entries and objects[0x6076, 0].value != rated_counts:
         raise DeviceError(
-            f"Simulated drive: object 6076 of {file.name} cannot hold the rated torque, {rated}; "
-            "check cia402.rated_torque_unit_nm."
+            f"Simulated drive: object 6076 of {file.name} cannot hold the rated torque, "
+            f"{rated_counts}; check cia402.rated_torque_unit_nm."
         )
 
 
 def _check_sync_id(value: int) -> None:
-    # Bit 30 would make the drive the producer, bit 29 the identifier a long one.
+    """Raise `Abort` if an identifier cannot be used for SYNC."""
+    # Bit 30 would make the drive the producer of SYNC, bit 29 would mean an identifier of 29 bits.
     if value > 0x7FF or not is_free_id(value):
         raise Abort(AbortCode.VALUE)
 
 
 def _check_quick_stop(value: int) -> None:
+    """Raise `Abort` if a quick stop option is not supported."""
     if value not in _QUICK_STOP_OPTIONS:
         raise Abort(AbortCode.VALUE)

@@ -1,8 +1,8 @@
-"""Faults to inject: how they are specified, what they do to frames, and the log of events.
+"""Faults to inject: their syntax, their effect on frames, and the log of events.
 
-A fault is written as ``KIND[,key=value…][@SECONDS]``: with ``@`` it begins so long after the drive
-was first enabled, without at once. Times are simulated time. A frame meets at most one fault, the
-oldest that it fits.
+A fault is written as ``KIND[,key=value…][@SECONDS]``. With ``@`` it begins this time after the
+drive was first enabled, otherwise at once. Times are simulated time. At most one fault acts on a
+frame: the oldest that matches.
 """
 
 import json
@@ -20,143 +20,180 @@ from rigd.errors import UserError
 
 
 class WrongUseError(UserError, ValueError):
-    """A request that cannot be met; the message says why, for the operator."""
+    """Error: a request cannot be fulfilled; the message states the reason for the operator."""
 
 
 # Specification of a fault
 
 Value = int | float | str
+"""Value of a fault's key."""
 Deliver = Callable[[int, bytes, object], None]
-"""Takes identifier, data and origin of what gets through."""
+"""Function that delivers a frame: identifier, data and origin."""
 
 SERIAL = -1
-"""Pseudo-identifier of the data on a serial line."""
+"""Pseudo-identifier of data on a serial line."""
 
 
 class FaultError(WrongUseError):
-    """A fault has a syntax error, or is not possible on this rig; the message says why."""
+    """Error: a fault is written wrongly or not possible on this rig; the message states why."""
 
 
 @dataclass(frozen=True, slots=True)
 class _FaultKey:
-    """Values that a key may have, and its default."""
+    """Key of a fault: its parser, its allowed values and its default."""
 
     read: Callable[[str], Value]
-    says: str
+    """Function that parses the value, or raises ValueError."""
+    allowed_text: str
+    """Description of the allowed values, for error messages."""
     default: Value | None = None
-    needed: bool = False
+    """Value if the key is omitted; None: the key is then absent."""
+    is_required: bool = False
+    """Whether the key must be given."""
 
 
-def _whole(low: int, high: int, **how: Any) -> _FaultKey:  # noqa: ANN401 - passed on
+def _integer_key(low: int, high: int, **key_options: Any) -> _FaultKey:  # noqa: ANN401 - passed on
+    """Return a key whose value is an integer from `low` to `high`."""
+
     def read(text: str) -> int:
         number = int(text, 0)
         if not low <= number <= high:
             raise ValueError(text)
         return number
 
-    return _FaultKey(read, f"a whole number from {low} to {high}", **how)
+    return _FaultKey(read, f"a whole number from {low} to {high}", **key_options)
 
 
-def _positive(**how: Any) -> _FaultKey:  # noqa: ANN401 - passed on
+def _positive_number_key(**key_options: Any) -> _FaultKey:  # noqa: ANN401 - passed on
+    """Return a key whose value is a number above 0."""
+
     def read(text: str) -> float:
         number = float(text)
-        if not 0 < number <= _LONGEST_S:
+        if not 0 < number <= _LARGEST_TIME_S:
             raise ValueError(text)
         return number
 
-    return _FaultKey(read, f"a number above 0, up to {_LONGEST_S:g}", **how)
+    return _FaultKey(read, f"a number above 0, up to {_LARGEST_TIME_S:g}", **key_options)
 
 
-def _one_of(*choices: str, **how: Any) -> _FaultKey:  # noqa: ANN401 - passed on
+def _choice_key(*choices: str, **key_options: Any) -> _FaultKey:  # noqa: ANN401 - passed on
+    """Return a key whose value is one of several words."""
+
     def read(text: str) -> str:
         if text not in choices:
             raise ValueError(text)
         return text
 
-    return _FaultKey(read, " or ".join(choices), **how)
+    return _FaultKey(read, " or ".join(choices), **key_options)
 
 
-_LONGEST_S = 1e6
-_MOST = 1_000_000_000
-_SENDER = {
-    "from": _one_of("drive", "sensor", "host", needed=True),
-    "id": _whole(0, 0x7FF),
-    "frames": _whole(1, _MOST, default=1),
+_LARGEST_TIME_S = 1e6
+"""Largest time in seconds in a fault."""
+_LARGEST_COUNT = 1_000_000_000
+"""Largest number of frames or bytes on which a fault acts."""
+_LINE_KEYS = {
+    "from": _choice_key("drive", "sensor", "host", is_required=True),
+    "id": _integer_key(0, 0x7FF),
+    "frames": _integer_key(1, _LARGEST_COUNT, default=1),
 }
-_DEVICE = _one_of("drive", "sensor", needed=True)
-_FOR = _positive()
+"""Keys of the faults on a line: sender, CAN identifier, number of frames."""
+_DEVICE_KEY = _choice_key("drive", "sensor", is_required=True)
+"""Key for the device on which a fault acts."""
+_DURATION_KEY = _positive_number_key()
+"""Key for the duration of a fault in seconds."""
 
-_TEXT = _FaultKey(str, "a value")
-_FOUND = _FaultKey(str, "a value", needed=True)
+_OPTIONAL_TEXT_KEY = _FaultKey(str, "a value")
+"""Optional key whose value `parse_obstacle` checks."""
+_REQUIRED_TEXT_KEY = _FaultKey(str, "a value", is_required=True)
+"""Required key whose value `parse_obstacle` checks."""
 
 LINE_KINDS = ("drop", "delay", "corrupt", "reorder")
+"""Kinds of faults on the line of one sender."""
 KINDS: dict[str, dict[str, _FaultKey]] = {
-    "drop": _SENDER | {"bytes": _whole(1, _MOST)},
-    "delay": _SENDER | {"ms": _positive(needed=True)},
-    "corrupt": _SENDER | {"byte": _whole(0, 255, default=0)},
-    "reorder": _SENDER,
-    "freeze": {"device": _DEVICE, "for": _FOR},
-    "emcy": {"code": _whole(0, 0xFFFF, needed=True), "register": _whole(0, 0xFF, default=1)},
-    "sto": {"for": _FOR},
-    "busoff": {"for": _FOR},
-    "saturate": {"gauge": _whole(0, 5, needed=True), "for": _FOR},
-    "status": {"bits": _whole(0, 0xFFFF, needed=True), "for": _FOR},
-    "jump": {"counts": _whole(-(2**31), 2**31 - 1, needed=True)},
-    "stuck": {"what": _one_of("encoder", "sensor", "gauge", needed=True)}
-    | {"gauge": _whole(0, 5, default=0), "every": _whole(2, 1000), "for": _FOR},
-    "cut": {"device": _one_of("bus", "sensor", default="bus")},
-    "restart": {"device": _DEVICE},
-    "power_cycle": {"device": _DEVICE},
-    "lag": {"ms": _positive(needed=True), "for": _FOR},
-    "no_pre_operational": {"for": _FOR},
-    "no_bit_12": {"for": _FOR},
-    "no_watch": {"for": _FOR},
-    "object": {
-        "index": _whole(0x1000, 0xFFFF, needed=True),
-        "sub": _whole(0, 255, default=0),
-        "value": _whole(0, 0xFFFF_FFFF),
+    "drop": _LINE_KEYS | {"bytes": _integer_key(1, _LARGEST_COUNT)},
+    "delay": _LINE_KEYS | {"ms": _positive_number_key(is_required=True)},
+    "corrupt": _LINE_KEYS | {"byte": _integer_key(0, 255, default=0)},
+    "reorder": _LINE_KEYS,
+    "freeze": {"device": _DEVICE_KEY, "for": _DURATION_KEY},
+    "emcy": {
+        "code": _integer_key(0, 0xFFFF, is_required=True),
+        "register": _integer_key(0, 0xFF, default=1),
     },
-    "obstacle": {"x": _FOUND, "angle": _FOUND, "stiffness": _TEXT, "damping": _TEXT}
-    | {"side": _TEXT, "rate": _TEXT, "for": _FOR},
-    "knock": {"x": _FOUND, "force": _FOUND, "duration": _FOUND},
+    "sto": {"for": _DURATION_KEY},
+    "busoff": {"for": _DURATION_KEY},
+    "saturate": {"gauge": _integer_key(0, 5, is_required=True), "for": _DURATION_KEY},
+    "status": {"bits": _integer_key(0, 0xFFFF, is_required=True), "for": _DURATION_KEY},
+    "jump": {"counts": _integer_key(-(2**31), 2**31 - 1, is_required=True)},
+    "stuck": {"what": _choice_key("encoder", "sensor", "gauge", is_required=True)}
+    | {
+        "gauge": _integer_key(0, 5, default=0),
+        "every": _integer_key(2, 1000),
+        "for": _DURATION_KEY,
+    },
+    "cut": {"device": _choice_key("bus", "sensor", default="bus")},
+    "restart": {"device": _DEVICE_KEY},
+    "power_cycle": {"device": _DEVICE_KEY},
+    "lag": {"ms": _positive_number_key(is_required=True), "for": _DURATION_KEY},
+    "no_pre_operational": {"for": _DURATION_KEY},
+    "no_bit_12": {"for": _DURATION_KEY},
+    "no_watch": {"for": _DURATION_KEY},
+    "object": {
+        "index": _integer_key(0x1000, 0xFFFF, is_required=True),
+        "sub": _integer_key(0, 255, default=0),
+        "value": _integer_key(0, 0xFFFF_FFFF),
+    },
+    "obstacle": {
+        "x": _REQUIRED_TEXT_KEY,
+        "angle": _REQUIRED_TEXT_KEY,
+        "stiffness": _OPTIONAL_TEXT_KEY,
+        "damping": _OPTIONAL_TEXT_KEY,
+    }
+    | {"side": _OPTIONAL_TEXT_KEY, "rate": _OPTIONAL_TEXT_KEY, "for": _DURATION_KEY},
+    "knock": {"x": _REQUIRED_TEXT_KEY, "force": _REQUIRED_TEXT_KEY, "duration": _REQUIRED_TEXT_KEY},
 }
-_MOMENTARY = ("emcy", "jump", "restart", "power_cycle", "object", "knock")
-LASTING = tuple(kind for kind in KINDS if kind not in _MOMENTARY)
-"""Kinds that last until they end by themselves or are ended."""
-DISTURBANCES = ("obstacle", "knock")
-"""Kinds that disturb the beam; their keys are those of `rigd.devices.obstacles.parse_obstacle`."""
-KINDS["end"] = {"fault": _one_of(*LASTING)}
+"""Keys of each kind of fault."""
+_MOMENTARY_KINDS = ("emcy", "jump", "restart", "power_cycle", "object", "knock")
+"""Kinds of faults without duration."""
+LASTING_KINDS = tuple(kind for kind in KINDS if kind not in _MOMENTARY_KINDS)
+"""Kinds of faults that last until they expire or are ended."""
+DISTURBANCE_KINDS = ("obstacle", "knock")
+"""Kinds of faults that disturb the beam, with the keys of
+`rigd.devices.obstacles.parse_obstacle`."""
+KINDS["end"] = {"fault": _choice_key(*LASTING_KINDS)}
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault, as an operator asks for it."""
+    """Fault to inject, as requested by the operator."""
 
     kind: str
+    """Kind of the fault, one of :data:`KINDS`."""
     values: Mapping[str, Value]
-    """Values by key; a key that was left out and has no default is missing."""
+    """Values by key; an omitted key without default is absent."""
     after_s: float | None = None
-    """Time after the drive was first enabled; None: at once."""
+    """Time in seconds from the first enabling of the drive to the fault; None: at once."""
 
     @property
     def is_persistent(self) -> bool:
-        """Whether it lasts until it is ended, neither by a time nor by a number of frames."""
-        return self.kind in LASTING and self.kind not in LINE_KINDS and "for" not in self.values
+        """Whether the fault lasts until it is ended, having neither duration nor frame count."""
+        return (
+            self.kind in LASTING_KINDS and self.kind not in LINE_KINDS and "for" not in self.values
+        )
 
     def __str__(self) -> str:
-        """Return the fault as it is written; `parse_fault` reads it back."""
-        words = [self.kind]
-        words += [f"{key}={_text(key, value)}" for key, value in self.values.items()]
-        return ",".join(words) + ("" if self.after_s is None else f"@{self.after_s!r}")
+        """Return the text form of the fault, which `parse_fault` reads back."""
+        assignments = [self.kind]
+        assignments += [f"{key}={_format_value(key, value)}" for key, value in self.values.items()]
+        return ",".join(assignments) + ("" if self.after_s is None else f"@{self.after_s!r}")
 
 
 def parse_fault(spec: str) -> Fault:
-    """Read a fault.
+    """Parse the text form of a fault.
 
     Raises
     ------
     FaultError
-        If a word is wrong; the message states what is allowed.
+        If a key or value is wrong; the message states the allowed ones.
 
     Examples
     --------
@@ -164,113 +201,124 @@ def parse_fault(spec: str) -> Fault:
     >>> parse_fault("drop,from=drive,frames=3@10").kind
     'drop'
     """
-    body, at, time = spec.partition("@")
-    kind, *words = (word.strip() for word in body.split(","))
+    fault_text, at, time = spec.partition("@")
+    kind, *assignments = (assignment.strip() for assignment in fault_text.split(","))
     if kind not in KINDS:
-        raise FaultError(_complaint(spec, f"unknown fault '{kind}'; choose {', '.join(KINDS)}"))
+        raise FaultError(_error_message(spec, f"unknown fault '{kind}'; choose {', '.join(KINDS)}"))
     keys = KINDS[kind]
     values: dict[str, Value] = {}
-    for word in words:
-        key, _, text = word.partition("=")
+    for assignment in assignments:
+        key, _, text = assignment.partition("=")
         if key not in keys:
-            raise FaultError(_complaint(spec, f"{kind} has no '{key}'; choose {', '.join(keys)}"))
+            raise FaultError(
+                _error_message(spec, f"{kind} has no '{key}'; choose {', '.join(keys)}")
+            )
         if key in values:
-            raise FaultError(_complaint(spec, f"'{key}' is given twice"))
+            raise FaultError(_error_message(spec, f"'{key}' is given twice"))
         try:
             values[key] = keys[key].read(text)
         except ValueError:
-            raise FaultError(_complaint(spec, f"{key}={text}: give {keys[key].says}")) from None
+            raise FaultError(
+                _error_message(spec, f"{key}={text}: give {keys[key].allowed_text}")
+            ) from None
     if "bytes" in values and "frames" in values:
-        raise FaultError(_complaint(spec, "give frames or bytes, not both"))
-    for name, key_of in keys.items():
-        if key_of.needed and name not in values:
-            raise FaultError(_complaint(spec, f"{kind} needs {name}: {key_of.says}"))
-        if key_of.default is not None and not (name == "frames" and "bytes" in values):
-            values.setdefault(name, key_of.default)
-    fault = Fault(kind, values, _time(spec, time) if at else None)
-    if kind in DISTURBANCES:
+        raise FaultError(_error_message(spec, "give frames or bytes, not both"))
+    for name, fault_key in keys.items():
+        if fault_key.is_required and name not in values:
+            raise FaultError(_error_message(spec, f"{kind} needs {name}: {fault_key.allowed_text}"))
+        if fault_key.default is not None and not (name == "frames" and "bytes" in values):
+            values.setdefault(name, fault_key.default)
+    fault = Fault(kind, values, _parse_start_time(spec, time) if at else None)
+    if kind in DISTURBANCE_KINDS:
         try:
             disturbance_of(fault, 0.0)
         except ObstacleError as error:
-            raise FaultError(_complaint(spec, str(error).partition(": ")[2].rstrip("."))) from None
+            raise FaultError(
+                _error_message(spec, str(error).partition(": ")[2].rstrip("."))
+            ) from None
     return fault
 
 
 def disturbance_of(fault: Fault, now_s: float) -> Disturbance:
-    """Return the obstacle or knock that a fault puts in the beam's way from now on.
+    """Return the obstacle or impact of a fault, which begins now.
 
     Parameters
     ----------
     fault
-        One of the `DISTURBANCES`.
+        Fault of a kind in `DISTURBANCE_KINDS`.
     now_s
-        Time since the drive was first enabled.
+        Time in seconds since the drive was first enabled.
     """
-    words = [f"{key}={value}" for key, value in fault.values.items() if key != "for"]
+    assignments = [f"{key}={value}" for key, value in fault.values.items() if key != "for"]
     if fault.kind == "knock":
-        words.append(f"at={now_s!r}")
+        assignments.append(f"at={now_s!r}")
     else:
-        words.append(f"from={now_s!r}")
+        assignments.append(f"from={now_s!r}")
         if "for" in fault.values:
-            words.append(f"until={now_s + float(fault.values['for'])!r}")
-    return parse_obstacle(",".join(words))
+            assignments.append(f"until={now_s + float(fault.values['for'])!r}")
+    return parse_obstacle(",".join(assignments))
 
 
-def _time(spec: str, text: str) -> float:
+def _parse_start_time(spec: str, text: str) -> float:
+    """Parse the time after ``@`` in a fault, in seconds."""
     try:
         seconds = float(text)
     except ValueError:
         seconds = -1.0
-    if not 0 <= seconds <= _LONGEST_S:
+    if not 0 <= seconds <= _LARGEST_TIME_S:
         raise FaultError(
-            _complaint(spec, f"'@{text}': give the seconds after enabling, 0 to {_LONGEST_S:g}")
+            _error_message(
+                spec, f"'@{text}': give the seconds after enabling, 0 to {_LARGEST_TIME_S:g}"
+            )
         )
     return seconds
 
 
-def _text(key: str, value: Value) -> str:
+def _format_value(key: str, value: Value) -> str:
+    """Format the value of a fault's key."""
     return f"{value:#x}" if key in ("id", "code", "bits") else f"{value}"
 
 
-def _complaint(spec: str, what: str) -> str:
+def _error_message(spec: str, what: str) -> str:
+    """Return the message for a wrong text of a fault."""
     return f"Fault '{spec}': {what}."
 
 
 # Faults on a line
 
 
-class _Active:
-    """A fault of a line, and how much of it is still to come."""
+class _ActiveFault:
+    """Active fault on a line, with the number of frames or bytes on which it still acts."""
 
     def __init__(self, fault: Fault) -> None:
         values = fault.values
         self.kind = fault.kind
         self.can_id = values.get("id")
         self.in_bytes = "bytes" in values
-        self.left = int(values["bytes"] if self.in_bytes else values["frames"])
+        self.remaining = int(values["bytes"] if self.in_bytes else values["frames"])
         self.delay_s = float(values.get("ms", 0)) * 1e-3
         self.byte = int(values.get("byte", 0))
 
-    def fits(self, can_id: int, data: bytes) -> bool:
-        """Whether it acts on this."""
+    def matches(self, can_id: int, data: bytes) -> bool:
+        """Return whether the fault acts on a frame with this identifier and data."""
         if self.can_id is not None and self.can_id != can_id:
             return False
         return self.kind != "corrupt" or self.byte < len(data)
 
 
 class FaultyLine:
-    """Line from one sender to all others, with the faults on it.
+    """Line from one sender to all receivers, on which faults act.
 
     Parameters
     ----------
     sender
-        Sender of the frames, for the log.
+        Name of the sender, for the log.
     deliver
-        Receives the frames that pass.
+        Function that delivers a frame to the receivers.
     postpone
-        Calls something after so many seconds.
+        Function that calls another function after a delay in seconds.
     log
-        Called for each frame that a fault hits.
+        Function that logs each frame on which a fault acts.
     """
 
     def __init__(
@@ -284,86 +332,88 @@ class FaultyLine:
         self._deliver = deliver
         self._postpone = postpone
         self._log = log
-        self._active: list[_Active] = []
-        self._held: list[tuple[int, bytes, object]] = []
+        self._active_faults: list[_ActiveFault] = []
+        self._held_frames: list[tuple[int, bytes, object]] = []
 
     @property
     def disturbed(self) -> bool:
-        """Whether a fault may act on what comes next."""
-        return bool(self._active or self._held)
+        """Whether a fault may act on the next frame."""
+        return bool(self._active_faults or self._held_frames)
 
     def add(self, fault: Fault) -> None:
-        """Let a fault act from now on."""
-        self._active.append(_Active(fault))
+        """Let a fault act on this line from now on."""
+        self._active_faults.append(_ActiveFault(fault))
 
     def end(self, kind: str | None) -> list[str]:
-        """End the faults of a kind, or all; return the kinds of those that were active."""
-        over = [fault for fault in self._active if kind in (None, fault.kind)]
-        self._active = [fault for fault in self._active if fault not in over]
-        return [fault.kind for fault in over]
+        """End the line's faults of a kind, or all; return the kinds of the ended faults."""
+        ended = [fault for fault in self._active_faults if kind in (None, fault.kind)]
+        self._active_faults = [fault for fault in self._active_faults if fault not in ended]
+        return [fault.kind for fault in ended]
 
     def send(self, can_id: int, data: bytes, origin: object = None) -> None:
         """Send a frame, or a record of a serial line, over this line."""
-        if not self._active and not self._held:
+        if not self._active_faults and not self._held_frames:
             self._deliver(can_id, data, origin)
             return
-        waiting, self._held = self._held, []
-        fault = next((fault for fault in self._active if fault.fits(can_id, data)), None)
-        if waiting and fault is not None and fault.kind == "reorder":
-            fault = None  # this is the frame that the held one waits for
+        held_frames, self._held_frames = self._held_frames, []
+        fault = next((fault for fault in self._active_faults if fault.matches(can_id, data)), None)
+        if held_frames and fault is not None and fault.kind == "reorder":
+            fault = None  # this is the frame for which the held frame waits
         if fault is None:
             self._deliver(can_id, data, origin)
         else:
             self._disturb(fault, can_id, data, origin)
-        # A held frame goes after the next one, whatever becomes of that.
-        for held in waiting:
+        # A held frame follows the next frame, whatever happens to that frame.
+        for held in held_frames:
             self._deliver(*held)
 
-    def _disturb(self, fault: _Active, can_id: int, data: bytes, origin: object) -> None:
-        hit = min(fault.left, len(data)) if fault.in_bytes else 1
-        fault.left -= hit
-        if fault.left == 0:
-            self._active.remove(fault)
-        where = {} if can_id == SERIAL else {"can_id": can_id}
-        self._log("simulator", fault.kind, sender=self._sender, data=data.hex(), **where)
+    def _disturb(self, fault: _ActiveFault, can_id: int, data: bytes, origin: object) -> None:
+        """Apply a fault to a frame: drop, delay, corrupt or hold it, and log it."""
+        bytes_hit = min(fault.remaining, len(data)) if fault.in_bytes else 1
+        fault.remaining -= bytes_hit
+        if fault.remaining == 0:
+            self._active_faults.remove(fault)
+        identifier = {} if can_id == SERIAL else {"can_id": can_id}
+        self._log("simulator", fault.kind, sender=self._sender, data=data.hex(), **identifier)
         if fault.kind == "delay":
             self._postpone(fault.delay_s, lambda: self._deliver(can_id, data, origin))
         elif fault.kind == "corrupt":
-            wrong = data[fault.byte] ^ 0xFF
-            data = data[: fault.byte] + bytes([wrong]) + data[fault.byte + 1 :]
+            corrupted_byte = data[fault.byte] ^ 0xFF
+            data = data[: fault.byte] + bytes([corrupted_byte]) + data[fault.byte + 1 :]
             self._deliver(can_id, data, origin)
         elif fault.kind == "reorder":
-            self._held.append((can_id, data, origin))
-        elif fault.in_bytes and hit < len(data):
-            self._deliver(can_id, data[hit:], origin)
+            self._held_frames.append((can_id, data, origin))
+        elif fault.in_bytes and bytes_hit < len(data):
+            self._deliver(can_id, data[bytes_hit:], origin)
 
 
 # Log of events
 
-_FLUSH_S = 0.2
-_SILENT = ("torque", "sdo write", *LINE_KINDS)
-"""Events too frequent to be shown on the terminal."""
+_FLUSH_INTERVAL_S = 0.2
+"""Time in seconds between two writes of the log to its file."""
+_UNSHOWN_EVENTS = ("torque", "sdo write", *LINE_KINDS)
+"""Events that are too frequent to be shown on the terminal."""
 
 
 class EventLog:
-    """Writes down each event with the simulated time, in seconds since the start.
+    """Log of events with simulated time, in a file of JSON lines and on the terminal.
 
     Parameters
     ----------
     path
-        Path of the new file of JSON lines; None for none.
+        Path of the new file of JSON lines; None: no file.
     quiet
         Whether nothing is shown on the terminal.
 
     Attributes
     ----------
     time_s : float
-        Simulated time; `BusSimulation` sets it.
+        Simulated time in seconds, which `BusSimulation` sets.
 
     Raises
     ------
     WrongUseError
-        If there is a file of that name.
+        If the file exists.
     DeviceError
         If the file cannot be written.
     """
@@ -371,52 +421,53 @@ class EventLog:
     def __init__(self, path: Path | None, *, quiet: bool) -> None:
         self._quiet = quiet
         self._path = path
-        self._file = None if path is None else _new_file(path)
+        self._file = None if path is None else _open_new_file(path)
         self._flushed_s = 0.0
         self.time_s = 0.0
 
     def __call__(self, device: str, what: str, **values: object) -> None:
-        """Write down that something happened to a device."""
+        """Log an event of a device, with values by name."""
         if self._file is not None:
             entry = {"t_s": round(self.time_s, 9), "device": device, "what": what, **values}
-            self._attempt(lambda file: file.write(json.dumps(entry) + "\n"))
-        if what not in _SILENT:
+            self._run_on_file(lambda file: file.write(json.dumps(entry) + "\n"))
+        if what not in _UNSHOWN_EVENTS:
             # States and faults must be in the file even if the process is killed.
             self._write_out()
             details = "  ".join(f"{key} {value}" for key, value in values.items())
             self.print_line(f"{self.time_s:10.3f} s  {device}: {what}  {details}".rstrip())
 
     def print_line(self, line: str) -> None:
-        """Print a line for the operator; ignore a closed terminal."""
+        """Print a line for the operator, unless quiet; ignore a closed terminal."""
         if not self._quiet:
             with suppress(OSError, ValueError):
                 sys.stdout.write(f"{line}\n")
                 sys.stdout.flush()
 
     def flush(self) -> None:
-        """Write out what has been waiting for some time."""
-        if time.monotonic() - self._flushed_s > _FLUSH_S:
+        """Write the logged events to the log file, if the last write was some time ago."""
+        if time.monotonic() - self._flushed_s > _FLUSH_INTERVAL_S:
             self._write_out()
 
     def close(self) -> None:
-        """Write out the rest."""
+        """Write the remaining events and close the log file."""
         file, self._file = self._file, None
         if file is not None:
             with suppress(OSError):
                 file.close()
 
     def discard(self) -> None:
-        """Leave no file, for nothing happened; a pipe or a device stays."""
+        """Close and remove the log file, since nothing was simulated; a pipe or device remains."""
         self.close()
         if self._path is not None and self._path.is_file():
             self._path.unlink()
 
     def _write_out(self) -> None:
+        """Write the logged events to the log file."""
         self._flushed_s = time.monotonic()
-        self._attempt(lambda file: file.flush())
+        self._run_on_file(lambda file: file.flush())
 
-    def _attempt(self, action: Callable[[TextIO], object]) -> None:
-        """Do something with the file; a full disk ends the log, not the simulated rig."""
+    def _run_on_file(self, action: Callable[[TextIO], object]) -> None:
+        """Run an action on the file; if the disk is full, close the log and continue."""
         if self._file is None:
             return
         try:
@@ -426,13 +477,13 @@ class EventLog:
             self.print_line(f"The log cannot be written any more ({error.strerror}).")
 
 
-def _new_file(path: Path) -> TextIO:
-    """Open a file that was not there, or a device or pipe, in which nothing can be overwritten."""
+def _open_new_file(path: Path) -> TextIO:
+    """Open a file that does not exist yet, or an existing device or pipe."""
     try:
         try:
             return path.open("x", encoding="utf-8")
         except FileExistsError:
-            if path.is_file() or not path.exists():  # a link that leads nowhere is a name, too
+            if path.is_file() or not path.exists():  # a dangling link counts as existing
                 raise WrongUseError(
                     f"--log {path} exists; choose another name or move it away, nothing is "
                     "overwritten."

@@ -1,8 +1,9 @@
-"""Links of the simulated rig: its end of the CAN bus, and a pseudo-terminal for the serial line.
+"""Connections of the simulated rig: its CAN bus, and a pseudo-terminal for the serial line.
 
 The bus is a Unix socket (`VirtualBus`) or a virtual interface of the kernel (`VirtualCan`). Both
-carry the 16 bytes of ``struct can_frame``. On the Unix socket every client hears every other one,
-as on a bus. Nothing here blocks: who does not read loses frames, as a slow CAN controller does.
+carry the 16 bytes of ``struct can_frame``. On the Unix socket every client receives the frames of
+all others, as on a bus. Nothing blocks: a client that does not read loses frames, like a slow CAN
+controller.
 """
 
 import os
@@ -21,16 +22,16 @@ from rigd.devices.parameters import RigParameters
 # Delays of the links
 
 
-def without_transport(rig: RigParameters) -> RigParameters:
-    """Return the rig with the delays that are left to simulate behind the wire.
+def without_transport_delay(rig: RigParameters) -> RigParameters:
+    """Return the rig with the delays that remain to be simulated in addition to the exchange.
 
-    With replies taken a tick later the exchange itself brings one period of what the profile
-    states; the decimating filter's delay is seen to by :class:`rigd.sim._devices.SimulatedRig`.
+    If replies are used one tick later, the exchange itself causes one period of the delays in the
+    profile. :class:`rigd.sim._devices.SimulatedRig` subtracts the decimating filter's delay.
 
     Raises
     ------
     DeviceError
-        If the profile states less than the exchange takes.
+        If a delay in the profile is shorter than the exchange takes.
     """
     if rig.acquisition is None or rig.acquisition.mode == "same_tick":
         return rig
@@ -52,13 +53,15 @@ def without_transport(rig: RigParameters) -> RigParameters:
 # CAN bus
 
 Handlers = dict[int, Callable[[], None]]
-"""Functions to call when a file descriptor has something to read."""
+"""Functions to call when a file descriptor is readable, by file descriptor."""
 OnFrames = Callable[[list[bytes], object], None]
-"""Takes the frames of a sender, in order, and who it is."""
+"""Function that processes the frames of a sender, in order, and the sender."""
 
-_READ_BYTES = 65_536
-_SEND_BUFFER = 425_984  # what the kernel makes of it holds some 0.2 s of a full bus
-_READ_FRAMES = 256
+_READ_SIZE = 65_536
+"""Largest number of bytes in one read from a socket."""
+_SEND_BUFFER_SIZE = 425_984  # the kernel derives from it a buffer for some 0.2 s of a full bus
+_MOST_FRAMES_PER_READ = 256
+"""Largest number of frames in one read from a virtual interface."""
 
 # linux/rtnetlink.h and linux/if_link.h
 _RTM_GETLINK = 18
@@ -69,10 +72,11 @@ _IFLA_INFO_KIND = 1
 _ATTRIBUTE_MASK = 0x3FFF
 _LINK_HEADER = struct.Struct("=BxHiII")
 _VIRTUAL_KINDS = ("vcan", "vxcan")
+"""Kinds of CAN interfaces without hardware, by the kernel's names."""
 
 
 class _LinkConnection:
-    """One connection, with its incomplete received frame and its unsent bytes."""
+    """Connection of a client to the bus, with incomplete received and unsent bytes."""
 
     def __init__(self, link: socket.socket, number: int) -> None:
         self.link = link
@@ -82,23 +86,24 @@ class _LinkConnection:
 
 
 class VirtualBus:
-    """A CAN bus on a Unix socket.
+    """Simulated CAN bus on a Unix socket.
 
     Parameters
     ----------
     path
         Path of the socket.
     handlers
-        Handlers of the event loop, by file descriptor; updated here.
+        Handlers of the event loop by file descriptor, which this class updates.
     on_frames
-        Gets what a client sends.
+        Function that processes the frames that a client sends.
     on_clients
-        Called when a client connects or disconnects, with their number.
+        Function that is called with a text and the number of clients when one connects or
+        disconnects.
 
     Attributes
     ----------
     lost : int
-        Frames that a client did not get because it does not read.
+        Number of frames that clients have not received because they do not read.
     """
 
     def __init__(
@@ -123,18 +128,18 @@ class VirtualBus:
         return len(self._clients)
 
     def open(self) -> None:
-        """Let clients connect, at first and after `close`."""
+        """Create the socket and accept clients, at first and after `close`."""
         self._listener = listen(self._path)
         self._handlers[self._listener.fileno()] = self._accept
 
     def send(self, frame: bytes, origin: object = None) -> None:
-        """Send a frame to all clients but the one that it comes from."""
+        """Send a frame to all clients except the one that sent it."""
         for client in self._clients:
             if client is not origin:
                 self._send(client, frame)
 
     def close(self) -> None:
-        """Close every connection; no client can connect any more."""
+        """Close the socket and every connection; no client can connect any more."""
         if self._listener.fileno() >= 0:
             del self._handlers[self._listener.fileno()]
             self._listener.close()
@@ -143,10 +148,11 @@ class VirtualBus:
             self._drop(client)
 
     def _accept(self) -> None:
+        """Accept the connection of a client, and register it in the event loop."""
         with suppress(OSError):
             link, _ = self._listener.accept()
             link.setblocking(False)
-            link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_SIZE)
             self._count += 1
             client = _LinkConnection(link, self._count)
             self._clients.append(client)
@@ -154,34 +160,40 @@ class VirtualBus:
             self._on_clients(f"client {client.number} connected", len(self._clients))
 
     def _receive(self, client: _LinkConnection) -> None:
+        """Receive frames of a client, and pass them on; drop a client that has closed."""
         try:
-            fresh = client.link.recv(_READ_BYTES)
+            received = client.link.recv(_READ_SIZE)
         except BlockingIOError:
             return
         except OSError:
-            fresh = b""
-        if not fresh:
+            received = b""
+        if not received:
             self._drop(client)
             return
-        data = client.received + fresh if client.received else fresh
-        whole = len(data) - len(data) % FRAME_SIZE
-        client.received = data[whole:]
-        self._on_frames([data[i : i + FRAME_SIZE] for i in range(0, whole, FRAME_SIZE)], client)
+        data = client.received + received if client.received else received
+        complete_size = len(data) - len(data) % FRAME_SIZE
+        client.received = data[complete_size:]
+        self._on_frames(
+            [data[i : i + FRAME_SIZE] for i in range(0, complete_size, FRAME_SIZE)], client
+        )
 
     def _send(self, client: _LinkConnection, frame: bytes) -> None:
-        # The rest of a frame has to go before the next one, or all later ones are torn.
+        """Send a frame to a client, after the unsent rest of the previous; count lost frames."""
+        # The rest of a frame has to be sent before the next one, or all later frames are
+        # misaligned.
         if client.unsent:
-            client.unsent = client.unsent[_offer(client.link, client.unsent) :]
+            client.unsent = client.unsent[_send_without_blocking(client.link, client.unsent) :]
             if client.unsent:
                 self.lost += 1
                 return
-        sent = _offer(client.link, frame)
+        sent = _send_without_blocking(client.link, frame)
         if sent == 0:
             self.lost += 1
         elif sent < len(frame):
             client.unsent = frame[sent:]
 
     def _drop(self, client: _LinkConnection) -> None:
+        """Close the connection of a client."""
         if client in self._clients:
             self._clients.remove(client)
             del self._handlers[client.link.fileno()]
@@ -190,7 +202,7 @@ class VirtualBus:
 
 
 class VirtualCan:
-    """A CAN bus that the kernel simulates (vcan).
+    """CAN bus that the kernel simulates (vcan).
 
     Parameters
     ----------
@@ -206,18 +218,20 @@ class VirtualCan:
     """
 
     clients = 1
-    """Who listens on such a bus is not known."""
+    """Number of clients, which is unknown on such a bus and assumed to be 1."""
     lost = 0
+    """Number of frames that could not be sent."""
 
     def __init__(self, channel: str, handlers: Handlers, on_frames: OnFrames) -> None:
         self._channel = channel
-        self._serve(self._bound(), handlers, on_frames)
+        self._use_socket(self._bound_socket(), handlers, on_frames)
 
     def open(self) -> None:
-        """Take part in the bus again, after `close`."""
-        self._serve(self._bound(), self._handlers, self._on_frames)
+        """Open the kernel's CAN interface again, after `close`."""
+        self._use_socket(self._bound_socket(), self._handlers, self._on_frames)
 
-    def _bound(self) -> socket.socket:
+    def _bound_socket(self) -> socket.socket:
+        """Return a new CAN socket bound to the interface, or raise."""
         channel = self._channel
         try:
             link = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
@@ -233,7 +247,8 @@ class VirtualCan:
             ) from None
         return link
 
-    def _serve(self, link: socket.socket, handlers: Handlers, on_frames: OnFrames) -> None:
+    def _use_socket(self, link: socket.socket, handlers: Handlers, on_frames: OnFrames) -> None:
+        """Use a socket, and register its handler in the event loop."""
         link.setblocking(False)
         self._link = link
         self._handlers = handlers
@@ -241,7 +256,7 @@ class VirtualCan:
         handlers[link.fileno()] = self._receive
 
     def send(self, frame: bytes, origin: object = None) -> None:
-        """Send a frame that a node sends; those of others are on the bus already."""
+        """Send a frame of a node; frames of other senders (`origin`) are on the bus already."""
         if origin is None and self._link.fileno() >= 0:
             try:
                 self._link.send(frame)
@@ -249,27 +264,28 @@ class VirtualCan:
                 self.lost += 1
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Close the socket on the kernel's CAN interface."""
         if self._link.fileno() >= 0:
             del self._handlers[self._link.fileno()]
             self._link.close()
 
     def _receive(self) -> None:
+        """Receive frames from the kernel's CAN interface, and pass them to the simulation."""
         frames: list[bytes] = []
         with suppress(OSError):
-            while len(frames) < _READ_FRAMES:
+            while len(frames) < _MOST_FRAMES_PER_READ:
                 frames.append(self._link.recv(FRAME_SIZE))
         if frames:
             self._on_frames(frames, self)
 
 
 def listen(path: Path) -> socket.socket:
-    """Return a listening Unix socket; remove one that a dead process has left.
+    """Return a listening Unix socket; replace a socket that a dead process has left.
 
     Raises
     ------
     DeviceError
-        If there can be none.
+        If the socket cannot be created.
     """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -287,12 +303,12 @@ def listen(path: Path) -> socket.socket:
 
 
 def is_virtual(channel: str) -> bool:
-    """Whether a network interface is a CAN bus without hardware.
+    """Return whether a network interface is a CAN bus without hardware.
 
     Raises
     ------
     DeviceError
-        If there is such an interface, and it is anything else.
+        If the interface exists, but is not a virtual CAN bus.
     """
     if not Path(f"/sys/class/net/{channel}").exists():
         return False
@@ -307,25 +323,25 @@ def is_virtual(channel: str) -> bool:
 
 
 def interface_kind(name: str) -> str:
-    """Return what the kernel calls the kind of a network interface; empty for hardware.
+    """Return the kernel's name for the kind of a network interface; empty for hardware.
 
-    A serial CAN adapter is also among the virtual devices of ``/sys``, so only the kernel's own
-    attribute counts (``IFLA_INFO_KIND``).
+    A serial CAN adapter is also among the virtual devices of ``/sys``, so the kernel's attribute
+    ``IFLA_INFO_KIND`` is used.
     """
     try:
         index = socket.if_nametoindex(name)
         with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, 0) as kernel:
             body = _LINK_HEADER.pack(socket.AF_UNSPEC, 0, index, 0, 0)
-            head = struct.pack("=IHHII", 16 + len(body), _RTM_GETLINK, _NLM_F_REQUEST, 1, 0)
-            kernel.send(head + body)
-            reply = kernel.recv(_READ_BYTES)
+            header = struct.pack("=IHHII", 16 + len(body), _RTM_GETLINK, _NLM_F_REQUEST, 1, 0)
+            kernel.send(header + body)
+            reply = kernel.recv(_READ_SIZE)
     except OSError:
         return ""
     return kind_in_reply(reply)
 
 
 def kind_in_reply(reply: bytes) -> str:
-    """Return the kind of interface in a message RTM_NEWLINK."""
+    """Return the kind of interface in a netlink message RTM_NEWLINK, or an empty text."""
     if len(reply) < 32 or struct.unpack_from("=H", reply, 4)[0] != _RTM_NEWLINK:
         return ""
     length = struct.unpack_from("=I", reply)[0]
@@ -338,7 +354,7 @@ def kind_in_reply(reply: bytes) -> str:
 
 
 def _attributes(data: bytes) -> Iterable[tuple[int, bytes]]:
-    """Yield type and value of netlink attributes."""
+    """Yield type and value of the netlink attributes in a message."""
     at = 0
     while at + 4 <= len(data):
         length, kind = struct.unpack_from("=HH", data, at)
@@ -348,8 +364,8 @@ def _attributes(data: bytes) -> Iterable[tuple[int, bytes]]:
         at += (length + 3) & ~3
 
 
-def _offer(link: socket.socket, data: bytes) -> int:
-    """Return how many bytes a socket took; a dead one takes none."""
+def _send_without_blocking(link: socket.socket, data: bytes) -> int:
+    """Send bytes on a socket without blocking; return the number sent, 0 if the socket is dead."""
     try:
         return link.send(data)
     except OSError:
@@ -358,30 +374,31 @@ def _offer(link: socket.socket, data: bytes) -> int:
 
 # Serial line
 
-_LINE_BYTES = 4096
+_LINE_READ_SIZE = 4096
+"""Largest number of bytes in one read from the serial line."""
 
 
 class PtyLine:
-    """The sensor's end of a serial line.
+    """Sensor's end of a serial line, on a pseudo-terminal.
 
-    While the other end is not open, what is sent is lost, as on a real line. A terminal with a
+    While the other end is not open, sent bytes are lost, as on a real line. A terminal with a
     closed end is always "readable", so it is polled from time to time instead.
 
     Parameters
     ----------
     handlers
-        Handlers of the event loop, by file descriptor; updated here.
+        Handlers of the event loop by file descriptor, which this class updates.
     on_bytes
-        Gets what the host sends.
+        Function that processes the bytes that the host sends.
     on_open
-        Called when the host opens the port, and when it closes it.
+        Function that is called with True or False when the host opens or closes the port.
 
     Attributes
     ----------
     port : str
-        What the host opens.
+        Path of the terminal that the host opens.
     lost : int
-        Bytes that the host did not take.
+        Number of bytes that the host did not accept.
     """
 
     def __init__(
@@ -397,50 +414,51 @@ class PtyLine:
         self.open()
 
     def open(self) -> None:
-        """Make the line, at first and after `close`; its port may get another name."""
-        self._ours, theirs = os.openpty()
-        tty.setraw(theirs)
-        self.port = os.ttyname(theirs)
-        os.close(theirs)
-        os.set_blocking(self._ours, False)
-        self._open = False
+        """Create the pseudo-terminal, at first and after `close`; its port may get another name."""
+        self._simulator_end, host_end = os.openpty()
+        tty.setraw(host_end)
+        self.port = os.ttyname(host_end)
+        os.close(host_end)
+        os.set_blocking(self._simulator_end, False)
+        self._is_open = False
 
     def write(self, data: bytes) -> None:
-        """Send bytes; those that the host does not take are gone."""
+        """Send bytes; bytes that the host does not accept are lost."""
         sent = 0
-        if self._open:
+        if self._is_open:
             with suppress(OSError):
-                sent = os.write(self._ours, data)
+                sent = os.write(self._simulator_end, data)
             self.lost += len(data) - sent
 
     def poll(self) -> None:
         """Check whether the host has opened or closed the port."""
-        if not self._open and self._ours >= 0:
+        if not self._is_open and self._simulator_end >= 0:
             self._receive()
 
     def close(self) -> None:
-        """Cut the line."""
-        if self._ours >= 0:
-            self._handlers.pop(self._ours, None)
-            os.close(self._ours)
-            self._ours = -1
-            self._open = False
+        """Close the pseudo-terminal, as if the line was interrupted."""
+        if self._simulator_end >= 0:
+            self._handlers.pop(self._simulator_end, None)
+            os.close(self._simulator_end)
+            self._simulator_end = -1
+            self._is_open = False
 
     def _receive(self) -> None:
+        """Read bytes of the host, and register whether the host has the port open."""
         data = b""
         try:
-            data = os.read(self._ours, _LINE_BYTES)
+            data = os.read(self._simulator_end, _LINE_READ_SIZE)
             is_open = True
         except BlockingIOError:
             is_open = True
         except OSError:
             is_open = False
-        if is_open and not self._open:
-            self._handlers[self._ours] = self._receive
-        elif self._open and not is_open:
-            del self._handlers[self._ours]
-        if is_open != self._open:
-            self._open = is_open
+        if is_open and not self._is_open:
+            self._handlers[self._simulator_end] = self._receive
+        elif self._is_open and not is_open:
+            del self._handlers[self._simulator_end]
+        if is_open != self._is_open:
+            self._is_open = is_open
             self._on_open(is_open)
         if data:
             self._on_bytes(data)

@@ -1,4 +1,4 @@
-"""Object dictionary of a simulated CANopen node: typed entries, its SDO server, and EDS files."""
+"""Object dictionary of a simulated CANopen node: typed entries, SDO server, and EDS files."""
 
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,13 +13,16 @@ from rigd.devices.eds import EdsEntry, EdsError, read_eds
 
 # Objects
 
-NUMBERS = "bBhHiIqQ"
-_FORMATS = {kind: Struct("<" + kind) for kind in NUMBERS}
-_LONGEST_TEXT = 1024
+INTEGER_LETTERS = "bBhHiIqQ"
+"""Letters of :mod:`struct` for the integer types."""
+_INTEGER_LAYOUTS = {kind: Struct("<" + kind) for kind in INTEGER_LETTERS}
+"""Binary layout of each integer type, by its letter."""
+_MOST_TEXT_BYTES = 1024
+"""Largest number of bytes that can be written to a text of variable length."""
 
 
 class AbortCode(IntEnum):
-    """SDO abort codes: why an access failed."""
+    """SDO abort code, which states why an access failed."""
 
     TOGGLE = 0x0503_0000
     COMMAND = 0x0504_0001
@@ -37,7 +40,7 @@ class AbortCode(IntEnum):
 
 
 class Abort(Exception):
-    """An access that the dictionary refuses.
+    """Error: the dictionary refuses an access.
 
     Attributes
     ----------
@@ -55,15 +58,21 @@ class Description:
     """Description of one sub-index in a device's file."""
 
     kind: str
-    """Type, as in `Entry`."""
+    """Type letter, as in `Entry`."""
     access: str
+    """Access right by SDO: "rw", "ro" or "wo"."""
     mapping: str
+    """Kinds of PDO into which the object can be mapped: "r", "t", "rt" or none."""
     default: int | None = None
-    """Value at power-on; None where the file does not state it."""
+    """Value at power-on; None if the file does not state it."""
     low: int | None = None
+    """Lower limit of the value; None if not stated."""
     high: int | None = None
+    """Upper limit of the value; None if not stated."""
     text: bytes = b""
-    fixed: bool = False
+    """Bytes at power-on of an entry that is no number."""
+    has_fixed_length: bool = False
+    """Whether bytes can be written only with the length of `text`."""
 
     def entry(self) -> "Entry":
         """Return an entry that stores what is written to it, and has no other function."""
@@ -75,37 +84,37 @@ class Description:
             self.low,
             self.high,
             self.text,
-            fixed=self.fixed,
+            has_fixed_length=self.has_fixed_length,
         )
 
 
 @dataclass(slots=True)
 class Entry:
-    """One sub-index: a number, or bytes.
+    """One sub-index of an object: an integer, or bytes.
 
     Parameters
     ----------
     kind
         Letter of :mod:`struct` for the number ("b", "B", "h", "H", "i", "I", "q", "Q"), or "s" for
-        bytes: a text, or a value that is not used in computations here.
+        bytes: a text, or a value that the simulation does not use.
     value
         Value at power-on.
     access
         "rw", "ro" or "wo", as seen by SDO.
     mapping
-        Into which PDOs it may go: "r", "t", "rt" or none.
+        Kinds of PDO into which it can be mapped: "r" (received), "t" (transmitted), "rt" or none.
     low, high
-        Range of values that may be written; by default that of the type.
+        Range of values that can be written; by default that of the type.
     text
-        The bytes at power-on.
-    fixed
-        Bytes: only as many as there are may be written.
-    live
-        Gives the value where it is not stored.
+        Bytes at power-on.
+    has_fixed_length
+        Whether bytes can be written only with the length of `text`.
+    read_value
+        Function that returns the value if it is not stored; None if it is stored.
     check
-        Called with a value to be written; raises `Abort` if it cannot be.
-    wrote
-        Called after the value has been written.
+        Function that raises `Abort` if a value cannot be written now.
+    after_write
+        Function that is called after a value has been written.
     """
 
     kind: str
@@ -115,74 +124,82 @@ class Entry:
     low: int | None = None
     high: int | None = None
     text: bytes = b""
-    fixed: bool = False
-    live: Callable[[], int] | None = None
+    has_fixed_length: bool = False
+    read_value: Callable[[], int] | None = None
     check: Callable[[int], None] | None = None
-    wrote: Callable[[], None] | None = None
+    after_write: Callable[[], None] | None = None
     default: int = field(init=False)
     default_text: bytes = field(init=False)
     bits: int = field(init=False)
-    """Bits of a number; 0 for bytes, which no PDO carries."""
+    """Length of the integer in bits; 0 for bytes, which no PDO carries."""
     _low: int = field(init=False)
     _high: int = field(init=False)
 
     def __post_init__(self) -> None:
+        """Store the values at power-on, and set the range."""
         self.default = self.value
         self.default_text = self.text
         self._set_range(self.low, self.high)
 
-    def become(self, described: Description, default: int | None) -> None:
-        """Adopt type, access, mapping and limits of a file; the function stays.
+    def adopt_description(self, description: Description, default: int | None) -> None:
+        """Adopt type, access, mapping and limits from a device's file; the function remains.
 
         Parameters
         ----------
         described
-            Entry of the file, a number as this one is.
+            Description in the file, of an integer as this entry.
         default
-            Value at power-on from now on; None leaves it as it is.
+            New value at power-on; None leaves it unchanged.
         """
-        if self.live is not None and described.kind != self.kind:
-            self.live = partial(_within, self.live, *_range_of(described.kind))
-        self.kind, self.access, self.mapping = described.kind, described.access, described.mapping
-        # What the drive here can do bounds it as well.
-        low = max((x for x in (self.low, described.low) if x is not None), default=None)
-        high = min((x for x in (self.high, described.high) if x is not None), default=None)
+        if self.read_value is not None and description.kind != self.kind:
+            self.read_value = partial(
+                _clamped_value, self.read_value, *_type_range(description.kind)
+            )
+        self.kind, self.access, self.mapping = (
+            description.kind,
+            description.access,
+            description.mapping,
+        )
+        # The capabilities of the simulated drive limit the range, too.
+        low = max((x for x in (self.low, description.low) if x is not None), default=None)
+        high = min((x for x in (self.high, description.high) if x is not None), default=None)
         self._set_range(low, high)
         if default is not None:
             self.default = default
-        least, most = _range_of(self.kind)
-        self.value = self.default = min(max(self.default, least), most)
+        lowest, largest = _type_range(self.kind)
+        self.value = self.default = min(max(self.default, lowest), largest)
 
     def _set_range(self, low: int | None, high: int | None) -> None:
-        self.bits = 0 if self.kind == "s" else 8 * _FORMATS[self.kind].size
-        least, most = _range_of(self.kind)
-        self._low = least if low is None else low
-        self._high = most if high is None else high
+        """Set the length in bits, and the range of values, by default that of the type."""
+        self.bits = 0 if self.kind == "s" else 8 * _INTEGER_LAYOUTS[self.kind].size
+        lowest, largest = _type_range(self.kind)
+        self._low = lowest if low is None else low
+        self._high = largest if high is None else high
 
-    def fits(self, size: int) -> bool:
-        """Whether so many bytes may be written."""
+    def accepts_length(self, size: int) -> bool:
+        """Return whether a value of `size` bytes can be written to the entry."""
         if self.kind != "s":
             return 8 * size == self.bits
-        return size == len(self.text) if self.fixed else size <= _LONGEST_TEXT
+        return size == len(self.text) if self.has_fixed_length else size <= _MOST_TEXT_BYTES
 
     @property
     def most_bytes(self) -> int:
-        """Largest number of bytes that may be written."""
+        """Largest number of bytes that can be written to the entry."""
         if self.kind != "s":
             return self.bits // 8
-        return len(self.text) if self.fixed else _LONGEST_TEXT
+        return len(self.text) if self.has_fixed_length else _MOST_TEXT_BYTES
 
     def get(self) -> int:
-        """Return the value as it is now."""
-        return self.value if self.live is None else self.live()
+        """Return the present value of an integer entry."""
+        return self.value if self.read_value is None else self.read_value()
 
-    def put(self, value: int) -> None:
-        """Store a value that was received; `wrote` is left to the caller.
+    def store_integer(self, value: int) -> None:
+        """Store a received integer; the caller then has to call `after_write`.
 
         Raises
         ------
         Abort
-            If the value is not allowed, or not now.
+            If the value is outside the range, or not allowed now.
         """
         if not self._low <= value <= self._high:
             raise Abort(AbortCode.VALUE)
@@ -191,46 +208,47 @@ class Entry:
         self.value = value
 
     def reset(self) -> None:
-        """Restore the value at power-on."""
+        """Restore the entry's value at power-on."""
         self.value = self.default
         self.text = self.default_text
 
     def encode(self) -> bytes:
-        """Return the bytes an SDO upload gives."""
-        return self.text if self.kind == "s" else _FORMATS[self.kind].pack(self.get())
+        """Return the value as bytes for an SDO upload."""
+        return self.text if self.kind == "s" else _INTEGER_LAYOUTS[self.kind].pack(self.get())
 
-    def take(self, data: bytes) -> int | str:
-        """Store the bytes of an SDO download, and return them as a number or in hexadecimal.
+    def store_bytes(self, data: bytes) -> int | str:
+        """Store the bytes of an SDO download; return them as an integer, or in hexadecimal.
 
         Raises
         ------
         Abort
-            If they are too many or too few, or the value is not allowed.
+            If the number of bytes is wrong, or the value is not allowed.
         """
-        if not self.fits(len(data)):
+        if not self.accepts_length(len(data)):
             raise Abort(AbortCode.LENGTH)
         if self.kind == "s":
             self.text = data
             return data.hex()
-        number: int = _FORMATS[self.kind].unpack(data)[0]
-        self.put(number)
+        number: int = _INTEGER_LAYOUTS[self.kind].unpack(data)[0]
+        self.store_integer(number)
         return number
 
 
-def _range_of(kind: str) -> tuple[int, int]:
-    """Return the least and the greatest value of a type."""
-    bits = 0 if kind == "s" else 8 * _FORMATS[kind].size
+def _type_range(kind: str) -> tuple[int, int]:
+    """Return the smallest and the largest value of a type."""
+    bits = 0 if kind == "s" else 8 * _INTEGER_LAYOUTS[kind].size
     if kind == "s" or kind.isupper():
         return 0, (1 << bits) - 1
     return -(1 << (bits - 1)), (1 << (bits - 1)) - 1
 
 
-def _within(live: Callable[[], int], least: int, most: int) -> int:
-    return min(max(live(), least), most)
+def _clamped_value(read_value: Callable[[], int], lowest: int, largest: int) -> int:
+    """Return a read value, limited to a range."""
+    return min(max(read_value(), lowest), largest)
 
 
 class ObjectDictionary:
-    """Entries by index and sub-index, with the access that SDO clients have."""
+    """Object dictionary: entries by index and sub-index, which SDO clients can access."""
 
     def __init__(self) -> None:
         self._entries: dict[tuple[int, int], Entry] = {}
@@ -240,7 +258,7 @@ class ObjectDictionary:
         return self._entries[key]
 
     def add(self, index: int, entry: Entry, sub: int = 0) -> Entry:
-        """Add an entry and return it."""
+        """Add an entry to the dictionary, and return the entry."""
         self._entries[index, sub] = entry
         self._indices.add(index)
         return entry
@@ -251,31 +269,38 @@ class ObjectDictionary:
         for sub, entry in entries.items():
             self.add(index, entry, sub)
 
-    def follow(self, file: Mapping[tuple[int, int], Description], own: Container[int]) -> None:
-        """Adopt the entries of a device's file, and no others.
+    def adopt_file_entries(
+        self, file: Mapping[tuple[int, int], Description], unchanged_indices: Container[int]
+    ) -> None:
+        """Restrict the dictionary to the entries of a device's file, and adopt their descriptions.
 
-        Entries keep their meaning where the file has them as numbers of any type; the others of
-        the file are storage.
+        Entries that are integers in both retain their function. The other entries of the file only
+        store values.
 
         Parameters
         ----------
         file
             Descriptions in the file, by index and sub-index.
-        own
-            Indices whose values at power-on are not the file's.
+        unchanged_indices
+            Indices whose values at power-on remain unchanged.
         """
-        before, self._entries = self._entries, {}
+        previous_entries, self._entries = self._entries, {}
         self._indices.clear()
-        for (index, sub), described in file.items():
-            entry = before.get((index, sub))
-            if entry is None or "s" in (entry.kind, described.kind):
-                entry = described.entry()
+        for (index, sub), description in file.items():
+            entry = previous_entries.get((index, sub))
+            if entry is None or "s" in (entry.kind, description.kind):
+                entry = description.entry()
             else:
-                entry.become(described, None if index in own else described.default)
+                entry.adopt_description(
+                    description, None if index in unchanged_indices else description.default
+                )
             self.add(index, entry, sub)
 
-    def override(self, index: int, sub: int, value: int | None) -> None:
-        """Override the value of an entry, or make it absent; add it if it is missing."""
+    def override_entry(self, index: int, sub: int, value: int | None) -> None:
+        """Set the value of an entry, also at power-on; None removes the entry.
+
+        An entry that does not exist is added.
+        """
         if value is None:
             self._entries.pop((index, sub), None)
             return
@@ -285,12 +310,12 @@ class ObjectDictionary:
         entry.value = entry.default = value
 
     def find(self, index: int, sub: int) -> Entry:
-        """Return an entry.
+        """Return the entry of the dictionary at an index and sub-index.
 
         Raises
         ------
         Abort
-            If there is none.
+            If there is no such entry.
         """
         entry = self._entries.get((index, sub))
         if entry is not None:
@@ -298,12 +323,12 @@ class ObjectDictionary:
         raise Abort(AbortCode.NO_SUB_INDEX if index in self._indices else AbortCode.NO_OBJECT)
 
     def read(self, index: int, sub: int) -> bytes:
-        """Return the value that a client reads.
+        """Return the value of an entry as bytes, as an SDO client reads it.
 
         Raises
         ------
         Abort
-            If it may not.
+            If the entry does not exist or is write-only.
         """
         entry = self.find(index, sub)
         if entry.access == "wo":
@@ -311,12 +336,12 @@ class ObjectDictionary:
         return entry.encode()
 
     def find_writable(self, index: int, sub: int) -> Entry:
-        """Return the entry that a client is about to write.
+        """Return the entry that an SDO client is about to write.
 
         Raises
         ------
         Abort
-            If it may not.
+            If the entry does not exist or is read-only.
         """
         entry = self.find(index, sub)
         if entry.access == "ro":
@@ -324,21 +349,21 @@ class ObjectDictionary:
         return entry
 
     def write(self, index: int, sub: int, data: bytes) -> int | str:
-        """Write a client's value, and return it as a number or, if bytes, in hexadecimal.
+        """Write the bytes of an SDO client, and return them as an integer or in hexadecimal.
 
         Raises
         ------
         Abort
-            If it may not, or not this.
+            If the entry cannot be written, or the value is not allowed.
         """
         entry = self.find_writable(index, sub)
-        value = entry.take(data)
-        if entry.wrote is not None:
-            entry.wrote()
+        value = entry.store_bytes(data)
+        if entry.after_write is not None:
+            entry.after_write()
         return value
 
     def reset(self, last: int) -> None:
-        """Put the entries up to an index, which is included, back to their power-on values."""
+        """Restore the values at power-on of all entries up to and including an index."""
         for (index, _), entry in self._entries.items():
             if index <= last:
                 entry.reset()
@@ -346,31 +371,39 @@ class ObjectDictionary:
 
 # SDO server
 
-_HEAD = Struct("<BHB")
-_ABORT = Struct("<BHBI")
+_SDO_HEADER = Struct("<BHB")
+"""Layout of the beginning of an SDO frame: command, index, sub-index."""
+_SDO_ABORT = Struct("<BHBI")
+"""Layout of an SDO abort: command, index, sub-index, abort code."""
 
 # Client command specifiers, in the three upper bits of the first byte.
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORTED = range(5)
 
-_EXPEDITED = 0x02
-_SIZE_GIVEN = 0x01
-_LAST_SEGMENT = 0x01
-_TOGGLE = 0x10
+_EXPEDITED_BIT = 0x02
+"""Bit of an SDO command: the frame contains the whole value."""
+_SIZE_STATED_BIT = 0x01
+"""Bit of an SDO command: the frame states the size of the value."""
+_LAST_SEGMENT_BIT = 0x01
+"""Bit of a segment's SDO command: it is the last segment."""
+_TOGGLE_BIT = 0x10
+"""Bit of a segment's SDO command that alternates between segments."""
 _EXPEDITED_SIZE = 4
+"""Largest number of value bytes in an expedited SDO transfer."""
 _SEGMENT_SIZE = 7
+"""Largest number of value bytes in a segment of an SDO transfer."""
 
 
 class SdoServer:
-    """Answers one client.
+    """SDO server of a node, for one client.
 
     Parameters
     ----------
     objects
-        Objects that are read and written.
+        Dictionary whose objects are read and written.
     reply
-        Takes the eight bytes of an answer.
-    wrote
-        Called after each successful write with index, sub-index, and what was written: a number, or
+        Function that sends the eight bytes of a reply.
+    after_write
+        Function that is called after each write with index, sub-index and the value: an integer, or
         bytes in hexadecimal.
     """
 
@@ -378,88 +411,92 @@ class SdoServer:
         self,
         objects: ObjectDictionary,
         reply: Callable[[bytes], None],
-        wrote: Callable[[int, int, int | str], None],
+        after_write: Callable[[int, int, int | str], None],
     ) -> None:
         self._objects = objects
         self._reply = reply
-        self._wrote = wrote
+        self._after_write = after_write
         self.reset()
 
     def reset(self) -> None:
-        """Forget a transfer that has not ended."""
+        """Discard an unfinished SDO transfer."""
         self._index = self._sub = 0
-        self._awaited: int | None = None  # specifier of the segments of a transfer under way
+        self._expected_specifier: int | None = None  # command specifier of the expected segments
         self._buffer = b""
         self._toggle = 0
 
     def receive(self, data: bytes) -> None:
-        """Process a request; ignore one that does not have eight bytes."""
+        """Process an SDO request; ignore a frame that does not have eight bytes."""
         if len(data) != 8:
             return
         specifier = data[0] >> 5
         is_segment = specifier in (_DOWNLOAD_SEGMENT, _UPLOAD_SEGMENT)
         if not is_segment:
             self.reset()
-            _, self._index, self._sub = _HEAD.unpack_from(data)
+            _, self._index, self._sub = _SDO_HEADER.unpack_from(data)
         try:
             if is_segment:
-                self._go_on(specifier, data)
+                self._process_segment(specifier, data)
             elif specifier == _DOWNLOAD:
                 self._start_download(data)
             elif specifier == _UPLOAD:
                 self._start_upload()
-            elif specifier != _ABORTED:  # block transfers, and what is not a request at all
+            elif specifier != _ABORTED:  # block transfers and invalid specifiers
                 raise Abort(AbortCode.COMMAND)
         except Abort as abort:
-            self._reply(_ABORT.pack(0x80, self._index, self._sub, abort.code))
+            self._reply(_SDO_ABORT.pack(0x80, self._index, self._sub, abort.code))
             self.reset()
 
     def _start_download(self, data: bytes) -> None:
+        """Process a write request: write an expedited value, or expect segments."""
         command = data[0]
         entry = self._objects.find_writable(self._index, self._sub)
-        if command & _EXPEDITED:
+        if command & _EXPEDITED_BIT:
             size = min(entry.most_bytes, _EXPEDITED_SIZE)
-            if command & _SIZE_GIVEN:
+            if command & _SIZE_STATED_BIT:
                 size = _EXPEDITED_SIZE - (command >> 2 & 0x03)
             self._write(data[4 : 4 + size])
         else:
-            # A number has one length, so that the segments need not be held against this one.
-            stated = int.from_bytes(data[4:8], "little")
-            if command & _SIZE_GIVEN and not entry.fits(stated):
+            # An integer has one length, so the segments need not be compared with this length.
+            stated_size = int.from_bytes(data[4:8], "little")
+            if command & _SIZE_STATED_BIT and not entry.accepts_length(stated_size):
                 raise Abort(AbortCode.LENGTH)
-            self._awaited = _DOWNLOAD_SEGMENT
-        self._reply(_HEAD.pack(0x60, self._index, self._sub).ljust(8, b"\0"))
+            self._expected_specifier = _DOWNLOAD_SEGMENT
+        self._reply(_SDO_HEADER.pack(0x60, self._index, self._sub).ljust(8, b"\0"))
 
     def _start_upload(self) -> None:
+        """Process a read request: reply with an expedited value, or offer segments."""
         value = self._objects.read(self._index, self._sub)
         size = len(value)
         if 0 < size <= _EXPEDITED_SIZE:
-            head = _HEAD.pack(0x43 | (_EXPEDITED_SIZE - size) << 2, self._index, self._sub)
-            self._reply(head + value.ljust(_EXPEDITED_SIZE, b"\0"))
+            header = _SDO_HEADER.pack(0x43 | (_EXPEDITED_SIZE - size) << 2, self._index, self._sub)
+            self._reply(header + value.ljust(_EXPEDITED_SIZE, b"\0"))
             return
-        self._awaited = _UPLOAD_SEGMENT
+        self._expected_specifier = _UPLOAD_SEGMENT
         self._buffer = value
-        self._reply(_HEAD.pack(0x41, self._index, self._sub) + size.to_bytes(4, "little"))
+        self._reply(_SDO_HEADER.pack(0x41, self._index, self._sub) + size.to_bytes(4, "little"))
 
-    def _go_on(self, specifier: int, data: bytes) -> None:
-        """Receive or send the next segment."""
+    def _process_segment(self, specifier: int, data: bytes) -> None:
+        """Process the request for the next segment: store or send it."""
         command = data[0]
-        if specifier != self._awaited:
+        if specifier != self._expected_specifier:
             raise Abort(AbortCode.COMMAND)
-        if command & _TOGGLE != self._toggle:
+        if command & _TOGGLE_BIT != self._toggle:
             raise Abort(AbortCode.TOGGLE)
-        toggle, self._toggle = self._toggle, self._toggle ^ _TOGGLE
+        toggle, self._toggle = self._toggle, self._toggle ^ _TOGGLE_BIT
         if specifier == _UPLOAD_SEGMENT:
             segment, self._buffer = self._buffer[:_SEGMENT_SIZE], self._buffer[_SEGMENT_SIZE:]
             is_last = not self._buffer
-            head = toggle | (_SEGMENT_SIZE - len(segment)) << 1 | (_LAST_SEGMENT if is_last else 0)
-            self._reply(bytes([head]) + segment.ljust(_SEGMENT_SIZE, b"\0"))
+            header = (
+                toggle | (_SEGMENT_SIZE - len(segment)) << 1 | (_LAST_SEGMENT_BIT if is_last else 0)
+            )
+            self._reply(bytes([header]) + segment.ljust(_SEGMENT_SIZE, b"\0"))
         else:
             self._buffer += data[1 : 1 + _SEGMENT_SIZE - (command >> 1 & 0x07)]
-            # No entry that can be written is longer: else a client could fill the memory.
+            # No writable entry is longer. Without this check a client could fill the memory.
             if len(self._buffer) > self._objects.find_writable(self._index, self._sub).most_bytes:
                 raise Abort(AbortCode.LENGTH)
-            is_last = bool(command & _LAST_SEGMENT)
+            is_last = bool(command & _LAST_SEGMENT_BIT)
             if is_last:
                 self._write(self._buffer)
             self._reply(bytes([0x20 | toggle]).ljust(8, b"\0"))
@@ -467,20 +504,24 @@ class SdoServer:
             self.reset()
 
     def _write(self, data: bytes) -> None:
-        self._wrote(self._index, self._sub, self._objects.write(self._index, self._sub, data))
+        """Write a complete value to the dictionary, and report the write."""
+        self._after_write(self._index, self._sub, self._objects.write(self._index, self._sub, data))
 
 
 # EDS files
 
 _FIRST_INDEX = 0x1000
 """Lowest index of objects; below it are types and dummies, which cannot be read."""
-_IDENTITY = 0x1018
-_WATCHED, _ONE_NODE = 0x1016, 0x1_0000
+_IDENTITY_INDEX = 0x1018
+"""Index of the identity object."""
+_HEARTBEAT_CONSUMER_INDEX, _NODE_ID_UNIT = 0x1016, 0x1_0000
+"""Index of the consumer heartbeat time."""
 
-_BOOLEAN: Final = 0x01
-_KINDS: Final = {
+_BOOLEAN_TYPE: Final = 0x01
+"""Data type (CiA 301) of a boolean."""
+_TYPE_LETTERS: Final = {
     0x00: "I",  # if no type is stated
-    _BOOLEAN: "B",
+    _BOOLEAN_TYPE: "B",
     0x02: "b",
     0x03: "h",
     0x04: "i",
@@ -490,29 +531,32 @@ _KINDS: Final = {
     0x15: "q",
     0x1B: "Q",
 }
-"""Letters of :mod:`struct` for the numbers of CiA 301; the rest is stored as bytes."""
-_TIMES: Final = {0x0C: 6, 0x0D: 6}
-"""Bytes of time of day and of time difference."""
+"""Letters of :mod:`struct` for the integer types of CiA 301; other types are stored as bytes."""
+_TIME_TYPE_LENGTHS: Final = {0x0C: 6, 0x0D: 6}
+"""Lengths in bytes of the data types (CiA 301) for time of day and time difference."""
 _SDO_ACCESS: Final = {"const": "ro", "rwr": "rw", "rww": "rw"}
+"""Access right by SDO for an access right in a file that also concerns PDOs."""
 _PDO_DIRECTIONS: Final = {"ro": "t", "const": "t", "wo": "r", "rwr": "t", "rww": "r"}
+"""Kinds of PDO into which an object of an access right can be mapped."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceFile:
-    """Content of an EDS or DCF file."""
+    """Content of a drive's EDS or DCF file, for the simulated drive."""
 
     name: str
+    """Name of the file."""
     entries: Mapping[tuple[int, int], Description]
-    """Entries by index and sub-index."""
+    """Descriptions by index and sub-index."""
 
-    def numbers(self, first: int, last: int) -> Iterator[int]:
-        """Yield how far behind the first one the indices of this range are that there are."""
+    def present_offsets(self, first: int, last: int) -> Iterator[int]:
+        """Yield the existing indices in a range, as offsets from `first`."""
         for index in range(first, last + 1):
             if any(key in self.entries for key in ((index, 0), (index, 1))):
                 yield index - first
 
-    def subs(self, index: int) -> int:
-        """Return how many sub-indices an object has, from 1 on without a gap."""
+    def sub_index_count(self, index: int) -> int:
+        """Return the number of sub-indices of an object, counted from 1 on without a gap."""
         sub = 0
         while (index, sub + 1) in self.entries:
             sub += 1
@@ -520,63 +564,70 @@ class DeviceFile:
 
 
 def read_device(path: Path, node_id: int) -> DeviceFile:
-    """Read a file for a device that is to have this node id.
+    """Read the EDS or DCF file of the drive to simulate, for its node number.
 
     Raises
     ------
     DeviceError
-        If it cannot be read, or is not of that kind.
+        If the file cannot be read, or is no EDS or DCF file.
     """
     try:
         eds = read_eds(path, node_id)
     except EdsError as error:
         raise DeviceError(f"The simulated drive cannot be made: {error}") from None
     entries = {
-        key: _described(entry) for key, entry in eds.entries.items() if key[0] >= _FIRST_INDEX
+        key: _to_description(entry) for key, entry in eds.entries.items() if key[0] >= _FIRST_INDEX
     }
     for sub, number in enumerate((eds.vendor_id, eds.product_code, eds.revision), 1):
-        described = entries.get((_IDENTITY, sub))
-        if described is not None and not described.default:
-            entries[_IDENTITY, sub] = replace(described, default=number)
+        description = entries.get((_IDENTITY_INDEX, sub))
+        if description is not None and not description.default:
+            entries[_IDENTITY_INDEX, sub] = replace(description, default=number)
     highest: dict[int, int] = {}
     for index, sub in entries:
         highest[index] = max(sub, highest.get(index, 0))
     for index, last in highest.items():
-        described = entries.get((index, 0))
-        if last and described is not None and described.default is None and described.kind == "B":
-            entries[index, 0] = replace(described, default=last)
+        description = entries.get((index, 0))
+        if (
+            last
+            and description is not None
+            and description.default is None
+            and description.kind == "B"
+        ):
+            entries[index, 0] = replace(description, default=last)
     return DeviceFile(path.name, entries)
 
 
-def _described(entry: EdsEntry) -> Description:
-    """Return the file's description of an object, in the terms of a simulated node."""
+def _to_description(entry: EdsEntry) -> Description:
+    """Convert the entry of an EDS file to a description for a simulated node."""
     access = _SDO_ACCESS.get(entry.access, entry.access)
-    kind = _KINDS.get(entry.data_type)
+    kind = _TYPE_LETTERS.get(entry.data_type)
     if kind is None:
-        size = _TIMES.get(entry.data_type) or (entry.bits or 0) // 8
-        return Description("s", access, "", text=_bytes(entry, size), fixed=size > 0)
-    boolean = entry.data_type == _BOOLEAN
+        size = _TIME_TYPE_LENGTHS.get(entry.data_type) or (entry.bits or 0) // 8
+        return Description(
+            "s", access, "", text=_default_bytes(entry, size), has_fixed_length=size > 0
+        )
+    is_boolean = entry.data_type == _BOOLEAN_TYPE
     # A boolean takes one bit in a PDO, which is not needed here.
-    mappable = entry.mappable and not boolean
+    mappable = entry.mappable and not is_boolean
     directions = _PDO_DIRECTIONS.get(entry.access, "rt") if mappable else ""
-    low, high = entry.low, 1 if boolean else entry.high
-    if low is not None and high is not None and low >= high:  # as tools write that know none
+    low, high = entry.low, 1 if is_boolean else entry.high
+    if low is not None and high is not None and low >= high:  # written by tools without limits
         low = high = None
-    if entry.index == _WATCHED and high is not None and high < _ONE_NODE:
-        low = high = None  # some files limit the time in its lower half and forget the node above
-    default = None if entry.default is None else _fitted(entry.default, kind)
+    if entry.index == _HEARTBEAT_CONSUMER_INDEX and high is not None and high < _NODE_ID_UNIT:
+        low = high = None  # some files limit only the time in the lower half, without the node
+    default = None if entry.default is None else _to_type_range(entry.default, kind)
     return Description(kind, access, directions, default, low, high)
 
 
-def _fitted(value: int, kind: str) -> int:
-    """Return a value as its type holds it: files write negative ones as unsigned, too."""
+def _to_type_range(value: int, kind: str) -> int:
+    """Convert a value to the range of its type; files may state negative values as unsigned."""
     bits = 8 * calcsize("<" + kind)
     value &= (1 << bits) - 1
     return value - (1 << bits) if kind.islower() and value >> (bits - 1) else value
 
 
-def _bytes(entry: EdsEntry, size: int) -> bytes:
-    """Return the default of an entry stored as bytes, of a given size or, for 0, of its own."""
+def _default_bytes(entry: EdsEntry, size: int) -> bytes:
+    """Return the default of an entry as `size` bytes or, if that is 0, as its own bytes."""
     data = entry.content
     if entry.default is not None and size:
         data = (entry.default & (1 << 8 * size) - 1).to_bytes(size, "little")

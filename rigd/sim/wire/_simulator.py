@@ -1,7 +1,7 @@
-"""``rigd simulate``: a simulated rig as a separate process, on the wire.
+"""``rigd simulate``: process of a simulated rig on a CAN bus and serial line.
 
-One thread, one loop: it waits for frames, for bytes of the serial line, and for the time to pass.
-The operator's commands come over the control socket.
+One event loop in one thread waits for frames, for bytes of the serial line and for the next period.
+The operator's commands arrive on the control socket.
 """
 
 import fcntl
@@ -42,7 +42,7 @@ from rigd.sim.wire._links import (
     VirtualCan,
     is_virtual,
     listen,
-    without_transport,
+    without_transport_delay,
 )
 
 if TYPE_CHECKING:
@@ -59,15 +59,17 @@ __all__ = [
 ]
 
 _LONGEST_SOCKET_NAME = 107
-_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Longest name of a Unix socket in bytes."""
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that end the simulator."""
 
 
 # One simulation per rig
 
 
 @contextmanager
-def only_one(rig_name: str) -> Iterator[None]:
-    """Raise if another simulated rig of the same name runs."""
+def reserve_rig_name(rig_name: str) -> Iterator[None]:
+    """Reserve the rig's name within this context, or raise if another simulator uses it."""
     folder = runtime_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -81,65 +83,73 @@ def only_one(rig_name: str) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            running = find_simulator(rig_name)
-            who = "" if running is None else f" (process {running.pid})"
+            running_simulator = find_simulator(rig_name)
+            process_text = (
+                "" if running_simulator is None else f" (process {running_simulator.pid})"
+            )
             raise DeviceError(
-                f"A simulated rig of the profile {rig_name} is already running{who}; end it first, "
-                "or use that one."
+                f"A simulated rig of the profile {rig_name} is already running{process_text}; end "
+                "it first, or use that one."
             ) from None
-        # What a dead one left must go first: it names the sockets that are about to live again.
+        # Remove the address file of a dead simulator first: it names the sockets to be created.
         forget(rig_name)
         yield
 
 
 @contextmanager
 def socket_folder(rig_name: str) -> Iterator[Path]:
-    """Make room for the sockets, whose names must be short."""
+    """Yield a folder for the sockets whose name is short enough; it may be temporary."""
     folder = runtime_folder()
     if len(os.fsencode(folder / f"{rig_name}.control")) <= _LONGEST_SOCKET_NAME:
         yield folder
         return
-    with tempfile.TemporaryDirectory(prefix="rigd-", dir="/tmp") as short:
-        yield Path(short)
+    with tempfile.TemporaryDirectory(prefix="rigd-", dir="/tmp") as short_folder:
+        yield Path(short_folder)
 
 
 @contextmanager
 def stop_requested() -> Iterator[Callable[[], bool]]:
-    """Yield whether a signal to end the process has arrived; ignored ones stay ignored."""
+    """Yield a function that returns whether a signal to end the process has arrived.
+
+    Signals that the process ignores remain ignored.
+    """
     requested: list[int] = []
-    before = {number: signal.getsignal(number) for number in _STOPPING}
-    caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
-    for number in caught:
-        signal.signal(number, lambda got, _: requested.append(got))
+    previous_handlers = {number: signal.getsignal(number) for number in _STOP_SIGNALS}
+    handled_signals = [
+        number for number, handler in previous_handlers.items() if handler != signal.SIG_IGN
+    ]
+    for number in handled_signals:
+        signal.signal(number, lambda number_received, _: requested.append(number_received))
     try:
         yield lambda: bool(requested)
     finally:
-        for number in caught:
-            signal.signal(number, before[number])
+        for number in handled_signals:
+            signal.signal(number, previous_handlers[number])
 
 
 # Control socket
 
-Answer = Callable[[dict[str, Any]], dict[str, Any]]
-"""Answers a request."""
+RequestHandler = Callable[[dict[str, Any]], dict[str, Any]]
+"""Function that returns the reply to a request."""
 
-_LONGEST_LINE = 65_536
+_LONGEST_REQUEST = 65_536
+"""Longest request in bytes."""
 
 
 class ControlSocket:
-    """Answers requests of other processes, within the event loop.
+    """Unix socket on which other processes send requests, served by the event loop.
 
     Parameters
     ----------
     path
         Path of the Unix socket.
     handlers
-        Handlers of the event loop, by file descriptor; updated here.
+        Handlers of the event loop by file descriptor, which this class updates.
     answer
-        Takes a request, returns the reply.
+        Function that returns the reply to a request.
     """
 
-    def __init__(self, path: Path, handlers: Handlers, answer: Answer) -> None:
+    def __init__(self, path: Path, handlers: Handlers, answer: RequestHandler) -> None:
         self._handlers = handlers
         self._answer = answer
         self._links: dict[socket.socket, bytes] = {}
@@ -148,7 +158,7 @@ class ControlSocket:
         handlers[self._listener.fileno()] = self._accept
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the control socket and the connections of all clients."""
         for link in list(self._links):
             self._drop(link)
         del self._handlers[self._listener.fileno()]
@@ -156,6 +166,7 @@ class ControlSocket:
         self._path.unlink(missing_ok=True)
 
     def _accept(self) -> None:
+        """Accept the connection of a client, and register it in the event loop."""
         with suppress(OSError):
             link, _ = self._listener.accept()
             link.setblocking(False)
@@ -163,22 +174,24 @@ class ControlSocket:
             self._handlers[link.fileno()] = lambda: self._receive(link)
 
     def _receive(self, link: socket.socket) -> None:
+        """Receive bytes of a client, and reply to each complete line with a request."""
         try:
-            fresh = link.recv(_LONGEST_LINE)
+            received = link.recv(_LONGEST_REQUEST)
         except BlockingIOError:
             return
         except OSError:
-            fresh = b""
-        *lines, rest = (self._links[link] + fresh).split(b"\n")
-        if not fresh or len(rest) > _LONGEST_LINE:
+            received = b""
+        *lines, incomplete = (self._links[link] + received).split(b"\n")
+        if not received or len(incomplete) > _LONGEST_REQUEST:
             self._drop(link)
             return
-        self._links[link] = rest
+        self._links[link] = incomplete
         for line in lines:
-            with suppress(OSError):  # who asks and does not read gets no answer
+            with suppress(OSError):  # a client that does not read gets no reply
                 link.send(json.dumps(self._reply(line)).encode() + b"\n")
 
     def _reply(self, line: bytes) -> dict[str, Any]:
+        """Return the reply to one line with a JSON request."""
         try:
             request = json.loads(line)
         except ValueError:
@@ -188,6 +201,7 @@ class ControlSocket:
         return self._answer(request)
 
     def _drop(self, link: socket.socket) -> None:
+        """Close the connection of a client."""
         del self._links[link]
         del self._handlers[link.fileno()]
         link.close()
@@ -195,8 +209,8 @@ class ControlSocket:
 
 # The process
 
-_IDLE_S = 0.01
-"""Longest time that the loop waits while nothing is due."""
+_LONGEST_WAIT_S = 0.01
+"""Longest time in seconds that the event loop waits while nothing is due."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,24 +218,24 @@ class SimulatorOptions:
     """Options of a simulated rig."""
 
     lock_step: bool = False
-    """Advance one period per SYNC instead of by wall time."""
+    """Whether each SYNC advances the rig by one period, instead of wall time."""
     log: Path | None = None
-    """File of JSON lines, one an event; a new one."""
+    """Path of a new file of JSON lines, one per event; None: no file."""
     faults: tuple[Fault, ...] = ()
-    """Faults to inject."""
+    """Faults to inject at the start."""
     quiet: bool = False
     """Whether nothing is shown on the terminal."""
     eds: Path | None = None
-    """The manufacturer's file of the drive that is simulated; by default the profile's, if any."""
+    """Path of the EDS file of the drive to simulate; None: the profile's, if any."""
 
 
 def check_on_wire(rig: RigParameters) -> None:
-    """Raise if a rig has nothing that can be simulated on the wire.
+    """Raise if a rig has no drive on a CAN bus that could be simulated.
 
     Raises
     ------
     WrongUseError
-        If it has no drive on a bus.
+        If the rig has no drive on a bus.
     """
     if rig.cia402 is None or rig.can is None:
         raise WrongUseError(
@@ -244,31 +258,31 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
     Returns
     -------
     int
-        Exit code.
+        Exit code of the process.
 
     Raises
     ------
     WrongUseError
-        If the profile cannot be simulated on the wire or has unknown values, a fault is none that
-        this rig can have, or the log's name is taken.
+        If the profile cannot be simulated on a bus or has unknown values, a fault is not possible
+        on this rig, or the log file exists.
     DeviceError
-        If its simulated rig is already running, or if sockets or files cannot be made.
+        If its simulated rig is already running, or if sockets or files cannot be created.
     """
     check_on_wire(rig)
-    if unknown := describe_unknown_values(rig):
-        raise WrongUseError(unknown)
+    if unknown_text := describe_unknown_values(rig):
+        raise WrongUseError(unknown_text)
     if rig.devices.sensor != "ati_serial":
-        rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses
+        rig = replace(rig, ati_serial=None)  # a profile may describe a sensor that it does not use
     with ExitStack() as stack:
-        stack.enter_context(only_one(rig.name))
+        stack.enter_context(reserve_rig_name(rig.name))
         log = EventLog(options.log, quiet=options.quiet)
         stack.callback(log.close)
-        starting = stack.enter_context(ExitStack())
-        starting.callback(log.discard)
-        process = _Process(rig, options, log, stack)
+        startup_stack = stack.enter_context(ExitStack())
+        startup_stack.callback(log.discard)
+        process = _SimulatorProcess(rig, options, log, stack)
         stop = stack.enter_context(stop_requested())
         process.start()
-        starting.pop_all()
+        startup_stack.pop_all()
         process.serve(stop)
     return 0
 
@@ -281,19 +295,20 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     rig_name
         Name of the profile.
     specs
-        Faults, as for `parse_fault`.
+        Faults in the syntax of `parse_fault`; an empty list requests the status.
 
     Returns
     -------
     list of str
-        The faults as parsed, and how to end one that lasts; without any, lines on its state.
+        One line per fault, with the command that ends it if it is persistent; without faults, the
+        lines of the simulator's status.
 
     Raises
     ------
     DeviceError
-        If no simulated rig of that name runs, or it refuses.
+        If no simulated rig of the profile runs, or it refuses a fault.
     WrongUseError
-        If a fault has a syntax error; then none is injected.
+        If a fault has a syntax error; then no fault is injected.
     """
     address = find_simulator(rig_name)
     if address is None:
@@ -314,8 +329,8 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     return lines
 
 
-class _Process:
-    """The lines to the outside, and the loop that serves them."""
+class _SimulatorProcess:
+    """Process of a simulated rig: its connections, and the event loop that serves them."""
 
     def __init__(
         self, rig: RigParameters, options: SimulatorOptions, log: EventLog, stack: ExitStack
@@ -324,15 +339,15 @@ class _Process:
         self._rig = rig
         self._options = options
         self._log = log
-        self._stack = stack
+        self._exit_stack = stack
         self._handlers: Handlers = {}
-        self._file: DeviceFile | None = None
+        self._device_file: DeviceFile | None = None
         assert rig.cia402 is not None
         eds = options.eds or (Path(rig.cia402.eds) if rig.cia402.eds else None)
         if eds is not None:
             from rigd.sim.wire._object_dictionary import read_device
 
-            self._file = read_device(eds, rig.cia402.node_id)
+            self._device_file = read_device(eds, rig.cia402.node_id)
         folder = stack.enter_context(socket_folder(rig.name))
         self._bus: VirtualBus | VirtualCan
         can_socket = ""
@@ -344,14 +359,14 @@ class _Process:
                 Path(can_socket), self._handlers, self._on_frames, self._on_clients
             )
         stack.callback(self._bus.close)
-        self._line: PtyLine | None = None
+        self._serial_line: PtyLine | None = None
         if rig.ati_serial is not None:
-            self._line = PtyLine(self._handlers, self._on_bytes, self._on_port)
-            stack.callback(self._line.close)
-        stated = None if rig.simulation is None else rig.simulation.seed
-        self._seed = fresh_seed() if stated is None else stated
+            self._serial_line = PtyLine(self._handlers, self._on_bytes, self._on_port)
+            stack.callback(self._serial_line.close)
+        stated_seed = None if rig.simulation is None else rig.simulation.seed
+        self._seed = fresh_seed() if stated_seed is None else stated_seed
         self._sessions = 0
-        self._world = self._make_world()
+        self._bus_simulation = self._make_bus_simulation()
         control = ControlSocket(folder / f"{rig.name}.control", self._handlers, self._answer)
         stack.callback(control.close)
         self._address = SimulatorAddress(
@@ -364,104 +379,118 @@ class _Process:
         )
 
     def start(self) -> None:
-        """Inject the initial faults, and print the addresses of the rig."""
+        """Inject the initial faults, print the rig's addresses, and write the address file."""
         for fault in self._options.faults:
-            self._world.inject(fault)
-        started = {} if self._options.lock_step else {"monotonic_ns": time.monotonic_ns()}
+            self._bus_simulation.inject(fault)
+        start_values = {} if self._options.lock_step else {"monotonic_ns": time.monotonic_ns()}
         self._log(
             "simulator",
             "started",
             rig=self._rig.name,
             lock_step=self._options.lock_step,
-            **({} if self._file is None else {"eds": self._file.name}),
-            **started,
+            **({} if self._device_file is None else {"eds": self._device_file.name}),
+            **start_values,
         )
-        for line in self._invitation():
+        for line in self._start_messages():
             self._log.print_line(line)
         announce(self._rig.name, self._address)
-        self._stack.callback(forget, self._rig.name)
+        self._exit_stack.callback(forget, self._rig.name)
         # Set-up leaves objects that are never freed: exclude them from garbage collection.
         gc.collect()
         gc.freeze()
         gc.disable()
-        self._stack.callback(gc.enable)
+        self._exit_stack.callback(gc.enable)
         if not self._options.lock_step:
-            # Replies in time while other processes work too; below every real-time loop. Of 2500
-            # replies on two busy cores 7 were late with it and 95 without.
+            # Real-time priority for replies in time while other processes work, below every
+            # real-time loop. Of 2500 replies on two busy cores, 7 were late with it, 95 without.
             with suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
 
     def serve(self, stop: Callable[[], bool]) -> None:
-        """Serve until a stop is requested."""
-        handlers, world, line, log = self._handlers, self._world, self._line, self._log
+        """Run the simulator's event loop until a stop is requested."""
+        handlers, bus_simulation, line, log = (
+            self._handlers,
+            self._bus_simulation,
+            self._serial_line,
+            self._log,
+        )
         now_ns = time.monotonic_ns
         poll_ns = 0
         while not stop():
-            ready, _, _ = select.select(handlers, (), (), world.wait_s(now_ns(), _IDLE_S))
+            ready, _, _ = select.select(
+                handlers, (), (), bus_simulation.wait_s(now_ns(), _LONGEST_WAIT_S)
+            )
             for descriptor in ready:
                 handler = handlers.get(descriptor)
                 if handler is not None:  # not closed by one of the others
                     handler()
             now = now_ns()
-            world.elapse(now)
+            bus_simulation.elapse(now)
             if now > poll_ns:
-                poll_ns = now + round(_IDLE_S * 1e9)
+                poll_ns = now + round(_LONGEST_WAIT_S * 1e9)
                 log.flush()
                 if line is not None:
                     line.poll()
         self._log("simulator", "ended")
 
-    def _make_world(self) -> BusSimulation:
-        # Late: a process that only injects a fault needs none of it.
+    def _make_bus_simulation(self) -> BusSimulation:
+        """Create the bus simulation with its drive and sensor."""
+        # Imported late: a process that only injects a fault does not need it.
         from rigd.sim.wire._drive_node import DriveNode
 
         rig = self._rig
-        simulated = self._simulated = SimulatedRig(without_transport(rig))
-        line = self._line
-        world = BusSimulation(
+        simulated_rig = self._simulated_rig = SimulatedRig(without_transport_delay(rig))
+        line = self._serial_line
+        bus_simulation = BusSimulation(
             rig,
-            simulated,
+            simulated_rig,
             lock_step=self._options.lock_step,
             now_ns=time.monotonic_ns(),
             send=self._bus.send,
-            write=_nowhere if line is None else line.write,
-            cut=self._cut,
-            mend=self._mend,
+            write=_discard_output if line is None else line.write,
+            cut=self._interrupt,
+            mend=self._reconnect,
             log=self._log,
         )
         assert rig.cia402 is not None
         drive = DriveNode(
             rig,
-            simulated,
-            world.step,
-            world.can_port("drive"),
+            simulated_rig,
+            bus_simulation.step,
+            bus_simulation.can_sender("drive"),
             self._log,
             sync_timeout_s=self._sync_timeout_s(),
-            file=self._file,
+            file=self._device_file,
         )
-        world.join("drive", drive)
+        bus_simulation.add_node("drive", drive)
         if rig.ati_serial is not None:
             from rigd.sim.wire._ati_serial_device import AtiSerialDevice
 
-            world.join_serial(AtiSerialDevice(rig, simulated, world.serial_port(), self._log))
+            bus_simulation.add_serial_device(
+                AtiSerialDevice(rig, simulated_rig, bus_simulation.serial_writer(), self._log)
+            )
         elif rig.ati_can is not None:
             from rigd.sim.wire._ati_can_node import AtiCanNode
 
-            world.join("sensor", AtiCanNode(rig, simulated, world.can_port("sensor"), self._log))
-        return world
+            bus_simulation.add_node(
+                "sensor",
+                AtiCanNode(rig, simulated_rig, bus_simulation.can_sender("sensor"), self._log),
+            )
+        return bus_simulation
 
     def _sync_timeout_s(self) -> float:
-        """Time after which the drive faults without a SYNC."""
+        """Return the time in seconds without SYNC after which the drive goes to fault."""
         drive = self._rig.cia402
         assert drive is not None
         if drive.own_watchdog_s:
             return drive.own_watchdog_s
-        if self._file is not None and (0x1006, 0) not in self._file.entries:
+        if self._device_file is not None and (0x1006, 0) not in self._device_file.entries:
             return math.inf  # no period is configured
-        # The tolerance of others is not known: use the heartbeat timeout.
+        # The tolerance of other drives is not known: use the heartbeat timeout.
         return drive.heartbeat_timeout_s
 
-    def _invitation(self) -> Iterator[str]:
+    def _start_messages(self) -> Iterator[str]:
+        """Yield the lines for the operator at the start: addresses, and commands to try."""
         address, rig = self._address, self._rig
         assert rig.can is not None
         mode = "one period per SYNC (lock-step)" if address.lock_step else "by wall time"
@@ -469,51 +498,59 @@ class _Process:
         yield f"  CAN      {address.can_socket or f'{rig.can.channel} (virtual)'}"
         if address.serial_port:
             yield f"  serial   {address.serial_port}"
-        if self._file is not None:
-            objects = len({index for index, _ in self._file.entries})
-            yield f"  drive    as {self._file.name} has it, {objects} objects"
-        fast = " --fast" if address.lock_step else ""
-        yield f"  session  rigd run chirp --profile {rig.name}{fast}"
+        if self._device_file is not None:
+            objects = len({index for index, _ in self._device_file.entries})
+            yield f"  drive    as {self._device_file.name} has it, {objects} objects"
+        fast_option = " --fast" if address.lock_step else ""
+        yield f"  session  rigd run chirp --profile {rig.name}{fast_option}"
         yield f"  fault    rigd inject --profile {rig.name} freeze,device=drive,for=0.5"
 
     def _on_frames(self, frames: list[bytes], origin: object) -> None:
-        self._world.hear(frames, origin, time.monotonic_ns())
+        """Pass frames of a host to the simulation."""
+        self._bus_simulation.receive_frames(frames, origin, time.monotonic_ns())
 
     def _on_bytes(self, data: bytes) -> None:
-        self._world.hear_serial(data)
+        """Pass bytes of the serial host to the simulation."""
+        self._bus_simulation.receive_serial(data)
 
-    def _on_clients(self, what: str, count: int) -> None:
-        self._log("bus", what, clients=count)
+    def _on_clients(self, event: str, count: int) -> None:
+        """Log that a client of the CAN bus has connected or disconnected."""
+        self._log("bus", event, clients=count)
         if count == 0:
-            self._world.left_alone(time.monotonic_ns())
+            self._bus_simulation.stop_waiting(time.monotonic_ns())
 
     def _on_port(self, is_open: bool) -> None:
+        """Log that the serial port was opened or closed."""
         self._log("line", "port opened" if is_open else "port closed")
 
-    def _cut(self, device: str) -> None:
+    def _interrupt(self, device: str) -> None:
+        """Interrupt the simulated CAN bus or serial line."""
         if device == "bus":
             self._bus.close()
-        elif self._line is not None:
-            self._line.close()
+        elif self._serial_line is not None:
+            self._serial_line.close()
 
-    def _mend(self, device: str) -> None:
+    def _reconnect(self, device: str) -> None:
+        """Reconnect the simulated CAN bus or serial line."""
         if device == "bus":
             self._bus.open()
-        elif self._line is not None:
-            self._line.open()
-            # The line may be another one now: the next process has to find it.
+        elif self._serial_line is not None:
+            self._serial_line.open()
+            # The line may have a new name, which the next process has to find.
             self._address = replace(self._address, serial_port=self._port)
             announce(self._rig.name, self._address)
 
     @property
     def _port(self) -> str:
-        return "" if self._line is None else self._line.port
+        """Name of the serial port for the host; empty if there is none."""
+        return "" if self._serial_line is None else self._serial_line.port
 
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Return the reply to a request on the control socket."""
         if "inject" in request:
             try:
                 fault = parse_fault(str(request["inject"]))
-                self._world.inject(fault)
+                self._bus_simulation.inject(fault)
             except (FaultError, DeviceError) as error:
                 return {"error": str(error)}
             return {"injected": str(fault)}
@@ -525,26 +562,26 @@ class _Process:
         if "status" in request:
             return {
                 "rig": self._rig.name,
-                "drive": "default" if self._file is None else self._file.name,
-                "time_s": round(self._world.now_s, 6),
+                "drive": "default" if self._device_file is None else self._device_file.name,
+                "time_s": round(self._bus_simulation.now_s, 6),
                 "lock_step": self._options.lock_step,
-                "moved_periods": self._world.moved,
-                "syncs": self._world.syncs,
+                "moved_periods": self._bus_simulation.rig_periods,
+                "syncs": self._bus_simulation.syncs,
                 "clients": self._bus.clients,
                 "lost_frames": self._bus.lost,
-                "lost_bytes": 0 if self._line is None else self._line.lost,
-                "disturbed": self._world.disturbed,
+                "lost_bytes": 0 if self._serial_line is None else self._serial_line.lost,
+                "disturbed": self._bus_simulation.disturbed,
             }
         return {"error": "A request has to be 'inject', 'status' or 'renew_noise'."}
 
     def _renew_noise(self, seed: int | None) -> int:
-        """Begin the noise of a session; without a seed that of the next one on this rig."""
+        """Restart the noise with a seed (None: the next of the series), and return the seed."""
         if seed is None:
             self._sessions += 1
             seed = session_seed(self._seed, self._sessions)
-        self._simulated.begin_session(seed)
+        self._simulated_rig.begin_session(seed)
         return seed
 
 
-def _nowhere(data: bytes) -> None:
-    """Discard output; a rig without a serial line writes none."""
+def _discard_output(data: bytes) -> None:
+    """Discard output, for a rig without a serial line."""

@@ -236,7 +236,7 @@ def fuzz_modbus(n, seed):
         if rng.random() < 0.2:
             del reply[rng.randrange(len(reply) + 1) :]
         try:
-            content = protocol.content_of(request, bytes(reply))
+            content = protocol.reply_content(request, bytes(reply))
         except (protocol.BadReply, protocol.ExceptionResponse):
             content = None
         if content is not None:

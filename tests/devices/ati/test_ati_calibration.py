@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rigd.devices.ati._calibration import (
-    CAN_CRITICAL,
-    SERIAL_CRITICAL,
+    CRITICAL_CAN_STATUS_BITS,
+    CRITICAL_SERIAL_STATUS_BITS,
     WIRE_ORDER,
     Calibration,
-    can_status,
-    first_register,
+    describe_can_status,
+    describe_serial_status,
+    first_block_register,
     parse_block,
+    printable_text,
     same_serial_number,
-    serial_status,
-    text_of,
     wrench_function,
 )
 
@@ -185,23 +185,23 @@ def test_serial_numbers():
 
 
 def test_text():
-    assert text_of(b"SI-20-1\0\0\0") == "SI-20-1"
-    assert text_of(b"FT1\xff\xff") == "FT1"
-    assert text_of(b"\0" * 8) == ""
-    assert text_of(b"\x00\x07") == "00 07"
-    assert text_of(b"A\xb0B") == "41 b0 42"
+    assert printable_text(b"SI-20-1\0\0\0") == "SI-20-1"
+    assert printable_text(b"FT1\xff\xff") == "FT1"
+    assert printable_text(b"\0" * 8) == ""
+    assert printable_text(b"\x00\x07") == "00 07"
+    assert printable_text(b"A\xb0B") == "41 b0 42"
 
 
 @settings(max_examples=60)
 @given(st.binary(max_size=32))
 def test_text_is_always_printable(raw):
-    assert text_of(raw).isprintable()
+    assert printable_text(raw).isprintable()
 
 
 def test_where_calibration_blocks_are():
-    assert first_register(1) == 0x00E3
-    assert first_register(2) == 0x01A3
-    assert first_register(16) == 0x0C23
+    assert first_block_register(1) == 0x00E3
+    assert first_block_register(2) == 0x01A3
+    assert first_block_register(16) == 0x0C23
 
 
 def test_a_calibration_block(fakes):
@@ -249,19 +249,19 @@ def test_a_damaged_calibration_block_is_read_or_refused(fakes, damage):
 
 
 def test_status_words():
-    assert can_status(0) == serial_status(0) == []
-    assert can_status(0x8001) == ["its watchdog has reset the board"]
-    assert can_status(0x0040) == ["the active calibration is bad"]
-    assert serial_status(0x0040) == ["status bit 6, which has no known meaning, is set"]
-    assert can_status(0x0800) == ["the sensor is too hot"]
-    assert serial_status(0x0800) == ["the reading of its thermistor is too high"]
-    assert "too much current" in serial_status(0x0200)[0]
-    assert "no known meaning" in can_status(0x0200)[0]
-    assert len(can_status(0x7FFF)) == 15
+    assert describe_can_status(0) == describe_serial_status(0) == []
+    assert describe_can_status(0x8001) == ["its watchdog has reset the board"]
+    assert describe_can_status(0x0040) == ["the active calibration is bad"]
+    assert describe_serial_status(0x0040) == ["status bit 6, which has no known meaning, is set"]
+    assert describe_can_status(0x0800) == ["the sensor is too hot"]
+    assert describe_serial_status(0x0800) == ["the reading of its thermistor is too high"]
+    assert "too much current" in describe_serial_status(0x0200)[0]
+    assert "no known meaning" in describe_can_status(0x0200)[0]
+    assert len(describe_can_status(0x7FFF)) == 15
 
 
 def test_critical_bits_are_those_of_the_table():
     critical_on_can = {1, 2, 3, 4, 5, 6, 7, 11, 12}
     critical_on_serial = {1, 2, 3, 4, 5, 7, 9, 10, 11, 12, 13}
-    assert sum(1 << bit for bit in critical_on_can) == CAN_CRITICAL
-    assert sum(1 << bit for bit in critical_on_serial) == SERIAL_CRITICAL
+    assert sum(1 << bit for bit in critical_on_can) == CRITICAL_CAN_STATUS_BITS
+    assert sum(1 << bit for bit in critical_on_serial) == CRITICAL_SERIAL_STATUS_BITS

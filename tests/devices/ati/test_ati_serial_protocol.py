@@ -25,9 +25,9 @@ def test_requests_have_the_published_bytes():
 
 
 def test_published_replies_are_understood():
-    assert protocol.content_of(protocol.START_STREAMING, hexed("0A 46 01 A2 62")) == b"\x01"
-    assert protocol.content_of(protocol.UNLOCK, hexed("0A 6A 01 BE A2")) == b"\x01"
-    assert protocol.content_of(protocol.LOCK, hexed("0A 6A 01 BE A2")) == b"\x01"
+    assert protocol.reply_content(protocol.START_STREAMING, hexed("0A 46 01 A2 62")) == b"\x01"
+    assert protocol.reply_content(protocol.UNLOCK, hexed("0A 6A 01 BE A2")) == b"\x01"
+    assert protocol.reply_content(protocol.LOCK, hexed("0A 6A 01 BE A2")) == b"\x01"
 
 
 def test_gains_and_offsets_are_written_in_twelve_bytes(fakes):
@@ -39,7 +39,7 @@ def test_gains_and_offsets_are_written_in_twelve_bytes(fakes):
     assert protocol.ACTIVE_GAINS == 0
     confirmed = body[:6] + fakes.crc_bitwise(body[:6])
     assert protocol.reply_length(request) == len(confirmed) == 8
-    assert protocol.content_of(request, confirmed) == body[2:6]
+    assert protocol.reply_content(request, confirmed) == body[2:6]
 
 
 def test_registers_are_read_high_byte_first(fakes):
@@ -47,7 +47,7 @@ def test_registers_are_read_high_byte_first(fakes):
     reply = hexed("0A 03 04 12 34 FF FE")
     reply += fakes.crc_bitwise(reply)
     assert protocol.reply_length(request) == len(reply)
-    assert protocol.registers_of(protocol.content_of(request, reply)) == (0x1234, 0xFFFE)
+    assert protocol.unpack_registers(protocol.reply_content(request, reply)) == (0x1234, 0xFFFE)
 
 
 @settings(max_examples=100)
@@ -61,7 +61,7 @@ def test_the_checksum_of_the_standard_example():
 
 
 def reply_to_status(fakes, body):
-    return protocol.content_of(
+    return protocol.reply_content(
         protocol.read_registers(protocol.STATUS_WORD, 1), body + fakes.crc_bitwise(body)
     )
 
@@ -78,7 +78,7 @@ def test_a_declined_start_and_lock_are_refusals(fakes):
     for request in (protocol.START_STREAMING, protocol.UNLOCK):
         body = request[:2] + b"\x00"
         with pytest.raises(protocol.ExceptionResponse, match="code 0"):
-            protocol.content_of(request, body + fakes.crc_bitwise(body))
+            protocol.reply_content(request, body + fakes.crc_bitwise(body))
 
 
 @pytest.mark.parametrize(
@@ -100,12 +100,12 @@ def test_confirmation_of_other_registers(fakes):
     request = protocol.write_registers(0, (1, 2))
     body = hexed("0A 10 00 00 00 03")
     with pytest.raises(protocol.BadReply, match="other registers"):
-        protocol.content_of(request, body + fakes.crc_bitwise(body))
+        protocol.reply_content(request, body + fakes.crc_bitwise(body))
 
 
 def test_silence_is_a_bad_reply():
     with pytest.raises(protocol.BadReply, match="no reply"):
-        protocol.content_of(protocol.UNLOCK, b"")
+        protocol.reply_content(protocol.UNLOCK, b"")
 
 
 @settings(max_examples=200)
@@ -124,7 +124,7 @@ def test_a_damaged_reply_is_never_taken(fakes, at, mask, cut, extra):
     for reply in (bytes(damaged), sound[:cut] + extra):
         if reply != sound:
             with pytest.raises(protocol.BadReply):
-                protocol.content_of(request, reply)
+                protocol.reply_content(request, reply)
 
 
 # The record stream

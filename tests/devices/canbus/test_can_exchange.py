@@ -155,7 +155,7 @@ def test_regardless_of_a_disturbed_bus_frames_go_and_come(ends, exchange, kind, 
     exchange.subscribe(0x181, got.append)
     far.send(ERROR | kind, data)
     far.send(0x181, b"x")
-    with exchange.regardless():
+    with exchange.ignore_errors():
         exchange.drain()
         exchange.send(pack_frame(0x80))
         far.send(0x181, b"y")
@@ -169,7 +169,7 @@ def test_regardless_of_a_disturbed_bus_frames_go_and_come(ends, exchange, kind, 
 def test_regardless_of_a_line_that_is_gone_waiting_ends_in_time(ends, exchange):
     _, far = ends
     far.socket.close()
-    with exchange.regardless():
+    with exchange.ignore_errors():
         exchange.drain()
         before = time.monotonic_ns()
         assert not exchange.wait_until(lambda: False, before + 20_000_000)
@@ -196,7 +196,7 @@ def test_regardless_of_a_port_that_cannot_be_waited_for_the_computer_is_not_kept
             raise DeviceError("it cannot be waited for")
 
     exchange = CanExchange(Broken())
-    with exchange.regardless():
+    with exchange.ignore_errors():
         assert not exchange.wait_until(lambda: False, time.monotonic_ns() + 50_000_000)
     assert 0 < tries <= 10 * 52  # ten a drain, a drain a millisecond
     with pytest.raises(DeviceError, match="cannot be read"):

@@ -20,9 +20,9 @@ class Box:
 class Line:
     """A device that answers with the number of the request, and a line that loses or holds."""
 
-    def __init__(self, *, pauses=True):
+    def __init__(self, *, may_pause=True):
         self.inbox = Box()
-        self.pairing = ReplyPairing(self.inbox, pauses=pauses)
+        self.pairing = ReplyPairing(self.inbox, may_pause=may_pause)
         self.waiting = deque()
         self.period = 0
         self.number = 0
@@ -42,17 +42,17 @@ class Line:
         if before:
             self.deliver()  # between the last reading and this request
         self.period += 1
-        if self.pairing.wants_pause():
-            self.pairing.pause()
+        if self.pairing.needs_pause():
+            self.pairing.register_pause()
             self.paused += 1
         else:
-            self.pairing.ask()
+            self.pairing.register_request()
             self.number += 1
             if event != "lost":
                 self.waiting.append((self.period + late, self.number))
         if event != "held":
             self.deliver(self.period)
-        return self.pairing.settle()
+        return self.pairing.process_replies()
 
     def right(self):
         return self.inbox.number == self.number
@@ -104,7 +104,7 @@ def test_after_a_loss_one_tick_without_a_request_tells(losses):
     line.tick()
     assert not any(line.tick("lost") for _ in range(losses))
     assert [line.tick() for _ in range(4)] == [False, False, True, True]
-    assert (line.paused, line.pairing.lost, line.pairing.unproven) == (1, losses, 0)
+    assert (line.paused, line.pairing.lost, line.pairing.lost_without_proof) == (1, losses, 0)
     assert line.right()
 
 
@@ -135,8 +135,8 @@ def test_several_periods_of_replies_at_once():
 
 
 def test_where_time_passes_with_the_requests_a_loss_stays_unproven():
-    line = Line(pauses=False)
+    line = Line(may_pause=False)
     line.tick()
     fresh = [line.tick(event) for event in ("lost", "lost", *["whole"] * 5)]
     assert fresh == [False] * 2 + [False] * 3 + [True] * 2
-    assert (line.paused, line.pairing.lost, line.pairing.unproven) == (0, 2, 2)
+    assert (line.paused, line.pairing.lost, line.pairing.lost_without_proof) == (0, 2, 2)

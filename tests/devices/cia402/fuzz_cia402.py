@@ -81,7 +81,7 @@ def connected(rig, seed):
     drive = Cia402Drive(rig, None)
     drive._subscribe(exchange)
     drive._node = Node(rig, exchange, drive._frames, drive._inbox)
-    drive._inbox.watching = True
+    drive._inbox.must_stay_operational = True
     return drive, port
 
 
@@ -106,7 +106,7 @@ def fuzz(rig, frames, seed=1):
             assert not drive._enabled
             # As after the operator's reset.
             drive._inbox.clear()
-            drive._inbox.watching = drive._inbox.received = True
+            drive._inbox.must_stay_operational = drive._inbox.heartbeat_received = True
             drive._may_be_on = False
     drive.disable()
     return ends

@@ -28,8 +28,8 @@ EDS = Path(package.__file__).with_name("drive.eds")
         (FRAMES.stop, 0x000, "02 05"),
         (FRAMES.pre_operational, 0x000, "80 05"),
         (FRAMES.disable_voltage, 0x605, "2B 40 60 00 00 00 00 00"),
-        (FRAMES.forget_heartbeat, 0x605, "23 16 10 01 00 00 00 00"),
-        (FRAMES.ask_mode, 0x605, "40 61 60 00 00 00 00 00"),
+        (FRAMES.end_heartbeat_monitoring, 0x605, "23 16 10 01 00 00 00 00"),
+        (FRAMES.read_mode_request, 0x605, "40 61 60 00 00 00 00 00"),
         (FRAMES.rpdo(0x00, 0), 0x205, "00 00 00 00"),
         (FRAMES.rpdo(0x06, 0), 0x205, "06 00 00 00"),
         (FRAMES.rpdo(0x0F, 1000), 0x205, "0F 00 E8 03"),
@@ -135,7 +135,7 @@ def test_the_state_of_every_statusword():
     seen = Counter()
     for word in range(0x10000):
         expected = words.get(word & 0b100_1111, with_bit_5.get(word & 0b110_1111))
-        state = protocol.state_of(word)
+        state = protocol.drive_state(word)
         assert state is (expected or protocol.DriveState.UNKNOWN), f"{word:#06x}"
         seen[state] += 1
     assert set(seen) == set(protocol.DriveState)
@@ -143,7 +143,7 @@ def test_the_state_of_every_statusword():
 
 def test_no_two_states_share_a_statusword():
     for word in range(0x80):
-        assert sum(word & mask == value for mask, value, _ in protocol._TABLE) <= 1
+        assert sum(word & mask == value for mask, value, _ in protocol._STATE_CODES) <= 1
 
 
 def test_every_error_code_has_words_of_its_class():

@@ -151,7 +151,7 @@ def test_a_late_reply_is_never_taken_for_the_next_ticks(make_drive, rig, scripte
 def test_a_reply_of_another_length_counts_as_an_error_of_the_bus(make_drive, rig):
     drive = make_drive(rig)
     drive.connect()
-    drive._inbox.take_tpdo(b"\x27\x16")
+    drive._inbox.store_tpdo(b"\x27\x16")
     assert drive.health().errors == 1
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigd.control import close_loop
-from rigd.devices.cia402._transitions import TorqueFollowing
+from rigd.devices.cia402._transitions import TorqueFollowingCheck
 from rigd.devices.contracts import DeviceError
 from rigd.excitation import chirp
 from rigd.profile import load_profile
@@ -15,7 +15,7 @@ from rigd.profile import load_profile
 
 @pytest.fixture
 def following():
-    return TorqueFollowing("Drive", 10.0)  # 100 per mille
+    return TorqueFollowingCheck("Drive", 10.0)  # 100 per mille
 
 
 def run(following, commands, actuals):
@@ -42,7 +42,7 @@ def test_within_the_tolerance_nothing_is_said(following):
 
 
 def test_zero_compares_nothing():
-    run(TorqueFollowing("Drive", 0.0), [900] * 50, [0] * 50)
+    run(TorqueFollowingCheck("Drive", 0.0), [900] * 50, [0] * 50)
 
 
 def test_enabling_begins_anew(following):
@@ -75,7 +75,7 @@ class TestADriveThatMeasuresItsTorque:
 
     def drive(self, commands, response_s, lost_from=None):
         """Return after how many ticks it is found, or None."""
-        following = TorqueFollowing("Drive", 10.0, response_s, 1e-3)
+        following = TorqueFollowingCheck("Drive", 10.0, response_s, 1e-3)
         share = 1 - exp(-1e-3 / self.LAG_S)
         held = pending = 0
         actual = 0.0

@@ -7,8 +7,8 @@ import pytest
 
 from rigd.devices.cia402.requirements import (
     ACCEPTABLE,
-    CORE,
-    OPTIONAL,
+    CORE_REQUIREMENTS,
+    OPTIONAL_REQUIREMENTS,
     REQUIREMENTS,
     AllowedValue,
     ObjectAccess,
@@ -22,29 +22,29 @@ def test_each_object_stands_there_once():
 
 
 def test_what_is_core_is_refused_and_says_why():
-    for each in CORE:
+    for each in CORE_REQUIREMENTS:
         assert each.core
-        assert each.address in each.missing(ACCEPTABLE)
+        assert each.address in each.refusal_reason(ACCEPTABLE)
         assert each.sentence.endswith(".")
 
 
 def test_what_is_optional_has_a_stand_in_or_has_to_be_accepted_by_name():
-    for each in OPTIONAL:
+    for each in OPTIONAL_REQUIREMENTS:
         assert not each.core
         assert each.stand_in or each.accept, each.address
         assert each.accept in ("", *ACCEPTABLE)
-        assert each.missing(ACCEPTABLE) == ""
-        assert bool(each.missing()) == bool(each.accept)
+        assert each.refusal_reason(ACCEPTABLE) == ""
+        assert bool(each.refusal_reason()) == bool(each.accept)
 
 
 def test_every_name_that_can_be_accepted_belongs_to_an_object():
-    assert {each.accept for each in OPTIONAL} - {""} == set(ACCEPTABLE)
+    assert {each.accept for each in OPTIONAL_REQUIREMENTS} - {""} == set(ACCEPTABLE)
 
 
 @pytest.mark.parametrize("name", ACCEPTABLE)
 def test_a_refusal_names_the_way_to_accept_it(name):
-    row = next(each for each in OPTIONAL if each.accept == name)
-    told = row.missing([other for other in ACCEPTABLE if other != name])
+    row = next(each for each in OPTIONAL_REQUIREMENTS if each.accept == name)
+    told = row.refusal_reason([other for other in ACCEPTABLE if other != name])
     assert f'cia402.accept_without = ["{name}"]' in told
     assert row.name in told
 

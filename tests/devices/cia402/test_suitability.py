@@ -14,7 +14,7 @@ from eds_files import (
 )
 
 from rigd.devices.cia402 import Grade, check_suitability
-from rigd.devices.cia402.requirements import CORE, OPTIONAL, requirement
+from rigd.devices.cia402.requirements import CORE_REQUIREMENTS, OPTIONAL_REQUIREMENTS, requirement
 from rigd.devices.eds import read_eds
 from rigd.profile import load_profile
 
@@ -58,7 +58,7 @@ def test_a_complete_drive_fits(judged, rig):
         grades = {f.what: f.grade for f in judgement.findings}
         assert set(grades.values()) == {Grade.FITS, Grade.SUBSTITUTED}
         # Every object of the table is told of, but for the identity and what is told in words.
-        assert len(grades) == len(CORE) + len(OPTIONAL) - 4 + 5
+        assert len(grades) == len(CORE_REQUIREMENTS) + len(OPTIONAL_REQUIREMENTS) - 4 + 5
 
 
 @pytest.mark.parametrize("name", WITH_TORQUE)
@@ -98,7 +98,7 @@ def test_what_the_two_real_drives_lack(rig):
     assert not [f for f in accepted.values() if f.grade is Grade.REFUSED]
 
 
-@pytest.mark.parametrize("needed", CORE, ids=lambda needed: needed.address)
+@pytest.mark.parametrize("needed", CORE_REQUIREMENTS, ids=lambda needed: needed.address)
 def test_what_is_core_and_missing_is_refused_by_its_name(judged, needed):
     place = f"{needed.index:04X}:{needed.sub}"
     found = judged(without(place if f"{place} " in COMPLETE else needed.address))
@@ -270,7 +270,7 @@ def test_write_only_and_out_of_limits_is_doubtful(judged, rig):
 
 def test_each_sentence_names_its_object_and_ends(judged):
     judgement = judged("6040 u16 rw 0")
-    assert len(judgement.refusals) >= len(CORE) - 1
+    assert len(judgement.refusals) >= len(CORE_REQUIREMENTS) - 1
     for finding in judgement.findings:
         assert finding.sentence == "" or finding.sentence.endswith(".")
         assert bool(finding.sentence) or finding.grade in (

@@ -30,14 +30,14 @@ class Drive:
     def __init__(self, step, send):
         self.frozen = self.sto_dropped = False
         self.torque_lag_s = 0.0
-        self.never_follows = self.stays_operational = self.watchless = False
+        self.never_sets_bit_12 = self.stays_operational = self.ignores_silent_host = False
         self.restarts = []
         self.angle_offset_counts = 0
         self.heard = []
         self.ticks_s = []
         self.emergencies = []
         self.step, self.send = step, send
-        self.moved = lambda: 0
+        self.rig_periods = lambda: 0
 
     def receive(self, can_id, data):
         if self.frozen:
@@ -45,7 +45,7 @@ class Drive:
         self.heard.append((can_id, data))
         if can_id == 0x80:
             self.step()
-            self.send(0x181, struct.pack("<I", self.moved()))
+            self.send(0x181, struct.pack("<I", self.rig_periods()))
 
     def tick(self, now_s):
         self.ticks_s.append(now_s)
@@ -132,15 +132,15 @@ class Recording:
             mend=self.mended.append,
             log=log,
         )
-        self.drive = Drive(self.world.step, self.world.can_port("drive"))
-        self.drive.moved = lambda: self.world.moved
-        self.world.join("drive", self.drive)
+        self.drive = Drive(self.world.step, self.world.can_sender("drive"))
+        self.drive.rig_periods = lambda: self.world.rig_periods
+        self.world.add_node("drive", self.drive)
         if serial:
-            self.sensor = SerialSensor(self.world.serial_port(), simulated.records_per_period)
-            self.world.join_serial(self.sensor)
+            self.sensor = SerialSensor(self.world.serial_writer(), simulated.records_per_period)
+            self.world.add_serial_device(self.sensor)
         else:
-            self.sensor = Sensor(self.world.can_port("sensor"))
-            self.world.join("sensor", self.sensor)
+            self.sensor = Sensor(self.world.can_sender("sensor"))
+            self.world.add_node("sensor", self.sensor)
 
     def _write(self, data):
         self.written += data
@@ -148,7 +148,7 @@ class Recording:
     def sync(self, *ticks):
         """Hear a SYNC on each of these ticks, fractions allowed."""
         for tick in ticks:
-            self.world.hear([SYNC], "host", round(tick * PERIOD_NS))
+            self.world.receive_frames([SYNC], "host", round(tick * PERIOD_NS))
 
     def from_nodes(self):
         """What the nodes sent, as (identifier, data)."""

@@ -88,9 +88,9 @@ def test_after_a_silence_the_phase_counts_anew():
     clock = WallClock(T, 0)
     for tick in range(500):
         clock.sync(tick * T)
-    assert not clock.idle
+    assert not clock.is_idle
     clock.elapse(1000 * T)
-    assert clock.idle
+    assert clock.is_idle
     first = clock.sync(1000.4 * T)
     moves = [clock.sync((1000.4 + tick + off) * T) for tick, off in ((1, 0.2), (2, -0.2), (3, 0.2))]
     assert first in (0, 1)
@@ -115,7 +115,7 @@ def test_lock_step_waits_for_a_host_but_not_for_ever():
 def test_lock_step_does_not_wait_for_nobody():
     clock = LockStep(T, 0)
     clock.sync(0)
-    clock.left_alone(10 * T)
+    clock.stop_waiting(10 * T)
     assert clock.elapse(14 * T) == 4
 
 

@@ -184,7 +184,7 @@ def virtual():
     theirs.setblocking(False)
     bus = links.VirtualCan.__new__(links.VirtualCan)
     handlers, heard = {}, []
-    bus._serve(ours, handlers, lambda frames, origin: heard.append((frames, origin)))
+    bus._use_socket(ours, handlers, lambda frames, origin: heard.append((frames, origin)))
     yield bus, theirs, handlers, heard
     bus.close()
     theirs.close()
@@ -345,14 +345,14 @@ def test_a_cut_line_is_dead(line):
 
 def test_what_the_exchange_takes_is_not_simulated_on_top():
     rig = load_profile("antenna_can").rig
-    assert links.without_transport(rig) is rig
+    assert links.without_transport_delay(rig) is rig
     late = replace(
         rig,
         acquisition=replace(rig.acquisition, mode="previous_tick"),
         encoder=replace(rig.encoder, delay_s=1.055e-3),
         sensor=replace(rig.sensor, delay_s=1.0e-3),
     )
-    left = links.without_transport(late)
+    left = links.without_transport_delay(late)
     assert left.encoder.delay_s == pytest.approx(5.5e-5)
     assert left.sensor.delay_s == pytest.approx(0.0, abs=1e-12)
     assert left.actuation == late.actuation
@@ -369,4 +369,4 @@ def test_a_profile_that_states_less_than_the_exchange_takes_is_refused(device):
     )
     rig = replace(rig, **{device: replace(getattr(rig, device), delay_s=0.5e-3)})
     with pytest.raises(DeviceError, match=rf"{device}\.delay_s = 0\.0005 s"):
-        links.without_transport(rig)
+        links.without_transport_delay(rig)

@@ -49,7 +49,7 @@ def test_missed_syncs_pass_as_periods_before_the_next_one(make_world):
 def test_without_sync_the_world_moves_by_the_clock(make_world):
     rig = make_world()
     rig.world.elapse(round(20.6 * PERIOD_NS))
-    assert rig.world.moved == 20
+    assert rig.world.rig_periods == 20
     rig.sync(21)
     assert rig.answers() == [21]
 
@@ -57,7 +57,7 @@ def test_without_sync_the_world_moves_by_the_clock(make_world):
 def test_syncs_read_together_after_a_pause_are_a_period_each(make_world):
     rig = make_world()
     rig.sync(*range(1, 11))
-    rig.world.hear([SYNC, numbered(1), SYNC, numbered(2), SYNC], "host", 13 * PERIOD_NS)
+    rig.world.receive_frames([SYNC, numbered(1), SYNC, numbered(2), SYNC], "host", 13 * PERIOD_NS)
     rig.world.elapse(round(13.2 * PERIOD_NS))
     rig.sync(14)
     assert rig.answers() == [*range(1, 15)]
@@ -88,24 +88,24 @@ def test_in_lock_step_only_syncs_move_the_rig_while_a_host_is_there(make_world):
     rig.sync(0.1, 0.2, 700, 701)
     rig.world.elapse(round(900 * PERIOD_NS))
     assert rig.answers() == [1, 2, 3, 4]
-    assert rig.world.moved == 4
+    assert rig.world.rig_periods == 4
 
 
 def test_in_lock_step_a_dead_host_is_noticed(make_world):
     rig = make_world(lock_step=True)
     rig.simulated.plant.enable()
     rig.sync(1)
-    rig.world.left_alone(2 * PERIOD_NS)
+    rig.world.stop_waiting(2 * PERIOD_NS)
     rig.world.elapse(52 * PERIOD_NS)
     assert rig.drive.ticks_s[-1] == pytest.approx(0.051)
-    assert rig.world.moved == 51
+    assert rig.world.rig_periods == 51
 
 
 def test_in_lock_step_a_rig_at_rest_waits_while_its_nodes_are_set_up(make_world):
     rig = make_world(lock_step=True)
     rig.world.elapse(500 * PERIOD_NS)
     assert rig.drive.ticks_s[-1] == pytest.approx(0.5)
-    assert rig.world.moved == 0
+    assert rig.world.rig_periods == 0
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -118,7 +118,7 @@ def test_lock_step_does_not_depend_on_when_frames_come(make_world, seed):
     for tick in range(300):
         now += chance.randrange(1, 5_000_000)
         rig.simulated.plant.command(0.2 if tick < 100 else -0.1)
-        rig.world.hear([SYNC], "host", now)
+        rig.world.receive_frames([SYNC], "host", now)
         rig.world.elapse(now + 1000)
         angles.append((rig.simulated.plant.angle_rad, rig.simulated.sensor.measure()))
     direct = make_world().simulated
@@ -134,7 +134,7 @@ def test_lock_step_does_not_depend_on_when_frames_come(make_world, seed):
 
 def test_a_host_is_heard_by_every_node_and_by_other_hosts(make_world):
     rig = make_world()
-    rig.world.hear([numbered(7)], "host", 0)
+    rig.world.receive_frames([numbered(7)], "host", 0)
     assert rig.drive.heard == rig.sensor.heard == [(RPDO, struct.pack("<I", 7))]
     assert rig.sent == [(numbered(7), "host")]
 
@@ -142,7 +142,7 @@ def test_a_host_is_heard_by_every_node_and_by_other_hosts(make_world):
 def test_nodes_hear_each_other_but_not_themselves(make_world):
     rig = make_world()
     rig.sync(1)
-    rig.world.hear([frame(POLL)], "host", PERIOD_NS)
+    rig.world.receive_frames([frame(POLL)], "host", PERIOD_NS)
     assert [can_id for can_id, _ in rig.sensor.heard] == [0x80, 0x181, POLL]
     assert [can_id for can_id, _ in rig.drive.heard] == [0x80, POLL, 0x680, 0x681]
     assert [origin for _, origin in rig.sent] == ["host", None, "host", None, None]
@@ -152,7 +152,7 @@ def test_what_is_no_plain_frame_is_nobody_s_business(make_world):
     rig = make_world()
     remote, long_id, error = 0x4000_0181, 0x8000_0080, 0x2000_0004
     flagged = [struct.pack("=IB3x8s", can_id, 0, b"") for can_id in (remote, long_id, error)]
-    rig.world.hear(flagged, "host", PERIOD_NS)
+    rig.world.receive_frames(flagged, "host", PERIOD_NS)
     assert rig.drive.heard == []
 
 
@@ -161,7 +161,7 @@ def test_what_is_no_plain_frame_is_nobody_s_business(make_world):
 
 def through(rig, first, last):
     for n in range(first, last):
-        rig.world.hear([numbered(n)], "host", n * 1000)
+        rig.world.receive_frames([numbered(n)], "host", n * 1000)
     return numbers(rig.drive.heard)
 
 
@@ -300,9 +300,9 @@ ENDLESS = [
     ("status,bits=0x0080", "sensor", "status_bits", 0),
     ("stuck,what=encoder", "simulated", "stuck_encoder", None),
     ("lag,ms=3", "drive", "torque_lag_s", 0.0),
-    ("no_bit_12", "drive", "never_follows", False),
+    ("no_bit_12", "drive", "never_sets_bit_12", False),
     ("no_pre_operational", "drive", "stays_operational", False),
-    ("no_watch", "drive", "watchless", False),
+    ("no_watch", "drive", "ignores_silent_host", False),
 ]
 
 
@@ -459,7 +459,7 @@ def test_a_host_that_is_off_the_bus_is_told_and_neither_heard_nor_spoken_to(make
     rig.sync(2, 3)
     assert [can_id for can_id, _ in rig.from_nodes()] == [0x2000_0040]
     assert len(rig.drive.heard) == heard
-    assert rig.world.moved == 3  # the world goes on
+    assert rig.world.rig_periods == 3  # the world goes on
     rig.sync(4, 5)
     assert len(rig.drive.heard) > heard
 
