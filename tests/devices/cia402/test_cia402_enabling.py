@@ -283,7 +283,7 @@ class TestAnAdapterThatRaisesAnything:
         assert scripted.frames(0x605) == []  # by PDO, at once
 
     def test_an_error_that_stands_keeps_no_sync_from_being_sent(self, drive, scripted):
-        drive._node.exchange._bus_off = "CAN bus can0: the controller is error-passive."
+        drive._node.exchange._bus_error = "CAN bus can0: the controller is error-passive."
         drive.disable()
         assert scripted.state == "switch-on disabled"
         assert drive.off_doubt == ""
