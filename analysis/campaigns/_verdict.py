@@ -234,23 +234,23 @@ def campaign_verdict(
         sweeps=sweeps,
         sentences=(
             *specimen_sentences.specimens(alike),
-            sentences.answer(freest, alpha, lambda_, validation),
+            sentences.describe_orders(freest, alpha, lambda_, validation),
             *_numbers(freest, best, modal, adequate, len(verdicts)),
             *_modes(freest, modal, mixed=alike.mixed),
             *_slopes(alpha, lambda_, modal),
-            *geometry.sweeps(sweeps),
-            *geometry.if_exact(freest, (alpha, lambda_), modal),
-            *sentences.welch_bias(
+            *geometry.describe_sweeps(sweeps),
+            *geometry.describe_orders_if_exact(freest, (alpha, lambda_), modal),
+            *sentences.describe_welch_bias(
                 freest, biases, _withheld(alpha, lambda_), comparable=not (alike.mixed or refused)
             ),
-            sentences.selected(pooled, close, alone, len(verdicts)),
+            sentences.describe_selection(pooled, close, alone, len(verdicts)),
             *(finding.sentence for finding in found),
-            *sentences.dissenting([(each.file, each.structure) for each in dissent], best),
-            *([] if alike.mixed else [sentences.scatter(freest)]),
-            *sentences.foresight(freest, validation, len(sessions)),
+            *sentences.describe_dissent([(each.file, each.structure) for each in dissent], best),
+            *([] if alike.mixed else [sentences.describe_scatter(freest)]),
+            *sentences.describe_prediction_errors(freest, validation, len(sessions)),
             *sentences.lost_trials(lost, len(sessions)),
         ),
-        experiments=(*geometry.experiments(sweeps, modal, sessions), *advice),
+        experiments=(*geometry.recommend_sweeps(sweeps, modal, sessions), *advice),
     )
 
 
@@ -277,27 +277,32 @@ def _numbers(
     """Describe the model of the numbers, whether it explains the records, and the losses."""
     gate = uniformity(modal.uniform_beam if modal else None)
     if modal is None or modal.tolerant is None:
-        left = sentences.left_over(freest, adequate, sessions)
-        return sentences.headline(freest, best), *gate, left, *sentences.sizes(freest.sizes)
-    left = sentences.noise_alone(adequate, sessions)
+        left = sentences.describe_residual(freest, adequate, sessions)
+        return (
+            sentences.describe_structure(freest, best),
+            *gate,
+            left,
+            *sentences.describe_loss_factors(freest.sizes),
+        )
+    left = sentences.describe_noise_sessions(adequate, sessions)
     return (
-        geometry.tolerance(modal, modal.tolerant),
+        geometry.describe_tolerance(modal, modal.tolerant),
         *gate,
         left,
-        *sentences.sizes(tolerant_sizes(modal.uniform_beam, modal.tolerant)),
+        *sentences.describe_loss_factors(tolerant_sizes(modal.uniform_beam, modal.tolerant)),
     )
 
 
 def _modes(freest: PooledEstimate, modal: PooledModal | None, *, mixed: bool) -> list[str]:
     if modal is not None and modal.leads:
-        return sentences.modes(modal.modes, modal.sessions, mixed=mixed)
-    return sentences.modes(freest.modes, freest.sessions, mixed=mixed)
+        return sentences.describe_modes(modal.modes, modal.sessions, mixed=mixed)
+    return sentences.describe_modes(freest.modes, freest.sessions, mixed=mixed)
 
 
 def _slopes(alpha: PooledOrder, lambda_: PooledOrder, modal: PooledModal | None) -> tuple[str, str]:
     if modal is None or modal.tolerant is None:
-        return sentences.order(alpha), sentences.order(lambda_)
-    return geometry.slope(alpha, modal), geometry.slope(lambda_, modal)
+        return sentences.describe_order(alpha), sentences.describe_order(lambda_)
+    return geometry.describe_slope(alpha, modal), geometry.describe_slope(lambda_, modal)
 
 
 def _withheld(*orders: PooledOrder) -> frozenset[str]:
