@@ -20,31 +20,32 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.workers import Workers
 
-FEWEST: Final = 3
-"""Sessions from which each can be predicted from the others: two are the fewest to be pooled."""
+FEWEST_SESSIONS: Final = 3
+"""Smallest number of sessions for which each can be predicted from the others, as pooling needs
+two."""
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOutError:
-    """Error of one model in a session that was not used for it.
+    """Prediction error of a model for a session that was not used to estimate the model.
 
     Attributes
     ----------
     path : Path
         File of the session.
     method : {"record", "welch"}
-        Whose parameters: pooled whole-record estimates of the other sessions, or the nominal model
-        of the others by the Welch method.
+        Source of the parameters: pooled whole-record estimates of the other sessions, or their
+        nominal model by the Welch method.
     name : str
-        The structure, as tables call it.
+        Damping structure, as named in tables.
     weighting : str or None
-        None with "record".
+        Weighting of the Welch fits; None with "record".
     error : float
-        Root mean square of predicted minus measured torque over that of the measured torque, in
-        the band, without means.
+        Root mean square of predicted minus measured torque, divided by that of the measured
+        torque, in the band and without means.
     own_error : float or None
-        The same with the session's own whole-record fit of that structure, None with "welch". What
-        noise there is, it holds too: an error no larger shows that the sessions agree.
+        The same error of the session's own whole-record fit of that structure; None with "welch".
+        It contains the noise, too, so an `error` that is no larger shows that the sessions agree.
     """
 
     path: Path
@@ -57,12 +58,12 @@ class LeftOutError:
 
 @dataclass(frozen=True, slots=True)
 class LostTrial:
-    """A session that was to be predicted from the others, and why it was not."""
+    """A session that could not be predicted from the others, and the reason."""
 
     path: Path
-    """The session."""
+    """Path of the session file."""
     reason: str
-    """Why, as the rest of a sentence."""
+    """Reason, as the end of a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +77,10 @@ class PlantPrediction:
     own: Plant | None
 
 
-def forecasts(sessions: Sequence[SessionAnalysis], left_out: int) -> tuple[PlantPrediction, ...]:
-    """Return the models of all sessions but one, for the prediction of that one."""
+def models_without_session(
+    sessions: Sequence[SessionAnalysis], left_out: int
+) -> tuple[PlantPrediction, ...]:
+    """Return the models estimated from all sessions but one, to predict that session."""
     session = sessions[left_out]
     others = [*sessions[:left_out], *sessions[left_out + 1 :]]
     own = {each.name: each.plant for each in session.record_estimates}
@@ -99,11 +102,13 @@ def validate(
     band_hz: tuple[float, float] | None,
     on_done: Callable[[int], None],
 ) -> tuple[tuple[LeftOutError, ...], tuple[LostTrial, ...]]:
-    """Predict every session from the others; return the errors, and the lost trials with reasons.
+    """Predict every session from the others; return prediction errors and sessions not predicted.
 
-    Results so far are retained even if all workers are lost.
+    If all workers are lost, all sessions count as not predicted.
     """
-    trials = [(each.path, forecasts(sessions, i), band_hz) for i, each in enumerate(sessions)]
+    trials = [
+        (each.path, models_without_session(sessions, i), band_hz) for i, each in enumerate(sessions)
+    ]
     try:
         results = workers.run(left_out_errors, trials, on_done)
     except CampaignError as error:
@@ -121,9 +126,9 @@ def validate(
 
 
 def left_out_errors(
-    path: Path, tried: Sequence[PlantPrediction], band_hz: tuple[float, float] | None
+    path: Path, predictions: Sequence[PlantPrediction], band_hz: tuple[float, float] | None
 ) -> tuple[LeftOutError, ...] | LostTrial:
-    """Read a session and compare its torque with what each model predicts from its angle.
+    """Return the error of each model in predicting a session's torque from its angle.
 
     An error of one session is returned, not raised, because the others are still usable.
     """
@@ -155,14 +160,14 @@ def left_out_errors(
             error=error(each.plant),
             own_error=None if each.own is None else error(each.own),
         )
-        for each in tried
+        for each in predictions
     )
 
 
 def by_model(
     errors: Sequence[LeftOutError],
 ) -> list[tuple[str, str, str | None, tuple[LeftOutError, ...]]]:
-    """Group errors by method, name and weighting, the smallest mean error first."""
+    """Group prediction errors by method, structure and weighting, the smallest mean error first."""
     found: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
     for each in errors:
         found.setdefault((each.method, each.name, each.weighting), []).append(each)

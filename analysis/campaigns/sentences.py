@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._experiment import fact_text, in_dispute
-from analysis.campaigns._statistics import BEST
+from analysis.campaigns._statistics import PAPER_BEST_MODELS
 from analysis.campaigns._welch_bias import LARGEST_MISFIT
 from analysis.identify.sentences import LOSSES
 from analysis.models import COEFFICIENT_OF, QUANTITIES, STRUCTURES
@@ -538,7 +538,7 @@ def describe_welch_bias(
     if not comparable:
         return []
     of_type = [each for each in biases if each.structure == freest.name]
-    best = [each for each in of_type if (each.structure, each.weighting) in BEST]
+    best = [each for each in of_type if (each.structure, each.weighting) in PAPER_BEST_MODELS]
     left_out = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
     sentences = []
     for each in best or of_type[:1]:

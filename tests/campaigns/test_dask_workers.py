@@ -76,7 +76,7 @@ def test_a_worker_of_other_versions_is_told(said, words):
 def test_a_cluster_without_workers_is_told(monkeypatch):
     import distributed
 
-    monkeypatch.setattr(dask_workers, "_WORKERS_S", 0.5)
+    monkeypatch.setattr(dask_workers, "_FIRST_WORKER_TIMEOUT_S", 0.5)
     with (
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as empty,
         pytest.raises(CampaignError, match="has no workers; start some with 'dask worker"),

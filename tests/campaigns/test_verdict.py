@@ -217,7 +217,9 @@ def test_words_about_scatter_and_misfit(estimates_of):
     assert "No significant between-session variance" in sentences.describe_scatter(best)
     assert "τ" not in sentences.describe_scatter(best)
     some = replace(best, parameters=(replace(best.parameters[0], between_std=0.1, chance=0.2),))
-    assert "lowest p of 1: 0.2; the τ above zero are within chance" in sentences.describe_scatter(some)
+    assert "lowest p of 1: 0.2; the τ above zero are within chance" in sentences.describe_scatter(
+        some
+    )
     shaken = replace(best, parameters=(replace(best.parameters[0], chance=1e-4),))
     assert "Between-session variance in ζ" in sentences.describe_scatter(shaken)
     assert "no structure fitted" in sentences.describe_residual(replace(best, misfit=9.0), 4, 4)
