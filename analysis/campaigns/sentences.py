@@ -89,7 +89,7 @@ def probability(chance: float) -> str:
     return f"{chance:.2g}" if chance > _SMALLEST_P_VALUE else f"< {_SMALLEST_P_VALUE:g}"
 
 
-def percentage_text(fraction: float) -> str:
+def percent(fraction: float) -> str:
     """Format a fraction as a percentage; a fraction above 99.9 % is not rounded up to 100 %.
 
     Examples
@@ -201,7 +201,7 @@ def _small_scatter_remark(found: Homogeneity) -> str:
 
 def _describe_heterogeneity(scatter: Heterogeneity) -> str:
     """Describe the between-session scatter of a quantity, relative to its uncertainty and size."""
-    i_squared_text = percentage_text(scatter.i_squared)
+    i_squared_text = percent(scatter.i_squared)
     equals = "" if i_squared_text.startswith(">") else "= "
     between_text = _mean_text([scatter.between_std], scatter)
     scatter_text = (

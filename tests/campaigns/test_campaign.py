@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from analysis.campaigns import CampaignError, SessionTask, analyse_session, campaign
-from analysis.campaigns._validation import models_without_session, left_out_errors
+from analysis.campaigns._validation import left_out_errors, models_without_session
 from analysis.identify import BAND_HZ, Plant
 from analysis.models import FrequencyResponseModel
 from analysis.record import load_record
