@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 import rigd
-from analysis.exchange._file_statements import FileStatements, time_samples
+from analysis.exchange._file_statements import FileStatements, plan_timebase
 from analysis.exchange._source import ExchangeError, read_source
 from analysis.record_checks import first_mode_hz, too_much_unknown
 from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
@@ -153,7 +153,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     statements.check_units(channels)
     timebase = statements.timebase(channels)
     channels, delays_s = statements.align(channels, timebase)
-    timebase = time_samples(source, plan, channels)
+    timebase = plan_timebase(source, plan, channels)
     warnings = statements.warnings
     warnings += _check_duration(source, plan, timebase)
     segments = _segment_ticks(

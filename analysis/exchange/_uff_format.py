@@ -16,12 +16,12 @@ from analysis.exchange._source import (
     ExchangeError,
     FileTimes,
     SourceChannel,
-    as_column,
     bounded_memory,
     channel_index,
     check_samples,
-    missing_library,
-    not_in_time,
+    missing_library_error,
+    not_in_time_error,
+    real_vector,
 )
 from rigd.printable import printable
 from rigd.text_table.titles import stated_unit_of, time_unit_s
@@ -60,7 +60,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
     try:
         import pyuff
     except ImportError as error:
-        raise missing_library(path, "pyuff") from error
+        raise missing_library_error(path, "pyuff") from error
     try:
         with bounded_memory():
             return _read_channels(path, names, pyuff.UFF)
@@ -120,7 +120,7 @@ def _channel(
     """Return one channel; `timed` states whether the user requests the times as a channel."""
     values = np.asarray(function["data"])
     if values.dtype.kind == "c":
-        raise not_in_time(path, name)
+        raise not_in_time_error(path, name)
     unit = _abscissa_unit(function)
     _check_time_response(path, name, function, unit)
     if len(values) != function["num_pts"]:
@@ -135,7 +135,7 @@ def _channel(
     start_s = float(stamps[0]) * (unit_s or 1.0) if len(stamps) else math.nan
     label = _label_text(function, "ordinate_axis_units_lab")
     return SourceChannel(
-        as_column(path, name, values),
+        real_vector(path, name, values),
         unit_label=label or stated_unit_of(_label_text(function, "ordinate_axis_lab")),
         rate_hz=_even_rate_hz(function, unit_s or 1.0) if is_time and not timed else None,
         start_ns=round(start_s * 1e9) if math.isfinite(start_s) else None,
