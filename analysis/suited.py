@@ -168,7 +168,7 @@ def welch_analysis(
     """
     from analysis.paper import FrequencyResponseError, SettingsError, analyse
 
-    optional = optional and settings.are_usual
+    optional = optional and settings.are_from_paper
     reason = against_welch(record, requested_hz) if optional else None
     if reason is None:
         try:

@@ -184,7 +184,8 @@ class FileStatements:
                 f"{statement}, and {rate_hz:.6g} Hz was stated",
                 "give the channel of times with --time"
                 if is_default
-                else f"state --rate-hz {file_rate_hz:.6g}, or give the channel of times with --time",
+                else f"state --rate-hz {file_rate_hz:.6g}, or give the channel of times with "
+                "--time",
             )
 
     def _check_times(self, times: FileTimes, rate_hz: float) -> None:

@@ -262,9 +262,10 @@ def channel_index(
 ) -> int:
     """Return the index of a channel that is given by its title or by its number, as ``#3``.
 
-    `titles` are the titles of all channels in the file. `duplicates_text` is the start of the message on
-    several channels of one title, such as "columns are named". `numbered` states whether a message
-    lists the titles with their numbers. Raise ExchangeError without exactly one such channel.
+    `titles` are the titles of all channels in the file. `duplicates_text` is the start of the
+    message on several channels of one title, such as "columns are named". `numbered` states whether
+    a message lists the titles with their numbers. Raise ExchangeError without exactly one such
+    channel.
     """
     count = titles.count(name)
     if count == 1:
