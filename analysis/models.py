@@ -329,7 +329,7 @@ RECORD_BAND_HZ: Final = (0.0, 50.0)
 """Default frequency band of the whole-record fits, if the sampling rate is high enough."""
 
 LARGEST_FRACTION_OF_RATE: Final = 0.4
-"""Highest fitted frequency relative to the sampling rate; filters need the range up to half of it."""
+"""Highest fitted frequency relative to the sampling rate; filters need the range above it."""
 
 PAPER_BAND_HZ: Final = (0.5875, 50.0)
 """Frequency band of the Welch fits in the reference paper."""

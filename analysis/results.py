@@ -1,7 +1,7 @@
 """Results of the analyses of one record, from which texts, pages and files are made.
 
-`record_result` analyses a session file and returns a `RecordResult`. A campaign retains part of each
-result (`analysis.campaigns.SessionAnalysis`) and combines these in an
+`record_result` analyses a session file and returns a `RecordResult`. A campaign retains part of
+each result (`analysis.campaigns.SessionAnalysis`) and combines these in an
 `analysis.campaigns.CampaignResult`.
 """
 

@@ -70,7 +70,7 @@ _LEAST_REST_S: Final = 0.5
 _LEAST_PAUSE_S: Final = 0.5
 """Time without a detection after which the next one is another touch, as the beam bounces."""
 _LONGEST_FILTER_TICKS: Final = 0.99
-"""Largest delay of the sensor's averaging filter in ticks (about a hundred sensor records a tick)."""
+"""Limit of the averaging filter's span in ticks, which is that of a hundred records per tick."""
 _MOST_TOUCHES: Final = 20
 """Largest number of touches found in a record; with more, the model does not fit the record."""
 _LARGEST_CHI2_PER_DEGREE: Final = 5.0
@@ -455,6 +455,7 @@ def _angle_noise_std(angle_rad: Real, resting: NDArray[np.bool_]) -> float:
 
 
 def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
+    """Return sentences on touches that are not estimated or not explained by the model."""
     sentences = []
     without_estimate = [each.number for each in touches if each.estimate is None]
     if without_estimate:
