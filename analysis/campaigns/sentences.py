@@ -319,16 +319,16 @@ def _order_clause(found: PooledOrder) -> str:
         return f"no {damping}"
     if found.status == "compatible" and found.interval is None:
         return f"{damping} of order 1 ({found.order} was not fitted)"
-    if found.order_text is None or found.interval is None or found.reason is not None:
+    if found.value is None or found.interval is None or found.reason is not None:
         return f"{damping} of an order that is not established"
     half_width = (found.interval[1] - found.interval[0]) / 2
-    value_text = " ± ".join(to_uncertainty((found.order_text, half_width), found.std or half_width))
+    value_text = " ± ".join(to_uncertainty((found.value, half_width), found.std or half_width))
     order_text = f"{found.order} = {value_text}"
     if found.status == "compatible":
         return f"{damping} of integer order ({order_text})"
     if found.status == "open":
         return f"{damping} of an order near 1 ({order_text}; 1 is doubtful, but not excluded)"
-    if abs(found.order_text - 1) < _NEARLY_INTEGER_DISTANCE:
+    if abs(found.value - 1) < _NEARLY_INTEGER_DISTANCE:
         return f"{damping} of nearly integer order ({order_text}; 1 is excluded)"
     return f"{damping} of fractional order ({order_text})"
 
@@ -384,7 +384,7 @@ def describe_loss_factors(found: Sequence[ReportedLossFactor]) -> list[str]:
         if each.omega_rad_s is None or not (each.size.std and each.size.interval_95):
             continue
         value, low, high = to_uncertainty((each.size.value, *each.size.interval_95), each.size.std)
-        remark = f", {each.size.remark}" if each.size.remark else ""
+        remark = f", {each.size.flag}" if each.size.flag else ""
         factors.append(
             f"{each.damping} {value} (95 %: {low} to {high}) at "
             f"{each.omega_rad_s / (2 * np.pi):.3g} Hz{remark}"

@@ -354,7 +354,7 @@ def _header_text(
     size: int | None,
 ) -> str:
     """Return the header of a data set; `size` is the length of a binary body in bytes."""
-    is_complex = column.values.dtype.set_type == "c"
+    is_complex = column.values.dtype.kind == "c"
     if table.axis.unit == "Hz":
         function_type, axis_type = (
             (_FREQUENCY_RESPONSE if is_complex else _COHERENCE),

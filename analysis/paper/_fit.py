@@ -364,7 +364,7 @@ def thinned(
         Weight of each chosen point, including the weights of omitted points around it. The sum
         is 1.
     """
-    n = measured.magnitude
+    n = measured.size
     if n <= count:
         return np.arange(n), weights
     # The density of the points has three equal parts: uniform, by the size of the response, and by
