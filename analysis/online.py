@@ -312,10 +312,10 @@ class OnlineEstimator:
                 selection = select(measurement, band_hz=band_hz, earlier=last_selection)
                 self._last_selection = selection
                 headline, analysis = selection.headline, selection.analysis
-                found = selection.verdict.findings
+                findings = selection.verdict.findings
                 orders = (selection.verdict.alpha, selection.verdict.lambda_)
             else:
-                headline, found, analysis = freest_alone(measurement, band_hz)
+                headline, findings, analysis = freest_alone(measurement, band_hz)
         except (SessionError, RecordError, ArithmeticError, ValueError) as error:
             # A running session receives the reason and continues, as later samples may suffice.
             is_expected = isinstance(error, SessionError | RecordError | MeasurementError)
@@ -332,9 +332,9 @@ class OnlineEstimator:
             took_s=time.monotonic() - started_s,
             headline=headline if has_modes else None,
             orders=orders if has_modes else (),
-            findings=found
+            findings=findings
             if has_modes
-            else tuple(each for each in found if each.kind in _FINDINGS_WITHOUT_MODES),
+            else tuple(each for each in findings if each.kind in _FINDINGS_WITHOUT_MODES),
             analysis=analysis if has_modes else None,
             warnings=record.warnings,
             problem="" if has_modes else "No mode has been excited enough yet.",

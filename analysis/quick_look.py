@@ -157,13 +157,15 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
     sentences = []
     length_s = record.time_s.size / record.rate_hz
     headline: Headline
-    found: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
     try:
         if length_s <= _LONGEST_FULL_ANALYSIS_S:
             whole = whole_record(record)
-            headline, found, validity = whole.headline, whole.verdict.findings, whole.validity
+            headline, findings, validity = whole.headline, whole.verdict.findings, whole.validity
         else:
-            headline, found, _ = freest_alone(Measurement.of_record(record), record_band_hz(record))
+            headline, findings, _ = freest_alone(
+                Measurement.of_record(record), record_band_hz(record)
+            )
             model = headline.fit.plant.beam, headline.fit.plant.damping
             validity = record_validity(record.metadata, record.angle_rad, record.rate_hz, model)
             sentences.append(
@@ -176,7 +178,7 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
         return None, stated_validity(record.metadata), [no_modes]
     if headline.uniform_beam is not None:
         validity = replace(validity, uniform_beam=headline.uniform_beam.summary)
-    sentences += [each.sentence for each in found]
+    sentences += [each.sentence for each in findings]
     if not headline.modes:
         sentences.append("No modes: none lies in the excited band.")
     return headline, validity, sentences
@@ -249,11 +251,13 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
         return None, _empty_coherence(), [str(error)]
     if estimate is None:
         return None, _empty_coherence(), []
-    found = estimate.response.without_delays(
+    undelayed = estimate.response.without_delays(
         input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
     )
-    shown = estimate.excited & (found.frequency_hz >= FIRST_HZ) & np.isfinite(found.response)
-    hz, values = found.frequency_hz[shown], found.response[shown]
+    shown = (
+        estimate.excited & (undelayed.frequency_hz >= FIRST_HZ) & np.isfinite(undelayed.response)
+    )
+    hz, values = undelayed.frequency_hz[shown], undelayed.response[shown]
     selected = response_thinning(hz).extremes(np.abs(values))
     response = {
         "frequency_hz": _round_digits(hz[selected]),
@@ -347,14 +351,14 @@ def _stored_quick_look(last: Path) -> dict[str, Any]:
 
 def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
     """Return the last quick look of a specimen before a time, from a session's folder."""
-    found = last_quick_look(
+    path_and_document = last_quick_look(
         path.parent,
         specimen,
         before_utc_ns=before_utc_ns,
         but=path.stem,
         usable=lambda document: any(mode["shown"] for mode in document["modes"]),
     )
-    return None if found is None else found[1]
+    return None if path_and_document is None else path_and_document[1]
 
 
 def _compare_modes(

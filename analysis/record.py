@@ -377,31 +377,31 @@ def _describe_faults(
     sweep: slice,
 ) -> tuple[str, ...]:
     """Return sentences on an incomplete session, missing samples and flags."""
-    found = []
+    sentences = []
     ending = outcome.get("outcome", "unknown")
     if ending in ("stopped", "fault"):
         reason = outcome.get("reason")
-        found.append(
+        sentences.append(
             f"The session's outcome is '{ending}', not 'complete'"
             + (f": {reason}" if reason else ".")
         )
     elif "recovered_from" in outcome:
-        found.append(
+        sentences.append(
             f"The file was recovered from {outcome['recovered_from']}, without loss of samples."
         )
     if outcome.get("recovered_protected") == "false":
-        found.append(
+        sentences.append(
             "The file was recovered from one whose metadata no checksum covered: compare rate, "
             "beam and segments with what is known of the session."
         )
     if unrecorded_ticks:
         recorded_s = (sweep.stop - sweep.start) / rate_hz
-        found.append(
+        sentences.append(
             f"The sweep was cut short: {recorded_s:.6g} s of it were recorded, "
             f"{unrecorded_ticks / rate_hz:.6g} s were not."
         )
     if gaps.sweep_missing_ticks:
-        found.append(
+        sentences.append(
             f"{gaps.sweep_missing_ticks} missing ticks in the sweep (longest gap of the record "
             f"{gaps.longest_gap_ticks} ticks) {_UNKNOWN_SAMPLES_TEXT}"
         )
@@ -410,8 +410,8 @@ def _describe_faults(
         ("torque", gaps.sweep_stale_torques),
     ):
         if count:
-            found.append(f"{count} stale values of the {channel} {_UNKNOWN_SAMPLES_TEXT}")
+            sentences.append(f"{count} stale values of the {channel} {_UNKNOWN_SAMPLES_TEXT}")
     for flag, consequence in _FLAG_CONSEQUENCES:
         if flag in flags:
-            found.append(f"{flags[flag]} samples of the sweep: {flag}. {consequence}")
-    return tuple(found)
+            sentences.append(f"{flags[flag]} samples of the sweep: {flag}. {consequence}")
+    return tuple(sentences)

@@ -221,10 +221,10 @@ class TouchAnalysis:
         marked_ticks = samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist()
         contact_ticks = round(CONTACT_S * rate_hz)
         free_from = [0, *(tick + contact_ticks for tick in marked_ticks)]
-        found, detected = "loop", list(zip(marked_ticks, free_from, strict=False))
+        source, detected = "loop", list(zip(marked_ticks, free_from, strict=False))
         if not marked_ticks:
             on_step("looking for touches")
-            found, detected = "record", _detect_touches(session, model, rate_hz, shear)
+            source, detected = "record", _detect_touches(session, model, rate_hz, shear)
             if len(detected) > _MOST_TOUCHES:
                 warnings.append(
                     f"More than {_MOST_TOUCHES} touches were found, of which the first are shown: "
@@ -242,7 +242,7 @@ class TouchAnalysis:
             samples["angle_rad"], rate_hz, (model.beam, model.damping),
         )  # fmt: skip
         return TouchedSession(
-            path, tuple(touches), found, model, rate_hz, shear is not None, tuple(warnings),
+            path, tuple(touches), source, model, rate_hz, shear is not None, tuple(warnings),
             validity,
         )  # fmt: skip
 
@@ -414,7 +414,7 @@ def _detect_touches(
     beam = watched_beam(model, rate_hz, noise)
     detector = TouchDetector(beam, rate_hz, DetectorSettings())
     is_armed = False
-    found: list[tuple[int, int]] = []
+    detections: list[tuple[int, int]] = []
     pause_ticks = round(_LEAST_PAUSE_S * rate_hz)
     last_detection = int(ticks[0]) - pause_ticks - 1
     previous_tick = int(ticks[0]) - 1
@@ -434,10 +434,10 @@ def _detect_touches(
             missed=tick - previous_tick - 1, angle_stale=angle_stale, wrench_stale=wrench_stale,
         ):  # fmt: skip
             if tick - last_detection > pause_ticks:
-                found.append((tick, last_detection + 1))
+                detections.append((tick, last_detection + 1))
             last_detection = tick
         previous_tick = tick
-    return found
+    return detections
 
 
 def _white_noise_std(values: Real) -> float:

@@ -240,22 +240,22 @@ def stated_specimens(
     of_campaign : Experiment
         Experiment of the sessions that are pooled.
     """
-    found: list[tuple[Experiment, list[str]]] = [(of_campaign, [])]
+    files_by_specimen: list[tuple[Experiment, list[str]]] = [(of_campaign, [])]
     for file, experiment in stated:
         if experiment is None:
             continue
-        for specimen, files in found:
+        for specimen, files in files_by_specimen:
             if specimen.same_specimen(experiment):
                 files.append(file)
                 break
         else:
-            found.append((experiment, [file]))
+            files_by_specimen.append((experiment, [file]))
     return tuple(
         StatedSpecimen(
             {key: specimen.facts[key] for key in _SPECIMEN_KEYS if key in specimen.facts},
             tuple(files),
         )
-        for specimen, files in found
+        for specimen, files in files_by_specimen
     )
 
 

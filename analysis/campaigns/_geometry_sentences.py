@@ -62,28 +62,35 @@ def describe_tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
     )
 
 
-def describe_slope(found: PooledOrder, modal: PooledModal) -> str:
+def describe_slope(pooled_order: PooledOrder, modal: PooledModal) -> str:
     """Describe an order of the damping as the slope of a loss over the visible modes.
 
     Parameters
     ----------
-    found : PooledOrder
+    pooled_order : PooledOrder
         Order estimated with a tolerance of the geometry.
     modal : PooledModal
         Modal model of all sessions, with the estimate `tolerant`.
     """
     estimate = modal.tolerant
     assert estimate is not None
-    counts = {f"“{status}”": count for status, count in found.alone.items()}
+    counts = {f"“{status}”": count for status, count in pooled_order.alone.items()}
     alone = describe_single_sessions(counts, sum(counts.values()))
-    if found.value is None or found.interval is None:
+    if pooled_order.value is None or pooled_order.interval is None:
         return (
-            f"The slope of the {LOSSES[found.order]} ({found.order}) is not identifiable: "
-            f"{found.reason}. {alone}"
+            f"The slope of the {LOSSES[pooled_order.order]} ({pooled_order.order}) is not "
+            "identifiable: "
+            f"{pooled_order.reason}. {alone}"
         )
     shown_hz = [mode.frequency_hz for mode in modal.modes]
     sentence = slope_of_loss(
-        found.order, found.value, found.interval, shown_hz, estimate, found.status, found.reason
+        pooled_order.order,
+        pooled_order.value,
+        pooled_order.interval,
+        shown_hz,
+        estimate,
+        pooled_order.status,
+        pooled_order.reason,
     )
     return f"{sentence} {alone}"
 
@@ -122,22 +129,22 @@ def describe_orders_if_exact(
 # Rising and falling sweeps
 
 
-def describe_sweeps(found: OppositeSweeps | None) -> list[str]:
+def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
     """Describe whether rising and falling sweeps show the same modes."""
-    if found is None:
+    if sweeps is None:
         return []
-    sweep_counts = f"{found.rising} rising and {found.falling} falling sweeps"
-    if not found.changed:
-        lowest_p_value = min(each.chance for each in found.modes)
+    sweep_counts = f"{sweeps.rising} rising and {sweeps.falling} falling sweeps"
+    if not sweeps.changed:
+        lowest_p_value = min(each.chance for each in sweeps.modes)
         largest_change = max(
-            abs(each.frequency) + NORMAL_95 * each.frequency_std for each in found.modes
+            abs(each.frequency) + NORMAL_95 * each.frequency_std for each in sweeps.modes
         )
         return [
             f"Nothing changed along the records: {sweep_counts} have the same modal constants "
             "(lowest "
             f"{p_value_text(lowest_p_value)}; frequencies to {100 * largest_change:.1g} %)."
         ]
-    each = "; ".join(map(_describe_mode_change, found.changed))
+    each = "; ".join(map(_describe_mode_change, sweeps.changed))
     return [
         f"Something changes along the records, or with the direction of the sweep: {sweep_counts} "
         "differ "
@@ -159,11 +166,11 @@ def _describe_mode_change(each: ModeInSweeps) -> str:
 
 
 def recommend_sweeps(
-    found: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionAnalysis]
+    sweeps: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionAnalysis]
 ) -> list[str]:
     """Recommend further sweeps that show whether the specimen changes during the records."""
-    if found is not None and found.changed:
-        modes = listed([str(each.mode) for each in found.changed])
+    if sweeps is not None and sweeps.changed:
+        modes = listed([str(each.mode) for each in sweeps.changed])
         return [
             "To tell a change in time from one with amplitude, repeat both sweeps with half the "
             f"amplitude: a difference in mode {modes} that stays is a change in time. Then check "
@@ -171,7 +178,7 @@ def recommend_sweeps(
         ]
     directions = {each.experiment.rising for each in sessions}
     refused = modal is not None and modal.uniform_beam.status == "refused"
-    if found is None and refused and directions in ({True}, {False}):
+    if sweeps is None and refused and directions in ({True}, {False}):
         missing_direction = "falling" if True in directions else "rising"
         return [
             f"Add {missing_direction} sweeps (start_hz and stop_hz exchanged): in sweeps of one "

@@ -52,7 +52,7 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
         Headlines as for single files. The last one, with ``file`` null, is that of all sessions
         together. Without whole-record fits the list is empty.
     """
-    found = [dict(each.headline) for each in campaign.sessions if each.headline]
+    documents = [dict(each.headline) for each in campaign.sessions if each.headline]
     numbers, verdict = campaign_numbers(campaign), campaign.verdict
     if numbers is not None and verdict is not None:
         orders = (verdict.alpha, verdict.lambda_)
@@ -60,8 +60,8 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
             replace(each.example, sentence=each.sentence, interval=None)
             for each in verdict.findings
         )
-        found.append(headline_json(None, numbers, orders, named, campaign.validity))
-    return found
+        documents.append(headline_json(None, numbers, orders, named, campaign.validity))
+    return documents
 
 
 def campaign_numbers(campaign: CampaignResult) -> Estimates | None:
@@ -169,7 +169,7 @@ def _reported_parameters(
     """Return the pooled parameters with their flags."""
     mixed = campaign.homogeneity.is_mixed
     flags = _order_flags(orders)
-    found = {
+    reported = {
         each.name: ReportedValue(
             each.value,
             each.std,
@@ -180,9 +180,9 @@ def _reported_parameters(
     }
     free = STRUCTURES[pooled.structure].free
     for name, value in pooled.plant.parameters.items():
-        if name not in found and (name not in PARAMETERS or name in free):
-            found[name] = ReportedValue(value, None, None, common_flag or _ON_BOUND_FLAG)
-    return found
+        if name not in reported and (name not in PARAMETERS or name in free):
+            reported[name] = ReportedValue(value, None, None, common_flag or _ON_BOUND_FLAG)
+    return reported
 
 
 def _order_flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:

@@ -133,9 +133,9 @@ class Homogeneity:
 
         Modes take precedence over parameters.
         """
-        found = [each for each in self.quantities if each.mixed and not each.of_rig]
-        of_modes = [each for each in found if each.quantity.startswith(tuple(_MODE_QUANTITIES))]
-        return max(of_modes or found, key=lambda each: each.own_stds, default=None)
+        mixed = [each for each in self.quantities if each.mixed and not each.of_rig]
+        of_modes = [each for each in mixed if each.quantity.startswith(tuple(_MODE_QUANTITIES))]
+        return max(of_modes or mixed, key=lambda each: each.own_stds, default=None)
 
     @property
     def mixed(self) -> bool:
@@ -153,8 +153,8 @@ class Homogeneity:
 
     def is_mixed(self, quantity: str) -> bool:
         """Return whether the pooled value of a quantity is the mean of a mixture."""
-        found = self.of(quantity)
-        return found is not None and found.mixed
+        scatter = self.of(quantity)
+        return scatter is not None and scatter.mixed
 
 
 def homogeneity(
@@ -272,7 +272,7 @@ def groups(estimate: NDArray[np.float64], std: NDArray[np.float64]) -> tuple[tup
     order = np.argsort(estimate)
     gaps = np.diff(estimate[order])
     session_std = math.sqrt(float(np.mean(std**2)))
-    found: tuple[tuple[int, ...], ...] = ()
+    best_groups: tuple[tuple[int, ...], ...] = ()
     clearest = _CLEAR_GAP_STDS
     for count in range(2, (order.size + 1) // 2 + 1):
         cut_indices = np.sort(np.argsort(gaps)[1 - count :]) + 1
@@ -281,5 +281,5 @@ def groups(estimate: NDArray[np.float64], std: NDArray[np.float64]) -> tuple[tup
         group_std = max(math.sqrt(squares / (order.size - count)), session_std)
         smallest_gap = float(gaps[cut_indices - 1].min()) / group_std
         if smallest_gap > clearest:
-            clearest, found = smallest_gap, tuple(tuple(part.tolist()) for part in parts)
-    return found
+            clearest, best_groups = smallest_gap, tuple(tuple(part.tolist()) for part in parts)
+    return best_groups

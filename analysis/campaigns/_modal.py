@@ -87,11 +87,11 @@ class PooledModal(ModalEstimate):
     @property
     def modes(self) -> tuple[PooledMode, ...]:
         """Frequency, damping ratio and inertia of each mode, with their standard deviations."""
-        found = []
+        pooled_modes = []
         for number in self.numbers:
             mode, (inertia, relative_std) = self.mode(number), self.inertia(number)
             between = self.between_std[self.rows([number])]
-            found.append(
+            pooled_modes.append(
                 PooledMode(
                     number=number,
                     frequency_hz=mode.frequency_hz,
@@ -107,7 +107,7 @@ class PooledModal(ModalEstimate):
                     participation_std_kg_m2=inertia * relative_std,
                 )
             )
-        return tuple(found)
+        return tuple(pooled_modes)
 
 
 def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
@@ -262,7 +262,7 @@ def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | Non
         _RESIDUE_PHASE_INDEX : len(modes) * len(CONSTANTS) : len(CONSTANTS)
     ]  # a view
     phases -= 2 * math.pi * np.round(phases / (2 * math.pi))
-    found = []
+    changes = []
     for index, mode in enumerate(modes):
         rows = slice(len(CONSTANTS) * index, len(CONSTANTS) * (index + 1))
         mode_difference, mode_covariance = difference[rows], covariance[rows, rows]
@@ -272,7 +272,7 @@ def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | Non
             )
         )
         std = np.sqrt(np.diag(mode_covariance))
-        found.append(
+        changes.append(
             ModeInSweeps(
                 mode,
                 float(mode_difference[_LN_FREQUENCY_INDEX]),
@@ -282,7 +282,7 @@ def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | Non
                 chance, chance < _SIGNIFICANCE_LEVEL / len(modes),
             )
         )  # fmt: skip
-    return OppositeSweeps(len(rising), len(falling), tuple(found))
+    return OppositeSweeps(len(rising), len(falling), tuple(changes))
 
 
 def _pool_groups(

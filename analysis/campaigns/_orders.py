@@ -74,8 +74,8 @@ def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
     """
     fitted = by_structure(sessions)
     most_fits = max(map(len, fitted.values()), default=0)
-    found = [each[0] for each in fitted.values() if len(each) == most_fits]
-    return max(found, key=_free_parameter_count).name if found else None
+    candidates = [each[0] for each in fitted.values() if len(each) == most_fits]
+    return max(candidates, key=_free_parameter_count).name if candidates else None
 
 
 def _free_parameter_count(estimate: RecordEstimate) -> int:
@@ -217,7 +217,7 @@ def tolerant_pooled_order(
     """
     order = exact.order
     status, reason = tolerant_status(order, estimate, refused=refused)
-    found = PooledOrder(
+    pooled = PooledOrder(
         order=order,
         status=status,
         value=estimate.values[order] if reason is None else None,
@@ -228,8 +228,8 @@ def tolerant_pooled_order(
         exact=exact,
     )
     if exact.mixture and exact.reason is not None:
-        return replace(found.doubted(exact.reason), mixture=True)
-    return found if _nearly_all_adequate(verdicts) else found.doubted(_UNEXPLAINED_REASON)
+        return replace(pooled.doubted(exact.reason), mixture=True)
+    return pooled if _nearly_all_adequate(verdicts) else pooled.doubted(_UNEXPLAINED_REASON)
 
 
 def _nearly_all_adequate(verdicts: Sequence[Verdict]) -> bool:

@@ -227,9 +227,9 @@ def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionF
         except (MemoryError, np.linalg.LinAlgError) as error:
             reason = "not enough memory" if isinstance(error, MemoryError) else error
             warnings = (*warnings, f"Not in the whole-record estimate: {path}: {reason}")
-    found = record_result.verdict.findings if record_result else ()
+    findings = record_result.verdict.findings if record_result else ()
     if invalidating := next(
-        (each.sentence for each in found if each.kind in _INVALIDATING_FINDINGS), None
+        (each.sentence for each in findings if each.kind in _INVALIDATING_FINDINGS), None
     ):
         return SessionFailure(path, f"{path}: {invalidating}", experiment)
     return _session_result(RecordResult(record, record_result, welch), task, experiment, warnings)

@@ -70,11 +70,11 @@ def fits_by_model(
 
 def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[ParameterStatistics, ...]:
     """Return statistics of the free parameters for each structure and weighting (Table 3)."""
-    found = []
+    statistics = []
     for (structure, weighting), fits in fits_by_model(sessions).items():
         for parameter in STRUCTURES[structure].free:
             values = np.array([fit.parameters[parameter] for fit in fits])
-            found.append(
+            statistics.append(
                 ParameterStatistics(
                     structure=structure,
                     weighting=weighting,
@@ -87,7 +87,7 @@ def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[Parameter
                     at_bounds=sum(parameter in fit.at_bounds for fit in fits),
                 )
             )
-    return tuple(found)
+    return tuple(statistics)
 
 
 # Nominal models
@@ -195,7 +195,7 @@ def mean_deviations(
     modelled : sequence of Peak or None
         Peaks of the model, one for each mode.
     """
-    found = []
+    deviations = []
     for number, (model, session_peaks) in enumerate(
         zip(modelled, zip(*measured, strict=True), strict=True), start=1
     ):
@@ -204,7 +204,7 @@ def mean_deviations(
             for peak in session_peaks
             if peak is not None and model is not None
         ]
-        found.append(
+        deviations.append(
             MeanPeakDeviation(
                 mode=number,
                 frequency_rad_s=_mean_or_nan([term.frequency_rad_s for term in terms]),
@@ -212,7 +212,7 @@ def mean_deviations(
                 sessions=len(terms),
             )
         )
-    return tuple(found)
+    return tuple(deviations)
 
 
 def _nominal_model(
@@ -319,7 +319,7 @@ def ranked_structures(
     alone = Counter(session.selected for session in sessions)
     misfit = {each.name: each.misfit for each in pooled}
     lowest = pooled[0].bic if pooled else min(bic.values(), default=0.0)
-    found = [
+    ranked = [
         RankedStructure(
             structure=each[0].structure,
             fitted=len(each),
@@ -332,7 +332,7 @@ def ranked_structures(
         )
         for name, each in fits.items()
     ]
-    return tuple(sorted(found, key=_rank_key))
+    return tuple(sorted(ranked, key=_rank_key))
 
 
 def _rank_key(each: RankedStructure) -> tuple[bool, bool, float]:

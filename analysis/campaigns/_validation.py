@@ -84,7 +84,7 @@ def models_without_session(
     session = sessions[left_out]
     others = [*sessions[:left_out], *sessions[left_out + 1 :]]
     own = {each.name: each.plant for each in session.record_estimates}
-    found = [
+    predictions = [
         PlantPrediction("record", each.name, None, each.plant, own[each.name])
         for each in pooled_estimates(others)
         if each.name in own
@@ -92,8 +92,8 @@ def models_without_session(
     for number, fit in enumerate(session.welch_fits):
         damping = mean_damping(fit.structure, [other.welch_fits[number] for other in others])
         plant = Plant(session.beam, damping, session.delay_s, session.tool_inertia_kg_m2)
-        found.append(PlantPrediction("welch", fit.structure, fit.weighting, plant, None))
-    return tuple(found)
+        predictions.append(PlantPrediction("welch", fit.structure, fit.weighting, plant, None))
+    return tuple(predictions)
 
 
 def validate(
@@ -168,8 +168,8 @@ def by_model(
     errors: Sequence[LeftOutError],
 ) -> list[tuple[str, str, str | None, tuple[LeftOutError, ...]]]:
     """Group prediction errors by method, structure and weighting, the smallest mean error first."""
-    found: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
+    errors_by_model: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
     for each in errors:
-        found.setdefault((each.method, each.name, each.weighting), []).append(each)
-    groups = [(*key, tuple(group)) for key, group in found.items()]
+        errors_by_model.setdefault((each.method, each.name, each.weighting), []).append(each)
+    groups = [(*key, tuple(group)) for key, group in errors_by_model.items()]
     return sorted(groups, key=lambda group: float(np.mean([each.error for each in group[3]])))

@@ -86,13 +86,13 @@ def common_findings(sessions: Sequence[SessionAnalysis]) -> tuple[CommonFinding,
 
     Two findings describe the same effect if their sentences differ only in numbers.
     """
-    found: dict[tuple[str, str], list[tuple[str, Finding]]] = {}
+    findings_by_effect: dict[tuple[str, str], list[tuple[str, Finding]]] = {}
     examined = [session for session in sessions if session.verdict is not None]
     for session in examined:
         for finding in session.verdict.findings if session.verdict else ():
             kind = finding.kind, _NUMBER_PATTERN.sub("#", finding.sentence)
-            found.setdefault(kind, []).append((session.name, finding))
-    counted = [_common_finding(group, len(examined)) for group in found.values()]
+            findings_by_effect.setdefault(kind, []).append((session.name, finding))
+    counted = [_common_finding(group, len(examined)) for group in findings_by_effect.values()]
     return tuple(sorted(counted, key=lambda each: -len(each.files)))
 
 
@@ -221,7 +221,7 @@ def campaign_verdict(
     )
     sweeps = opposite_sweeps(sessions)
     refused = modal is not None and modal.uniform_beam.status == "refused"
-    found = common_findings(sessions)
+    findings = common_findings(sessions)
     close_rivals = rivals(pooled, BIC_TIE)
     alone = dict(Counter(each.selected for each in sessions if each.selected).most_common())
     adequate = sum(verdict.adequate for verdict in verdicts)
@@ -237,7 +237,7 @@ def campaign_verdict(
         adequate=adequate,
         alpha=alpha,
         lambda_=lambda_,
-        findings=found,
+        findings=findings,
         dissent=dissent,
         sweeps=sweeps,
         sentences=(
@@ -255,7 +255,7 @@ def campaign_verdict(
                 comparable=not (homogeneity.mixed or refused),
             ),
             sentences.describe_selection(pooled, close_rivals, alone, len(verdicts)),
-            *(finding.sentence for finding in found),
+            *(finding.sentence for finding in findings),
             *sentences.describe_dissent([(each.file, each.structure) for each in dissent], best),
             *([] if homogeneity.mixed else [sentences.describe_scatter(freest)]),
             *sentences.describe_prediction_errors(freest, validation, len(sessions)),
@@ -329,12 +329,12 @@ def _dissenting_sessions(
     sessions: Sequence[SessionAnalysis], best: PooledEstimate
 ) -> tuple[Dissent, ...]:
     """Return the sessions that by themselves exclude the structure of the lowest common BIC."""
-    found = []
+    dissents = []
     for session in sessions:
         by_name = {each.name: each for each in session.record_estimates}
         if by_name:
             own = min(by_name.values(), key=lambda each: each.bic)
             margin = by_name[best.name].bic - own.bic
             if margin > BIC_DECISIVE:
-                found.append(Dissent(session.name, own.name, margin))
-    return tuple(sorted(found, key=lambda each: -each.margin))
+                dissents.append(Dissent(session.name, own.name, margin))
+    return tuple(sorted(dissents, key=lambda each: -each.margin))

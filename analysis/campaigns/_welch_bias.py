@@ -112,7 +112,7 @@ def welch_biases(
         Biases by type, then by weighting. A type whose whole-record residual is more than noise is
         left out, because its pooled estimate is no reference.
     """
-    found = []
+    biases = []
     by_name = {each.name: each for each in pooled if each.misfit <= LARGEST_MISFIT}
     for (structure, weighting), fits in fits_by_model(sessions).items():
         estimate = by_name.get(structure)
@@ -140,7 +140,7 @@ def welch_biases(
                     at_bounds=sum(name in fit.at_bounds for fit in fits),
                 )
             )
-        found.append(
+        biases.append(
             WelchBias(
                 structure,
                 weighting,
@@ -156,7 +156,7 @@ def welch_biases(
                 ),
             )
         )
-    return tuple(found)
+    return tuple(biases)
 
 
 def _mean_or_nan(values: Sequence[float]) -> float:

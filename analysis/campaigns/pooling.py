@@ -161,13 +161,13 @@ class PooledMode:
 
 def pooled_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
     """Pool frequency and damping ratio, separately, of each mode that all sessions have."""
-    found = []
+    pooled_list = []
     for modes in zip(*(each.modes for each in estimates), strict=False):
         frequency = _pool_quantity([(mode.frequency_hz, mode.frequency_std_hz) for mode in modes])
         ratio = _pool_quantity([(mode.damping_ratio, mode.damping_ratio_std) for mode in modes])
         if frequency is not None and ratio is not None:
-            found.append(PooledMode(modes[0].number, *frequency, *ratio))
-    return tuple(found)
+            pooled_list.append(PooledMode(modes[0].number, *frequency, *ratio))
+    return tuple(pooled_list)
 
 
 def _pool_quantity(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, float] | None:
@@ -273,7 +273,7 @@ class PooledEstimate:
     def sizes(self) -> tuple[ReportedLossFactor, ...]:
         """Loss factors of the kinds of damping that all sessions together determine."""
         names = tuple(each.name for each in self.parameters)
-        t, found = student_t_quantile(0.95, self.sessions - 1), []
+        t, loss_factors = student_t_quantile(0.95, self.sessions - 1), []
         values = self.plant.parameters
         first_rad_s = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
         for damping, coefficient, order in _DAMPING_PARAMETERS:
@@ -282,8 +282,8 @@ class PooledEstimate:
                 factor = math.exp(t * size.std / size.value)
                 interval = size.value / factor, size.value * factor
                 quantity = ReportedValue(size.value, size.std, interval)
-                found.append(ReportedLossFactor(damping, size.omega_rad_s, quantity))
-        return tuple(found)
+                loss_factors.append(ReportedLossFactor(damping, size.omega_rad_s, quantity))
+        return tuple(loss_factors)
 
     @property
     def by_name(self) -> dict[str, PooledParameter]:
@@ -304,11 +304,11 @@ def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimat
 
 def by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, list[RecordEstimate]]:
     """Return the whole-record estimates of all sessions by the name of the structure."""
-    found: dict[str, list[RecordEstimate]] = {}
+    estimates_by_name: dict[str, list[RecordEstimate]] = {}
     for session in sessions:
         for estimate in session.record_estimates:
-            found.setdefault(estimate.name, []).append(estimate)
-    return found
+            estimates_by_name.setdefault(estimate.name, []).append(estimate)
+    return estimates_by_name
 
 
 def determines_damping(estimate: RecordEstimate) -> bool:

@@ -119,28 +119,30 @@ _SLIGHT_FREQUENCY_SCATTER: Final = 2e-3
 by 0.3 %."""
 
 
-def specimens(found: Homogeneity) -> list[str]:
+def specimens(homogeneity: Homogeneity) -> list[str]:
     """Return sentences about different specimens; an empty list if the sessions agree."""
-    sentences = _describe_stated_specimens(found.specimens) if len(found.specimens) > 1 else []
-    leading = found.leading
+    sentences = (
+        _describe_stated_specimens(homogeneity.specimens) if len(homogeneity.specimens) > 1 else []
+    )
+    leading = homogeneity.leading
     return (
         sentences
         if leading is None
-        else [*sentences, *_describe_different_specimens(found, leading)]
+        else [*sentences, *_describe_different_specimens(homogeneity, leading)]
     )
 
 
-def title(text: str, found: Homogeneity) -> str:
+def title(text: str, homogeneity: Homogeneity) -> str:
     """Return a title, with an addition if the values are pooled over several specimens.
 
     Parameters
     ----------
     text : str
         Title without the mark.
-    found : Homogeneity
+    homogeneity : Homogeneity
         Whether the sessions are of one specimen.
     """
-    return f"{text}, {_MIXTURE_TITLE}" if found.mixed else text
+    return f"{text}, {_MIXTURE_TITLE}" if homogeneity.mixed else text
 
 
 def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]:
@@ -167,11 +169,11 @@ def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]
     ]
 
 
-def _describe_different_specimens(found: Homogeneity, leading: Heterogeneity) -> list[str]:
+def _describe_different_specimens(homogeneity: Homogeneity, leading: Heterogeneity) -> list[str]:
     """Describe how the estimates show that the sessions are of different specimens."""
     others = [
         label(each.quantity)[0]
-        for each in found.quantities
+        for each in homogeneity.quantities
         if each.mixed and not each.of_rig and each is not leading
     ]
     also = f" The same holds of {', '.join(others)}." if others else ""
@@ -182,13 +184,15 @@ def _describe_different_specimens(found: Homogeneity, leading: Heterogeneity) ->
         f"{MIXTURE_MARK}) that "
         "may hold for none of the specimens: analyse the sessions of each specimen separately, or "
         "find what changed between sessions (clamp, temperature, "
-        f"wear).{_small_scatter_remark(found)}",
+        f"wear).{_small_scatter_remark(homogeneity)}",
     ]
 
 
-def _small_scatter_remark(found: Homogeneity) -> str:
+def _small_scatter_remark(homogeneity: Homogeneity) -> str:
     """Return a remark that the frequencies vary little in relative terms, or an empty text."""
-    frequencies = [each for each in found.quantities if each.quantity.startswith("frequency_hz")]
+    frequencies = [
+        each for each in homogeneity.quantities if each.quantity.startswith("frequency_hz")
+    ]
     mixed = [each for each in frequencies if each.mixed]
     if not mixed or any(each.between_std > _SLIGHT_FREQUENCY_SCATTER * each.mean for each in mixed):
         return ""
@@ -310,42 +314,54 @@ def describe_orders(
     return f"{sentence} Error of the torque predicted for an unseen session: {error_texts}."
 
 
-def _order_clause(found: PooledOrder) -> str:
+def _order_clause(pooled_order: PooledOrder) -> str:
     """Describe the order of one damping as the clause of a sentence."""
-    if found.exact is not None:
-        return _slope_clause(found)
-    damping = _DAMPING_OF_ORDER[found.order]
-    if found.status == "absent":
+    if pooled_order.exact is not None:
+        return _slope_clause(pooled_order)
+    damping = _DAMPING_OF_ORDER[pooled_order.order]
+    if pooled_order.status == "absent":
         return f"no {damping}"
-    if found.status == "compatible" and found.interval is None:
-        return f"{damping} of order 1 ({found.order} was not fitted)"
-    if found.value is None or found.interval is None or found.reason is not None:
+    if pooled_order.status == "compatible" and pooled_order.interval is None:
+        return f"{damping} of order 1 ({pooled_order.order} was not fitted)"
+    if (
+        pooled_order.value is None
+        or pooled_order.interval is None
+        or pooled_order.reason is not None
+    ):
         return f"{damping} of an order that is not established"
-    half_width = (found.interval[1] - found.interval[0]) / 2
-    value_text = " ± ".join(to_uncertainty((found.value, half_width), found.std or half_width))
-    order_text = f"{found.order} = {value_text}"
-    if found.status == "compatible":
+    half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
+    value_text = " ± ".join(
+        to_uncertainty((pooled_order.value, half_width), pooled_order.std or half_width)
+    )
+    order_text = f"{pooled_order.order} = {value_text}"
+    if pooled_order.status == "compatible":
         return f"{damping} of integer order ({order_text})"
-    if found.status == "open":
+    if pooled_order.status == "open":
         return f"{damping} of an order near 1 ({order_text}; 1 is doubtful, but not excluded)"
-    if abs(found.value - 1) < _NEARLY_INTEGER_DISTANCE:
+    if abs(pooled_order.value - 1) < _NEARLY_INTEGER_DISTANCE:
         return f"{damping} of nearly integer order ({order_text}; 1 is excluded)"
     return f"{damping} of fractional order ({order_text})"
 
 
-def _slope_clause(found: PooledOrder) -> str:
+def _slope_clause(pooled_order: PooledOrder) -> str:
     """Describe how one loss grows with frequency over the visible modes, as a clause."""
-    loss = LOSSES[found.order]
-    if found.value is None or found.interval is None or found.reason is not None:
+    loss = LOSSES[pooled_order.order]
+    if (
+        pooled_order.value is None
+        or pooled_order.interval is None
+        or pooled_order.reason is not None
+    ):
         return f"{loss} with a slope that is not established"
-    half_width = (found.interval[1] - found.interval[0]) / 2
-    slope_text = " ± ".join(to_uncertainty((found.value, half_width), found.std or half_width))
+    half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
+    slope_text = " ± ".join(
+        to_uncertainty((pooled_order.value, half_width), pooled_order.std or half_width)
+    )
     conclusion = {
         "compatible": "consistent with order 1",
         "fractional": "which excludes order 1",
         "open": "which alone does not exclude order 1",
     }
-    return f"{loss} growing as f^({slope_text}), {conclusion[found.status]}"
+    return f"{loss} growing as f^({slope_text}), {conclusion[pooled_order.status]}"
 
 
 def describe_structure(freest: PooledEstimate, best: PooledEstimate) -> str:
@@ -377,10 +393,10 @@ def describe_structure(freest: PooledEstimate, best: PooledEstimate) -> str:
     return sentence
 
 
-def describe_loss_factors(found: Sequence[ReportedLossFactor]) -> list[str]:
+def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[str]:
     """Describe each loss factor at the frequency where it depends least on the order."""
     factors = []
-    for each in found:
+    for each in loss_factors:
         if each.omega_rad_s is None or not (each.size.std and each.size.interval_95):
             continue
         value, low, high = to_uncertainty((each.size.value, *each.size.interval_95), each.size.std)
@@ -464,54 +480,58 @@ def describe_noise_sessions(adequate: int, sessions: int) -> str:
     )
 
 
-def describe_modes(found: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[str]:
+def describe_modes(pooled_modes: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[str]:
     """Describe frequency and damping ratio of each mode.
 
     Parameters
     ----------
-    found : sequence of PooledMode
+    pooled_modes : sequence of PooledMode
         Modes pooled over the sessions.
     sessions : int
         Number of sessions.
     mixed : bool
         Whether the sessions are of several specimens.
     """
-    if not found:
+    if not pooled_modes:
         return []
     t = student_t_quantile(0.95, sessions - 1)
-    modes = "; ".join(_mode_clause(each, t) for each in found)
+    modes = "; ".join(_mode_clause(each, t) for each in pooled_modes)
     of = "the sessions, a mixture" if mixed else "the sessions"
     return [f"Modes: {modes} (± 95 % of the mean over {of})."]
 
 
-def describe_order(found: PooledOrder) -> str:
+def describe_order(pooled_order: PooledOrder) -> str:
     """Describe the pooled estimate of one order of the damping."""
-    name, damping = found.order, _DAMPING_OF_ORDER[found.order]
-    counts = {f"“{status}”": count for status, count in found.alone.items()}
+    name, damping = pooled_order.order, _DAMPING_OF_ORDER[pooled_order.order]
+    counts = {f"“{status}”": count for status, count in pooled_order.alone.items()}
     alone = f" {describe_single_sessions(counts, sum(counts.values()))}"
-    if found.status == "absent":
+    if pooled_order.status == "absent":
         return f"No {damping} was found, so its order {name} has no meaning.{alone}"
-    if found.status == "compatible" and found.interval is None:
+    if pooled_order.status == "compatible" and pooled_order.interval is None:
         return (
             f"The order {name} of the {damping} is fixed at 1, with which it is compatible.{alone}"
         )
-    if found.value is None or found.interval is None:
-        return f"The order {name} of the {damping} is not identifiable: {found.reason}.{alone}"
-    half_width = (found.interval[1] - found.interval[0]) / 2
-    value, low, high = to_uncertainty((found.value, *found.interval), found.std or half_width)
+    if pooled_order.value is None or pooled_order.interval is None:
+        return (
+            f"The order {name} of the {damping} is not identifiable: {pooled_order.reason}.{alone}"
+        )
+    half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
+    value, low, high = to_uncertainty(
+        (pooled_order.value, *pooled_order.interval), pooled_order.std or half_width
+    )
     statement = (
         f"The order {name} of the {damping} is {value} "
         f"(95 %: {low} to {high}, between-session variance included)"
     )
-    if found.reason is not None:
+    if pooled_order.reason is not None:
         would = statement.replace(" is ", " would be ", 1)
-        return f"{would}, but {found.reason}; do not interpret it.{alone}"
+        return f"{would}, but {pooled_order.reason}; do not interpret it.{alone}"
     conclusion = {
         "compatible": "consistent with 1",
         "fractional": "1 is excluded",
         "open": "1 is doubtful, but not excluded",
     }
-    return f"{statement}: {conclusion[found.status]}.{alone}"
+    return f"{statement}: {conclusion[pooled_order.status]}.{alone}"
 
 
 def describe_welch_bias(
@@ -542,11 +562,11 @@ def describe_welch_bias(
     left_out = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
     sentences = []
     for each in best or of_type[:1]:
-        found = [one for one in each.significant if one.parameter not in left_out]
-        if not found:
+        significant = [one for one in each.significant if one.parameter not in left_out]
+        if not significant:
             continue
         sentences.append(
-            f"Welch's {'; '.join(map(_bias_clause, found))} (type {each.structure}, weights "
+            f"Welch's {'; '.join(map(_bias_clause, significant))} (type {each.structure}, weights "
             f"{each.weighting}, as in Table 3): bias, not scatter, which more sessions do not "
             "reduce."
         )
@@ -582,7 +602,7 @@ def describe_dissent(sessions: Sequence[tuple[str, str]], best: PooledEstimate) 
 
     Parameters
     ----------
-    who : sequence of tuple
+    sessions : sequence of tuple
         File of each such session, and the structure that it selects.
     best : PooledEstimate
         Estimate of the structure that all sessions select together.

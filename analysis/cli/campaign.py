@@ -92,22 +92,22 @@ def campaign_command(
         campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
         dask=dask, uniformity=uniformity,
     )  # fmt: skip
-    found = _analyse_and_write(
+    result = _analyse_and_write(
         run, len(files), folder, outputs, with_paper=with_paper, formats=formats
     )
     lines = [f"Report of the campaign: {folder / 'report.html'}"]
     if outputs.json is not None and not outputs.json_to_stdout:
         # Before any output: the streams may be closed.
-        text = document_text(campaign_document(found, with_paper=with_paper))
+        text = document_text(campaign_document(result, with_paper=with_paper))
         write_new(outputs.json, text, overwrite=outputs.overwrite)
         lines.insert(0, f"All results as JSON: {outputs.json}")
     console = outputs.console()
-    console.print(campaign_tables(found, with_paper=with_paper, verbose=outputs.verbose))
+    console.print(campaign_tables(result, with_paper=with_paper, verbose=outputs.verbose))
     console.print("\n".join(lines), markup=False, soft_wrap=True)
     if outputs.json_to_stdout:
-        content = campaign_document(found, with_paper=with_paper)
+        content = campaign_document(result, with_paper=with_paper)
         print(document_text(content, ascii_only=True), end="")  # noqa: T201 - the requested output
-    return 1 if found.failures or found.lost_trials else 0
+    return 1 if result.failures or result.lost_trials else 0
 
 
 def _analyse_and_write(
@@ -132,16 +132,16 @@ def _analyse_and_write(
             progress.update(bar, completed=done, total=total + _MOST_FIGURES, description=name)
 
         with new_folder(folder, overwrite=outputs.overwrite) as partial_folder:
-            found = run(on_progress=on_progress)
-            if len(found.sessions) == 1:
-                raise SingleSessionError(found.sessions[0].path, found.failures)
+            result = run(on_progress=on_progress)
+            if len(result.sessions) == 1:
+                raise SingleSessionError(result.sessions[0].path, result.failures)
             write_campaign(
-                found, partial_folder, with_paper=with_paper, formats=formats,
+                result, partial_folder, with_paper=with_paper, formats=formats,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),
             )  # fmt: skip
     report_error = partial(print_readable, progress.console)
-    for failure in found.failures:
+    for failure in result.failures:
         report_error(f"Error: {failure.message}")
-    for lost in found.lost_trials:
+    for lost in result.lost_trials:
         report_error(f"Error: {lost.path} is not predicted from the others: {lost.reason}")
-    return found
+    return result

@@ -77,10 +77,10 @@ def session_files(paths: Sequence[Path]) -> list[Path]:
     NoSessionsError
         A folder contains no session.
     """
-    found: list[Path] = []
+    session_paths: list[Path] = []
     for path in paths:
         if not path.is_dir():
-            found.append(path)
+            session_paths.append(path)
             continue
         sessions = sorted(each for each in path.glob("*.mcap") if each.is_file())
         if not sessions:
@@ -94,8 +94,8 @@ def session_files(paths: Sequence[Path]) -> list[Path]:
                     else ""
                 )
             )
-        found += sessions
-    return found
+        session_paths += sessions
+    return session_paths
 
 
 def session_command(
@@ -135,15 +135,15 @@ def session_command(
     from analysis.report.folder import report_folders, write_new
 
     folders = report_folders(files, outputs.report, overwrite=outputs.overwrite)
-    found, errors, code = _analyse_all(files, folders, routes, rerun, outputs)
-    if not found:
+    record_results, errors, code = _analyse_all(files, folders, routes, rerun, outputs)
+    if not record_results:
         return code
-    results = document(found, {**(others or {}), **errors})
+    results = document(record_results, {**(others or {}), **errors})
     if outputs.json is not None and not outputs.json_to_stdout:
         # Before any output: the streams may be closed.
         write_new(outputs.json, document_text(results), overwrite=outputs.overwrite)
     console = outputs.console()
-    _print_tables(console, found, single=len(files) == 1, verbose=outputs.verbose)
+    _print_tables(console, record_results, single=len(files) == 1, verbose=outputs.verbose)
     if outputs.json_to_stdout:
         typer.echo(document_text(results, ascii_only=True), nl=False)
     elif outputs.json is not None:
@@ -189,7 +189,7 @@ def _analyse_all(
     from rigd.printable import progress_bar
     from rigd.session import SessionError
 
-    found: list[RecordResult] = []
+    results: list[RecordResult] = []
     errors: dict[str, str] = {}
     code = 0
     with progress_bar() as progress:
@@ -203,7 +203,7 @@ def _analyse_all(
                 progress.update(task, advance=weight, description=f"{name}: {done}")
 
             try:
-                found.append(
+                results.append(
                     _analyse_file(
                         file,
                         folder,
@@ -222,7 +222,7 @@ def _analyse_all(
                 errors[str(file)] = message = _error_message(file, error)
                 progress.update(task, completed=number * steps)
                 print_message(f"Error: {message}")
-    return found, errors, code
+    return results, errors, code
 
 
 def _error_message(file: Path, error: Exception) -> str:

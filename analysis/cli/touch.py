@@ -123,7 +123,7 @@ def _analyse_sessions(
     from rigd.printable import progress_bar
     from rigd.session import SessionError
 
-    found: list[TouchedSession] = []
+    sessions: list[TouchedSession] = []
     errors: dict[str, str] = {}
     analysis = TouchAnalysis(model)
     with progress_bar() as progress:
@@ -134,10 +134,10 @@ def _analyse_sessions(
                 progress.update(task, description=f"{name}: {step}")
 
             try:
-                found.append(analysis.session(file, on_step))
+                sessions.append(analysis.session(file, on_step))
             except (SessionError, RecordError, MemoryError) as error:
                 message = str(error) or f"{file}: not enough memory; close other programs."
                 errors[str(file)] = message
                 print_readable(progress.console, f"Error: {message}")
             progress.update(task, completed=number + 1)
-    return found, errors
+    return sessions, errors

@@ -126,8 +126,8 @@ def stated_unit(unit: str) -> str:
 
 def unit_in_brackets(name: str) -> str | None:
     """Return the unit in brackets after a name, as in ``Angle [deg]``; None without one."""
-    found = _BRACKETS_PATTERN.search(name)
-    return canonical_unit(found[1]) if found else None
+    match = _BRACKETS_PATTERN.search(name)
+    return canonical_unit(match[1]) if match else None
 
 
 def unit_in_suffix(name: str) -> str | None:
@@ -138,8 +138,8 @@ def unit_in_suffix(name: str) -> str | None:
 
 def _split_number(unit: str) -> tuple[float, str]:
     """Split a text such as ``0.02 N.m`` into number and unit; the number is 1 by default."""
-    found = _NUMBER_PATTERN.match(unit.strip())
-    return (float(found[0]), unit.strip()[found.end() :]) if found else (1.0, unit)
+    match = _NUMBER_PATTERN.match(unit.strip())
+    return (float(match[0]), unit.strip()[match.end() :]) if match else (1.0, unit)
 
 
 def _plain_spelling(text: str) -> str:

@@ -315,13 +315,13 @@ class FileStatements:
             for n in channels
         }
         self._report_shift(statement, skips, delays_s, timebase.rate_hz)
-        found = {
+        aligned = {
             n: replace(channel, values=channel.values[skips[n] : skips[n] + common_length])
             for n, channel in channels.items()
         }
         if time is not None and len(set(skips.values())) > 1:
             self.warnings.append(f"The times in '{time.channel}' were cut like the channels.")
-        return found, delays_s
+        return aligned, delays_s
 
     def _report_shift(
         self,

@@ -261,7 +261,7 @@ def _segment_ticks(
     path: Path, segments_s: Mapping[str, tuple[float, float]], rate_hz: float, ticks: int
 ) -> dict[str, tuple[int, int]]:
     """Return first and end tick of each segment; raise if one is not inside the record."""
-    found = {}
+    ticks_by_name = {}
     for name, (begin_s, end_s) in segments_s.items():
         first, end = round(begin_s * rate_hz), round(end_s * rate_hz)
         if not 0 <= first < end <= ticks:
@@ -269,17 +269,17 @@ def _segment_ticks(
                 f"{path}: the segment {name} from {begin_s:g} to {end_s:g} s is not inside the "
                 f"record, which lasts {ticks / rate_hz:g} s; count from the first sample."
             )
-        found[name] = (first, end)
-    return found
+        ticks_by_name[name] = (first, end)
+    return ticks_by_name
 
 
 def _describe_missing_samples(
     titles: Mapping[str, str], status: NDArray[np.uint32], first: int, ticks: NDArray[np.int64]
 ) -> list[str]:
     """Return sentences on missing samples and on values that are not finite."""
-    found = []
+    sentences = []
     if first:
-        found.append(
+        sentences.append(
             f"The first {first} samples were left out: angle or torque is not finite there."
         )
     for flag, name in (
@@ -288,15 +288,17 @@ def _describe_missing_samples(
     ):
         count = int(np.count_nonzero(status & flag))
         if count:
-            found.append(f"{count} samples of '{name}' are not finite; they were flagged as stale.")
+            sentences.append(
+                f"{count} samples of '{name}' are not finite; they were flagged as stale."
+            )
     steps = np.diff(ticks)
     missing = int(steps.sum()) - len(steps)
     if missing:
-        found.append(
+        sentences.append(
             f"{missing} samples are missing in {np.count_nonzero(steps > 1)} gaps of the time, the "
             f"longest of {int(steps.max()) - 1}."
         )
-    return found
+    return sentences
 
 
 def _interpolate_gaps(ticks: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:

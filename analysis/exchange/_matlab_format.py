@@ -144,8 +144,8 @@ _ELEMENT_PATTERN: Final = re.compile(r"(.+)\((\d+)\)")
 
 def _split_element(text: str) -> tuple[str, int | None]:
     """Split ``log(2)`` into name and element index (from 0); the index is None without one."""
-    found = _ELEMENT_PATTERN.fullmatch(text)
-    return (found[1], int(found[2]) - 1) if found else (text, None)
+    match = _ELEMENT_PATTERN.fullmatch(text)
+    return (match[1], int(match[2]) - 1) if match else (text, None)
 
 
 def _read_vector(path: Path, name: str, contents: Mapping[str, Any]) -> NDArray[Any]:

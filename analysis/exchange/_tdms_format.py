@@ -64,13 +64,17 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
                     for channel in group.channels()
                 }
                 is_cut_off = file.file_status.incomplete_final_segment
-                found = {name: _read_channel(path, name, channels, is_cut_off) for name in names}
+                source_channels = {
+                    name: _read_channel(path, name, channels, is_cut_off) for name in names
+                }
                 for name in names:
                     levels = (channels[name], file[channels[name].group_name], file)
                     scale = _unapplied_scale([level.properties for level in levels])
                     times = _group_times(path, name, names, channels)
-                    found[name] = replace(found[name], unapplied_scale=scale, times=times)
-                return _drop_relative_starts(found)
+                    source_channels[name] = replace(
+                        source_channels[name], unapplied_scale=scale, times=times
+                    )
+                return _drop_relative_starts(source_channels)
     except (ExchangeError, OSError, MemoryError):
         raise
     except Exception as error:  # npTDMS lets through whatever a damaged file provokes
@@ -207,8 +211,8 @@ def _group_times(
         ):
             continue
         try:
-            found = _read_channel(path, other, channels, False)
+            time_channel = _read_channel(path, other, channels, False)
         except ExchangeError:  # texts, say
             continue
-        return FileTimes(other, found.values, time_unit_s(found.unit_label))
+        return FileTimes(other, time_channel.values, time_unit_s(time_channel.unit_label))
     return None

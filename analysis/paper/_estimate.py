@@ -173,13 +173,13 @@ def estimate_warnings(
     record: Record, settings: WelchSettings, response: FrequencyResponse
 ) -> tuple[str, ...]:
     """Return sentences on weaknesses of an estimate, such as few segments or a low resolution."""
-    found = []
+    sentences = []
     is_welch = settings.estimator != "fft"
     length = (
         settings.segmentation(record.rate_hz).segment_length if is_welch else len(record.time_s)
     )
     if is_welch and response.segments < PAPER_SEGMENTS:
-        found.append(
+        sentences.append(
             f"Only {response.segments} Welch segment(s) of {length} samples fit "
             "the sweep of "
             f"{record.first_sweep_samples}{_segment_remedy(record.first_sweep_samples)}"
@@ -187,7 +187,7 @@ def estimate_warnings(
     resolution_hz = record.rate_hz / length
     first_mode_hz = undamped_frequencies_rad_s(record.beam, 1)[0] / (2 * np.pi)
     if resolution_hz > first_mode_hz:
-        found.append(
+        sentences.append(
             f"A transform of {1 / resolution_hz:.3g} s resolves {resolution_hz:.3g} Hz and cannot "
             f"show the first mode, at {first_mode_hz:.3g} Hz; take longer segments, or record "
             "longer."
@@ -195,12 +195,12 @@ def estimate_warnings(
     excited_hz = _excited_band_hz(record.metadata)
     first_hz, last_hz = settings.band_hz
     if excited_hz is not None and (excited_hz[0] > first_hz or excited_hz[1] < last_hz):
-        found.append(
+        sentences.append(
             f"The band {first_hz:g} to {last_hz:g} Hz reaches beyond the excitation "
             f"({excited_hz[0]:g} to {excited_hz[1]:g} Hz): what was not excited is noise; "
             "narrow --band."
         )
-    return tuple(found)
+    return tuple(sentences)
 
 
 def _excited_band_hz(metadata: Mapping[str, str]) -> tuple[float, float] | None:

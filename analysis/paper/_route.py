@@ -470,12 +470,12 @@ def _evaluate_fit(
     )
 
 
-def _are_followed(found: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
+def _are_followed(fitted_modes: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
     """Return whether each mode vibrates near the frequency of the undamped beam's mode."""
     undamped_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
     return tuple(
         mode.damping_ratio < 1 and abs(mode.frequency_hz / own_hz - 1) < LARGEST_SHIFT
-        for mode, own_hz in zip(found, undamped_hz[: len(found)], strict=True)
+        for mode, own_hz in zip(fitted_modes, undamped_hz[: len(fitted_modes)], strict=True)
     )
 
 
