@@ -99,9 +99,13 @@ class OnlineEstimate:
             return self.problem
         reported_values = [
             *headline.parameters.values(),
-            *(each for mode in headline.modes for each in (mode.frequency_hz, mode.damping_ratio)),
+            *(
+                reported_value
+                for mode in headline.modes
+                for reported_value in (mode.frequency_hz, mode.damping_ratio)
+            ),
         ]
-        flags = [each.flag for each in reported_values]
+        flags = [reported_value.flag for reported_value in reported_values]
         return None if None in flags else flags[0]
 
     @property
@@ -151,7 +155,7 @@ class OnlineEstimate:
             "problem": self.problem,
             "doubt": self.doubt,
             "warnings": self.warnings,
-            "findings": [each.sentence for each in self.findings],
+            "findings": [finding.sentence for finding in self.findings],
             "modes": [],
         }
         headline, fit, plant = self.headline, self.predicting, self.plant
@@ -334,7 +338,7 @@ class OnlineEstimator:
             orders=orders if has_modes else (),
             findings=findings
             if has_modes
-            else tuple(each for each in findings if each.kind in _FINDINGS_WITHOUT_MODES),
+            else tuple(finding for finding in findings if finding.kind in _FINDINGS_WITHOUT_MODES),
             analysis=analysis if has_modes else None,
             warnings=record.warnings,
             problem="" if has_modes else "No mode has been excited enough yet.",

@@ -113,7 +113,11 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
         start_utc_ns = _parse_integer(metadata.get("start_utc_ns", ""))
         flags += record.warnings
         headline, validity, remarks = _fit_headline(record)
-        modes = [] if headline is None else [_mode_document(each) for each in headline.modes]
+        modes = (
+            []
+            if headline is None
+            else [_mode_document(reported_mode) for reported_mode in headline.modes]
+        )
         flags += remarks
         response, coherence, remarks = _response_document(record)
         flags += remarks
@@ -178,7 +182,7 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
         return None, stated_validity(record.metadata), [no_modes]
     if headline.uniform_beam is not None:
         validity = replace(validity, uniform_beam=headline.uniform_beam.summary)
-    sentences += [each.sentence for each in findings]
+    sentences += [finding.sentence for finding in findings]
     if not headline.modes:
         sentences.append("No modes: none lies in the excited band.")
     return headline, validity, sentences

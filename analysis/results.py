@@ -105,13 +105,13 @@ class WholeRecord:
     @property
     def fits(self) -> Mapping[str, RecordFit]:
         """Fits by their names in tables, the lowest BIC first."""
-        return {each.name: each.fit for each in self.selection.candidates}
+        return {candidate.name: candidate.fit for candidate in self.selection.candidates}
 
     @property
     def delta_bic(self) -> Mapping[str, float]:
         """Difference of each fit's BIC from the lowest BIC, by the name of the fit."""
         best, *_ = self.selection.candidates
-        return {each.name: each.bic - best.bic for each in self.selection.candidates}
+        return {candidate.name: candidate.bic - best.bic for candidate in self.selection.candidates}
 
     @property
     def headline(self) -> Headline:
@@ -174,7 +174,9 @@ class WholeRecord:
             "scale_uncertainty": {
                 name: value for name, value in self.record.uncertainty.items() if name in SCALES
             },
-            "combined": {name: each.as_json() for name, each in self.combined.items()},
+            "combined": {
+                name: reported_value.as_json() for name, reported_value in self.combined.items()
+            },
         }
 
     def _covariance_json(self) -> dict[str, Any]:
@@ -183,7 +185,8 @@ class WholeRecord:
 
         return {
             "names": [
-                f"ln_{each}" if each in LOGARITHMIC else each for each in self.fit.determined
+                f"ln_{parameter}" if parameter in LOGARITHMIC else parameter
+                for parameter in self.fit.determined
             ],
             "matrix": self.fit.covariance.tolist(),
         }
@@ -196,7 +199,7 @@ class WholeRecord:
         """
         exact = (self.headline.exact or self.headline).parameters
         flagged = {name for name in _ORDER_NAMES & exact.keys() if exact[name].flag is not None}
-        return frozenset(flagged | {each.order for each in self.orders if each.value is None})
+        return frozenset(flagged | {order.order for order in self.orders if order.value is None})
 
 
 @dataclass(frozen=True, slots=True)

@@ -457,7 +457,7 @@ def _angle_noise_std(angle_rad: Real, resting: NDArray[np.bool_]) -> float:
 def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
     """Return sentences on touches that are not estimated or not explained by the model."""
     sentences = []
-    without_estimate = [each.number for each in touches if each.estimate is None]
+    without_estimate = [touch.number for touch in touches if touch.estimate is None]
     if without_estimate:
         sentences.append(
             f"Touch {_number_list(without_estimate)}: not estimated; it takes {_LEAST_BEFORE_S:g} "
@@ -465,9 +465,9 @@ def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
             f"before a touch and {1e3 * _LEAST_AFTER_S:g} ms after it."
         )
     not_explained = [
-        each.number
-        for each in touches
-        if each.estimate is not None and each.estimate.chi2_per_degree > _LARGEST_CHI2_PER_DEGREE
+        touch.number
+        for touch in touches
+        if touch.estimate is not None and touch.estimate.chi2_per_degree > _LARGEST_CHI2_PER_DEGREE
     ]
     if not_explained:
         sentences.append(

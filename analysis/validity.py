@@ -79,7 +79,7 @@ def worst(validities: Iterable[Validity]) -> Validity:
     validities : iterable of Validity
         Validities of the single records.
     """
-    slopes = [each.predicted_peak_tip_slope_rad for each in validities]
+    slopes = [validity.predicted_peak_tip_slope_rad for validity in validities]
     known = [slope for slope in slopes if slope is not None]
     return _validity_of_slope(max(known)) if known and len(known) == len(slopes) else Validity()
 

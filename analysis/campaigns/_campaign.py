@@ -120,7 +120,7 @@ class CampaignResult:
     @property
     def validity(self) -> Validity:
         """Validity of the linear model for the campaign: the worst of its sessions."""
-        return worst(each.validity for each in self.sessions)
+        return worst(session.validity for session in self.sessions)
 
     @property
     def trials(self) -> int:
@@ -250,15 +250,17 @@ def campaign_result(
     lost : sequence of LostTrial, optional
         Sessions that could not be predicted from the others.
     """
-    names = distinct_names([*(each.path for each in sessions), *(each.path for each in failures)])
-    sessions = [replace(each, name=name) for each, name in zip(sessions, names, strict=False)]
+    names = distinct_names(
+        [*(session.path for session in sessions), *(session.path for session in failures)]
+    )
+    sessions = [replace(session, name=name) for session, name in zip(sessions, names, strict=False)]
     failures = [
-        replace(each, name=name)
-        for each, name in zip(failures, names[len(sessions) :], strict=True)
+        replace(session, name=name)
+        for session, name in zip(failures, names[len(sessions) :], strict=True)
     ]
     pooled = pooled_estimates(sessions)
-    usable = [(each.name, each.experiment) for each in sessions]
-    left_out = [(each.name, each.experiment) for each in failures]
+    usable = [(session.name, session.experiment) for session in sessions]
+    left_out = [(session.name, session.experiment) for session in failures]
     specimens = stated_specimens([*usable, *left_out], sessions[0].experiment)
     homogeneity_test = homogeneity(sessions, pooled, specimens)
     biases = welch_biases(sessions, pooled)
@@ -294,7 +296,7 @@ def _separate_experiments(
     usable = [result for result in results if isinstance(result, SessionAnalysis)]
     common = usable[most_common([session.experiment for session in usable])]
     stated = [result.experiment for result in results if result.experiment]
-    agreeing = sum(common.experiment.difference(each) is None for each in stated)
+    agreeing = sum(common.experiment.difference(experiment) is None for experiment in stated)
     majority_text = ", as in most" if 2 * agreeing > len(stated) else ""
     sessions: list[SessionAnalysis] = []
     failures: list[SessionFailure] = []
@@ -320,29 +322,33 @@ def _equalize_welch_fits(
     all sessions are omitted. A session that planned its own excitation is never excluded, because
     its record is as informative as any other.
     """
-    without_fits = [each for each in sessions if not each.frequency_hz.size]
+    without_fits = [session for session in sessions if not session.frequency_hz.size]
     if not without_fits:
         return sessions, failures
-    any_searched = any(each.experiment.planned_itself for each in without_fits)
+    any_searched = any(session.experiment.planned_itself for session in without_fits)
     if any_searched or 2 * len(without_fits) >= len(sessions):
-        return [each.without_welch() for each in sessions], failures
+        return [session.without_welch() for session in sessions], failures
     excluded = [
         SessionFailure(
-            each.path,
-            f"{each.path}: {each.warnings[-1]} Most others have them: analyse this one by itself.",
-            each.experiment,
+            session.path,
+            f"{session.path}: {session.warnings[-1]} Most others have them: analyse this one by "
+            "itself.",
+            session.experiment,
         )
-        for each in without_fits
+        for session in without_fits
     ]
-    return [each for each in sessions if each.frequency_hz.size], [*failures, *excluded]
+    return [session for session in sessions if session.frequency_hz.size], [*failures, *excluded]
 
 
 def _complete_labels(
     results: Sequence[SessionAnalysis | SessionFailure],
 ) -> list[SessionAnalysis | SessionFailure]:
     """Return the results with the specimens' labels completed (see `labelled`)."""
-    stated = iter(labelled([each.experiment for each in results if each.experiment]))
-    return [replace(each, experiment=next(stated)) if each.experiment else each for each in results]
+    stated = iter(labelled([result.experiment for result in results if result.experiment]))
+    return [
+        replace(result, experiment=next(stated)) if result.experiment else result
+        for result in results
+    ]
 
 
 def _exclusion_reason(

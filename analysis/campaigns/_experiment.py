@@ -265,9 +265,12 @@ def labelled(experiments: Sequence[Experiment]) -> list[Experiment]:
     With a single label in the campaign, a session without a label is taken to be of that specimen.
     With several labels, its specimen is unknown.
     """
-    if len({each.label for each in experiments if each.label}) < 2:
+    if len({experiment.label for experiment in experiments if experiment.label}) < 2:
         return list(experiments)
-    return [replace(each, facts={LABEL_KEY: each.label, **each.facts}) for each in experiments]
+    return [
+        replace(experiment, facts={LABEL_KEY: experiment.label, **experiment.facts})
+        for experiment in experiments
+    ]
 
 
 def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
@@ -276,7 +279,7 @@ def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
     return tuple(
         key
         for key, value in first.items()
-        if not all(_equal_values(each.facts.get(key, value), value) for each in specimens)
+        if not all(_equal_values(specimen.facts.get(key, value), value) for specimen in specimens)
     )
 
 
@@ -285,7 +288,7 @@ def most_common(experiments: Sequence[Experiment]) -> int:
 
     A session that planned its own excitation agrees with any other, so it is no candidate.
     """
-    indices = [i for i, each in enumerate(experiments) if not each.planned_itself]
+    indices = [i for i, experiment in enumerate(experiments) if not experiment.planned_itself]
     return max(
         indices or range(len(experiments)),
         key=lambda i: sum(experiments[i].difference(two) is None for two in experiments),

@@ -38,7 +38,7 @@ def describe_tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
     stated = modal.stated[-1]
     tolerance_text = f"{100 * stated:g} % as the files state it"
     if len(modal.stated) > 1:
-        stated_texts = listed([f"{100 * each:g}" for each in modal.stated])
+        stated_texts = listed([f"{100 * uniformity:g}" for uniformity in modal.stated])
         tolerance_text = (
             f"{100 * stated:g} %, the largest of the {stated_texts} % that the files state"
         )
@@ -105,8 +105,8 @@ def describe_orders_if_exact(
     if modal is None or modal.uniform_beam.status == "refused":
         return []
     orders_shown = []
-    for each in orders:
-        exact = each.exact
+    for order in orders:
+        exact = order.exact
         if exact is None or exact.reason or exact.value is None or exact.interval is None:
             continue
         half_width = (exact.interval[1] - exact.interval[0]) / 2
@@ -117,7 +117,7 @@ def describe_orders_if_exact(
             "open": "1 would be doubtful",
         }
         orders_shown.append(
-            f"{each.order} {value} (95 %: {low} to {high}; {conclusions[exact.status]})"
+            f"{order.order} {value} (95 %: {low} to {high}; {conclusions[exact.status]})"
         )
     return (
         [f"{EXACT_CONDITION.capitalize()} (type {freest.name}): {'; '.join(orders_shown)}."]
@@ -135,24 +135,25 @@ def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
         return []
     sweep_counts = f"{sweeps.rising} rising and {sweeps.falling} falling sweeps"
     if not sweeps.changed:
-        lowest_p_value = min(each.chance for each in sweeps.modes)
+        lowest_p_value = min(mode_change.chance for mode_change in sweeps.modes)
         largest_change = max(
-            abs(each.frequency) + NORMAL_95 * each.frequency_std for each in sweeps.modes
+            abs(mode_change.frequency) + NORMAL_95 * mode_change.frequency_std
+            for mode_change in sweeps.modes
         )
         return [
             f"Nothing changed along the records: {sweep_counts} have the same modal constants "
             "(lowest "
             f"{p_value_text(lowest_p_value)}; frequencies to {100 * largest_change:.1g} %)."
         ]
-    each = "; ".join(map(_describe_mode_change, sweeps.changed))
+    mode_change = "; ".join(map(_describe_mode_change, sweeps.changed))
     return [
         f"Something changes along the records, or with the direction of the sweep: {sweep_counts} "
         "differ "
-        f"in {each}. Each mode is as it was when the sweep passed it."
+        f"in {mode_change}. Each mode is as it was when the sweep passed it."
     ]
 
 
-def _describe_mode_change(each: ModeInSweeps) -> str:
+def _describe_mode_change(mode_change: ModeInSweeps) -> str:
     """Describe how one mode differs in falling sweeps from rising ones."""
 
     def percent(value: float, std: float) -> str:
@@ -160,8 +161,10 @@ def _describe_mode_change(each: ModeInSweeps) -> str:
         return f"{size} ± {spread} % {'higher' if value > 0 else 'lower'}"
 
     return (
-        f"mode {each.mode} (falling: frequency {percent(each.frequency, each.frequency_std)}, "
-        f"damping ratio {percent(each.damping, each.damping_std)}; {p_value_text(each.chance)})"
+        f"mode {mode_change.mode} (falling: frequency "
+        f"{percent(mode_change.frequency, mode_change.frequency_std)}, "
+        f"damping ratio {percent(mode_change.damping, mode_change.damping_std)}; "
+        f"{p_value_text(mode_change.chance)})"
     )
 
 

@@ -154,8 +154,8 @@ def _simpler_estimate(
         name=conditional.name,
         fixed={name: value for name, value in fixed.items() if name in COEFFICIENT_OF},
         parameters={
-            each.name: ReportedValue(each.value, each.std, each.interval)
-            for each in conditional.parameters
+            parameter.name: ReportedValue(parameter.value, parameter.std, parameter.interval)
+            for parameter in conditional.parameters
         },
     )
 
@@ -170,13 +170,13 @@ def _reported_parameters(
     mixed = campaign.homogeneity.is_mixed
     flags = _order_flags(orders)
     reported = {
-        each.name: ReportedValue(
-            each.value,
-            each.std,
-            each.interval,
-            common_flag or (_MIXTURE_FLAG if mixed(each.name) else flags.get(each.name)),
+        parameter.name: ReportedValue(
+            parameter.value,
+            parameter.std,
+            parameter.interval,
+            common_flag or (_MIXTURE_FLAG if mixed(parameter.name) else flags.get(parameter.name)),
         )
-        for each in pooled.parameters
+        for parameter in pooled.parameters
     }
     free = STRUCTURES[pooled.structure].free
     for name, value in pooled.plant.parameters.items():
@@ -188,10 +188,10 @@ def _reported_parameters(
 def _order_flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
     """Return the reason against each doubtful order, also for the coefficient of the order."""
     return {
-        name: each.reason
-        for each in orders
-        if each.reason is not None
-        for name in (each.order, COEFFICIENT_OF[each.order])
+        name: order.reason
+        for order in orders
+        if order.reason is not None
+        for name in (order.order, COEFFICIENT_OF[order.order])
     }
 
 
@@ -200,7 +200,10 @@ def _reported_loss_factors(
 ) -> tuple[ReportedLossFactor, ...]:
     """Return the loss factors with their flags."""
     flags = _order_flags(orders)
-    return tuple(each.flagged(common_flag or flags.get(each.order)) for each in pooled.sizes)
+    return tuple(
+        loss_factor.flagged(common_flag or flags.get(loss_factor.order))
+        for loss_factor in pooled.sizes
+    )
 
 
 def _reported_modes(
@@ -226,11 +229,11 @@ def _reported_modes(
     )
 
 
-def _structure_status(each: RankedStructure, pooled: PooledEstimate) -> StructureStatus:
+def _structure_status(structure: RankedStructure, pooled: PooledEstimate) -> StructureStatus:
     """Return whether a structure is selected, compatible with the sessions, or excluded."""
-    if each.name == pooled.name:
+    if structure.name == pooled.name:
         return "selected"
-    bic_difference = each.bic_above_lowest
+    bic_difference = structure.bic_above_lowest
     return (
         "compatible" if bic_difference is not None and bic_difference < BIC_DECISIVE else "excluded"
     )

@@ -133,9 +133,11 @@ class Homogeneity:
 
         Modes take precedence over parameters.
         """
-        mixed = [each for each in self.quantities if each.mixed and not each.of_rig]
-        of_modes = [each for each in mixed if each.quantity.startswith(tuple(_MODE_QUANTITIES))]
-        return max(of_modes or mixed, key=lambda each: each.own_stds, default=None)
+        mixed = [scatter for scatter in self.quantities if scatter.mixed and not scatter.of_rig]
+        of_modes = [
+            scatter for scatter in mixed if scatter.quantity.startswith(tuple(_MODE_QUANTITIES))
+        ]
+        return max(of_modes or mixed, key=lambda scatter: scatter.own_stds, default=None)
 
     @property
     def mixed(self) -> bool:
@@ -149,7 +151,7 @@ class Homogeneity:
 
     def of(self, quantity: str) -> Heterogeneity | None:
         """Return the between-session scatter of a quantity, or None if it is not known."""
-        return next((each for each in self.quantities if each.quantity == quantity), None)
+        return next((scatter for scatter in self.quantities if scatter.quantity == quantity), None)
 
     def is_mixed(self, quantity: str) -> bool:
         """Return whether the pooled value of a quantity is the mean of a mixture."""
@@ -175,10 +177,10 @@ def homogeneity(
     """
     name = common_structure(sessions)
     common_estimates = [
-        (session.name, each)
+        (session.name, estimate)
         for session in sessions
-        for each in session.record_estimates
-        if each.name == name
+        for estimate in session.record_estimates
+        if estimate.name == name
     ]
     values_by_quantity = dict(_mode_values(common_estimates))
     freest = freest_estimate(pooled)
@@ -202,12 +204,16 @@ def homogeneity(
 
 def _mode_values(estimates: Sequence[tuple[str, RecordEstimate]]) -> Iterator[tuple[str, Values]]:
     """Yield frequencies and damping ratios of the modes that all sessions have."""
-    count = min((len(each.modes) for _, each in estimates), default=0)
+    count = min((len(estimate.modes) for _, estimate in estimates), default=0)
     for quantity, std in _MODE_QUANTITIES.items():
         for index in range(count):
             values = (
-                (file, getattr(each.modes[index], quantity), getattr(each.modes[index], std))
-                for file, each in estimates
+                (
+                    file,
+                    getattr(estimate.modes[index], quantity),
+                    getattr(estimate.modes[index], std),
+                )
+                for file, estimate in estimates
             )
             yield f"{quantity}_{index + 1}", _with_known_std(values)
 
@@ -219,22 +225,22 @@ def _parameter_values(
     for parameter in freest.parameters:
         name = parameter.name
         values = (
-            (session.name, each.parameters[name], each.std[name] or 0.0)
+            (session.name, estimate.parameters[name], estimate.std[name] or 0.0)
             for session in sessions
-            for each in session.record_estimates
-            if each.name == freest.name and name in each.determined
+            for estimate in session.record_estimates
+            if estimate.name == freest.name and name in estimate.determined
         )
         yield name, _with_known_std(values)
 
 
 def _with_known_std(values: Iterator[tuple[str, float, float]]) -> Values:
     """Return the entries with a finite and positive standard deviation."""
-    return tuple(each for each in values if math.isfinite(each[2]) and each[2] > 0)
+    return tuple(entry for entry in values if math.isfinite(entry[2]) and entry[2] > 0)
 
 
 def _test_heterogeneity(quantity: str, values: Values, level: float) -> Heterogeneity:
     """Return the between-session scatter of a quantity, tested at a significance level."""
-    estimate, std = np.array([each[1:] for each in values]).T
+    estimate, std = np.array([entry[1:] for entry in values]).T
     logarithmic = quantity in LOGARITHMIC
     if logarithmic:
         estimate, std = np.log(estimate), std / estimate

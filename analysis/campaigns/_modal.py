@@ -118,16 +118,24 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
     sessions : sequence of SessionAnalysis
         Sessions of the campaign.
     """
-    with_modes = [each for each in sessions if each.modal is not None and each.nominal is not None]
-    modes = _common_modes([each.modal for each in with_modes if each.modal is not None])
-    used = [each for each in with_modes if each.modal and set(modes) <= set(each.modal.visible)]
+    with_modes = [
+        session for session in sessions if session.modal is not None and session.nominal is not None
+    ]
+    modes = _common_modes([session.modal for session in with_modes if session.modal is not None])
+    used = [
+        session
+        for session in with_modes
+        if session.modal and set(modes) <= set(session.modal.visible)
+    ]
     if not modes or len(used) < _FEWEST_SESSIONS:
         return None
-    effects = _pooled_constants([each.modal for each in used if each.modal is not None], modes)
+    effects = _pooled_constants(
+        [session.modal for session in used if session.modal is not None], modes
+    )
     estimate = _modal_estimate(modes, effects.mean, effects.covariance)
     nominal = used[0].nominal
     assert nominal is not None
-    stated = tuple(sorted({each.uniformity for each in used}))
+    stated = tuple(sorted({session.uniformity for session in used}))
     tolerant = None
     if stated[-1]:
         # Intervals are normal ones, and Student's t of few sessions is wider.
@@ -158,7 +166,7 @@ def _modal_estimate(
 
 def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
     """Return the numbers of the modes that nearly all sessions show."""
-    mode_counts = Counter(number for each in estimates for number in each.visible)
+    mode_counts = Counter(number for estimate in estimates for number in estimate.visible)
     fewest = max(_COMMON_MODE_FRACTION * len(estimates), _FEWEST_SESSIONS)
     return tuple(sorted(number for number, sessions in mode_counts.items() if sessions >= fewest))
 
@@ -237,7 +245,7 @@ class OppositeSweeps:
     @property
     def changed(self) -> tuple[ModeInSweeps, ...]:
         """Modes that differ significantly between rising and falling sweeps."""
-        return tuple(each for each in self.modes if each.changed)
+        return tuple(mode for mode in self.modes if mode.changed)
 
 
 def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | None:

@@ -54,8 +54,12 @@ def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
         return None
     best = pooled[0]
     return max(
-        (each for each in pooled if each.sessions >= _DETERMINING_FRACTION * best.sessions),
-        key=lambda each: len(STRUCTURES[each.structure].free),
+        (
+            estimate
+            for estimate in pooled
+            if estimate.sessions >= _DETERMINING_FRACTION * best.sessions
+        ),
+        key=lambda estimate: len(STRUCTURES[estimate.structure].free),
     )
 
 
@@ -74,7 +78,7 @@ def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
     """
     fitted = by_structure(sessions)
     most_fits = max(map(len, fitted.values()), default=0)
-    candidates = [each[0] for each in fitted.values() if len(each) == most_fits]
+    candidates = [estimates[0] for estimates in fitted.values() if len(estimates) == most_fits]
     return max(candidates, key=_free_parameter_count).name if candidates else None
 
 
@@ -234,12 +238,12 @@ def tolerant_pooled_order(
 
 def _nearly_all_adequate(verdicts: Sequence[Verdict]) -> bool:
     """Return whether the residuals of nearly all sessions are noise."""
-    return sum(each.adequate for each in verdicts) >= _ADEQUATE_FRACTION * len(verdicts)
+    return sum(verdict.adequate for verdict in verdicts) >= _ADEQUATE_FRACTION * len(verdicts)
 
 
 def rivals(ranked: Sequence[PooledEstimate], margin: float) -> tuple[PooledEstimate, ...]:
     """Return the estimates, except the first, whose BIC is less than `margin` above the lowest."""
-    return tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + margin)
+    return tuple(estimate for estimate in ranked[1:] if estimate.bic < ranked[0].bic + margin)
 
 
 def _status_and_reason(
@@ -270,7 +274,9 @@ def _status_and_reason(
     if not _nearly_all_adequate(verdicts):
         return "open", _UNEXPLAINED_REASON
     integer_rivals = [
-        each for each in (ranked[0], *rivals(ranked, BIC_DECISIVE)) if _has_order_one(each, order)
+        estimate
+        for estimate in (ranked[0], *rivals(ranked, BIC_DECISIVE))
+        if _has_order_one(estimate, order)
     ]
     low, high = parameter.interval
     if low <= 1 <= high:

@@ -151,7 +151,7 @@ class SessionAnalysis:
         """Name of the structure that this session alone selects; None without a verdict."""
         if self.verdict is None:
             return None
-        return min(self.record_estimates, key=lambda each: each.bic).name
+        return min(self.record_estimates, key=lambda estimate: estimate.bic).name
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +229,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionF
             warnings = (*warnings, f"Not in the whole-record estimate: {path}: {reason}")
     findings = record_result.verdict.findings if record_result else ()
     if invalidating := next(
-        (each.sentence for each in findings if each.kind in _INVALIDATING_FINDINGS), None
+        (finding.sentence for finding in findings if finding.kind in _INVALIDATING_FINDINGS), None
     ):
         return SessionFailure(path, f"{path}: {invalidating}", experiment)
     return _session_result(RecordResult(record, record_result, welch), task, experiment, warnings)

@@ -151,7 +151,7 @@ class NominalModel:
     @property
     def mean_wmse(self) -> float:
         """Weighted mean square error in (N·m/rad)², averaged over the sessions."""
-        return float(np.mean([each.wmse for each in self.indices]))
+        return float(np.mean([index_set.wmse for index_set in self.indices]))
 
 
 def mean_damping(structure: str, fits: Sequence[WelchFit]) -> Damping:
@@ -335,7 +335,7 @@ def ranked_structures(
     return tuple(sorted(ranked, key=_rank_key))
 
 
-def _rank_key(each: RankedStructure) -> tuple[bool, bool, float]:
+def _rank_key(structure: RankedStructure) -> tuple[bool, bool, float]:
     """Return the key by which structures are sorted: pooled ones first, then by BIC."""
-    bic = each.bic_above_lowest
-    return not each.pooled, bic is None, bic or 0.0
+    bic = structure.bic_above_lowest
+    return not structure.pooled, bic is None, bic or 0.0

@@ -83,11 +83,11 @@ def models_without_session(
     """Return the models estimated from all sessions but one, to predict that session."""
     session = sessions[left_out]
     others = [*sessions[:left_out], *sessions[left_out + 1 :]]
-    own = {each.name: each.plant for each in session.record_estimates}
+    own = {estimate.name: estimate.plant for estimate in session.record_estimates}
     predictions = [
-        PlantPrediction("record", each.name, None, each.plant, own[each.name])
-        for each in pooled_estimates(others)
-        if each.name in own
+        PlantPrediction("record", estimate.name, None, estimate.plant, own[estimate.name])
+        for estimate in pooled_estimates(others)
+        if estimate.name in own
     ]
     for number, fit in enumerate(session.welch_fits):
         damping = mean_damping(fit.structure, [other.welch_fits[number] for other in others])
@@ -154,13 +154,13 @@ def left_out_errors(
     return tuple(
         LeftOutError(
             path=path,
-            method=each.method,
-            name=each.name,
-            weighting=each.weighting,
-            error=error(each.plant),
-            own_error=None if each.own is None else error(each.own),
+            method=prediction.method,
+            name=prediction.name,
+            weighting=prediction.weighting,
+            error=error(prediction.plant),
+            own_error=None if prediction.own is None else error(prediction.own),
         )
-        for each in predictions
+        for prediction in predictions
     )
 
 
@@ -169,7 +169,7 @@ def by_model(
 ) -> list[tuple[str, str, str | None, tuple[LeftOutError, ...]]]:
     """Group prediction errors by method, structure and weighting, the smallest mean error first."""
     errors_by_model: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
-    for each in errors:
-        errors_by_model.setdefault((each.method, each.name, each.weighting), []).append(each)
+    for error in errors:
+        errors_by_model.setdefault((error.method, error.name, error.weighting), []).append(error)
     groups = [(*key, tuple(group)) for key, group in errors_by_model.items()]
-    return sorted(groups, key=lambda group: float(np.mean([each.error for each in group[3]])))
+    return sorted(groups, key=lambda group: float(np.mean([error.error for error in group[3]])))

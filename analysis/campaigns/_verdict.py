@@ -93,7 +93,7 @@ def common_findings(sessions: Sequence[SessionAnalysis]) -> tuple[CommonFinding,
             kind = finding.kind, _NUMBER_PATTERN.sub("#", finding.sentence)
             findings_by_effect.setdefault(kind, []).append((session.name, finding))
     counted = [_common_finding(group, len(examined)) for group in findings_by_effect.values()]
-    return tuple(sorted(counted, key=lambda each: -len(each.files)))
+    return tuple(sorted(counted, key=lambda effect: -len(effect.files)))
 
 
 def _common_finding(group: list[tuple[str, Finding]], sessions: int) -> CommonFinding:
@@ -322,7 +322,7 @@ def _describe_slopes(
 
 def _withheld_orders(*orders: PooledOrder) -> frozenset[str]:
     """Return the orders with a reason against reporting them for an exactly uniform beam."""
-    return frozenset(each.order for each in orders if (each.exact or each).reason is not None)
+    return frozenset(order.order for order in orders if (order.exact or order).reason is not None)
 
 
 def _dissenting_sessions(

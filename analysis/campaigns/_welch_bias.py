@@ -91,7 +91,7 @@ class WelchBias:
     @property
     def significant(self) -> tuple[ParameterBias, ...]:
         """Parameters whose bias is significant."""
-        return tuple(each for each in self.parameters if each.significant)
+        return tuple(parameter for parameter in self.parameters if parameter.significant)
 
 
 def welch_biases(
@@ -113,7 +113,11 @@ def welch_biases(
         left out, because its pooled estimate is no reference.
     """
     biases = []
-    by_name = {each.name: each for each in pooled if each.misfit <= LARGEST_MISFIT}
+    by_name = {
+        record_estimate.name: record_estimate
+        for record_estimate in pooled
+        if record_estimate.misfit <= LARGEST_MISFIT
+    }
     for (structure, weighting), fits in fits_by_model(sessions).items():
         estimate = by_name.get(structure)
         if estimate is None or len(fits) < _FEWEST_SESSIONS:
@@ -148,10 +152,10 @@ def welch_biases(
                 _mean_or_nan([fit.indices.wmse for fit in fits if fit.indices]),
                 _mean_or_nan(
                     [
-                        each.indices.wmse
+                        record_estimate.indices.wmse
                         for session in sessions
-                        for each in session.record_estimates
-                        if each.name == structure
+                        for record_estimate in session.record_estimates
+                        if record_estimate.name == structure
                     ]
                 ),
             )

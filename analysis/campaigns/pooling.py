@@ -162,7 +162,7 @@ class PooledMode:
 def pooled_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
     """Pool frequency and damping ratio, separately, of each mode that all sessions have."""
     pooled_list = []
-    for modes in zip(*(each.modes for each in estimates), strict=False):
+    for modes in zip(*(estimate.modes for estimate in estimates), strict=False):
         frequency = _pool_quantity([(mode.frequency_hz, mode.frequency_std_hz) for mode in modes])
         ratio = _pool_quantity([(mode.damping_ratio, mode.damping_ratio_std) for mode in modes])
         if frequency is not None and ratio is not None:
@@ -272,7 +272,7 @@ class PooledEstimate:
     @property
     def sizes(self) -> tuple[ReportedLossFactor, ...]:
         """Loss factors of the kinds of damping that all sessions together determine."""
-        names = tuple(each.name for each in self.parameters)
+        names = tuple(parameter.name for parameter in self.parameters)
         t, loss_factors = student_t_quantile(0.95, self.sessions - 1), []
         values = self.plant.parameters
         first_rad_s = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
@@ -288,7 +288,7 @@ class PooledEstimate:
     @property
     def by_name(self) -> dict[str, PooledParameter]:
         """Pooled parameters by their names."""
-        return {each.name: each for each in self.parameters}
+        return {parameter.name: parameter for parameter in self.parameters}
 
 
 def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimate, ...]:
@@ -299,7 +299,12 @@ def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimat
     by_name = by_structure(sessions)
     most_fits = max(map(len, by_name.values()), default=0)
     found = [pooled(estimates) for estimates in by_name.values() if len(estimates) == most_fits]
-    return tuple(sorted((each for each in found if each is not None), key=lambda each: each.bic))
+    return tuple(
+        sorted(
+            (estimate for estimate in found if estimate is not None),
+            key=lambda estimate: estimate.bic,
+        )
+    )
 
 
 def by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, list[RecordEstimate]]:
@@ -340,7 +345,9 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     means = {name: float(np.mean([e.parameters[name] for e in used])) for name in SETTINGS}
     return PooledEstimate(
         structure=used[0].structure,
-        plant=_pooled_plant(used[0], means | {each.name: each.value for each in parameters}),
+        plant=_pooled_plant(
+            used[0], means | {parameter.name: parameter.value for parameter in parameters}
+        ),
         parameters=parameters,
         covariance=effects.covariance,
         modes=pooled_modes(used),

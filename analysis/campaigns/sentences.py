@@ -172,9 +172,9 @@ def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]
 def _describe_different_specimens(homogeneity: Homogeneity, leading: Heterogeneity) -> list[str]:
     """Describe how the estimates show that the sessions are of different specimens."""
     others = [
-        label(each.quantity)[0]
-        for each in homogeneity.quantities
-        if each.mixed and not each.of_rig and each is not leading
+        label(scatter.quantity)[0]
+        for scatter in homogeneity.quantities
+        if scatter.mixed and not scatter.of_rig and scatter is not leading
     ]
     also = f" The same holds of {', '.join(others)}." if others else ""
     return [
@@ -191,10 +191,12 @@ def _describe_different_specimens(homogeneity: Homogeneity, leading: Heterogenei
 def _small_scatter_remark(homogeneity: Homogeneity) -> str:
     """Return a remark that the frequencies vary little in relative terms, or an empty text."""
     frequencies = [
-        each for each in homogeneity.quantities if each.quantity.startswith("frequency_hz")
+        scatter for scatter in homogeneity.quantities if scatter.quantity.startswith("frequency_hz")
     ]
-    mixed = [each for each in frequencies if each.mixed]
-    if not mixed or any(each.between_std > _SLIGHT_FREQUENCY_SCATTER * each.mean for each in mixed):
+    mixed = [scatter for scatter in frequencies if scatter.mixed]
+    if not mixed or any(
+        scatter.between_std > _SLIGHT_FREQUENCY_SCATTER * scatter.mean for scatter in mixed
+    ):
         return ""
     return (
         f" Frequencies vary by less than {100 * _SLIGHT_FREQUENCY_SCATTER:g} %, as those of one "
@@ -241,7 +243,7 @@ def _describe_groups(scatter: Heterogeneity) -> str:
 
 def _extreme_sessions(values: Values) -> tuple[tuple[str, float, float], tuple[str, float, float]]:
     """Return the entries of the sessions with the lowest and the highest value."""
-    ordered = sorted(values, key=lambda each: each[1])
+    ordered = sorted(values, key=lambda entry: entry[1])
     return ordered[0], ordered[-1]
 
 
@@ -396,14 +398,18 @@ def describe_structure(freest: PooledEstimate, best: PooledEstimate) -> str:
 def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[str]:
     """Describe each loss factor at the frequency where it depends least on the order."""
     factors = []
-    for each in loss_factors:
-        if each.omega_rad_s is None or not (each.size.std and each.size.interval_95):
+    for loss_factor in loss_factors:
+        if loss_factor.omega_rad_s is None or not (
+            loss_factor.size.std and loss_factor.size.interval_95
+        ):
             continue
-        value, low, high = to_uncertainty((each.size.value, *each.size.interval_95), each.size.std)
-        remark = f", {each.size.flag}" if each.size.flag else ""
+        value, low, high = to_uncertainty(
+            (loss_factor.size.value, *loss_factor.size.interval_95), loss_factor.size.std
+        )
+        remark = f", {loss_factor.size.flag}" if loss_factor.size.flag else ""
         factors.append(
-            f"{each.damping} {value} (95 %: {low} to {high}) at "
-            f"{each.omega_rad_s / (2 * np.pi):.3g} Hz{remark}"
+            f"{loss_factor.damping} {value} (95 %: {low} to {high}) at "
+            f"{loss_factor.omega_rad_s / (2 * np.pi):.3g} Hz{remark}"
         )
     return [f"Loss factors at the pivot frequencies: {'; '.join(factors)}."] if factors else []
 
@@ -430,7 +436,7 @@ def describe_selection(
     best = ranked[0]
     sentence = f"Lowest BIC: type {best.name}."
     if close:
-        names = " or ".join(f"type {each.name}" for each in close)
+        names = " or ".join(f"type {rival.name}" for rival in close)
         sentence += (
             f" All sessions together do not distinguish it from {names} (ΔBIC "
             f"{close[0].bic - best.bic:.1f}; 10 = decisive)."
@@ -495,7 +501,7 @@ def describe_modes(pooled_modes: Sequence[PooledMode], sessions: int, *, mixed: 
     if not pooled_modes:
         return []
     t = student_t_quantile(0.95, sessions - 1)
-    modes = "; ".join(_mode_clause(each, t) for each in pooled_modes)
+    modes = "; ".join(_mode_clause(mode, t) for mode in pooled_modes)
     of = "the sessions, a mixture" if mixed else "the sessions"
     return [f"Modes: {modes} (± 95 % of the mean over {of})."]
 
@@ -557,43 +563,47 @@ def describe_welch_bias(
     """
     if not comparable:
         return []
-    of_type = [each for each in biases if each.structure == freest.name]
-    best = [each for each in of_type if (each.structure, each.weighting) in PAPER_BEST_MODELS]
+    of_type = [bias for bias in biases if bias.structure == freest.name]
+    best = [bias for bias in of_type if (bias.structure, bias.weighting) in PAPER_BEST_MODELS]
     left_out = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
     sentences = []
-    for each in best or of_type[:1]:
-        significant = [one for one in each.significant if one.parameter not in left_out]
+    for bias in best or of_type[:1]:
+        significant = [one for one in bias.significant if one.parameter not in left_out]
         if not significant:
             continue
         sentences.append(
-            f"Welch's {'; '.join(map(_bias_clause, significant))} (type {each.structure}, weights "
-            f"{each.weighting}, as in Table 3): bias, not scatter, which more sessions do not "
+            f"Welch's {'; '.join(map(_bias_clause, significant))} (type {bias.structure}, weights "
+            f"{bias.weighting}, as in Table 3): bias, not scatter, which more sessions do not "
             "reduce."
         )
-        if each.wmse < each.record_wmse:
+        if bias.wmse < bias.record_wmse:
             sentences.append(
-                f"The lower WMSE of the Welch fits ({each.wmse:.3g} against "
-                f"{each.record_wmse:.3g} (N·m/rad)²) is no evidence for them: it is the distance "
+                f"The lower WMSE of the Welch fits ({bias.wmse:.3g} against "
+                f"{bias.record_wmse:.3g} (N·m/rad)²) is no evidence for them: it is the distance "
                 "from Welch's response, which has the same bias."
             )
     return sentences
 
 
-def _bias_clause(each: ParameterBias) -> str:
+def _bias_clause(parameter_bias: ParameterBias) -> str:
     """Describe the value of one parameter of a Welch fit and its bias."""
-    symbol, factor, unit = label(each.parameter)
-    value, scatter = to_uncertainty((each.welch, each.welch_std), each.welch_std, factor)
-    (record,) = to_uncertainty((each.record,), each.record_std, factor)
-    (bias_text,) = to_uncertainty((abs(each.bias),), each.bias_std, factor)
-    name = each.parameter if each.parameter in _ORDERS else symbol
+    symbol, factor, unit = label(parameter_bias.parameter)
+    value, scatter = to_uncertainty(
+        (parameter_bias.welch, parameter_bias.welch_std), parameter_bias.welch_std, factor
+    )
+    (record,) = to_uncertainty((parameter_bias.record,), parameter_bias.record_std, factor)
+    (bias_text,) = to_uncertainty((abs(parameter_bias.bias),), parameter_bias.bias_std, factor)
+    name = parameter_bias.parameter if parameter_bias.parameter in _ORDERS else symbol
     unit_text = f"·{unit}" if unit else ""
     bounds_remark = (
-        f", at the edge of the search range in {each.at_bounds}" if each.at_bounds else ""
+        f", at the edge of the search range in {parameter_bias.at_bounds}"
+        if parameter_bias.at_bounds
+        else ""
     )
     return (
         f"{name} ({value} ± {scatter}{unit_text} between sessions{bounds_remark}) is "
         f"{bias_text}{unit_text} "
-        f"{'above' if each.bias > 0 else 'below'} the whole records' {record}{unit_text}"
+        f"{'above' if parameter_bias.bias > 0 else 'below'} the whole records' {record}{unit_text}"
     )
 
 
@@ -630,12 +640,14 @@ def describe_scatter(best: PooledEstimate) -> str:
     The level of the test gives one false alarm in a hundred campaigns.
     """
     level = _SIGNIFICANCE_LEVEL / max(len(best.parameters), 1)
-    varying = [label(each.name)[0] for each in best.parameters if each.chance < level]
+    varying = [
+        label(parameter.name)[0] for parameter in best.parameters if parameter.chance < level
+    ]
     if not varying:
-        lowest = min((each.chance for each in best.parameters), default=1.0)
+        lowest = min((parameter.chance for parameter in best.parameters), default=1.0)
         tau_remark = (
             "; the τ above zero are within chance"
-            if any(each.between_std > 0 for each in best.parameters)
+            if any(parameter.between_std > 0 for parameter in best.parameters)
             else ""
         )
         return (
@@ -665,13 +677,17 @@ def describe_prediction_errors(
         Number of sessions.
     """
     structure_errors = [
-        each for each in validation if each.method == "record" and each.name == best.name
+        left_out
+        for left_out in validation
+        if left_out.method == "record" and left_out.name == best.name
     ]
-    own_errors = [each.own_error for each in structure_errors if each.own_error is not None]
+    own_errors = [
+        left_out.own_error for left_out in structure_errors if left_out.own_error is not None
+    ]
     if not own_errors:
         return []
     error, own_error = (
-        float(np.mean([each.error for each in structure_errors])),
+        float(np.mean([left_out.error for left_out in structure_errors])),
         float(np.mean(own_errors)),
     )
     verdict = (

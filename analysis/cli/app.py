@@ -437,7 +437,7 @@ def _figure_formats(text: str) -> tuple[FigureFormat, ...]:
             f"{', '.join(FIGURE_FORMATS)}.",
             param_hint="--figures",
         )
-    return tuple(each for each in FIGURE_FORMATS if each in names)
+    return tuple(figure_format for figure_format in FIGURE_FORMATS if figure_format in names)
 
 
 def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:

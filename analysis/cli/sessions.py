@@ -82,7 +82,7 @@ def session_files(paths: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             session_paths.append(path)
             continue
-        sessions = sorted(each for each in path.glob("*.mcap") if each.is_file())
+        sessions = sorted(file for file in path.glob("*.mcap") if file.is_file())
         if not sessions:
             any_incomplete = any(path.glob("*.mcap.part"))
             raise NoSessionsError(
@@ -163,10 +163,10 @@ def _print_tables(
     """Print the tables of a single file, or a summary of several files."""
     from analysis.report import result_text, summary_table
 
-    by_welch = [each for each in results if each.welch is not None]
+    by_welch = [result for result in results if result.welch is not None]
     if single or not by_welch:
-        for each in results:
-            console.print(result_text(each, verbose=verbose))
+        for result in results:
+            console.print(result_text(result, verbose=verbose))
     else:
         console.print(summary_table(by_welch))
         console.print("")

@@ -97,9 +97,9 @@ def welch_settings(
 
 def choice(text: str, choices: Sequence[_Choice], option: str) -> _Choice:
     """Return the choice that a text names, ignoring case; raise a usage error for others."""
-    for each in choices:
-        if each == text.lower():
-            return each
+    for candidate in choices:
+        if candidate == text.lower():
+            return candidate
     raise typer.BadParameter(
         f"there is no '{text}'; choose from {', '.join(choices)}.", param_hint=option
     )

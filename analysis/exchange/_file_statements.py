@@ -165,7 +165,9 @@ class FileStatements:
         statement = f"the file says that '{name}' was sampled at {file_rate_hz:.6g} Hz"
         is_default = file_rate_hz == _DEFAULT_RATE_HZ
         ratio = max(file_rate_hz / rate_hz, rate_hz / file_rate_hz)
-        wrong_unit = any(abs(ratio / each - 1) < _RATE_TOLERANCE for each in _UNIT_RATIOS)
+        wrong_unit = any(
+            abs(ratio / unit_ratio - 1) < _RATE_TOLERANCE for unit_ratio in _UNIT_RATIOS
+        )
         if is_default:
             statement += ", which programs write where no rate was given"
         if time is not None and (time.channel == name or is_default or not wrong_unit):

@@ -449,7 +449,9 @@ def torque_anomaly(
             for values in (angle_rad, torque_nm)
         )
         model = (transfer(s, specimen.beam, Damping()) + specimen.tool_inertia_kg_m2 * s**2) * angle
-        model_power, torque_power = (float(np.vdot(each, each).real) for each in (model, torque))
+        model_power, torque_power = (
+            float(np.vdot(spectrum, spectrum).real) for spectrum in (model, torque)
+        )
         if not (0.0 < model_power < np.inf and 0.0 < torque_power < np.inf):
             return None
         ratio = complex(np.vdot(model, torque) / model_power)

@@ -180,7 +180,7 @@ def _find_value(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # n
                 )
             if key not in dtype.names:
                 raise no_such_channel_error(
-                    path, name, (f"{parent_name}.{each}" for each in dtype.names)
+                    path, name, (f"{parent_name}.{field}" for field in dtype.names)
                 )
             value = value.reshape(-1)[0][key]
         elif key not in contents:
@@ -212,7 +212,7 @@ def _vector_or_column(path: Path, name: str, value: Any, column: int | None) -> 
         )
     names = getattr(getattr(value, "dtype", None), "names", None)
     if names:
-        field_names = ", ".join(f"{name}.{each}" for each in names[:12])
+        field_names = ", ".join(f"{name}.{field}" for field in names[:12])
         raise ExchangeError(
             f"{path}: '{name}' is a struct; choose one of its fields: {field_names}."
         )
@@ -295,13 +295,13 @@ def _read_hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[An
         link = _hdf5_link(dataset, part, h5py)
         if link is None:
             raise no_such_channel_error(
-                path, name, (each for each in variables if not each.startswith("#"))
+                path, name, (member for member in variables if not member.startswith("#"))
             )
         if not isinstance(link, h5py.HardLink):
             raise _external_data_error(path, name)
         dataset = dataset[part]
     if not isinstance(dataset, h5py.Dataset):
-        field_names = ", ".join(f"{name}.{each}" for each in list(dataset)[:12])
+        field_names = ", ".join(f"{name}.{member}" for member in list(dataset)[:12])
         raise ExchangeError(
             f"{path}: '{name}' is a struct; choose one of its fields: {field_names}."
         )

@@ -247,7 +247,7 @@ def no_such_channel_error(path: Path, name: str, available: Iterable[str]) -> Ex
     """Return the error for a channel that is missing, with the names of the available channels."""
     names = list(available)
     listed = ", ".join(
-        repr(printable(each, _MOST_NAME_CHARACTERS)) for each in names[:_MOST_NAMES_LISTED]
+        repr(printable(channel, _MOST_NAME_CHARACTERS)) for channel in names[:_MOST_NAMES_LISTED]
     )
     more = f" and {len(names) - _MOST_NAMES_LISTED} more" if len(names) > _MOST_NAMES_LISTED else ""
     return ExchangeError(
@@ -278,7 +278,9 @@ def channel_index(
     number = name.removeprefix("#")
     if name != number and number.isdecimal() and 0 < int(number) <= len(titles):
         return int(number) - 1
-    listed = [f"#{number} {each}" for number, each in enumerate(titles, 1)] if numbered else titles
+    listed = (
+        [f"#{number} {title}" for number, title in enumerate(titles, 1)] if numbered else titles
+    )
     raise no_such_channel_error(path, name, listed)
 
 

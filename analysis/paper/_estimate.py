@@ -95,10 +95,10 @@ def estimate(
         raise FrequencyResponseError(f"{record.path}: {error}") from error
     try:
         response, whole_record = (
-            each.band(*settings.band_hz).without_delays(
+            estimated.band(*settings.band_hz).without_delays(
                 input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
             )
-            for each in (response, whole_record)
+            for estimated in (response, whole_record)
         )
     except SpectralError as error:
         raise SettingsError(f"{record.path}: {error}") from error
