@@ -131,8 +131,8 @@ class Region(Protocol):
 class Box:
     """Constant bounds, at which each unknown of a step is clipped.
 
-    The other unknowns of a clipped step are not optimised again, as they are in `_step` within
-    limits: the fits to a frequency response would need 7 % more evaluations.
+    The other unknowns of a clipped step are not optimised again, as they are in `_compute_step`
+    within limits: the fits to a frequency response would need 7 % more evaluations.
     """
 
     lower: NDArray[np.float64]
@@ -221,10 +221,10 @@ def descend(
             break
         limits = region.limits(x)
         model = current.hessian + second_estimate if uses_second else current.hessian
-        step = _step(model, current, free, damping, limits)
+        step = _compute_step(model, current, free, damping, limits)
         if step is None:  # not convex
             uses_second, model = False, current.hessian
-            step = _step(model, current, free, damping, limits)
+            step = _compute_step(model, current, free, damping, limits)
         if step is None:
             break
         trial = region.end(x, step)
@@ -258,7 +258,7 @@ def descend(
     return Minimum(x, current, evaluations, second_estimate)
 
 
-def _step(
+def _compute_step(
     model: NDArray[np.float64],
     current: NormalEquations,
     free: NDArray[np.bool_],

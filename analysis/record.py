@@ -136,7 +136,7 @@ class Record:
         Time constants of the torque channel's first- and second-order low-pass filter.
     uncertainty
         Relative standard uncertainties stated in the file, by quantity
-        (`record_checks.UNCERTAIN`).
+        (`record_checks.UNCERTAIN_QUANTITIES`).
     uniformity
         Relative standard deviation of mode frequencies from those of a uniform beam; 0.001 if not
         stated.

@@ -228,17 +228,17 @@ def stated_torque_filter_s(session: Session) -> tuple[float, float]:
     return (constant_s, 0.0) if order == 1.0 else (0.0, constant_s)
 
 
-SCALES: Final = ("torque_scale", "length", "density")
+SCALE_QUANTITIES: Final = ("torque_scale", "length", "density")
 """Quantities that no session can determine, and whose uncertainty a file may state."""
 
-UNCERTAIN: Final = (*SCALES, "tip_mass")
+UNCERTAIN_QUANTITIES: Final = (*SCALE_QUANTITIES, "tip_mass")
 """All quantities whose uncertainty a file may state."""
 
 
 def stated_uncertainty(session: Session) -> dict[str, float]:
     """Return the relative standard uncertainties that a session states, by quantity.
 
-    The quantities are those of `UNCERTAIN`.
+    The quantities are those of `UNCERTAIN_QUANTITIES`.
 
     Raises
     ------
@@ -246,7 +246,7 @@ def stated_uncertainty(session: Session) -> dict[str, float]:
         An uncertainty is negative, or so large that the value would be unknown.
     """
     stated = {}
-    for name in UNCERTAIN:
+    for name in UNCERTAIN_QUANTITIES:
         key = f"uncertainty_{name}_percent"
         percent = session.number(key, 0.0)
         if not 0.0 <= percent <= MAX_UNCERTAINTY_PERCENT:
@@ -469,22 +469,23 @@ def check_fillable(
         )
 
 
-def too_much_unknown(what: str, unknown: int, of: int) -> str | None:
+def too_much_unknown(channel_text: str, unknown: int, total: int) -> str | None:
     """Return an error message if too many samples of a channel are unknown, or None.
 
     The limit is the fraction `MAX_UNKNOWN_FRACTION`.
 
     Parameters
     ----------
-    what : str
+    channel_text : str
         Name of the channel in the message.
-    unknown, of : int
+    unknown, total : int
         Number of samples without a new value, and number of all samples.
     """
-    if unknown <= MAX_UNKNOWN_FRACTION * of:
+    if unknown <= MAX_UNKNOWN_FRACTION * total:
         return None
     return (
-        f"{unknown} of {of} samples ({100 * unknown / of:.2g} %) of {what} are missing or flagged, "
+        f"{unknown} of {total} samples ({100 * unknown / total:.2g} %) of {channel_text} are "
+        "missing or flagged, "
         f"more than the {100 * MAX_UNKNOWN_FRACTION:g} % that an analysis tolerates; record the "
         "session again."
     )

@@ -163,7 +163,7 @@ class WholeRecord:
     def headline_json(self) -> dict[str, Any]:
         """Return the reported estimates as the content of a JSON document."""
         from analysis.identify import headline_json
-        from analysis.record_checks import SCALES
+        from analysis.record_checks import SCALE_QUANTITIES
 
         file, findings = str(self.record.path), self.verdict.findings
         content = headline_json(file, self.headline, self.orders, findings, self.validity)
@@ -172,7 +172,9 @@ class WholeRecord:
         return {
             **content,
             "scale_uncertainty": {
-                name: value for name, value in self.record.uncertainty.items() if name in SCALES
+                name: value
+                for name, value in self.record.uncertainty.items()
+                if name in SCALE_QUANTITIES
             },
             "combined": {
                 name: reported_value.as_json() for name, reported_value in self.combined.items()

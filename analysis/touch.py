@@ -235,7 +235,7 @@ class TouchAnalysis:
         for number, (tick, free_from) in enumerate(detected, start=1):
             on_step(f"touch {number} of {len(detected)}")
             touch_samples = around_touch(samples, tick, rate_hz, free_from)
-            touches.append(self._touch(touch_samples, number, tick, model, rate_hz, shear))
+            touches.append(self._estimate_touch(touch_samples, number, tick, model, rate_hz, shear))
         warnings += _describe_doubts(touches)
         validity = record_validity(
             readable_texts(session.metadata, "keys of the metadata")[0],
@@ -246,7 +246,7 @@ class TouchAnalysis:
             validity,
         )  # fmt: skip
 
-    def _touch(
+    def _estimate_touch(
         self,
         touch_samples: NDArray[np.void],
         number: int,
@@ -377,7 +377,7 @@ def _shear_projection(session: Session) -> tuple[float, ...] | None:
     if not text:
         return None
     try:
-        numbers = tuple(float(part) for part in text.split(","))
+        numbers = tuple(float(number_text) for number_text in text.split(","))
     except ValueError:
         numbers = ()
     if len(numbers) != 6 or not np.isfinite(numbers).all():

@@ -65,13 +65,13 @@ def record_validity(
     if stated.predicted_peak_tip_slope_rad is not None:
         return stated
     with np.errstate(all="ignore"):  # a wrong model may overflow, and the validity is then unknown
-        return worst(
+        return combined_validity(
             _validity_of_slope(tip_motion(beam, damping, angle_rad, rate_hz).slope_rad)
             for beam, damping in models
         )
 
 
-def worst(validities: Iterable[Validity]) -> Validity:
+def combined_validity(validities: Iterable[Validity]) -> Validity:
     """Return the combined validity of several records; unknown if any of them is unknown.
 
     Parameters

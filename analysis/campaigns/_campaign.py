@@ -10,9 +10,9 @@ import numpy as np
 
 from analysis.campaigns._experiment import (
     CampaignError,
+    complete_labels,
     distinct_names,
-    labelled,
-    most_common,
+    most_common_index,
     stated_specimens,
 )
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
@@ -36,9 +36,9 @@ from analysis.campaigns._validation import FEWEST_SESSIONS, LeftOutError, LostTr
 from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns._welch_bias import WelchBias, welch_biases
 from analysis.campaigns.pooling import PooledEstimate, PooledMode, pooled_estimates
-from analysis.campaigns.workers import Lost, available_cores, dask_cluster, process_pool
+from analysis.campaigns.workers import LostTask, available_cores, dask_cluster, process_pool
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.validity import worst
+from analysis.validity import combined_validity
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -119,8 +119,8 @@ class CampaignResult:
 
     @property
     def validity(self) -> Validity:
-        """Validity of the linear model for the campaign: the worst of its sessions."""
-        return worst(session.validity for session in self.sessions)
+        """Validity of the linear model for the campaign: the combined_validity of its sessions."""
+        return combined_validity(session.validity for session in self.sessions)
 
     @property
     def trials(self) -> int:
@@ -211,7 +211,7 @@ def campaign(
         sessions, failures = _separate_experiments(
             [
                 SessionFailure(path, f"{path}: {result.reason}; analyse it by itself.")
-                if isinstance(result, Lost)
+                if isinstance(result, LostTask)
                 else result
                 for path, result in zip(paths, results, strict=True)
             ]
@@ -294,7 +294,7 @@ def _separate_experiments(
         return [], [result for result in results if isinstance(result, SessionFailure)]
     results = _complete_labels(results)
     usable = [result for result in results if isinstance(result, SessionAnalysis)]
-    common = usable[most_common([session.experiment for session in usable])]
+    common = usable[most_common_index([session.experiment for session in usable])]
     stated = [result.experiment for result in results if result.experiment]
     agreeing = sum(common.experiment.difference(experiment) is None for experiment in stated)
     majority_text = ", as in most" if 2 * agreeing > len(stated) else ""
@@ -343,8 +343,8 @@ def _equalize_welch_fits(
 def _complete_labels(
     results: Sequence[SessionAnalysis | SessionFailure],
 ) -> list[SessionAnalysis | SessionFailure]:
-    """Return the results with the specimens' labels completed (see `labelled`)."""
-    stated = iter(labelled([result.experiment for result in results if result.experiment]))
+    """Return the results with the specimens' labels completed (see `complete_labels`)."""
+    stated = iter(complete_labels([result.experiment for result in results if result.experiment]))
     return [
         replace(result, experiment=next(stated)) if result.experiment else result
         for result in results

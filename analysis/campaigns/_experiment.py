@@ -24,7 +24,7 @@ class CampaignError(ValueError):
 
 
 class SingleSessionError(CampaignError):
-    """Only one file of a campaign can be used.
+    """Error if only one file of a campaign can be used.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class SingleSessionError(CampaignError):
         self.failures = failures
 
 
-def task_errors() -> tuple[type[Exception], ...]:
+def session_error_types() -> tuple[type[Exception], ...]:
     """Return the exceptions that make one session unusable and do not affect the others."""
     from analysis.identify import MeasurementError
     from analysis.paper import FrequencyResponseError
@@ -111,7 +111,9 @@ class Experiment:
     def of(cls, record: Record) -> Experiment:
         """Return the specimen and the excitation that a record states."""
         beam, metadata = record.beam, record.metadata
-        stated = {key: _parse_number(metadata[key]) for key in _EXCITATION_KEYS if key in metadata}
+        excitation_facts = {
+            key: _parse_number(metadata[key]) for key in _EXCITATION_KEYS if key in metadata
+        }
         label = metadata.get(LABEL_KEY, "").strip()
         return cls(
             facts={
@@ -120,7 +122,7 @@ class Experiment:
                 "beam_density_kg_per_m": beam.density_kg_per_m,
                 "beam_bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
                 "tool_inertia_kg_m2": record.tool_inertia_kg_m2,
-                **stated,
+                **excitation_facts,
             },
             sweep_s=record.sweep_samples / record.rate_hz,
             identity=(
@@ -141,7 +143,7 @@ class Experiment:
 
     @property
     def planned_itself(self) -> bool:
-        """Whether the session planned its own excitation, so that it agrees with any other."""
+        """Whether the excitation was planned while it ran, which is compatible with any other."""
         return self.facts.get("excitation") == _SEARCH_NAME
 
     def unfinished_sweep_reason(self, outcome: str) -> str:
@@ -229,7 +231,7 @@ class StatedSpecimen:
 
 
 def stated_specimens(
-    stated: Iterable[tuple[str, Experiment | None]], of_campaign: Experiment
+    stated: Iterable[tuple[str, Experiment | None]], campaign_experiment: Experiment
 ) -> tuple[StatedSpecimen, ...]:
     """Group files by the specimen that they state, the specimen of the campaign first.
 
@@ -240,7 +242,7 @@ def stated_specimens(
     of_campaign : Experiment
         Experiment of the sessions that are pooled.
     """
-    files_by_specimen: list[tuple[Experiment, list[str]]] = [(of_campaign, [])]
+    files_by_specimen: list[tuple[Experiment, list[str]]] = [(campaign_experiment, [])]
     for file, experiment in stated:
         if experiment is None:
             continue
@@ -259,7 +261,7 @@ def stated_specimens(
     )
 
 
-def labelled(experiments: Sequence[Experiment]) -> list[Experiment]:
+def complete_labels(experiments: Sequence[Experiment]) -> list[Experiment]:
     """Give sessions without a specimen label an empty label, if there are several labels.
 
     With a single label in the campaign, a session without a label is taken to be of that specimen.
@@ -283,7 +285,7 @@ def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
     )
 
 
-def most_common(experiments: Sequence[Experiment]) -> int:
+def most_common_index(experiments: Sequence[Experiment]) -> int:
     """Return the index of the first experiment with which most other experiments agree.
 
     A session that planned its own excitation agrees with any other, so it is no candidate.
@@ -295,11 +297,11 @@ def most_common(experiments: Sequence[Experiment]) -> int:
     )
 
 
-def _equal_values(one: str | float, two: str | float) -> bool:
+def _equal_values(first: str | float, second: str | float) -> bool:
     """Return whether two stated values are equal, numbers up to rounding."""
-    if isinstance(one, str) or isinstance(two, str):
-        return one == two
-    return math.isclose(one, two, rel_tol=1e-9)
+    if isinstance(first, str) or isinstance(second, str):
+        return first == second
+    return math.isclose(first, second, rel_tol=1e-9)
 
 
 def fact_text(key: str, value: str | float) -> str:

@@ -75,12 +75,12 @@ def describe_slope(pooled_order: PooledOrder, modal: PooledModal) -> str:
     estimate = modal.tolerant
     assert estimate is not None
     counts = {f"“{status}”": count for status, count in pooled_order.alone.items()}
-    alone = describe_single_sessions(counts, sum(counts.values()))
+    sessions_sentence = describe_single_sessions(counts, sum(counts.values()))
     if pooled_order.value is None or pooled_order.interval is None:
         return (
             f"The slope of the {LOSSES[pooled_order.order]} ({pooled_order.order}) is not "
             "identifiable: "
-            f"{pooled_order.reason}. {alone}"
+            f"{pooled_order.reason}. {sessions_sentence}"
         )
     shown_hz = [mode.frequency_hz for mode in modal.modes]
     sentence = slope_of_loss(
@@ -92,7 +92,7 @@ def describe_slope(pooled_order: PooledOrder, modal: PooledModal) -> str:
         pooled_order.status,
         pooled_order.reason,
     )
-    return f"{sentence} {alone}"
+    return f"{sentence} {sessions_sentence}"
 
 
 def describe_orders_if_exact(

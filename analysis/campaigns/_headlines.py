@@ -56,11 +56,11 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
     numbers, verdict = campaign_numbers(campaign), campaign.verdict
     if numbers is not None and verdict is not None:
         orders = (verdict.alpha, verdict.lambda_)
-        named = (
+        named_findings = (
             replace(each.example, sentence=each.sentence, interval=None)
             for each in verdict.findings
         )
-        documents.append(headline_json(None, numbers, orders, named, campaign.validity))
+        documents.append(headline_json(None, numbers, orders, named_findings, campaign.validity))
     return documents
 
 

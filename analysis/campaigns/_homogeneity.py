@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
 
-Values = tuple[tuple[str, float, float], ...]
+SessionValues = tuple[tuple[str, float, float], ...]
 """Types of file, estimate and its standard deviation, one entry for each session."""
 
 SIGNIFICANCE_LEVEL: Final = 0.01
@@ -79,7 +79,7 @@ class Heterogeneity:
     """
 
     quantity: str
-    values: Values
+    values: SessionValues
     mean: float
     between_std: float
     cochran_q: float
@@ -110,7 +110,7 @@ class Heterogeneity:
 
 @dataclass(frozen=True, slots=True)
 class Homogeneity:
-    """Evidence for and against one specimen.
+    """Result of the test of whether the sessions of a campaign are of one specimen.
 
     Attributes
     ----------
@@ -134,10 +134,10 @@ class Homogeneity:
         Modes take precedence over parameters.
         """
         mixed = [scatter for scatter in self.quantities if scatter.mixed and not scatter.of_rig]
-        of_modes = [
+        mode_scatters = [
             scatter for scatter in mixed if scatter.quantity.startswith(tuple(_MODE_QUANTITIES))
         ]
-        return max(of_modes or mixed, key=lambda scatter: scatter.own_stds, default=None)
+        return max(mode_scatters or mixed, key=lambda scatter: scatter.own_stds, default=None)
 
     @property
     def mixed(self) -> bool:
@@ -149,13 +149,13 @@ class Homogeneity:
         """Whether neither the files nor the estimates contradict a single specimen."""
         return len(self.specimens) < _FEWEST_SESSIONS and not self.mixed
 
-    def of(self, quantity: str) -> Heterogeneity | None:
+    def scatter_of(self, quantity: str) -> Heterogeneity | None:
         """Return the between-session scatter of a quantity, or None if it is not known."""
         return next((scatter for scatter in self.quantities if scatter.quantity == quantity), None)
 
     def is_mixed(self, quantity: str) -> bool:
         """Return whether the pooled value of a quantity is the mean of a mixture."""
-        scatter = self.of(quantity)
+        scatter = self.scatter_of(quantity)
         return scatter is not None and scatter.mixed
 
 
@@ -202,7 +202,9 @@ def homogeneity(
     )
 
 
-def _mode_values(estimates: Sequence[tuple[str, RecordEstimate]]) -> Iterator[tuple[str, Values]]:
+def _mode_values(
+    estimates: Sequence[tuple[str, RecordEstimate]],
+) -> Iterator[tuple[str, SessionValues]]:
     """Yield frequencies and damping ratios of the modes that all sessions have."""
     count = min((len(estimate.modes) for _, estimate in estimates), default=0)
     for quantity, std in _MODE_QUANTITIES.items():
@@ -220,7 +222,7 @@ def _mode_values(estimates: Sequence[tuple[str, RecordEstimate]]) -> Iterator[tu
 
 def _parameter_values(
     sessions: Sequence[SessionAnalysis], freest: PooledEstimate
-) -> Iterator[tuple[str, Values]]:
+) -> Iterator[tuple[str, SessionValues]]:
     """Yield the estimates of each pooled parameter, one for each session."""
     for parameter in freest.parameters:
         name = parameter.name
@@ -233,12 +235,12 @@ def _parameter_values(
         yield name, _with_known_std(values)
 
 
-def _with_known_std(values: Iterator[tuple[str, float, float]]) -> Values:
+def _with_known_std(values: Iterator[tuple[str, float, float]]) -> SessionValues:
     """Return the entries with a finite and positive standard deviation."""
     return tuple(entry for entry in values if math.isfinite(entry[2]) and entry[2] > 0)
 
 
-def _test_heterogeneity(quantity: str, values: Values, level: float) -> Heterogeneity:
+def _test_heterogeneity(quantity: str, values: SessionValues, level: float) -> Heterogeneity:
     """Return the between-session scatter of a quantity, tested at a significance level."""
     estimate, std = np.array([entry[1:] for entry in values]).T
     logarithmic = quantity in LOGARITHMIC
@@ -248,7 +250,7 @@ def _test_heterogeneity(quantity: str, values: Values, level: float) -> Heteroge
     chance = float(chi_square_p_value(effects.cochran_q[0], len(values) - 1))
     mean = math.exp(effects.mean[0]) if logarithmic else float(effects.mean[0])
     significant = chance < level
-    split = groups(estimate, std) if significant else ()
+    split = split_groups(estimate, std) if significant else ()
     q = float(effects.cochran_q[0])
     return Heterogeneity(
         quantity=quantity,
@@ -258,11 +260,13 @@ def _test_heterogeneity(quantity: str, values: Values, level: float) -> Heteroge
         cochran_q=q,
         chance=chance,
         mixed=significant and (bool(split) or q * (1 - _MIXTURE_I_SQUARED) >= len(values) - 1),
-        groups=tuple(tuple(values[index][0] for index in sorted(part)) for part in split),
+        groups=tuple(tuple(values[index][0] for index in sorted(group)) for group in split),
     )
 
 
-def groups(estimate: NDArray[np.float64], std: NDArray[np.float64]) -> tuple[tuple[int, ...], ...]:
+def split_groups(
+    estimate: NDArray[np.float64], std: NDArray[np.float64]
+) -> tuple[tuple[int, ...], ...]:
     """Split estimates at clear gaps into groups of session indices, the lowest values first.
 
     There are at most half as many groups as sessions, so that at least one group has two members.
@@ -282,10 +286,15 @@ def groups(estimate: NDArray[np.float64], std: NDArray[np.float64]) -> tuple[tup
     clearest = _CLEAR_GAP_STDS
     for count in range(2, (order.size + 1) // 2 + 1):
         cut_indices = np.sort(np.argsort(gaps)[1 - count :]) + 1
-        parts = np.split(order, cut_indices)
-        squares = sum(float(((estimate[p] - estimate[p].mean()) ** 2).sum()) for p in parts)
+        candidate_groups = np.split(order, cut_indices)
+        squares = sum(
+            float(((estimate[p] - estimate[p].mean()) ** 2).sum()) for p in candidate_groups
+        )
         group_std = max(math.sqrt(squares / (order.size - count)), session_std)
         smallest_gap = float(gaps[cut_indices - 1].min()) / group_std
         if smallest_gap > clearest:
-            clearest, best_groups = smallest_gap, tuple(tuple(part.tolist()) for part in parts)
+            clearest, best_groups = (
+                smallest_gap,
+                tuple(tuple(group.tolist()) for group in candidate_groups),
+            )
     return best_groups

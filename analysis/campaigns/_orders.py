@@ -13,7 +13,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
-from analysis.campaigns.pooling import by_structure
+from analysis.campaigns.pooling import estimates_by_structure
 from analysis.identify import tolerant_status
 from analysis.identify.profile_likelihood import WIDEST_FRACTION
 from analysis.identify.verdict import BIC_DECISIVE, too_few_modes
@@ -76,7 +76,7 @@ def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
     str or None
         The freest structure that was fitted to every session. None without whole-record fits.
     """
-    fitted = by_structure(sessions)
+    fitted = estimates_by_structure(sessions)
     most_fits = max(map(len, fitted.values()), default=0)
     candidates = [estimates[0] for estimates in fitted.values() if len(estimates) == most_fits]
     return max(candidates, key=_free_parameter_count).name if candidates else None
@@ -171,11 +171,13 @@ def pooled_order(
     session_orders = [
         verdict.alpha if order == "alpha" else verdict.lambda_ for verdict in verdicts
     ]
-    alone: dict[str, int] = dict(Counter(str(one.status) for one in session_orders).most_common())
+    single_statuses: dict[str, int] = dict(
+        Counter(str(one.status) for one in session_orders).most_common()
+    )
     freest = freest_estimate(ranked)
     assert freest is not None
     parameter = freest.by_name.get(order)
-    status, reason = _status_and_reason(order, ranked, freest, verdicts, alone)
+    status, reason = _status_and_reason(order, ranked, freest, verdicts, single_statuses)
     is_known = parameter is not None and status not in ("not identifiable", "absent")
     mixture = is_known and (
         homogeneity.is_mixed(order) or (homogeneity.mixed and freest.sessions < len(verdicts))
@@ -193,7 +195,7 @@ def pooled_order(
         else None,
         interval=parameter.interval if parameter and is_known else None,
         reason=reason,
-        alone=alone,
+        alone=single_statuses,
         mixture=mixture,
         std=parameter.std if parameter and is_known else None,
     )
@@ -241,7 +243,7 @@ def _nearly_all_adequate(verdicts: Sequence[Verdict]) -> bool:
     return sum(verdict.adequate for verdict in verdicts) >= _ADEQUATE_FRACTION * len(verdicts)
 
 
-def rivals(ranked: Sequence[PooledEstimate], margin: float) -> tuple[PooledEstimate, ...]:
+def rival_estimates(ranked: Sequence[PooledEstimate], margin: float) -> tuple[PooledEstimate, ...]:
     """Return the estimates, except the first, whose BIC is less than `margin` above the lowest."""
     return tuple(estimate for estimate in ranked[1:] if estimate.bic < ranked[0].bic + margin)
 
@@ -251,7 +253,7 @@ def _status_and_reason(
     ranked: Sequence[PooledEstimate],
     freest: PooledEstimate,
     verdicts: Sequence[Verdict],
-    alone: Mapping[str, int],
+    single_statuses: Mapping[str, int],
 ) -> tuple[PooledStatus, str | None]:
     """Return the status of one order, and the reason against reporting it."""
     structure = STRUCTURES[freest.structure]
@@ -265,7 +267,7 @@ def _status_and_reason(
     if (
         parameter is None
         and structure.fixed.get(order) == 1.0
-        and next(iter(alone)) == "compatible"
+        and next(iter(single_statuses)) == "compatible"
     ):
         # No fitted structure has it free: only the sessions' own verdicts are available.
         return "compatible", None
@@ -275,7 +277,7 @@ def _status_and_reason(
         return "open", _UNEXPLAINED_REASON
     integer_rivals = [
         estimate
-        for estimate in (ranked[0], *rivals(ranked, BIC_DECISIVE))
+        for estimate in (ranked[0], *rival_estimates(ranked, BIC_DECISIVE))
         if _has_order_one(estimate, order)
     ]
     low, high = parameter.interval

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from analysis.campaigns._estimates import RecordEstimate, WelchFit
-from analysis.campaigns._experiment import Experiment, task_errors
+from analysis.campaigns._experiment import Experiment, session_error_types
 from analysis.models import RECORD_BAND_HZ, WelchSettings
 from analysis.paper import Indices, fit_indices
 from analysis.results import RecordResult, whole_record, with_uniformity
@@ -195,7 +195,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionF
     from analysis.record import load_record
     from analysis.suited import remarks, welch_analysis
 
-    session_errors = task_errors()
+    session_errors = session_error_types()
     experiment = None
     try:
         record = with_uniformity(load_record(path), task.uniformity)

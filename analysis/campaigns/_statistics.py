@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns.pooling import by_structure, determines_damping, pooled_bic
+from analysis.campaigns.pooling import determines_damping, estimates_by_structure, pooled_bic
 from analysis.models import PARAMETERS, STRUCTURES, FrequencyResponseModel
 from analysis.paper import fit_indices, peak_deviation, resonant_peaks
 from rigd.beam import undamped_frequencies_rad_s
@@ -177,9 +177,11 @@ def best_models(models: Sequence[NominalModel]) -> tuple[NominalModel, ...]:
 
     These are the paper's two best models if they were fitted, else the two of lowest mean WMSE.
     """
-    named = tuple(m for m in models if (m.structure, m.weighting) in PAPER_BEST_MODELS)
+    paper_models = tuple(m for m in models if (m.structure, m.weighting) in PAPER_BEST_MODELS)
     return (
-        named if len(named) == len(PAPER_BEST_MODELS) else tuple(sorted(models, key=_wmse_key)[:2])
+        paper_models
+        if len(paper_models) == len(PAPER_BEST_MODELS)
+        else tuple(sorted(models, key=_wmse_key)[:2])
     )
 
 
@@ -313,10 +315,10 @@ def ranked_structures(
     pooled : sequence of PooledEstimate
         Pooled estimates, the lowest BIC first.
     """
-    fits = by_structure(sessions)
+    fits = estimates_by_structure(sessions)
     most_fits = max(map(len, fits.values()), default=0)
     bic = {name: pooled_bic(each) for name, each in fits.items() if len(each) == most_fits}
-    alone = Counter(session.selected for session in sessions)
+    single_selections = Counter(session.selected for session in sessions)
     misfit = {each.name: each.misfit for each in pooled}
     lowest = pooled[0].bic if pooled else min(bic.values(), default=0.0)
     ranked = [
@@ -324,7 +326,7 @@ def ranked_structures(
             structure=each[0].structure,
             fitted=len(each),
             determined=sum(map(determines_damping, each)),
-            selected_alone=alone[name],
+            selected_alone=single_selections[name],
             misfit=misfit.get(name)
             or float(np.median([one.cost / one.degrees_of_freedom for one in each])),
             bic_above_lowest=bic[name] - lowest if name in bic else None,

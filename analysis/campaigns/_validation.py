@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns._experiment import CampaignError, task_errors
+from analysis.campaigns._experiment import CampaignError, session_error_types
 from analysis.campaigns._statistics import mean_damping
 from analysis.campaigns.pooling import pooled_estimates
-from analysis.campaigns.workers import Lost
+from analysis.campaigns.workers import LostTask
 from analysis.identify import Measurement, Plant
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class LostTrial:
 
 @dataclass(frozen=True, slots=True)
 class PlantPrediction:
-    """Plant predicted for a session by the other sessions, with the session's own estimate."""
+    """Model estimated from the other sessions, with which one session is predicted."""
 
     method: str
     name: str
@@ -116,7 +116,7 @@ def validate(
     errors: list[LeftOutError] = []
     lost: list[LostTrial] = []
     for session, result in zip(sessions, results, strict=True):
-        if isinstance(result, Lost):
+        if isinstance(result, LostTask):
             lost.append(LostTrial(session.path, result.reason))
         elif isinstance(result, LostTrial):
             lost.append(result)
@@ -140,7 +140,7 @@ def left_out_errors(
         record = load_record(path)
         band_hz = record_band_hz(record, band_hz)
         comparison = Comparison.of(Measurement.of_record(record), band_hz)
-    except task_errors() as why:
+    except session_error_types() as why:
         return LostTrial(path, str(why))
     except MemoryError:
         return LostTrial(path, "not enough memory to predict it; use fewer --jobs")

@@ -16,7 +16,7 @@ from analysis.campaigns._orders import (
     PooledOrder,
     freest_estimate,
     pooled_order,
-    rivals,
+    rival_estimates,
     tolerant_pooled_order,
 )
 from analysis.identify import refused_reason, tolerant_sizes
@@ -222,8 +222,10 @@ def campaign_verdict(
     sweeps = opposite_sweeps(sessions)
     refused = modal is not None and modal.uniform_beam.status == "refused"
     findings = common_findings(sessions)
-    close_rivals = rivals(pooled, BIC_TIE)
-    alone = dict(Counter(each.selected for each in sessions if each.selected).most_common())
+    close_rivals = rival_estimates(pooled, BIC_TIE)
+    single_selections = dict(
+        Counter(each.selected for each in sessions if each.selected).most_common()
+    )
     adequate = sum(verdict.adequate for verdict in verdicts)
     dissent = _dissenting_sessions(sessions, best)
     advice_counts = Counter(advice for verdict in verdicts for advice in verdict.experiments)
@@ -233,7 +235,7 @@ def campaign_verdict(
         structure=best.structure,
         rivals=tuple(each.name for each in close_rivals),
         sessions=len(verdicts),
-        alone=alone,
+        alone=single_selections,
         adequate=adequate,
         alpha=alpha,
         lambda_=lambda_,
@@ -254,7 +256,7 @@ def campaign_verdict(
                 _withheld_orders(alpha, lambda_),
                 comparable=not (homogeneity.mixed or refused),
             ),
-            sentences.describe_selection(pooled, close_rivals, alone, len(verdicts)),
+            sentences.describe_selection(pooled, close_rivals, single_selections, len(verdicts)),
             *(finding.sentence for finding in findings),
             *sentences.describe_dissent([(each.file, each.structure) for each in dissent], best),
             *([] if homogeneity.mixed else [sentences.describe_scatter(freest)]),

@@ -83,10 +83,12 @@ def random_effects(
         Positive definite covariance of each session's estimates.
     """
     weight = 1 / np.diagonal(covariances, axis1=1, axis2=2)
-    total = weight.sum(axis=0)
-    q = (weight * (estimates - (weight * estimates).sum(axis=0) / total) ** 2).sum(axis=0)
+    total_weight = weight.sum(axis=0)
+    q = (weight * (estimates - (weight * estimates).sum(axis=0) / total_weight) ** 2).sum(axis=0)
     excess = q - (len(estimates) - 1)
-    between = np.maximum(excess / (total - (weight**2).sum(axis=0) / total), 0.0)
+    between_variance = np.maximum(
+        excess / (total_weight - (weight**2).sum(axis=0) / total_weight), 0.0
+    )
 
     # In units of a typical standard deviation: parameters differ by orders of magnitude.
     unit = 1 / np.sqrt(weight.mean(axis=0))
@@ -94,7 +96,7 @@ def random_effects(
     origin = estimates.mean(axis=0)
     own_covariances, total_covariances = (
         covariances / units,
-        covariances / units + np.diag(between / unit**2),
+        covariances / units + np.diag(between_variance / unit**2),
     )
     deviations = (estimates - origin) / unit
     shift, mean_covariance, squared_deviations = _weighted_mean(deviations, total_covariances)
@@ -104,7 +106,7 @@ def random_effects(
     return RandomEffects(
         mean=origin + unit * shift,
         covariance=units * mean_covariance,
-        between_std=np.sqrt(between),
+        between_std=np.sqrt(between_variance),
         cochran_q=q,
         deviance=min(
             log_determinants + squared_deviations, _weighted_mean(deviations, own_covariances)[2]
@@ -159,7 +161,7 @@ class PooledMode:
     participation_std_kg_m2: float | None = None
 
 
-def pooled_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
+def pool_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
     """Pool frequency and damping ratio, separately, of each mode that all sessions have."""
     pooled_list = []
     for modes in zip(*(estimate.modes for estimate in estimates), strict=False):
@@ -296,18 +298,20 @@ def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimat
 
     The estimates are sorted by BIC, the lowest first.
     """
-    by_name = by_structure(sessions)
+    by_name = estimates_by_structure(sessions)
     most_fits = max(map(len, by_name.values()), default=0)
-    found = [pooled(estimates) for estimates in by_name.values() if len(estimates) == most_fits]
+    pooled_list = [
+        pool_estimates(estimates) for estimates in by_name.values() if len(estimates) == most_fits
+    ]
     return tuple(
         sorted(
-            (estimate for estimate in found if estimate is not None),
+            (estimate for estimate in pooled_list if estimate is not None),
             key=lambda estimate: estimate.bic,
         )
     )
 
 
-def by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, list[RecordEstimate]]:
+def estimates_by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, list[RecordEstimate]]:
     """Return the whole-record estimates of all sessions by the name of the structure."""
     estimates_by_name: dict[str, list[RecordEstimate]] = {}
     for session in sessions:
@@ -321,38 +325,44 @@ def determines_damping(estimate: RecordEstimate) -> bool:
     return set(STRUCTURES[estimate.structure].free) <= set(estimate.determined)
 
 
-def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
+def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     """Pool the estimates of one structure; None if fewer than two determine its damping.
 
     A parameter of rig or specimen (mostly the tool inertia) that is at a bound in some session is
     not in the common covariance. The pooled plant has the unweighted mean of such a parameter.
     """
-    used = list(filter(determines_damping, estimates))
-    if len(used) < _FEWEST_SESSIONS:
+    used_estimates = list(filter(determines_damping, estimates))
+    if len(used_estimates) < _FEWEST_SESSIONS:
         return None
-    names = [name for name in used[0].determined if all(name in e.determined for e in used)]
-    values, covariances = _stack_estimates(used, names)
+    names = [
+        name
+        for name in used_estimates[0].determined
+        if all(name in e.determined for e in used_estimates)
+    ]
+    values, covariances = _stack_estimates(used_estimates, names)
     effects = random_effects(values, covariances)
     std = np.sqrt(np.diag(effects.covariance))
-    within = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
-    t = student_t_quantile(0.95, len(used) - 1)
-    chances = chi_square_p_value(effects.cochran_q, len(used) - 1)
-    columns = (effects.mean, std, within, effects.between_std, chances)
+    within_std = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
+    t = student_t_quantile(0.95, len(used_estimates) - 1)
+    chances = chi_square_p_value(effects.cochran_q, len(used_estimates) - 1)
+    statistics = (effects.mean, std, within_std, effects.between_std, chances)
     parameters = tuple(
         _pooled_parameter(name, t, *row)
-        for name, row in zip(names, np.transpose(columns).tolist(), strict=True)
+        for name, row in zip(names, np.transpose(statistics).tolist(), strict=True)
     )
-    means = {name: float(np.mean([e.parameters[name] for e in used])) for name in SETTINGS}
+    means = {
+        name: float(np.mean([e.parameters[name] for e in used_estimates])) for name in SETTINGS
+    }
     return PooledEstimate(
-        structure=used[0].structure,
+        structure=used_estimates[0].structure,
         plant=_pooled_plant(
-            used[0], means | {parameter.name: parameter.value for parameter in parameters}
+            used_estimates[0], means | {parameter.name: parameter.value for parameter in parameters}
         ),
         parameters=parameters,
         covariance=effects.covariance,
-        modes=pooled_modes(used),
-        sessions=len(used),
-        misfit=float(np.median([e.cost / e.degrees_of_freedom for e in used])),
+        modes=pool_modes(used_estimates),
+        sessions=len(used_estimates),
+        misfit=float(np.median([e.cost / e.degrees_of_freedom for e in used_estimates])),
         bic=pooled_bic(estimates),
     )
 
@@ -388,7 +398,13 @@ def _stack_estimates(
 
 
 def _pooled_parameter(
-    name: str, t: float, mean: float, std: float, within: float, between: float, chance: float
+    name: str,
+    t: float,
+    mean: float,
+    std: float,
+    within_std: float,
+    between_std: float,
+    chance: float,
 ) -> PooledParameter:
     """Return a pooled parameter from the statistics of its value or of its logarithm."""
     value = math.exp(mean) if name in LOGARITHMIC else mean
@@ -398,10 +414,10 @@ def _pooled_parameter(
         value=value,
         std=unit * std,
         interval=_parameter_interval(name, mean, t * std),
-        within_std=unit * within,
-        between_std=unit * between,
+        within_std=unit * within_std,
+        between_std=unit * between_std,
         chance=chance,
-        next_interval=_parameter_interval(name, mean, t * math.hypot(std, between)),
+        next_interval=_parameter_interval(name, mean, t * math.hypot(std, between_std)),
     )
 
 
@@ -413,7 +429,7 @@ def _parameter_interval(name: str, mean: float, half_width: float) -> tuple[floa
 
 
 def _coordinate(name: str, value: float) -> float:
-    """Return the logarithm of a positive parameter, or the value of another one."""
+    """Return the value of a parameter, or its logarithm if the logarithm is estimated."""
     return math.log(value) if name in LOGARITHMIC else value
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from analysis.campaigns._experiment import StatedSpecimen
-    from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, Values
+    from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, SessionValues
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
@@ -55,9 +55,9 @@ def label(quantity: str) -> tuple[str, float, str]:
     if quantity in QUANTITIES:
         symbol, _, unit, factor = QUANTITIES[quantity]
         unit, factor = _FINER_UNITS.get(quantity, (unit, factor))
-        power, _, rest = unit.partition(" ")
+        power, _, unit_rest = unit.partition(" ")
         if power.startswith("1e"):
-            unit = f"10{power.removeprefix('1e').translate(_SUPERSCRIPTS)} {rest}"
+            unit = f"10{power.removeprefix('1e').translate(_SUPERSCRIPTS)} {unit_rest}"
         return _CLEARER_NAMES.get(quantity, symbol), factor, "" if unit == "1" else unit
     field_name, mode = quantity.rsplit("_", 1)
     mode_quantity, factor, unit = _MODE_QUANTITIES[field_name]
@@ -77,7 +77,7 @@ def with_unit(parameter: str) -> str:
     return f"{symbol} ({unit})" if unit else symbol
 
 
-def probability(chance: float) -> str:
+def probability(p_value: float) -> str:
     """Format a p-value, with a lower bound for values that are too small to be shown.
 
     Examples
@@ -86,7 +86,7 @@ def probability(chance: float) -> str:
     >>> probability(0.0312), probability(0.0)
     ('0.031', '< 1e-99')
     """
-    return f"{chance:.2g}" if chance > _SMALLEST_P_VALUE else f"< {_SMALLEST_P_VALUE:g}"
+    return f"{p_value:.2g}" if p_value > _SMALLEST_P_VALUE else f"< {_SMALLEST_P_VALUE:g}"
 
 
 def percent(fraction: float) -> str:
@@ -176,10 +176,10 @@ def _describe_different_specimens(homogeneity: Homogeneity, leading: Heterogenei
         for scatter in homogeneity.quantities
         if scatter.mixed and not scatter.of_rig and scatter is not leading
     ]
-    also = f" The same holds of {', '.join(others)}." if others else ""
+    others_sentence = f" The same holds of {', '.join(others)}." if others else ""
     return [
         "The sessions are not of one specimen in one state: "
-        f"{_describe_heterogeneity(leading)}.{also}",
+        f"{_describe_heterogeneity(leading)}.{others_sentence}",
         f"{_describe_groups(leading)} Pooled values are then means of a mixture (marked "
         f"{MIXTURE_MARK}) that "
         "may hold for none of the specimens: analyse the sessions of each specimen separately, or "
@@ -208,7 +208,7 @@ def _small_scatter_remark(homogeneity: Homogeneity) -> str:
 def _describe_heterogeneity(scatter: Heterogeneity) -> str:
     """Describe the between-session scatter of a quantity, relative to its uncertainty and size."""
     i_squared_text = percent(scatter.i_squared)
-    equals = "" if i_squared_text.startswith(">") else "= "
+    equals_sign = "" if i_squared_text.startswith(">") else "= "
     between_text = _mean_text([scatter.between_std], scatter)
     scatter_text = (
         f"{between_text}, {100 * scatter.between_std / abs(scatter.mean):.2g} %; "
@@ -219,7 +219,7 @@ def _describe_heterogeneity(scatter: Heterogeneity) -> str:
         f"{label(scatter.quantity)[0]} varies between sessions by {scatter.own_stds:.3g} of its "
         "own "
         f"standard deviations ({scatter_text}Cochran's Q = {scatter.cochran_q:.3g} where "
-        f"{scatter.degrees_of_freedom} is expected, I² {equals}{i_squared_text})"
+        f"{scatter.degrees_of_freedom} is expected, I² {equals_sign}{i_squared_text})"
     )
 
 
@@ -241,7 +241,9 @@ def _describe_groups(scatter: Heterogeneity) -> str:
     )
 
 
-def _extreme_sessions(values: Values) -> tuple[tuple[str, float, float], tuple[str, float, float]]:
+def _extreme_sessions(
+    values: SessionValues,
+) -> tuple[tuple[str, float, float], tuple[str, float, float]]:
     """Return the entries of the sessions with the lowest and the highest value."""
     ordered = sorted(values, key=lambda entry: entry[1])
     return ordered[0], ordered[-1]
@@ -251,8 +253,8 @@ def _mean_text(values: Sequence[float], scatter: Heterogeneity) -> str:
     """Format the mean of values with its unit, and enough digits to distinguish the groups."""
     _, factor, unit = label(scatter.quantity)
     digits = min(decimals(factor * max(scatter.between_std, 1e-300)), 9)
-    times = "·" if unit.startswith("10") else " "
-    return f"{factor * float(np.mean(values)):.{digits}f}{times}{unit}".rstrip()
+    separator = "·" if unit.startswith("10") else " "
+    return f"{factor * float(np.mean(values)):.{digits}f}{separator}{unit}".rstrip()
 
 
 def _list_files(names: Sequence[str]) -> str:
@@ -267,7 +269,8 @@ def _list_files(names: Sequence[str]) -> str:
 
 _DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
 """Name of the damping whose order each parameter is."""
-_ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
+_ORDER_NAMES: Final[tuple[Order, ...]] = ("alpha", "lambda")
+"""Names of the orders of internal and of external damping."""
 _CLASSICAL_STRUCTURE: Final = "III"
 """Structure with internal and external damping, both of order 1."""
 _SIGNIFICANCE_LEVEL: Final = 0.01
@@ -376,7 +379,9 @@ def describe_structure(freest: PooledEstimate, best: PooledEstimate) -> str:
     best : PooledEstimate
         Estimate of the lowest BIC.
     """
-    fixed_orders = [name for name in _ORDERS if STRUCTURES[freest.structure].fixed.get(name) == 1.0]
+    fixed_orders = [
+        name for name in _ORDER_NAMES if STRUCTURES[freest.structure].fixed.get(name) == 1.0
+    ]
     verb = "is" if len(fixed_orders) == 1 else "are"
     consequence = (
         f"; it assumes that {' and '.join(fixed_orders)} {verb} 1."
@@ -416,8 +421,8 @@ def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[st
 
 def describe_selection(
     ranked: Sequence[PooledEstimate],
-    close: Sequence[PooledEstimate],
-    alone: Mapping[str, int],
+    rivals: Sequence[PooledEstimate],
+    single_selections: Mapping[str, int],
     sessions: int,
 ) -> str:
     """Describe which structure all sessions select together, and which ones single sessions select.
@@ -426,25 +431,25 @@ def describe_selection(
     ----------
     ranked : sequence of PooledEstimate
         Estimates of all structures, the lowest BIC first.
-    close : sequence of PooledEstimate
+    rivals : sequence of PooledEstimate
         Estimates whose BIC is not distinguishable from the lowest.
-    alone : mapping of str to int
+    single_selections : mapping of str to int
         Number of sessions that select each structure by themselves.
     sessions : int
         Number of sessions.
     """
     best = ranked[0]
     sentence = f"Lowest BIC: type {best.name}."
-    if close:
-        names = " or ".join(f"type {rival.name}" for rival in close)
+    if rivals:
+        names = " or ".join(f"type {rival.name}" for rival in rivals)
         sentence += (
             f" All sessions together do not distinguish it from {names} (ΔBIC "
-            f"{close[0].bic - best.bic:.1f}; 10 = decisive)."
+            f"{rivals[0].bic - best.bic:.1f}; 10 = decisive)."
         )
     elif len(ranked) > 1:
         margin = ranked[1].bic - best.bic
         sentence += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
-    selections = {f"type {name}": count for name, count in alone.items()}
+    selections = {f"type {name}": count for name, count in single_selections.items()}
     return f"{sentence} {describe_single_sessions(selections, sessions)}"
 
 
@@ -510,16 +515,18 @@ def describe_order(pooled_order: PooledOrder) -> str:
     """Describe the pooled estimate of one order of the damping."""
     name, damping = pooled_order.order, _DAMPING_OF_ORDER[pooled_order.order]
     counts = {f"“{status}”": count for status, count in pooled_order.alone.items()}
-    alone = f" {describe_single_sessions(counts, sum(counts.values()))}"
+    sessions_sentence = f" {describe_single_sessions(counts, sum(counts.values()))}"
     if pooled_order.status == "absent":
-        return f"No {damping} was found, so its order {name} has no meaning.{alone}"
+        return f"No {damping} was found, so its order {name} has no meaning.{sessions_sentence}"
     if pooled_order.status == "compatible" and pooled_order.interval is None:
         return (
-            f"The order {name} of the {damping} is fixed at 1, with which it is compatible.{alone}"
+            f"The order {name} of the {damping} is fixed at 1, with which it is "
+            f"compatible.{sessions_sentence}"
         )
     if pooled_order.value is None or pooled_order.interval is None:
         return (
-            f"The order {name} of the {damping} is not identifiable: {pooled_order.reason}.{alone}"
+            f"The order {name} of the {damping} is not identifiable: "
+            f"{pooled_order.reason}.{sessions_sentence}"
         )
     half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
     value, low, high = to_uncertainty(
@@ -530,14 +537,14 @@ def describe_order(pooled_order: PooledOrder) -> str:
         f"(95 %: {low} to {high}, between-session variance included)"
     )
     if pooled_order.reason is not None:
-        would = statement.replace(" is ", " would be ", 1)
-        return f"{would}, but {pooled_order.reason}; do not interpret it.{alone}"
+        conditional = statement.replace(" is ", " would be ", 1)
+        return f"{conditional}, but {pooled_order.reason}; do not interpret it.{sessions_sentence}"
     conclusion = {
         "compatible": "consistent with 1",
         "fractional": "1 is excluded",
         "open": "1 is doubtful, but not excluded",
     }
-    return f"{statement}: {conclusion[pooled_order.status]}.{alone}"
+    return f"{statement}: {conclusion[pooled_order.status]}.{sessions_sentence}"
 
 
 def describe_welch_bias(
@@ -563,11 +570,13 @@ def describe_welch_bias(
     """
     if not comparable:
         return []
-    of_type = [bias for bias in biases if bias.structure == freest.name]
-    best = [bias for bias in of_type if (bias.structure, bias.weighting) in PAPER_BEST_MODELS]
+    type_biases = [bias for bias in biases if bias.structure == freest.name]
+    best_model_biases = [
+        bias for bias in type_biases if (bias.structure, bias.weighting) in PAPER_BEST_MODELS
+    ]
     left_out = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
     sentences = []
-    for bias in best or of_type[:1]:
+    for bias in best_model_biases or type_biases[:1]:
         significant = [one for one in bias.significant if one.parameter not in left_out]
         if not significant:
             continue
@@ -593,7 +602,7 @@ def _bias_clause(parameter_bias: ParameterBias) -> str:
     )
     (record,) = to_uncertainty((parameter_bias.record,), parameter_bias.record_std, factor)
     (bias_text,) = to_uncertainty((abs(parameter_bias.bias),), parameter_bias.bias_std, factor)
-    name = parameter_bias.parameter if parameter_bias.parameter in _ORDERS else symbol
+    name = parameter_bias.parameter if parameter_bias.parameter in _ORDER_NAMES else symbol
     unit_text = f"·{unit}" if unit else ""
     bounds_remark = (
         f", at the edge of the search range in {parameter_bias.at_bounds}"
@@ -622,7 +631,7 @@ def describe_dissent(sessions: Sequence[tuple[str, str]], best: PooledEstimate) 
     names = ", ".join(
         f"{file} (type {structure})" for file, structure in sessions[:_MOST_FILES_LISTED]
     )
-    more = (
+    more_text = (
         f" and {len(sessions) - _MOST_FILES_LISTED} more"
         if len(sessions) > _MOST_FILES_LISTED
         else ""
@@ -630,7 +639,7 @@ def describe_dissent(sessions: Sequence[tuple[str, str]], best: PooledEstimate) 
     return [
         f"Type {best.name} is excluded by {len(sessions)} single "
         f"session{'s' if len(sessions) > 1 else ''}: "
-        f"{names}{more}. Check their reports (analyze --each) before relying on the mean."
+        f"{names}{more_text}. Check their reports (analyze --each) before relying on the mean."
     ]
 
 
@@ -717,11 +726,13 @@ def lost_trials(lost: Sequence[LostTrial], requested: int) -> list[str]:
     if not lost:
         return []
     reasons = "; ".join(f"{trial.path.name}: {trial.reason}" for trial in lost[:_MOST_FILES_LISTED])
-    more = f"; and {len(lost) - _MOST_FILES_LISTED} more" if len(lost) > _MOST_FILES_LISTED else ""
+    more_text = (
+        f"; and {len(lost) - _MOST_FILES_LISTED} more" if len(lost) > _MOST_FILES_LISTED else ""
+    )
     return [
         f"Of {requested} sessions to be predicted from the others, {requested - len(lost)} "
         f"{'was' if requested - len(lost) == 1 else 'were'} and {len(lost)} "
-        f"{'was' if len(lost) == 1 else 'were'} not ({reasons}{more}). Prediction errors are "
+        f"{'was' if len(lost) == 1 else 'were'} not ({reasons}{more_text}). Prediction errors are "
         "averaged "
         "over those predicted."
     ]
@@ -738,8 +749,8 @@ def describe_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
         Number of sessions.
     """
     (first, count), *others = counts.items()
-    more = "".join(f", {what} in {n}" for what, n in others)
-    return f"Single sessions: {first} in {count} of {sessions}{more}."
+    other_texts = "".join(f", {conclusion} in {n}" for conclusion, n in others)
+    return f"Single sessions: {first} in {count} of {sessions}{other_texts}."
 
 
 def _describe_damping(structure: str) -> str:

@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
 Result = TypeVar("Result")
+"""Type of a task's result."""
 
-_POLL_S: Final = 2.0
+_PRESENCE_CHECK_INTERVAL_S: Final = 2.0
 """Interval in seconds at which the presence of worker processes is checked."""
 
 _FEWEST_LOST_TASKS: Final = 2
@@ -43,7 +44,7 @@ fault."""
 
 
 @dataclass(frozen=True, slots=True)
-class Lost:
+class LostTask:
     """Result of a task whose worker process ended each time it ran the task.
 
     Attributes
@@ -99,7 +100,7 @@ class Workers:
         function: Callable[..., Result],
         arguments: Sequence[tuple[Any, ...]],
         on_done: Callable[[int], None] = _ignore_progress,
-    ) -> list[Result | Lost]:
+    ) -> list[Result | LostTask]:
         """Call a function with every tuple of arguments, in parallel.
 
         Parameters
@@ -114,19 +115,19 @@ class Workers:
         Returns
         -------
         list
-            Results in the order of the arguments; `Lost` for a task whose process ended each time.
+            Results in the order of the arguments; `LostTask` if a task's process ended each time.
 
         Raises
         ------
         CampaignError
             There are no workers any more.
         """
-        results: dict[int, Result | Lost] = {}
+        results: dict[int, Result | LostTask] = {}
 
         def submit(index: int) -> Future[Result]:
             return self._executor.submit(function, *arguments[index])
 
-        def store_result(index: int, result: Result | Lost) -> None:
+        def store_result(index: int, result: Result | LostTask) -> None:
             results[index] = result
             on_done(index)
 
@@ -137,9 +138,9 @@ class Workers:
                 for index in interrupted:
                     self._replace_executor(alone=True)
                     if self._run_until_process_ends(deque([index]), submit, store_result):
-                        store_result(index, Lost(self._lost_task_reason))
+                        store_result(index, LostTask(self._lost_task_reason))
             if interrupted:
-                any_finished = any(not isinstance(result, Lost) for result in results.values())
+                any_finished = any(not isinstance(result, LostTask) for result in results.values())
                 if (
                     self._no_workers_message
                     and not any_finished
@@ -168,7 +169,7 @@ class Workers:
                         self._replace_executor()
                     break
                 queue.popleft()
-            for future in wait(in_progress, _POLL_S, FIRST_COMPLETED).done:
+            for future in wait(in_progress, _PRESENCE_CHECK_INTERVAL_S, FIRST_COMPLETED).done:
                 index = in_progress.pop(future)
                 try:
                     result = future.result()

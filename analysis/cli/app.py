@@ -17,7 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 import rigd
 from analysis.cli.exchange import IMPORT_EPILOG, export_app, import_command
 from analysis.cli.sessions import NoSessionsError, Outputs, session_command, session_files
-from analysis.cli.standard_streams import complain, standard_streams
+from analysis.cli.standard_streams import print_error, standard_streams
 from analysis.cli.touch import TOUCH_EPILOG, touch_command
 from analysis.cli.welch_options import (
     Band,
@@ -26,7 +26,7 @@ from analysis.cli.welch_options import (
     Overlap,
     Segment,
     band_hz,
-    choice,
+    parse_option_choice,
     welch_settings,
 )
 from analysis.results import FIGURE_FORMATS, Routes
@@ -94,6 +94,7 @@ Version = Annotated[
         "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
     ),
 ]
+"""Option --version."""
 
 
 _EXIT_INTERRUPTED: Final = 130
@@ -110,7 +111,7 @@ _OTHER_COMMANDS: Final = {
 }
 """Descriptions of the other commands in the help, by their names."""
 
-_EPILOG = """\
+_HELP_EPILOG = """\
 Example: analyze session.mcap --types III,VI --json fits.json
 
 Figures, tables and JSON go to session.report/ next to the file (session.report-2/ if that exists).
@@ -119,6 +120,7 @@ campaign.report/ next to the first. Sessions that do not suit Welch's method (st
 narrow sweeps, short or stopped ones) get only the whole-record analysis, and a line that says why.
 
 Exit code: 0 done; 1 a file could not be analysed; 2 usage error; 130 stopped by Ctrl-C."""
+"""Text at the end of the help of the command."""
 
 
 _METHOD_NAMES: Final = ("welch", "record", "all")
@@ -137,6 +139,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+"""Application of the command `analyze` with its subcommands."""
 app.command("import", epilog=IMPORT_EPILOG)(import_command)
 app.command("touch", epilog=TOUCH_EPILOG)(touch_command)
 app.add_typer(export_app, name="export")
@@ -169,7 +172,7 @@ def _suppress_library_warnings() -> None:
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
-@app.command(DEFAULT_COMMAND, epilog=_EPILOG, cls=CommandWithOthers)
+@app.command(DEFAULT_COMMAND, epilog=_HELP_EPILOG, cls=CommandWithOthers)
 def analyze(
     context: typer.Context,
     files: Annotated[
@@ -280,7 +283,7 @@ def analyze(
     try:
         files = session_files(files)
     except NoSessionsError as error:
-        complain(str(error))
+        print_error(str(error))
         raise typer.Exit(1) from None
     is_campaign = len(files) > 1 and not each
     if not is_campaign:
@@ -296,7 +299,7 @@ def analyze(
         raise typer.BadParameter(
             "the workers are those of --dask; leave one of the two out.", param_hint="--jobs"
         )
-    method = choice(method, _METHOD_NAMES, "--method")
+    method = parse_option_choice(method, _METHOD_NAMES, "--method")
     if fix and method == "welch":
         raise typer.BadParameter(
             "the Welch fits take all of them from the file; leave it out, or take --method all.",
@@ -343,13 +346,13 @@ def analyze(
             except SingleSessionError as single:
                 code = _report_single_session(single, routes, outputs)
             except CampaignError as error:
-                complain(str(error))
+                print_error(str(error))
                 code = 1
     except OutputExistsError as error:
-        complain(str(error))
+        print_error(str(error))
         code = 2
     except OutputError as error:
-        complain(str(error))
+        print_error(str(error))
         code = 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
@@ -395,14 +398,14 @@ def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
 def _report_single_session(single: SingleSessionError, routes: Routes, outputs: Outputs) -> int:
     """Print the errors of the unusable files of a campaign, and report the only usable one."""
     for failure in single.failures:
-        complain(failure.message)
+        print_error(failure.message)
     typer.echo(f"A campaign needs two sessions: {single.path} is reported alone.", err=True)
     others = {str(failure.path): failure.message for failure in single.failures}
     return max(1, session_command([single.path], routes, outputs, others=others))
 
 
 def _fixed_parameters(text: str) -> tuple[Setting, ...]:
-    """Return the parameters named in --fix; raise a usage error for unknown names."""
+    """Return the parameters named in --fix; raise a usage error if one is unknown."""
     from analysis.identify import SETTINGS
 
     names = [name.strip() for name in text.split(",") if name.strip()]
@@ -428,7 +431,7 @@ def _relative_uniformity(uniformity_percent: float) -> float:
 
 
 def _figure_formats(text: str) -> tuple[FigureFormat, ...]:
-    """Return the figure formats named in --figures; raise a usage error for others."""
+    """Return the figure formats named in --figures; raise a usage error if one is unknown."""
     names = {name.strip().lower() for name in text.split(",") if name.strip()}
     unknown = sorted(names.difference(FIGURE_FORMATS))
     if unknown or not names:
@@ -441,7 +444,7 @@ def _figure_formats(text: str) -> tuple[FigureFormat, ...]:
 
 
 def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:
-    """Raise a usage error if --rerun is given with several sessions, or its file exists."""
+    """Raise a usage error if --rerun has several sessions; raise if its file is taken."""
     from analysis.report import check_rerun_file
 
     if len(files) > 1:

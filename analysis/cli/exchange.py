@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from typer.models import OptionInfo
 
-from analysis.cli.standard_streams import complain
+from analysis.cli.standard_streams import print_error
 from analysis.cli.welch_options import (
     Band,
     Estimator,
@@ -17,7 +17,7 @@ from analysis.cli.welch_options import (
     Overlap,
     Segment,
     band_hz,
-    choice,
+    parse_option_choice,
     welch_settings,
 )
 
@@ -32,6 +32,7 @@ export_app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
 )
+"""Application of the commands `analyze export …`."""
 
 IMPORT_EPILOG = """\
 Example: analyze import log.tdms session.mcap --angle "Rig/Angle:deg" --torque "Rig/Tz:mN.m"
@@ -52,13 +53,16 @@ Exit code: 0 done, 1 it cannot be exported, 2 usage error, 130 stopped by Ctrl-C
 _Session = Annotated[
     Path, typer.Argument(metavar="SESSION", readable=False, help="Session file (.mcap).")
 ]
+"""Argument SESSION of the export commands."""
 _Target = Annotated[
     Path,
     typer.Argument(metavar="OUT", readable=False, help="New file: .csv, .mat, .uff, .unv, .uf58."),
 ]
+"""Argument OUT of the commands that export records and responses."""
 _Binary = Annotated[
     bool, typer.Option("--binary", help="Write 8-byte floats instead of text (universal files).")
 ]
+"""Option --binary."""
 
 
 def _channel_option(help_text: str) -> OptionInfo:
@@ -281,7 +285,7 @@ def export_model_command(
         bool,
         typer.Option("--beam", help="The beam's model, even where its test was not passed."),
     ] = False,
-    given: Annotated[
+    input_kind: Annotated[
         str,
         typer.Option(
             "--input",
@@ -315,7 +319,7 @@ def export_model_command(
 
     options = ModelOptions(
         beam,
-        choice(given, INPUTS, "--input"),
+        parse_option_choice(input_kind, INPUTS, "--input"),
         _parse_order(order),
         _parse_rate(rate),
         SAMPLES if samples is None else samples,
@@ -371,7 +375,7 @@ def _model_lines(model: LinearModel, source: Path, target: Path) -> list[str]:
 
 
 def _parse_order(text: str) -> int | None:
-    """Return the number of states given by --order, None for auto; raise a usage error."""
+    """Return the number of states in --order, or None for auto; raise if invalid."""
     if text == "auto":
         return None
     if not (text.isascii() and text.isdecimal() and 1 <= int(text[:6]) <= _MOST_STATES):
@@ -383,7 +387,7 @@ def _parse_order(text: str) -> int | None:
 
 
 def _parse_rate(text: str) -> float | None:
-    """Return the sampling rate given by --rate, None for continuous; raise a usage error."""
+    """Return the rate in Hz in --rate, or None for continuous; raise if invalid."""
     if text == "continuous":
         return None
     try:
@@ -421,16 +425,16 @@ def _exit_code(run: Callable[[], None]) -> int:
     try:
         run()
     except (SettingsError, TargetError, OutputExistsError, SessionExistsError) as error:
-        complain(str(error))
+        print_error(str(error))
         return 2
     except (
         ExchangeError, SessionError, RecordError, FrequencyResponseError, MeasurementError,
         OutputError, IdentifiedBeamError, LinearModelError,
     ) as error:  # fmt: skip
-        complain(str(error))
+        print_error(str(error))
         return 1
     except LinAlgError as error:
-        complain(f"The estimate failed ({error}); is this a record of the rig?")
+        print_error(f"The estimate failed ({error}); is this a record of the rig?")
         return 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
@@ -453,9 +457,9 @@ _LATEST_END_S: Final = 1e6
 
 
 def _parse_interval(option: str, text: str) -> tuple[float, float]:
-    """Return begin and end in seconds of a segment's option; raise a usage error."""
+    """Return begin and end of a segment in seconds, from an option; raise if invalid."""
     try:
-        begin_s, end_s = (float(part) for part in text.split(","))
+        begin_s, end_s = (float(number_text) for number_text in text.split(","))
     except ValueError:
         begin_s = end_s = math.nan
     if not 0.0 <= begin_s < end_s <= _LATEST_END_S:

@@ -23,7 +23,7 @@ _EXIT_FAILED: Final = 1
 """Exit code if a standard stream cannot be written."""
 
 
-def complain(message: str) -> None:
+def print_error(message: str) -> None:
     """Print an error message to standard error."""
     typer.echo(f"Error: {readable_message(message)}", err=True)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from analysis.cli.sessions import NoSessionsError, Outputs, session_files
-from analysis.cli.standard_streams import complain, print_readable
+from analysis.cli.standard_streams import print_error, print_readable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,10 +69,10 @@ def touch_command(
             report_folders(files[:1], report)
         code = _run_analysis(files, model, outputs)
     except (OutputExistsError, IdentifiedBeamError) as error:
-        complain(str(error))
+        print_error(str(error))
         code = 2
     except (NoSessionsError, OutputError) as error:
-        complain(str(error))
+        print_error(str(error))
         code = 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)

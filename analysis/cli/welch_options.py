@@ -16,7 +16,7 @@ _MAX_NFFT_SAMPLES: Final = 2**22
 """Longest FFT in samples: 26 times the paper's, which takes seconds and a few 100 MB."""
 
 
-_Choice = TypeVar("_Choice", bound=str)
+_ChoiceName = TypeVar("_ChoiceName", bound=str)
 """Type of the names among which an option chooses."""
 
 Band = Annotated[
@@ -27,7 +27,7 @@ Band = Annotated[
         "record's rate]",
     ),
 ]
-"""Option --band."""
+"""Option --band: frequency band of the fits."""
 Estimator = Annotated[
     str,
     typer.Option(
@@ -36,28 +36,28 @@ Estimator = Annotated[
         "reference as instrument (no bias from fed-back noise); fft: one FFT of the whole record.",
     ),
 ]
-"""Option --frf."""
+"""Option --frf: estimator of the frequency response."""
 Segment = Annotated[
     int | None,
     typer.Option(
         metavar="SAMPLES", min=2, help="Welch segment.  [default: 17.266 s, as in the paper]"
     ),
 ]
-"""Option --segment."""
+"""Option --segment: length of a Welch segment."""
 Overlap = Annotated[
     int | None,
     typer.Option(
         metavar="SAMPLES", min=0, help="Overlap of segments.  [default: 15 % of the segment]"
     ),
 ]
-"""Option --overlap."""
+"""Option --overlap: overlap of Welch segments."""
 Nfft = Annotated[
     int | None,
     typer.Option(
         metavar="SAMPLES", min=2, max=_MAX_NFFT_SAMPLES, help="FFT length.  [default: 160 s]"
     ),
 ]
-"""Option --nfft."""
+"""Option --nfft: length of the FFT."""
 
 
 def welch_settings(
@@ -86,7 +86,7 @@ def welch_settings(
             param_hint="--nfft",
         )
     return WelchSettings(
-        estimator=choice(frf, get_args(FrfEstimator), "--frf"),
+        estimator=parse_option_choice(frf, get_args(FrfEstimator), "--frf"),
         segment_length=segment,
         overlap=overlap,
         nfft=nfft,
@@ -95,7 +95,7 @@ def welch_settings(
     )
 
 
-def choice(text: str, choices: Sequence[_Choice], option: str) -> _Choice:
+def parse_option_choice(text: str, choices: Sequence[_ChoiceName], option: str) -> _ChoiceName:
     """Return the choice that a text names, ignoring case; raise a usage error for others."""
     for candidate in choices:
         if candidate == text.lower():
@@ -106,11 +106,11 @@ def choice(text: str, choices: Sequence[_Choice], option: str) -> _Choice:
 
 
 def band_hz(text: str | None) -> tuple[float, float] | None:
-    """Return the band in Hz stated by --band, or None without it; raise a usage error."""
+    """Return the band in Hz stated by --band, or None without it; raise if invalid."""
     if text is None:
         return None
     try:
-        first_hz, last_hz = (float(part) for part in text.split(","))
+        first_hz, last_hz = (float(frequency_text) for frequency_text in text.split(","))
     except ValueError:
         first_hz = last_hz = math.nan
     if not 0.0 <= first_hz < last_hz < math.inf:
@@ -122,7 +122,7 @@ def band_hz(text: str | None) -> tuple[float, float] | None:
 
 
 def _parse_types(text: str) -> tuple[str, ...]:
-    """Return the model types named in --types; raise a usage error for others."""
+    """Return the model types named in --types; raise a usage error if one is unknown."""
     from analysis.models import STRUCTURES
 
     names = _split_list(text.upper())
@@ -137,7 +137,7 @@ def _parse_types(text: str) -> tuple[str, ...]:
 
 
 def _parse_weightings(text: str) -> tuple[str, ...]:
-    """Return the weightings named in --weights; raise a usage error for others."""
+    """Return the weightings named in --weights; raise a usage error if one is unknown."""
     from analysis.models import WeightingError, weighting_name
 
     try:
@@ -153,4 +153,4 @@ def _parse_weightings(text: str) -> tuple[str, ...]:
 
 def _split_list(text: str) -> tuple[str, ...]:
     """Return the names in a comma-separated list, each once, in their order."""
-    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    return tuple(dict.fromkeys(entry.strip() for entry in text.split(",") if entry.strip()))

@@ -83,7 +83,7 @@ def canonical_unit(text: str) -> str | None:
     return _UNITS_BY_SPELLING.get(spelling) or _UNITS_BY_WORD.get(spelling.lower())
 
 
-def factor(quantity: str, unit: str) -> float:
+def unit_factor(quantity: str, unit: str) -> float:
     """Return the size of a unit in rad, N·m, N or s.
 
     Parameters
@@ -246,7 +246,7 @@ def parse_choice(text: str, quantity: str) -> ChannelChoice:
             f"'{text}' does not say channel and unit; write CHANNEL:UNIT with one of the units "
             f"{', '.join(UNIT_SIZES[quantity])}. A unit is never guessed."
         )
-    size = factor(quantity, unit)
+    size = unit_factor(quantity, unit)
     return ChannelChoice(channel.strip(), stated_unit(unit), size)
 
 
@@ -296,13 +296,13 @@ class Timebase:
         return int(self.ticks[-1]) + 1 - len(self.ticks)
 
 
-def uniform(path: Path, samples: int, rate_hz: float) -> Timebase:
+def uniform_timebase(path: Path, samples: int, rate_hz: float) -> Timebase:
     """Return the time base of samples without gaps, at the rate that the user states."""
     _check_rate(path, rate_hz)
     return Timebase(np.arange(samples), rate_hz, 0.0)
 
 
-def from_time_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) -> Timebase:
+def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) -> Timebase:
     """Return the sampling rate and the tick of each sample, determined from time stamps.
 
     Parameters

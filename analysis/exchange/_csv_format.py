@@ -63,7 +63,11 @@ _BLOCK_ROWS: Final = 20_000
 
 def write_csv(table: ExportTable, stream: BinaryIO) -> None:
     """Write a table as CSV in UTF-8; a complex column becomes a real and an imaginary column."""
-    columns = [part for column in (table.axis, *table.columns) for part in _real_parts(column)]
+    columns = [
+        real_column
+        for column in (table.axis, *table.columns)
+        for real_column in _real_parts(column)
+    ]
     stream.write((",".join(column.name for column in columns) + "\n").encode("utf-8"))
     for begin in range(0, len(table.axis.values), _BLOCK_ROWS):
         texts = [
@@ -79,5 +83,5 @@ def _real_parts(column: ExportColumn) -> Iterator[ExportColumn]:
         yield column
         return
     quantity, _, unit = column.name.partition("_")
-    for part, values in (("real", column.values.real), ("imaginary", column.values.imag)):
-        yield replace(column, name=f"{quantity}_{part}_{unit}", values=values)
+    for part_name, values in (("real", column.values.real), ("imaginary", column.values.imag)):
+        yield replace(column, name=f"{quantity}_{part_name}_{unit}", values=values)

@@ -15,8 +15,8 @@ import numpy as np
 from analysis.exchange._channels import (
     MAX_JITTER,
     canonical_unit,
-    from_time_stamps,
-    uniform,
+    timebase_from_stamps,
+    uniform_timebase,
     unit_in_brackets,
     unit_in_suffix,
 )
@@ -61,9 +61,9 @@ def plan_timebase(path: Path, plan: ImportPlan, channels: Mapping[str, SourceCha
     """Return the time base of a record, from its channel of times or from the stated rate."""
     if plan.time is not None:
         time_s = channels[plan.time.channel].values * plan.time.factor
-        return from_time_stamps(path, plan.time.channel, time_s)
+        return timebase_from_stamps(path, plan.time.channel, time_s)
     samples = len(next(iter(channels.values())).values)
-    return uniform(path, samples, plan.rate_hz or 0.0)
+    return uniform_timebase(path, samples, plan.rate_hz or 0.0)
 
 
 @dataclass(slots=True)
@@ -87,7 +87,7 @@ class FileStatements:
     warnings: list[str] = field(default_factory=list)
     ignored: list[str] = field(default_factory=list)
 
-    def contradict(self, statement: str, remedy: str) -> None:
+    def report_contradiction(self, statement: str, remedy: str) -> None:
         """Raise an error on a contradiction, or record that the plan overrides the file."""
         if not self.plan.ignore_file_metadata:
             raise ExchangeError(
@@ -109,7 +109,7 @@ class FileStatements:
             label = channels[choice.channel].unit_label.strip()
             stated_unit = canonical_unit(label) if label else unit_in_brackets(choice.channel)
             if stated_unit is not None and stated_unit != choice.unit:
-                self.contradict(
+                self.report_contradiction(
                     f"the file says that '{choice.channel}' is in {stated_unit}, and {choice.unit} "
                     "was stated",
                     f"state '{choice.channel}:{stated_unit}', or correct the file",
@@ -130,7 +130,7 @@ class FileStatements:
         """Raise if the file states a scale that could not be applied to the values."""
         for name, channel in channels.items():
             if channel.unapplied_scale:
-                self.contradict(
+                self.report_contradiction(
                     f"the values of '{name}' are raw, and the file asks for a scale that is not "
                     f"known here ({printable(channel.unapplied_scale, 60)})",
                     "export scaled values",
@@ -176,13 +176,13 @@ class FileStatements:
                 "show."
             )
         elif time is not None:
-            self.contradict(
+            self.report_contradiction(
                 f"{statement}, and the times in '{time.channel}' as {time.unit} show "
                 f"{rate_hz:.6g} Hz",
                 f"state the unit of '{time.channel}' (s, ms, us, ns)",
             )
         else:
-            self.contradict(
+            self.report_contradiction(
                 f"{statement}, and {rate_hz:.6g} Hz was stated",
                 "give the channel of times with --time"
                 if is_default
@@ -197,7 +197,7 @@ class FileStatements:
             return
         if len(values) < len(times.values):
             row_number = int(np.argmin(np.isfinite(times.values))) + 1
-            self.contradict(
+            self.report_contradiction(
                 f"the times '{printable(times.name, 60)}' are missing from sample {row_number} on, "
                 f"in {len(times.values) - len(values)} samples, so that these may be none",
                 "repair or remove their lines",
@@ -210,7 +210,7 @@ class FileStatements:
             row_number = int(np.argmax(steps < 0.0)) + 2
             if (steps < 0.0).all():
                 return  # it runs backwards, as an index or a countdown may
-            self.contradict(
+            self.report_contradiction(
                 f"the times {name} go back at sample {row_number}, so that another record begins "
                 "there",
                 "cut one record out of the file",
@@ -220,7 +220,7 @@ class FileStatements:
         if (steps == 0.0).any() and any(
             abs(rate_hz * typical_step * unit_s - 1) < _COARSE_TOLERANCE for unit_s in units_s
         ):
-            self.contradict(
+            self.report_contradiction(
                 f"the time {name} of sample {int(np.argmax(steps == 0.0)) + 2} is that of the one "
                 "before it",
                 "remove what is stated twice",
@@ -234,20 +234,20 @@ class FileStatements:
         missing = 0
         file_rate_hz = 1 / (step * unit_s)
         try:
-            file_timebase = from_time_stamps(self.path, times.name, values * unit_s)
+            file_timebase = timebase_from_stamps(self.path, times.name, values * unit_s)
         except ExchangeError:
             pass
         else:
             file_rate_hz, missing = file_timebase.rate_hz, file_timebase.missing
             tolerance = _RATE_TOLERANCE + 2 * file_timebase.jitter / len(values)
         if missing:
-            self.contradict(
+            self.report_contradiction(
                 f"the times {name} have gaps of {missing} samples in all, and a record without "
                 "gaps was stated",
                 f"give --time '{times.name}:UNIT' instead of --rate-hz",
             )
         elif abs(file_rate_hz / rate_hz - 1) > tolerance:
-            self.contradict(
+            self.report_contradiction(
                 f"the times {name} show {file_rate_hz:.6g} Hz, and {rate_hz:.6g} Hz was stated",
                 f"give --time '{times.name}:UNIT' instead of --rate-hz",
             )
@@ -277,7 +277,7 @@ class FileStatements:
             unknown = sorted(measured - set(starts))
             start_ns = next(iter(starts.values()), 0)
             if unknown and start_ns and abs(start_ns) < _EARLIEST_DATE_NS:
-                self.contradict(
+                self.report_contradiction(
                     f"the file says that '{next(iter(starts))}' begins at {_time_text(start_ns)}, "
                     f"and does not say when '{unknown[0]}' begins",
                     "give channels that begin together, or cut them to the same samples",
@@ -295,22 +295,22 @@ class FileStatements:
             f"{_time_text(starts[last])}"
         )
         if plan.ignore_file_metadata:
-            self.contradict(statement, "")
+            self.report_contradiction(statement, "")
             check_lengths(self.path, channels)
             return channels, {}
         remedy = "give channels that begin together, or cut them to the same samples"
         without_start = sorted(set(channels) - set(starts))
         if without_start:
-            self.contradict(
+            self.report_contradiction(
                 f"{statement}, and does not say when '{without_start[0]}' begins", remedy
             )
         if timebase.missing:
-            self.contradict(f"{statement}, and the times have gaps", remedy)
+            self.report_contradiction(f"{statement}, and the times have gaps", remedy)
         period_ns = 1e9 / timebase.rate_hz
         skips = {n: round((starts[last] - start) / period_ns) for n, start in starts.items()}
         common_length = min(len(channel.values) - skips[n] for n, channel in channels.items())
         if common_length < 2:
-            self.contradict(f"{statement}, so that they have no time in common", remedy)
+            self.report_contradiction(f"{statement}, so that they have no time in common", remedy)
         angle = plan.channels["angle_rad"].channel
         delays_s = {
             n: (starts[angle] - starts[n] + (skips[angle] - skips[n]) * period_ns) / 1e9
@@ -340,7 +340,7 @@ class FileStatements:
             remainder = abs(delay_s) * rate_hz
             is_time = self.plan.time is not None and name == self.plan.time.channel
             if remainder > MAX_JITTER and name not in channels_with_delay and not is_time:
-                self.contradict(
+                self.report_contradiction(
                     f"{statement}, and '{name}' lies {remainder:.2g} periods between the samples "
                     "of the "
                     "angle",

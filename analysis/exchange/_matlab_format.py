@@ -107,7 +107,7 @@ def _read_channels(
 
 
 def _vector_from(path: Path, contents: Mapping[str, Any], name: str) -> NDArray[Any]:
-    """Return the values of a vector, given the contents first."""
+    """Return the values of a channel; the argument order allows `functools.partial`."""
     return _read_vector(path, name, contents)
 
 
@@ -160,8 +160,8 @@ def _find_value(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # n
     first, fields, _ = _split_name(name, contents)
     value: Any = None
     parent_name = ""
-    for depth, part in enumerate((first, *fields)):
-        key, element = _split_element(part)
+    for depth, component in enumerate((first, *fields)):
+        key, element = _split_element(component)
         if depth:
             dtype = getattr(value, "dtype", None)
             if dtype is None or dtype.names is None:
@@ -187,7 +187,7 @@ def _find_value(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # n
             raise no_such_channel_error(path, name, contents)
         else:
             value = contents[key]
-        parent_name = f"{parent_name}.{part}" if depth else part
+        parent_name = f"{parent_name}.{component}" if depth else component
         if element is not None:
             count = getattr(value, "size", 0)
             if not 0 <= element < count:
@@ -291,15 +291,15 @@ def _read_hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[An
     variables = list(file)  # their names alone: a link may lead into another file
     variable, fields, column = _split_name(name, variables)
     dataset = file
-    for part in (variable, *fields):
-        link = _hdf5_link(dataset, part, h5py)
+    for component in (variable, *fields):
+        link = _hdf5_link(dataset, component, h5py)
         if link is None:
             raise no_such_channel_error(
                 path, name, (member for member in variables if not member.startswith("#"))
             )
         if not isinstance(link, h5py.HardLink):
             raise _external_data_error(path, name)
-        dataset = dataset[part]
+        dataset = dataset[component]
     if not isinstance(dataset, h5py.Dataset):
         field_names = ", ".join(f"{name}.{member}" for member in list(dataset)[:12])
         raise ExchangeError(
@@ -347,7 +347,7 @@ def _external_data_error(path: Path, name: str) -> ExchangeError:
 
 
 def write_mat(table: ExportTable, stream: BinaryIO) -> None:
-    """Write each column as a variable (n×1) of its name, and a struct ``information``.
+    """Write a table as MATLAB variables (n×1), and its metadata as a struct ``information``.
 
     A field of the struct is a number, a row of numbers if the text has several with commas between
     them, or else a text.
@@ -379,12 +379,12 @@ _LARGEST_EXACT: Final = 2**53
 
 def _metadata_value(key: str, text: str) -> str | float | NDArray[Any]:
     """Return the value of a metadata text: a number, a row of numbers, or the text."""
-    parts = [part.strip() for part in text.split(",")]
+    entries = [entry.strip() for entry in text.split(",")]
     is_text = key in _TEXT_KEYS or (key.startswith(META_PREFIX) and not unit_of(key))
-    if is_text or not all(map(_NUMBER_PATTERN.fullmatch, parts)):
+    if is_text or not all(map(_NUMBER_PATTERN.fullmatch, entries)):
         return text
-    if len(parts) > 1:
-        return np.array([list(map(float, parts))])
+    if len(entries) > 1:
+        return np.array([list(map(float, entries))])
     if text.strip().isdecimal() and _LARGEST_EXACT < int(text) < 2**63:
         return np.array([[int(text)]], dtype=np.int64)
     return float(text)

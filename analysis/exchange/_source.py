@@ -226,11 +226,12 @@ def bounded_memory(extra_bytes: int = MAX_MEMORY_BYTES) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, (soft_limit, hard_limit))
 
 
-def check_samples(path: Path, what: str, samples: int) -> None:
+def check_samples(path: Path, channel_text: str, samples: int) -> None:
     """Raise if a channel has, or claims to have, more than `MAX_SAMPLES` samples."""
     if samples > MAX_SAMPLES:
         raise ExchangeError(
-            f"{path}: {what} has {samples} samples, more than the {MAX_SAMPLES} that are read; cut "
+            f"{path}: {channel_text} has {samples} samples, more than the {MAX_SAMPLES} that are "
+            "read; cut "
             "the session out of the file first."
         )
 

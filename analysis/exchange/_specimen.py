@@ -12,7 +12,7 @@ from analysis.record_checks import (
     MAX_TIP_MASS_KG,
     MAX_UNCERTAINTY_PERCENT,
     MAX_UNIFORMITY_PERCENT,
-    UNCERTAIN,
+    UNCERTAIN_QUANTITIES,
 )
 from rigd.beam import Beam
 from rigd.documents import DocumentError, parse_toml, read_text
@@ -34,7 +34,7 @@ class SpecimenFile:
     tool_inertia_kg_m2 : float
         Inertia about the motor's axis of the parts between torque sensor and beam.
     uncertainty_percent : mapping of str to float
-        Stated relative standard uncertainties of quantities in `record_checks.UNCERTAIN`.
+        Stated relative standard uncertainties of the `UNCERTAIN_QUANTITIES`.
     uniformity_percent : float or None
         Relative standard deviation of mode frequencies from those of a uniform beam; None if not
         stated.
@@ -97,7 +97,7 @@ def read_specimen(path: Path) -> SpecimenFile:
         tool_inertia_kg_m2,
         {
             name: value
-            for name in UNCERTAIN
+            for name in UNCERTAIN_QUANTITIES
             if (value := percent(f"{name}_percent", high=MAX_UNCERTAINTY_PERCENT)) is not None
         },
         percent("uniformity_percent", high=MAX_UNIFORMITY_PERCENT),

@@ -39,6 +39,7 @@ _EARLIEST_START_NS: Final = int(_EARLIEST_START.astype("datetime64[ns]").astype(
 _LEAD_IN_BYTES: Final = 28
 """Number of bytes of a segment's lead-in."""
 _HAS_METADATA, _NEW_LIST, _BIG_ENDIAN = 1 << 1, 1 << 2, 1 << 6
+"""Bits in the lead-in: the segment has metadata, a new list of channels, big-endian numbers."""
 
 
 def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
@@ -147,7 +148,7 @@ def _plain_lower_case(text: str) -> str:
 
 
 def _rate_hz(increment: object, unit_s: float) -> float | None:
-    """Return the sampling rate of an increment; None if the increment is not valid."""
+    """Return the sampling rate in Hz for a time increment; None if it is not valid."""
     if not isinstance(increment, int | float) or not 0 < increment < math.inf:
         return None
     return 1 / (increment * unit_s)

@@ -91,7 +91,7 @@ def _read_channels(
     for name, number in numbers.items():
         function = file.read_sets(set_numbers[number])
         stamps = np.asarray(function["x"], dtype=np.float64)
-        channels[name] = _channel(path, name, function, stamps, timed=ABSCISSA in names)
+        channels[name] = _source_channel(path, name, function, stamps, timed=ABSCISSA in names)
         times.append(stamps)
         units.append(_abscissa_unit(function))
     if ABSCISSA in names:
@@ -114,7 +114,7 @@ def _check_set_count(path: Path) -> None:
         )
 
 
-def _channel(
+def _source_channel(
     path: Path, name: str, function: Mapping[str, Any], stamps: NDArray[np.float64], *, timed: bool
 ) -> SourceChannel:
     """Return one channel; `timed` states whether the user requests the times as a channel."""
@@ -171,7 +171,7 @@ def _check_time_response(path: Path, name: str, function: Mapping[str, Any], uni
     text = ""
     if kind not in (_GENERAL_FUNCTION, _TIME_RESPONSE):
         text = f"its function type is {kind}{_code_name(kind, _FUNCTION_TYPES)}"
-    elif axis not in (_UNKNOWN, _GENERAL, _TIME_CODE):
+    elif axis not in (_UNKNOWN_AXIS, _GENERAL_AXIS, _TIME_CODE):
         text = f"its abscissa is of type {axis}{_code_name(axis, _ABSCISSA_TYPES)}"
     elif axis != _TIME_CODE and (
         unit.lower() in ("hz", "khz", "rpm", "rad/s") or label.lower().startswith("freq")
@@ -238,8 +238,11 @@ _INCREMENT_TOLERANCE: Final = 1e-10
 increment instead of all abscissae."""
 
 _GENERAL_FUNCTION, _TIME_RESPONSE, _FREQUENCY_RESPONSE, _COHERENCE = 0, 1, 4, 6
-_TIME_AXIS, _FREQUENCY_AXIS, _GENERAL, _UNKNOWN = 17, 18, 1, 0
+"""Codes of the function type in the header of a data set."""
+_TIME_AXIS, _FREQUENCY_AXIS, _GENERAL_AXIS, _UNKNOWN_AXIS = 17, 18, 1, 0
+"""Codes of the data type of an axis in the header of a data set."""
 _REAL_DOUBLE, _COMPLEX_DOUBLE = 4, 6
+"""Codes of the number format in the header of a data set."""
 
 _UNIT_EXPONENTS: Final = {"N.m": (1, 1), "N": (0, 1)}
 """Exponents of length and force in a unit."""
@@ -256,7 +259,7 @@ _SI_UNITS_SET: Final = (
 
 
 def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
-    """Write the units (data set 164: SI) and each column as a function (data set 58).
+    """Write a table to a universal file: units (data set 164) and a function per column (58).
 
     Times and frequencies are stated by first value and increment. In a record with gaps, or if six
     digits are not enough for these, each abscissa is written.
@@ -378,9 +381,11 @@ def _header_text(
         f"{function_type:5d}{0:10d}{0:5d}{0:10d} {'NONE':10}{0:10d}{0:4d} {'NONE':10}{0:10d}{0:4d}",
         f"{data_type:10d}{len(axis):10d}{int(is_even):10d}{first:13.5E}{increment:13.5E}{0.0:13.5E}",
         _axis_line(axis_type, (0, 0), table.axis.title, table.axis.unit),
-        _axis_line(_GENERAL, _UNIT_EXPONENTS.get(unit, (0, 0)), title, unit),
-        _axis_line(_GENERAL if divisor_unit else _UNKNOWN, (0, 0), divisor_title, divisor_unit),
-        _axis_line(_UNKNOWN, (0, 0), "", ""),
+        _axis_line(_GENERAL_AXIS, _UNIT_EXPONENTS.get(unit, (0, 0)), title, unit),
+        _axis_line(
+            _GENERAL_AXIS if divisor_unit else _UNKNOWN_AXIS, (0, 0), divisor_title, divisor_unit
+        ),
+        _axis_line(_UNKNOWN_AXIS, (0, 0), "", ""),
     ]
     return "\n".join(lines) + "\n"
 

@@ -188,15 +188,15 @@ def fit_many(
     _check_response(frequency_hz, response, structures)
     omega = 2 * np.pi * frequency_hz
     whole_model = FrequencyResponseModel(frequency_hz, beam, tool_inertia_kg_m2)
-    grids: list[tuple[_Grid, _Grid]] = []
+    grids: list[tuple[_FrequencyGrid, _FrequencyGrid]] = []
     for weighting in weightings:
         all_weights = weights(omega, weighting)
         index, point_weights = thinned(response, all_weights, _FEW_POINTS)
         few_model = FrequencyResponseModel(frequency_hz[index], beam, tool_inertia_kg_m2)
         grids.append(
             (
-                _Grid(few_model, response[index], point_weights),
-                _Grid(whole_model, response, all_weights),
+                _FrequencyGrid(few_model, response[index], point_weights),
+                _FrequencyGrid(whole_model, response, all_weights),
             )
         )
     return tuple(
@@ -211,7 +211,7 @@ _Linearization = tuple[NDArray[np.complex128], NDArray[np.complex128]]
 
 
 @dataclass(frozen=True, slots=True)
-class _Grid:
+class _FrequencyGrid:
     """Frequency points, with weights, at which model and measurement are compared."""
 
     model: FrequencyResponseModel
@@ -222,7 +222,7 @@ class _Grid:
 class _FrfProblem:
     """Cost (Eq. 26) of one structure on a frequency grid, as a function of the unknowns."""
 
-    def __init__(self, unknowns: DampingUnknowns, grid: _Grid) -> None:
+    def __init__(self, unknowns: DampingUnknowns, grid: _FrequencyGrid) -> None:
         self.unknowns = unknowns
         self.grid = grid
         self._recent_linearizations: Recent[_Linearization] = Recent()
@@ -254,14 +254,16 @@ class _FrfProblem:
         )
 
 
-def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfFit:
+def _fit(
+    structure: Structure, weighting: str, few: _FrequencyGrid, whole: _FrequencyGrid
+) -> FrfFit:
     """Fit a structure: descents on few points, then refinement of the best on all points."""
     unknowns = DampingUnknowns.of(structure, whole.model.beam)
     bounds = Box(*unknowns.bounds)
     few_problem, whole_problem = _FrfProblem(unknowns, few), _FrfProblem(unknowns, whole)
     rough_minima = [
         descend(few_problem.normal_equations, x, bounds, relative_tolerance=_ROUGH_TOLERANCE)
-        for x in starts(structure, few_problem.cost)
+        for x in starting_points(structure, few_problem.cost)
     ]
     # The descents first converge on the few points. With the Hessian estimated there, one or two
     # steps on all points remain.
@@ -399,7 +401,7 @@ _MOST_STARTS: Final = 8
 """Largest number of descents for each structure."""
 
 
-def starts(
+def starting_points(
     structure: Structure, cost: Callable[[NDArray[np.float64]], float]
 ) -> list[NDArray[np.float64]]:
     """Choose starting points of the descents for a structure, by increasing cost.

@@ -8,7 +8,7 @@ import pytest
 
 from analysis.campaigns import Heterogeneity, Homogeneity, sentences
 from analysis.campaigns._orders import freest_estimate, pooled_order
-from analysis.campaigns.pooling import pooled
+from analysis.campaigns.pooling import pool_estimates
 from analysis.identify import Finding
 from analysis.statistics import student_t_quantile
 
@@ -44,12 +44,12 @@ def estimates_of(make_estimate):
 
 
 def ranked(*groups):
-    return sorted(map(pooled, groups), key=lambda each: each.bic)
+    return sorted(map(pool_estimates, groups), key=lambda each: each.bic)
 
 
 def test_the_modes_have_student_s_interval_as_the_figure_of_them(estimates_of):
     """Of four sessions it is 3.18 standard deviations to either side, and not 1.96."""
-    found = pooled(estimates_of("VI", 100.0))
+    found = pool_estimates(estimates_of("VI", 100.0))
     std = found.modes[0].damping_ratio_std
     (said_of,) = sentences.describe_modes(found.modes, found.sessions, mixed=False)
     half = float(said_of.split("± ")[1].split(" %")[0]) / 100
@@ -148,8 +148,8 @@ def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(
     assert "Type VII has the lowest BIC" in second
     assert found.alpha.value == pytest.approx(0.996)
     # Not if it is of two sessions where the other is of all.
-    few = replace(pooled(six), sessions=2)
-    assert freest_estimate([pooled(seven), few]).structure == "VII"
+    few = replace(pool_estimates(six), sessions=2)
+    assert freest_estimate([pool_estimates(seven), few]).structure == "VII"
 
 
 def test_damping_that_no_session_needs_is_absent(estimates_of):
