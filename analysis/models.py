@@ -304,7 +304,7 @@ def weighting_name(weighting: Weighting) -> str:
 
 
 def _exponent(weighting: str) -> float:
-    """Return the exponent K of the weighting omega^K with a name; raise if there is none."""
+    """Return the exponent K of a named weighting omega^K; raise if the name is not valid."""
     if weighting == "const":
         return 0.0
     if weighting == "omega":
@@ -470,12 +470,12 @@ class DampingUnknowns:
         beam : Beam
             Beam whose first two undamped modes are the reference frequencies.
         """
-        first, second = (float(w) for w in undamped_frequencies_rad_s(beam, 2))
+        first_rad_s, second_rad_s = (float(w) for w in undamped_frequencies_rad_s(beam, 2))
         return cls(
             structure=structure,
-            ln_internal_rad_s=math.log(second),
-            ln_external_rad_s=math.log(first),
-            ln_external_unit=math.log(beam.density_over_stiffness * first**2),
+            ln_internal_rad_s=math.log(second_rad_s),
+            ln_external_rad_s=math.log(first_rad_s),
+            ln_external_unit=math.log(beam.density_over_stiffness * first_rad_s**2),
         )
 
     @property

@@ -125,7 +125,9 @@ class OnlineEstimate:
         flagged = {name for name in COEFFICIENT_OF if name in headline.flags}
         if not flagged or fit is not headline.fit:
             return fit
-        return next((each for each in analysis.fits if each.structure is INTEGER), fit)
+        return next(
+            (candidate for candidate in analysis.fits if candidate.structure is INTEGER), fit
+        )
 
     @property
     def plant(self) -> Plant | None:

@@ -329,9 +329,9 @@ def _join_bins(
     band_starts = (
         np.flatnonzero(np.diff(hz) > np.maximum(_JOIN_DISTANCE * hz[:-1], resolution_hz)) + 1
     )
-    for first, end in pairwise([0, *band_starts, hz.size]):
-        if end > first and hz[end - 1] - hz[first] >= resolution_hz:
-            yield float(hz[first]), float(hz[end - 1])
+    for start, end in pairwise([0, *band_starts, hz.size]):
+        if end > start and hz[end - 1] - hz[start] >= resolution_hz:
+            yield float(hz[start]), float(hz[end - 1])
 
 
 def _empty_coherence() -> dict[str, Any]:
@@ -432,11 +432,11 @@ def _text_lines(document: Mapping[str, Any]) -> Iterator[str]:
     doubts = dict.fromkeys(
         flag for mode in shown for name in _MODE_QUANTITIES if (flag := mode[name]["flag"])
     )
-    yield from (f"  doubtful: {doubt}" for doubt in doubts)
+    yield from (f"  doubtful: {doubt_text}" for doubt_text in doubts)
     hidden_modes = [str(mode["mode"]) for mode in document["modes"] if not mode["shown"]]
     if hidden_modes:
-        kind = "mode" if len(hidden_modes) == 1 else "modes"
-        yield f"  not visible in this record: {kind} {listed(hidden_modes)}"
+        noun = "mode" if len(hidden_modes) == 1 else "modes"
+        yield f"  not visible in this record: {noun} {listed(hidden_modes)}"
     coherence = document["coherence"]
     if coherence["mean"] is not None:
         bands = ", ".join(f"{first:.3g} to {last:.3g}" for first, last in coherence["low_bands"])

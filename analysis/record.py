@@ -324,29 +324,30 @@ def _sweep_range(session: Session, first_tick: int, length: int) -> tuple[slice,
     """Return the range of the sweep's samples, and the number of ticks not recorded at its ends."""
     if "sweep" not in session.segments:
         return slice(0, length), 0
-    first, end = session.segments["sweep"]
-    start = max(first - first_tick, 0)
+    planned_first, end = session.segments["sweep"]
+    start = max(planned_first - first_tick, 0)
     stop = min(end - first_tick, length)
     if stop <= start:
         raise RecordError(
-            f"{session.path}: segment 'sweep' covers ticks {first} to {end - 1}, but the record "
+            f"{session.path}: segment 'sweep' covers ticks {planned_first} to {end - 1}, but the "
+            "record "
             f"holds ticks {first_tick} to {first_tick + length - 1}, so nothing of the sweep was "
             "recorded."
         )
-    return slice(start, stop), (end - first) - (stop - start)
+    return slice(start, stop), (end - planned_first) - (stop - start)
 
 
 def _first_sweep_range(session: Session, first_tick: int, sweep: slice) -> slice | None:
     """Return the range of the first of two sweeps; None if there is only one sweep."""
-    first, end = session.segments.get("there", (0, 0))
-    start, stop = max(first - first_tick, sweep.start), min(end - first_tick, sweep.stop)
+    planned_first, end = session.segments.get("there", (0, 0))
+    start, stop = max(planned_first - first_tick, sweep.start), min(end - first_tick, sweep.stop)
     return slice(start, stop) if stop > start else None
 
 
 def _rest_angle(session: Session, ticks: NDArray[np.int64]) -> float | None:
     """Return the median angle in rad over the segment ``rest``; None without this segment."""
-    first, end = session.segments.get("rest", (0, 0))
-    at_rest = (ticks >= first) & (ticks < end)
+    first_tick, end = session.segments.get("rest", (0, 0))
+    at_rest = (ticks >= first_tick) & (ticks < end)
     return float(np.median(session.samples["angle_rad"][at_rest])) if at_rest.any() else None
 
 

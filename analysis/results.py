@@ -231,9 +231,9 @@ class RecordResult:
         else:
             # The Welch fits differ, and the largest slope of the tip among them is used.
             models = () if self.welch is None else self.welch.models
-            dampings = [each.fit.damping for each in models]
+            dampings = [model.fit.damping for model in models]
             validity = _record_validity(
-                self.record, *((self.record.beam, each) for each in dampings)
+                self.record, *((self.record.beam, damping) for damping in dampings)
             )
         object.__setattr__(self, "validity", validity)
 

@@ -87,7 +87,7 @@ _DAMPING_ATTACHMENTS: Final = ("specimen.toml", "profile.toml")
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """Touch of a session with its estimate.
+    """Contact of the antenna during a session, with the estimate of its position and time.
 
     Attributes
     ----------
@@ -354,21 +354,21 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
     """Return the sensor's low-pass filter and the filter that averages its records."""
     order, constant_s = max(enumerate(stated_torque_filter_s(session), start=1), key=itemgetter(1))
     corner_hz = 1 / (2 * pi * constant_s) if constant_s else 0.0
-    kind = session.metadata.get("sensor_filter", "")
-    if not kind:
+    filter_kind = session.metadata.get("sensor_filter", "")
+    if not filter_kind:
         return SensorFilter(corner_hz, order)
     delay_s = session.number("sensor_filter_delay_s", 0.0)
     # A mean of n records of a tick is (n - 1) / 2n of a tick old, the triangle twice as much.
-    fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(kind, inf)
+    fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(filter_kind, inf)
     if not 0.0 <= fraction < _LONGEST_FILTER_TICKS:
         raise RecordError(
-            f"{session.path}: sensor_filter is {kind[:100]!r} with sensor_filter_delay_s = "
+            f"{session.path}: sensor_filter is {filter_kind[:100]!r} with sensor_filter_delay_s = "
             f"{delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} s) "
             f"or a triangle (shorter than a period); correct the file's metadata."
         )
     records = round(1 / (1 - fraction))
     spacing_s = fraction / rate_hz / max(records - 1, 1)
-    return SensorFilter.of_records(corner_hz, order, kind, records, spacing_s)
+    return SensorFilter.of_records(corner_hz, order, filter_kind, records, spacing_s)
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:

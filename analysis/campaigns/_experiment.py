@@ -165,8 +165,11 @@ class Experiment:
         excitation_free = self.planned_itself or other.planned_itself
         other_facts = dict(other.facts)
         if {self.rising, other.rising} == {True, False}:
-            first, last = _SWEEP_END_KEYS
-            other_facts[first], other_facts[last] = other_facts[last], other_facts[first]
+            start_key, stop_key = _SWEEP_END_KEYS
+            other_facts[start_key], other_facts[stop_key] = (
+                other_facts[stop_key],
+                other_facts[start_key],
+            )
         for key, own_value in self.facts.items():
             other_value = (
                 own_value
@@ -182,10 +185,10 @@ class Experiment:
         """Whether the sweep rises in frequency; None without a sweep or with both directions."""
         if self.facts.get("excitation") != _SWEEP_NAME or "there_and_back" in self.facts:
             return None
-        first, last = (self.facts.get(key) for key in _SWEEP_END_KEYS)
-        if not isinstance(first, float) or not isinstance(last, float) or first == last:
+        start_hz, stop_hz = (self.facts.get(key) for key in _SWEEP_END_KEYS)
+        if not isinstance(start_hz, float) or not isinstance(stop_hz, float) or start_hz == stop_hz:
             return None
-        return first < last
+        return start_hz < stop_hz
 
     def same_specimen(self, other: Experiment) -> bool:
         """Return whether another experiment states the same beam and the same tool inertia."""
@@ -277,10 +280,10 @@ def complete_labels(experiments: Sequence[Experiment]) -> list[Experiment]:
 
 def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
     """Return the keys of the properties in which specimens differ."""
-    first = specimens[0].facts
+    first_facts = specimens[0].facts
     return tuple(
         key
-        for key, value in first.items()
+        for key, value in first_facts.items()
         if not all(_equal_values(specimen.facts.get(key, value), value) for specimen in specimens)
     )
 

@@ -29,8 +29,10 @@ _OTHER_BASES: Final = {
 
 def p_value_text(p_value: float) -> str:
     """Format a p-value as an equation or inequality."""
-    written = probability(p_value)
-    return f"p {written}" if written.startswith("<") else f"p = {written}"
+    probability_text = probability(p_value)
+    return (
+        f"p {probability_text}" if probability_text.startswith("<") else f"p = {probability_text}"
+    )
 
 
 def describe_tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
@@ -173,13 +175,13 @@ def recommend_sweeps(
 ) -> list[str]:
     """Recommend further sweeps that show whether the specimen changes during the records."""
     if sweeps is not None and sweeps.changed:
-        modes = listed([str(each.mode) for each in sweeps.changed])
+        modes = listed([str(mode_change.mode) for mode_change in sweeps.changed])
         return [
             "To tell a change in time from one with amplitude, repeat both sweeps with half the "
             f"amplitude: a difference in mode {modes} that stays is a change in time. Then check "
             "clamp and temperature."
         ]
-    directions = {each.experiment.rising for each in sessions}
+    directions = {session.experiment.rising for session in sessions}
     refused = modal is not None and modal.uniform_beam.status == "refused"
     if sweeps is None and refused and directions in ({True}, {False}):
         missing_direction = "falling" if True in directions else "rising"

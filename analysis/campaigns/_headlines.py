@@ -52,13 +52,13 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
         Headlines as for single files. The last one, with ``file`` null, is that of all sessions
         together. Without whole-record fits the list is empty.
     """
-    documents = [dict(each.headline) for each in campaign.sessions if each.headline]
+    documents = [dict(session.headline) for session in campaign.sessions if session.headline]
     numbers, verdict = campaign_numbers(campaign), campaign.verdict
     if numbers is not None and verdict is not None:
         orders = (verdict.alpha, verdict.lambda_)
         named_findings = (
-            replace(each.example, sentence=each.sentence, interval=None)
-            for each in verdict.findings
+            replace(finding.example, sentence=finding.sentence, interval=None)
+            for finding in verdict.findings
         )
         documents.append(headline_json(None, numbers, orders, named_findings, campaign.validity))
     return documents
@@ -81,16 +81,17 @@ def campaign_numbers(campaign: CampaignResult) -> Estimates | None:
     if pooled is None or verdict is None:
         return None
     orders = (verdict.alpha, verdict.lambda_)
-    exact_orders = tuple(each.exact or each for each in orders)
-    explained = verdict.adequate >= _ADEQUATE_FRACTION * verdict.sessions
-    common_flag = None if explained else _UNEXPLAINED_FLAG
+    exact_orders = tuple(order.exact or order for order in orders)
+    are_explained = verdict.adequate >= _ADEQUATE_FRACTION * verdict.sessions
+    common_flag = None if are_explained else _UNEXPLAINED_FLAG
     exact = Estimates(
         name=pooled.name,
         parameters=_reported_parameters(campaign, pooled, exact_orders, common_flag),
         sizes=_reported_loss_factors(pooled, exact_orders, common_flag),
         modes=_reported_modes(campaign, pooled, common_flag),
         structures=tuple(
-            (each.name, _structure_status(each, pooled)) for each in campaign.structures
+            (structure.name, _structure_status(structure, pooled))
+            for structure in campaign.structures
         ),
         simpler=_simpler_estimate(campaign, pooled),
         drag_speed_m_s=None,
@@ -121,20 +122,20 @@ def _add_flags(
     return replace(
         numbers,
         parameters={
-            name: each.flagged(mixture_flag(name) or flags.get(name))
-            for name, each in numbers.parameters.items()
+            name: parameter.flagged(mixture_flag(name) or flags.get(name))
+            for name, parameter in numbers.parameters.items()
         },
         modes=tuple(
             replace(
-                each,
-                frequency_hz=each.frequency_hz.flagged(
-                    mixture_flag(f"frequency_hz_{each.number}") if each.shown else _NOT_SHOWN_FLAG
+                mode,
+                frequency_hz=mode.frequency_hz.flagged(
+                    mixture_flag(f"frequency_hz_{mode.number}") if mode.shown else _NOT_SHOWN_FLAG
                 ),
-                damping_ratio=each.damping_ratio.flagged(
-                    mixture_flag(f"damping_ratio_{each.number}") if each.shown else _NOT_SHOWN_FLAG
+                damping_ratio=mode.damping_ratio.flagged(
+                    mixture_flag(f"damping_ratio_{mode.number}") if mode.shown else _NOT_SHOWN_FLAG
                 ),
             )
-            for each in numbers.modes
+            for mode in numbers.modes
         ),
     )
 

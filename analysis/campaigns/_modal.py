@@ -256,11 +256,17 @@ def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | Non
     sessions : sequence of SessionAnalysis
         Sessions of the campaign.
     """
-    rising = [each.modal for each in sessions if each.modal and each.experiment.rising is True]
-    falling = [each.modal for each in sessions if each.modal and each.experiment.rising is False]
+    rising = [
+        session.modal for session in sessions if session.modal and session.experiment.rising is True
+    ]
+    falling = [
+        session.modal
+        for session in sessions
+        if session.modal and session.experiment.rising is False
+    ]
     if not rising or not falling:
         return None
-    common = set.intersection(*(set(each.visible) for each in (*rising, *falling)))
+    common = set.intersection(*(set(estimate.visible) for estimate in (*rising, *falling)))
     modes = tuple(sorted(common))
     if not modes:
         return None

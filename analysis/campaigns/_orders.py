@@ -77,8 +77,10 @@ def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
         The freest structure that was fitted to every session. None without whole-record fits.
     """
     fitted = estimates_by_structure(sessions)
-    most_fits = max(map(len, fitted.values()), default=0)
-    candidates = [estimates[0] for estimates in fitted.values() if len(estimates) == most_fits]
+    fitted_sessions = max(map(len, fitted.values()), default=0)
+    candidates = [
+        estimates[0] for estimates in fitted.values() if len(estimates) == fitted_sessions
+    ]
     return max(candidates, key=_free_parameter_count).name if candidates else None
 
 

@@ -296,8 +296,8 @@ def _record_estimates(
 
     order = list(STRUCTURES)
     requested = [
-        estimate_of(each)
-        for each in whole.selection.candidates
-        if each.fit.structure.name in structures or each.fit is whole.fit
+        estimate_of(candidate)
+        for candidate in whole.selection.candidates
+        if candidate.fit.structure.name in structures or candidate.fit is whole.fit
     ]
-    return tuple(sorted(requested, key=lambda each: order.index(each.structure)))
+    return tuple(sorted(requested, key=lambda estimate: order.index(estimate.structure)))

@@ -161,11 +161,11 @@ def mean_damping(structure: str, fits: Sequence[WelchFit]) -> Damping:
 
 def nominal_models(sessions: Sequence[SessionAnalysis]) -> tuple[NominalModel, ...]:
     """Return the nominal model for each structure and weighting, compared with each session."""
-    first = sessions[0]
-    if not first.frequency_hz.size:
+    first_session = sessions[0]
+    if not first_session.frequency_hz.size:
         return ()
-    frequency_hz, beam = first.frequency_hz, first.beam
-    model = FrequencyResponseModel(frequency_hz, beam, first.tool_inertia_kg_m2)
+    frequency_hz, beam = first_session.frequency_hz, first_session.beam
+    model = FrequencyResponseModel(frequency_hz, beam, first_session.tool_inertia_kg_m2)
     return tuple(
         _nominal_model(structure, weighting, fits, sessions, model, frequency_hz, beam)
         for (structure, weighting), fits in fits_by_model(sessions).items()
@@ -316,23 +316,27 @@ def ranked_structures(
         Pooled estimates, the lowest BIC first.
     """
     fits = estimates_by_structure(sessions)
-    most_fits = max(map(len, fits.values()), default=0)
-    bic = {name: pooled_bic(each) for name, each in fits.items() if len(each) == most_fits}
+    fitted_sessions = max(map(len, fits.values()), default=0)
+    bic = {
+        name: pooled_bic(estimates)
+        for name, estimates in fits.items()
+        if len(estimates) == fitted_sessions
+    }
     single_selections = Counter(session.selected for session in sessions)
-    misfit = {each.name: each.misfit for each in pooled}
+    misfit = {pooled_estimate.name: pooled_estimate.misfit for pooled_estimate in pooled}
     lowest = pooled[0].bic if pooled else min(bic.values(), default=0.0)
     ranked = [
         RankedStructure(
-            structure=each[0].structure,
-            fitted=len(each),
-            determined=sum(map(determines_damping, each)),
+            structure=estimates[0].structure,
+            fitted=len(estimates),
+            determined=sum(map(determines_damping, estimates)),
             selected_alone=single_selections[name],
             misfit=misfit.get(name)
-            or float(np.median([one.cost / one.degrees_of_freedom for one in each])),
+            or float(np.median([one.cost / one.degrees_of_freedom for one in estimates])),
             bic_above_lowest=bic[name] - lowest if name in bic else None,
             pooled=name in misfit,
         )
-        for name, each in fits.items()
+        for name, estimates in fits.items()
     ]
     return tuple(sorted(ranked, key=_rank_key))
 

@@ -106,11 +106,12 @@ def validate(
 
     If all workers are lost, all sessions count as not predicted.
     """
-    trials = [
-        (each.path, models_without_session(sessions, i), band_hz) for i, each in enumerate(sessions)
+    prediction_tasks = [
+        (session.path, models_without_session(sessions, i), band_hz)
+        for i, session in enumerate(sessions)
     ]
     try:
-        results = workers.run(left_out_errors, trials, on_done)
+        results = workers.run(left_out_errors, prediction_tasks, on_done)
     except CampaignError as error:
         return (), tuple(LostTrial(session.path, str(error)) for session in sessions)
     errors: list[LeftOutError] = []

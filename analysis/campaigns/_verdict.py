@@ -90,8 +90,8 @@ def common_findings(sessions: Sequence[SessionAnalysis]) -> tuple[CommonFinding,
     examined = [session for session in sessions if session.verdict is not None]
     for session in examined:
         for finding in session.verdict.findings if session.verdict else ():
-            kind = finding.kind, _NUMBER_PATTERN.sub("#", finding.sentence)
-            findings_by_effect.setdefault(kind, []).append((session.name, finding))
+            effect_key = finding.kind, _NUMBER_PATTERN.sub("#", finding.sentence)
+            findings_by_effect.setdefault(effect_key, []).append((session.name, finding))
     counted = [_common_finding(group, len(examined)) for group in findings_by_effect.values()]
     return tuple(sorted(counted, key=lambda effect: -len(effect.files)))
 
@@ -224,7 +224,7 @@ def campaign_verdict(
     findings = common_findings(sessions)
     close_rivals = rival_estimates(pooled, BIC_TIE)
     single_selections = dict(
-        Counter(each.selected for each in sessions if each.selected).most_common()
+        Counter(session.selected for session in sessions if session.selected).most_common()
     )
     adequate = sum(verdict.adequate for verdict in verdicts)
     dissent = _dissenting_sessions(sessions, best)
@@ -233,7 +233,7 @@ def campaign_verdict(
     return CampaignVerdict(
         headline=freest.name,
         structure=best.structure,
-        rivals=tuple(each.name for each in close_rivals),
+        rivals=tuple(rival.name for rival in close_rivals),
         sessions=len(verdicts),
         alone=single_selections,
         adequate=adequate,
@@ -258,7 +258,9 @@ def campaign_verdict(
             ),
             sentences.describe_selection(pooled, close_rivals, single_selections, len(verdicts)),
             *(finding.sentence for finding in findings),
-            *sentences.describe_dissent([(each.file, each.structure) for each in dissent], best),
+            *sentences.describe_dissent(
+                [(dissenter.file, dissenter.structure) for dissenter in dissent], best
+            ),
             *([] if homogeneity.mixed else [sentences.describe_scatter(freest)]),
             *sentences.describe_prediction_errors(freest, validation, len(sessions)),
             *sentences.lost_trials(lost, len(sessions)),
@@ -333,10 +335,10 @@ def _dissenting_sessions(
     """Return the sessions that by themselves exclude the structure of the lowest common BIC."""
     dissents = []
     for session in sessions:
-        by_name = {each.name: each for each in session.record_estimates}
+        by_name = {estimate.name: estimate for estimate in session.record_estimates}
         if by_name:
-            own = min(by_name.values(), key=lambda each: each.bic)
+            own = min(by_name.values(), key=lambda estimate: estimate.bic)
             margin = by_name[best.name].bic - own.bic
             if margin > BIC_DECISIVE:
                 dissents.append(Dissent(session.name, own.name, margin))
-    return tuple(sorted(dissents, key=lambda each: -each.margin))
+    return tuple(sorted(dissents, key=lambda dissenter: -dissenter.margin))

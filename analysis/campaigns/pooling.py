@@ -299,9 +299,11 @@ def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimat
     The estimates are sorted by BIC, the lowest first.
     """
     by_name = estimates_by_structure(sessions)
-    most_fits = max(map(len, by_name.values()), default=0)
+    fitted_sessions = max(map(len, by_name.values()), default=0)
     pooled_list = [
-        pool_estimates(estimates) for estimates in by_name.values() if len(estimates) == most_fits
+        pool_estimates(estimates)
+        for estimates in by_name.values()
+        if len(estimates) == fitted_sessions
     ]
     return tuple(
         sorted(

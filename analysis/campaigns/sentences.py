@@ -748,9 +748,9 @@ def describe_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
     sessions : int
         Number of sessions.
     """
-    (first, count), *others = counts.items()
+    (first_conclusion, count), *others = counts.items()
     other_texts = "".join(f", {conclusion} in {n}" for conclusion, n in others)
-    return f"Single sessions: {first} in {count} of {sessions}{other_texts}."
+    return f"Single sessions: {first_conclusion} in {count} of {sessions}{other_texts}."
 
 
 def _describe_damping(structure: str) -> str:

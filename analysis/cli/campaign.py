@@ -86,8 +86,8 @@ def campaign_command(
     from analysis.report.campaign_report import campaign_tables
     from analysis.report.folder import report_folders, write_new
 
-    name_source = files[0] if outputs.report is not None else files[0].with_name(_DEFAULT_NAME)
-    (folder,) = report_folders([name_source], outputs.report, overwrite=outputs.overwrite)
+    folder_source = files[0] if outputs.report is not None else files[0].with_name(_DEFAULT_NAME)
+    (folder,) = report_folders([folder_source], outputs.report, overwrite=outputs.overwrite)
     run = partial(
         campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
         dask=dask, uniformity=uniformity,

@@ -132,8 +132,8 @@ def unit_in_brackets(name: str) -> str | None:
 
 def unit_in_suffix(name: str) -> str | None:
     """Return the unit that the last word of a name suggests, as in ``angle_rad``, or None."""
-    _, underscore, last = name.strip().rpartition("_")
-    return _NAME_SUFFIXES.get(last) if underscore else None
+    _, underscore, last_word = name.strip().rpartition("_")
+    return _NAME_SUFFIXES.get(last_word) if underscore else None
 
 
 def _split_number(unit: str) -> tuple[float, str]:
@@ -330,10 +330,10 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
     steps_s = np.diff(time_s)
     not_increasing = np.flatnonzero(steps_s <= 0.0)
     if not_increasing.size:
-        first = int(not_increasing[0])
+        index = int(not_increasing[0])
         raise ExchangeError(
-            f"{path}: the time '{channel}' does not increase from sample {first + 1} "
-            f"({time_s[first]:.9g} s) to sample {first + 2} ({time_s[first + 1]:.9g} s); repair "
+            f"{path}: the time '{channel}' does not increase from sample {index + 1} "
+            f"({time_s[index]:.9g} s) to sample {index + 2} ({time_s[index + 1]:.9g} s); repair "
             "the times, or give --rate-hz instead of --time if the samples are equidistant."
         )
     # The median distinguishes a step of one tick from a gap; the mean over all such steps is not at
@@ -360,14 +360,15 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
     _check_rate(path, rate_hz)
     deviation = (time_s - time_s[0]) * rate_hz - ticks
     deviation = np.abs(deviation - np.median(deviation))
-    worst = int(np.argmax(deviation))
-    if deviation[worst] > MAX_JITTER:
+    worst_index = int(np.argmax(deviation))
+    if deviation[worst_index] > MAX_JITTER:
         raise ExchangeError(
-            f"{path}: the times '{channel}' are not equidistant: sample {worst + 1} lies "
-            f"{deviation[worst]:.2g} periods from where {rate_hz:g} Hz would have it. Resample the "
+            f"{path}: the times '{channel}' are not equidistant: sample {worst_index + 1} lies "
+            f"{deviation[worst_index]:.2g} periods from where {rate_hz:g} Hz would have it. "
+            "Resample the "
             "record to one rate, or give --rate-hz instead of --time if only the stamps are off."
         )
-    return Timebase(ticks.astype(np.int64), rate_hz, float(deviation[worst]))
+    return Timebase(ticks.astype(np.int64), rate_hz, float(deviation[worst_index]))
 
 
 def _regression_slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:

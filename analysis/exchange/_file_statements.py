@@ -289,10 +289,14 @@ class FileStatements:
                 )
             check_lengths(self.path, channels)
             return channels, {}
-        first, last = min(starts, key=starts.__getitem__), max(starts, key=starts.__getitem__)
+        first_channel, last_channel = (
+            min(starts, key=starts.__getitem__),
+            max(starts, key=starts.__getitem__),
+        )
         statement = (
-            f"the file says that '{first}' begins at {_time_text(starts[first])} and '{last}' at "
-            f"{_time_text(starts[last])}"
+            f"the file says that '{first_channel}' begins at {_time_text(starts[first_channel])} "
+            f"and '{last_channel}' at "
+            f"{_time_text(starts[last_channel])}"
         )
         if plan.ignore_file_metadata:
             self.report_contradiction(statement, "")
@@ -307,7 +311,9 @@ class FileStatements:
         if timebase.missing:
             self.report_contradiction(f"{statement}, and the times have gaps", remedy)
         period_ns = 1e9 / timebase.rate_hz
-        skips = {n: round((starts[last] - start) / period_ns) for n, start in starts.items()}
+        skips = {
+            n: round((starts[last_channel] - start) / period_ns) for n, start in starts.items()
+        }
         common_length = min(len(channel.values) - skips[n] for n, channel in channels.items())
         if common_length < 2:
             self.report_contradiction(f"{statement}, so that they have no time in common", remedy)

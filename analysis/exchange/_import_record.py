@@ -164,7 +164,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     titles = {name: choice.channel for name, choice in plan.channels.items()}
     columns, status, first_sample = hold_last_values(source, titles, columns)
     ticks = timebase.ticks[first_sample:]
-    after_gap = np.diff(ticks, prepend=-1) > 1
+    is_after_gap = np.diff(ticks, prepend=-1) > 1
     if timebase.jitter > _REPORTED_JITTER:
         warnings.append(
             f"The time stamps lie up to {timebase.jitter:.2g} periods from equidistant ones."
@@ -177,7 +177,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
         plan.specimen,
     )
     warnings += [anomaly] if anomaly else []
-    status[after_gap] |= np.uint32(Status.AFTER_LOST)
+    status[is_after_gap] |= np.uint32(Status.AFTER_LOST)
     start_utc_ns, start_warning = _session_start(source, int(ticks[-1]) / timebase.rate_hz)
     warnings += [start_warning] if start_warning else []
     metadata = _session_metadata(source, target, file_format, plan, timebase.rate_hz)
@@ -250,8 +250,8 @@ def _si_columns(
     columns = {}
     with np.errstate(over="ignore"):
         for name, choice in plan.channels.items():
-            reverse = plan.reverse_torque and name == "coupling_torque_nm"
-            factor = -choice.factor if reverse else choice.factor
+            is_reversed = plan.reverse_torque and name == "coupling_torque_nm"
+            factor = -choice.factor if is_reversed else choice.factor
             values = channels[choice.channel].values
             columns[name] = values if factor == 1.0 else values * factor
     return columns
@@ -263,24 +263,24 @@ def _segment_ticks(
     """Return first and end tick of each segment; raise if one is not inside the record."""
     ticks_by_name = {}
     for name, (begin_s, end_s) in segments_s.items():
-        first, end = round(begin_s * rate_hz), round(end_s * rate_hz)
-        if not 0 <= first < end <= ticks:
+        first_tick, end = round(begin_s * rate_hz), round(end_s * rate_hz)
+        if not 0 <= first_tick < end <= ticks:
             raise ExchangeError(
                 f"{path}: the segment {name} from {begin_s:g} to {end_s:g} s is not inside the "
                 f"record, which lasts {ticks / rate_hz:g} s; count from the first sample."
             )
-        ticks_by_name[name] = (first, end)
+        ticks_by_name[name] = (first_tick, end)
     return ticks_by_name
 
 
 def _describe_missing_samples(
-    titles: Mapping[str, str], status: NDArray[np.uint32], first: int, ticks: NDArray[np.int64]
+    titles: Mapping[str, str], status: NDArray[np.uint32], omitted: int, ticks: NDArray[np.int64]
 ) -> list[str]:
     """Return sentences on missing samples and on values that are not finite."""
     sentences = []
-    if first:
+    if omitted:
         sentences.append(
-            f"The first {first} samples were left out: angle or torque is not finite there."
+            f"The first {omitted} samples were left out: angle or torque is not finite there."
         )
     for flag, name in (
         (Status.ANGLE_STALE, titles["angle_rad"]),

@@ -157,10 +157,10 @@ def _read_vector(path: Path, name: str, contents: Mapping[str, Any]) -> NDArray[
 
 def _find_value(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # noqa: ANN401
     """Return a variable, or a field of a struct or of an element of a struct array."""
-    first, fields, _ = _split_name(name, contents)
+    variable, fields, _ = _split_name(name, contents)
     value: Any = None
     parent_name = ""
-    for depth, component in enumerate((first, *fields)):
+    for depth, component in enumerate((variable, *fields)):
         key, element = _split_element(component)
         if depth:
             dtype = getattr(value, "dtype", None)

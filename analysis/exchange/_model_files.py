@@ -89,6 +89,6 @@ def _json_value(value: Any) -> Any:  # noqa: ANN401
     return value.tolist()
 
 
-def _string_array(value: Any, kind: type) -> Any:  # noqa: ANN401
+def _string_array(value: Any, element_type: type) -> Any:  # noqa: ANN401
     """Return a list of strings as an array of a type; other values unchanged."""
-    return np.array(value, dtype=kind) if isinstance(value, list) else value
+    return np.array(value, dtype=element_type) if isinstance(value, list) else value

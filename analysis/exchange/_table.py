@@ -165,7 +165,10 @@ def _ascii_unit(name: str) -> str:
 
 def _segment_texts(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
     """Return first and end tick of each segment as text."""
-    return {f"segment_{name}_ticks": f"{first},{end}" for name, (first, end) in segments.items()}
+    return {
+        f"segment_{name}_ticks": f"{first_tick},{end}"
+        for name, (first_tick, end) in segments.items()
+    }
 
 
 def _origin_information(path: Path) -> dict[str, str]:

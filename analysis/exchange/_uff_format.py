@@ -95,12 +95,12 @@ def _read_channels(
         times.append(stamps)
         units.append(_abscissa_unit(function))
     if ABSCISSA in names:
-        first = next(iter(channels.values()))
+        first_channel = next(iter(channels.values()))
         channels[ABSCISSA] = SourceChannel(
             _common_times(path, channels, times),
             unit_label=units[0],
             rate_hz=None if units[0] else _even_rate_hz(function, 1.0),
-            start_ns=first.start_ns,
+            start_ns=first_channel.start_ns,
         )
     return channels
 
@@ -166,20 +166,23 @@ def _even_rate_hz(function: Mapping[str, Any], unit_s: float) -> float | None:
 
 def _check_time_response(path: Path, name: str, function: Mapping[str, Any], unit: str) -> None:
     """Raise if a data set is a spectrum or another function that is not of time."""
-    kind, axis = function["func_type"], function["abscissa_spec_data_type"]
+    function_type, axis = function["func_type"], function["abscissa_spec_data_type"]
     label = _label_text(function, "abscissa_axis_lab")
-    text = ""
-    if kind not in (_GENERAL_FUNCTION, _TIME_RESPONSE):
-        text = f"its function type is {kind}{_code_name(kind, _FUNCTION_TYPES)}"
+    contradiction = ""
+    if function_type not in (_GENERAL_FUNCTION, _TIME_RESPONSE):
+        contradiction = (
+            f"its function type is {function_type}{_code_name(function_type, _FUNCTION_TYPES)}"
+        )
     elif axis not in (_UNKNOWN_AXIS, _GENERAL_AXIS, _TIME_CODE):
-        text = f"its abscissa is of type {axis}{_code_name(axis, _ABSCISSA_TYPES)}"
+        contradiction = f"its abscissa is of type {axis}{_code_name(axis, _ABSCISSA_TYPES)}"
     elif axis != _TIME_CODE and (
         unit.lower() in ("hz", "khz", "rpm", "rad/s") or label.lower().startswith("freq")
     ):
-        text = f"its abscissa is '{label or unit}'"
-    if text:
+        contradiction = f"its abscissa is '{label or unit}'"
+    if contradiction:
         raise ExchangeError(
-            f"{path}: '{name}' is not a function of time: {text}. A session is made of measured "
+            f"{path}: '{name}' is not a function of time: {contradiction}. A session is made of "
+            "measured "
             "samples: give angle and torque over time."
         )
 
@@ -292,17 +295,19 @@ def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     stream.write(_SI_UNITS_SET.encode("ascii"))
     for column in table.columns:
         if column.values.dtype.kind in "fc":
-            body = _encode_body(axis, column.values, is_even=is_even, binary=binary)
-            header = _header_text(table, axis, column, is_even, len(body) if binary else None)
-            stream.write(header.encode("ascii") + body + b"    -1\n")
+            encoded_values = _encode_body(axis, column.values, is_even=is_even, binary=binary)
+            header = _header_text(
+                table, axis, column, is_even, len(encoded_values) if binary else None
+            )
+            stream.write(header.encode("ascii") + encoded_values + b"    -1\n")
 
 
 def _is_reproducible(axis: NDArray[np.float64], tolerance: float) -> bool:
     """Return whether first value and increment, with six digits, reproduce every abscissa."""
     if len(axis) < 2:
         return True
-    first, increment = _start_and_increment(axis)
-    reproduced = float(f"{first:.5e}") + float(f"{increment:.5e}") * np.arange(len(axis))
+    start, increment = _start_and_increment(axis)
+    reproduced = float(f"{start:.5e}") + float(f"{increment:.5e}") * np.arange(len(axis))
     return bool(np.abs(reproduced - axis).max() <= tolerance * increment)
 
 
@@ -314,8 +319,8 @@ def _is_increment_exact(axis: NDArray[np.float64]) -> bool:
 
 def _are_abscissae_distinct(axis: NDArray[np.float64]) -> bool:
     """Return whether six digits are enough to write each abscissa as text."""
-    written = np.array([f"{value:.5e}" for value in axis.tolist()], dtype=np.float64)
-    return bool(np.abs(written - axis).max() <= _TEXT_TOLERANCE * np.diff(axis).min())
+    rounded = np.array([f"{value:.5e}" for value in axis.tolist()], dtype=np.float64)
+    return bool(np.abs(rounded - axis).max() <= _TEXT_TOLERANCE * np.diff(axis).min())
 
 
 def _start_and_increment(axis: NDArray[np.float64]) -> tuple[float, float]:
@@ -338,13 +343,13 @@ def _encode_body(
     if not is_even:
         formats[0] = "%13.5E"
     # Four numbers to a line, but for abscissae with complex values: three.
-    repeat = 1 if len(formats) == 3 else 4 // len(formats)
-    full_rows = len(numbers) - len(numbers) % repeat
+    rows_per_line = 1 if len(formats) == 3 else 4 // len(formats)
+    full_rows = len(numbers) - len(numbers) % rows_per_line
     full_line, last_line = (
-        "".join(formats * repeat) + "\n",
+        "".join(formats * rows_per_line) + "\n",
         "".join(formats * (len(numbers) - full_rows)),
     )
-    text = full_line * (full_rows // repeat) % tuple(numbers[:full_rows].ravel().tolist())
+    text = full_line * (full_rows // rows_per_line) % tuple(numbers[:full_rows].ravel().tolist())
     text += f"{last_line}\n" % tuple(numbers[full_rows:].ravel().tolist()) if last_line else ""
     return text.encode("ascii")
 
@@ -365,7 +370,7 @@ def _header_text(
         )
     else:
         function_type, axis_type = _TIME_RESPONSE, _TIME_AXIS
-    first, increment = _start_and_increment(axis) if is_even else (0.0, 0.0)
+    start, increment = _start_and_increment(axis) if is_even else (0.0, 0.0)
     set_type = (
         "    58"
         if size is None
@@ -379,7 +384,7 @@ def _header_text(
         f"{set_type:80}",
         *(f"{_ascii_text(text):80.80}" for text in _identification_lines(table, column)),
         f"{function_type:5d}{0:10d}{0:5d}{0:10d} {'NONE':10}{0:10d}{0:4d} {'NONE':10}{0:10d}{0:4d}",
-        f"{data_type:10d}{len(axis):10d}{int(is_even):10d}{first:13.5E}{increment:13.5E}{0.0:13.5E}",
+        f"{data_type:10d}{len(axis):10d}{int(is_even):10d}{start:13.5E}{increment:13.5E}{0.0:13.5E}",
         _axis_line(axis_type, (0, 0), table.axis.title, table.axis.unit),
         _axis_line(_GENERAL_AXIS, _UNIT_EXPONENTS.get(unit, (0, 0)), title, unit),
         _axis_line(
@@ -400,10 +405,12 @@ def _identification_lines(table: ExportTable, column: ExportColumn) -> tuple[str
     return column.name, table.source, settings or "NONE", "NONE", table.information["exported_by"]
 
 
-def _axis_line(kind: int, exponents: tuple[int, int], title: str, unit: str) -> str:
+def _axis_line(axis_type: int, exponents: tuple[int, int], title: str, unit: str) -> str:
     """Return the line of a header that describes an axis."""
     length, force = exponents
-    return f"{kind:10d}{length:5d}{force:5d}{0:5d} {title or 'NONE':20.20} {unit or 'NONE':20.20}"
+    return (
+        f"{axis_type:10d}{length:5d}{force:5d}{0:5d} {title or 'NONE':20.20} {unit or 'NONE':20.20}"
+    )
 
 
 def _ascii_text(text: str) -> str:

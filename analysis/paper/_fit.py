@@ -255,12 +255,18 @@ class _FrfProblem:
 
 
 def _fit(
-    structure: Structure, weighting: str, few: _FrequencyGrid, whole: _FrequencyGrid
+    structure: Structure,
+    weighting: str,
+    few_points_grid: _FrequencyGrid,
+    whole_grid: _FrequencyGrid,
 ) -> FrfFit:
     """Fit a structure: descents on few points, then refinement of the best on all points."""
-    unknowns = DampingUnknowns.of(structure, whole.model.beam)
+    unknowns = DampingUnknowns.of(structure, whole_grid.model.beam)
     bounds = Box(*unknowns.bounds)
-    few_problem, whole_problem = _FrfProblem(unknowns, few), _FrfProblem(unknowns, whole)
+    few_problem, whole_problem = (
+        _FrfProblem(unknowns, few_points_grid),
+        _FrfProblem(unknowns, whole_grid),
+    )
     rough_minima = [
         descend(few_problem.normal_equations, x, bounds, relative_tolerance=_ROUGH_TOLERANCE)
         for x in starting_points(structure, few_problem.cost)
@@ -450,11 +456,11 @@ def sandwich_covariance(
     scaled = hessian / np.outer(scale, scale)
     if np.linalg.cond(scaled) > 1e12:
         return None
-    scores = (jacobian.conj() * (weights * deviation)).real
+    gradient_terms = (jacobian.conj() * (weights * deviation)).real
     correlated = _correlated_bins(np.sqrt(weights) * deviation)
     # Bartlett's kernel over a number of bins equals the mean square of sums over as many
     # neighbours.
-    cumulative = np.cumsum(np.pad(scores, ((0, 0), (correlated, correlated - 1))), axis=1)
+    cumulative = np.cumsum(np.pad(gradient_terms, ((0, 0), (correlated, correlated - 1))), axis=1)
     neighbour_sums = cumulative[:, correlated:] - cumulative[:, :-correlated]
     gradient_covariance = neighbour_sums @ neighbour_sums.T / correlated
     inverse = np.linalg.inv(scaled) / np.outer(scale, scale)

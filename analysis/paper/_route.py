@@ -152,8 +152,8 @@ def resonant_peaks(
         if candidates.size == 0:
             peaks.append(None)
             continue
-        best = candidates[np.argmax(magnitude[candidates])]
-        peaks.append(Peak(float(frequency_hz[best]), 20 * float(np.log10(magnitude[best]))))
+        largest = candidates[np.argmax(magnitude[candidates])]
+        peaks.append(Peak(float(frequency_hz[largest]), 20 * float(np.log10(magnitude[largest]))))
     return tuple(peaks)
 
 
@@ -459,7 +459,7 @@ def _evaluate_fit(
         response=response,
         indices=fit_indices(2 * np.pi * measured.frequency_hz, measured.response, response),
         modes=beam_modes,
-        followed=_are_followed(beam_modes, beam),
+        followed=_vibrate_near_undamped(beam_modes, beam),
         peaks=peaks,
         deviations=tuple(
             None
@@ -470,7 +470,7 @@ def _evaluate_fit(
     )
 
 
-def _are_followed(fitted_modes: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
+def _vibrate_near_undamped(fitted_modes: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
     """Return whether each mode vibrates near the frequency of the undamped beam's mode."""
     undamped_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
     return tuple(
