@@ -200,7 +200,7 @@ def select(
     fixed: Iterable[Setting] = (),
     band_hz: tuple[float, float] | None = None,
 ) -> Selection:
-    """Fit every structure to a record, and select the one that its data support.
+    """Fit every damping structure to a record, and select the best supported one.
 
     Parameters
     ----------

@@ -111,7 +111,7 @@ class Structure:
         return "gamma" in self.free
 
     def has(self, name: str) -> bool:
-        """Return whether the structure has the damping to which a parameter belongs.
+        """Return whether the structure has the kind of damping to which a parameter belongs.
 
         The result is True for a parameter of beam or rig.
 
@@ -138,7 +138,7 @@ class Structure:
 
 
 def _structure(name: str, fixed: dict[Parameter, float]) -> Structure:
-    """Return a structure with given fixed parameters; the other parameters are free."""
+    """Return a damping structure with given fixed parameters; the other ones are free."""
     free = tuple(p for p in PARAMETERS if p not in fixed)
     return Structure(name, free, MappingProxyType(fixed))
 

@@ -68,7 +68,7 @@ class Routes:
 
 @dataclass(frozen=True, slots=True)
 class WholeRecord:
-    """Fits of all structures to a whole record, and the selected structure.
+    """Fits of all damping structures to a whole record, and the selected structure.
 
     Attributes
     ----------
@@ -263,7 +263,7 @@ def _record_validity(record: Record, *models: tuple[Beam, Damping]) -> Validity:
 def whole_record(
     record: Record, fixed: tuple[Setting, ...] = (), band_hz: tuple[float, float] | None = None
 ) -> WholeRecord:
-    """Fit every structure to a whole record, and select the one that its data support.
+    """Fit every damping structure to a whole record, and select the best supported one.
 
     Parameters
     ----------

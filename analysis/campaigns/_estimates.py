@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class WelchFit:
-    """Fit of one structure, with one weighting, to one session's response by the Welch method.
+    """Fit of one damping structure and weighting to a session's response by the Welch method.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class WelchFit:
 
     @classmethod
     def of(cls, model: FittedModel) -> WelchFit:
-        """Return the results of a Welch fit that a campaign retains."""
+        """Return the results of a fitted model that a campaign retains."""
         fit = model.fit
         return cls(
             structure=fit.structure.name,
@@ -65,7 +65,7 @@ class WelchFit:
 
 @dataclass(frozen=True, slots=True)
 class RecordEstimate:
-    """Fit of one structure to one whole record (see `analysis.identify.RecordFit`).
+    """Fit of one damping structure to one whole record (see `analysis.identify.RecordFit`).
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class RecordEstimate:
 
     @property
     def name(self) -> str:
-        """Name of the structure as shown in tables."""
+        """Name of the damping structure as shown in tables."""
         return self.structure
 
     @property

@@ -36,7 +36,7 @@ def p_value_text(p_value: float) -> str:
 
 
 def describe_tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
-    """Describe the modal constants that the parameters follow from, and the tolerance."""
+    """Describe the basis of the parameters and the tolerated deviation from a uniform beam."""
     stated = modal.stated[-1]
     tolerance_text = f"{100 * stated:g} % as the files state it"
     if len(modal.stated) > 1:

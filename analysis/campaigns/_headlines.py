@@ -39,7 +39,7 @@ _ADEQUATE_FRACTION: Final = 0.9
 
 
 def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
-    """Collect the headlines of the sessions of a campaign and of all sessions together.
+    """Collect the reported estimates of each session and of all sessions together, as JSON.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def _add_flags(
 def _simpler_estimate(
     campaign: CampaignResult, pooled: PooledEstimate
 ) -> ConditionalEstimate | None:
-    """Return the estimate of the lowest BIC, which is valid if its fixed orders are true.
+    """Return the estimate of the lowest BIC; it is valid if its fixed orders are true.
 
     Return None if that estimate is the reported one.
     """
@@ -231,7 +231,7 @@ def _reported_modes(
 
 
 def _structure_status(structure: RankedStructure, pooled: PooledEstimate) -> StructureStatus:
-    """Return whether a structure is selected, compatible with the sessions, or excluded."""
+    """Return whether a damping structure is selected, compatible with the data, or excluded."""
     if structure.name == pooled.name:
         return "selected"
     bic_difference = structure.bic_above_lowest

@@ -164,7 +164,7 @@ def homogeneity(
     pooled: Sequence[PooledEstimate],
     specimens: Sequence[StatedSpecimen],
 ) -> Homogeneity:
-    """Test whether sessions are of one specimen, comparing all by one structure.
+    """Test whether sessions are of one specimen, by their fits of one damping structure.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ _RESIDUE_PHASE_INDEX: Final = CONSTANTS.index("residue_phase_rad")
 
 @dataclass(frozen=True, slots=True)
 class PooledModal(ModalEstimate):
-    """Modal model of all sessions together.
+    """Modal model (frequencies, damping ratios, residues) pooled over all sessions.
 
     Attributes
     ----------

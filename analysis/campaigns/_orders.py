@@ -40,7 +40,7 @@ structure for it to be reported."""
 
 
 def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
-    """Return the freest pooled structure that nearly all sessions determine.
+    """Return the estimate of the freest damping structure that nearly all sessions determine.
 
     A structure that far fewer sessions determine than the one of the lowest BIC does not represent
     all sessions.
@@ -64,7 +64,7 @@ def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
 
 
 def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
-    """Return the name of the structure by which the modes of all sessions are compared.
+    """Return the name of the damping structure by which all sessions are compared.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
 
 
 def _free_parameter_count(estimate: RecordEstimate) -> int:
-    """Return the number of free parameters of an estimate's structure."""
+    """Return the number of free parameters of an estimate's damping structure."""
     return len(STRUCTURES[estimate.structure].free)
 
 
@@ -145,7 +145,7 @@ class PooledOrder:
     exact: PooledOrder | None = None
 
     def doubted(self, reason: str) -> PooledOrder:
-        """Return the order with a reason for doubt, or unchanged if it already has a reason."""
+        """Return the order with a reason for doubt; unchanged if it already has a reason."""
         if self.reason is not None:
             return self
         return replace(self, status="open" if self.interval else self.status, reason=reason)
@@ -157,7 +157,7 @@ def pooled_order(
     verdicts: Sequence[Verdict],
     homogeneity: Homogeneity,
 ) -> PooledOrder:
-    """Assess one order from all sessions, by the same rules as for one record.
+    """Assess one order of the damping from all sessions, by the same rules as for one record.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def tolerant_pooled_order(
     *,
     refused: bool,
 ) -> PooledOrder:
-    """Assess one order with a tolerance of the geometry.
+    """Assess one order of the damping, with a tolerance for deviations from a uniform beam.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ def _status_and_reason(
     verdicts: Sequence[Verdict],
     single_statuses: Mapping[str, int],
 ) -> tuple[PooledStatus, str | None]:
-    """Return the status of one order, and the reason against reporting it."""
+    """Return the status of one order of the damping, and the reason against reporting it."""
     structure = STRUCTURES[freest.structure]
     modes = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[0][0]
     several_modes = 2 * sum(len(v.visible_modes) > 1 for v in verdicts) > len(verdicts)
@@ -290,7 +290,7 @@ def _status_and_reason(
 
 
 def _has_order_one(estimate: PooledEstimate, order: Order) -> bool:
-    """Return whether a structure has this kind of damping with its order fixed at 1."""
+    """Return whether a damping structure has this kind of damping with a fixed order of 1."""
     return STRUCTURES[estimate.structure].fixed.get(order) == 1.0
 
 

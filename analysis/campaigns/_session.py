@@ -148,7 +148,7 @@ class SessionAnalysis:
 
     @property
     def selected(self) -> str | None:
-        """Name of the structure that this session alone selects; None without a verdict."""
+        """Name of the damping structure that this session selects; None without a verdict."""
         if self.verdict is None:
             return None
         return min(self.record_estimates, key=lambda estimate: estimate.bic).name
@@ -156,7 +156,7 @@ class SessionAnalysis:
 
 @dataclass(frozen=True, slots=True)
 class SessionTask:
-    """Settings common to the analyses of all sessions.
+    """Settings common to the analyses of all sessions of a campaign.
 
     Attributes
     ----------
@@ -278,7 +278,7 @@ def _session_result(
 def _record_estimates(
     whole: WholeRecord, structures: Collection[str], measured: FrequencyResponse, delay_s: float
 ) -> tuple[RecordEstimate, ...]:
-    """Return the whole-record fits of the requested structures and of the selected one."""
+    """Return the fits of the requested damping structures and of the selected one."""
     from analysis.identify import ResponseGrid
     from analysis.models import STRUCTURES
 

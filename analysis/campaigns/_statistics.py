@@ -63,13 +63,13 @@ class ParameterStatistics:
 def fits_by_model(
     sessions: Sequence[SessionAnalysis],
 ) -> dict[tuple[str, str], tuple[WelchFit, ...]]:
-    """Return the Welch fits of all sessions by structure and weighting."""
+    """Return the Welch fits of all sessions by damping structure and weighting."""
     rows = zip(*(session.welch_fits for session in sessions), strict=True)
     return {(row[0].structure, row[0].weighting): row for row in rows}
 
 
 def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[ParameterStatistics, ...]:
-    """Return statistics of the free parameters for each structure and weighting (Table 3)."""
+    """Return statistics of the free parameters of all Welch fits (Table 3 of the paper)."""
     statistics = []
     for (structure, weighting), fits in fits_by_model(sessions).items():
         for parameter in STRUCTURES[structure].free:
@@ -160,7 +160,7 @@ def mean_damping(structure: str, fits: Sequence[WelchFit]) -> Damping:
 
 
 def nominal_models(sessions: Sequence[SessionAnalysis]) -> tuple[NominalModel, ...]:
-    """Return the nominal model for each structure and weighting, compared with each session."""
+    """Return the nominal model for each damping structure and weighting."""
     first_session = sessions[0]
     if not first_session.frequency_hz.size:
         return ()
@@ -226,7 +226,7 @@ def _nominal_model(
     frequency_hz: NDArray[np.float64],
     beam: Beam,
 ) -> NominalModel:
-    """Return the nominal model of one structure and weighting."""
+    """Return the nominal model of one damping structure and weighting."""
     damping = mean_damping(structure, fits)
     response = model.evaluate(damping)
     count = len(sessions[0].peaks)
@@ -299,14 +299,14 @@ class RankedStructure:
 
     @property
     def name(self) -> str:
-        """Name of the structure as shown in tables."""
+        """Name of the damping structure as shown in tables."""
         return self.structure
 
 
 def ranked_structures(
     sessions: Sequence[SessionAnalysis], pooled: Sequence[PooledEstimate]
 ) -> tuple[RankedStructure, ...]:
-    """Rank all fitted structures: first the pooled ones by their BIC, then the others.
+    """Rank all fitted damping structures: first the pooled ones by BIC, then the others.
 
     Parameters
     ----------
@@ -342,6 +342,6 @@ def ranked_structures(
 
 
 def _rank_key(structure: RankedStructure) -> tuple[bool, bool, float]:
-    """Return the key by which structures are sorted: pooled ones first, then by BIC."""
+    """Return the sorting key of a damping structure: pooled ones first, then by BIC."""
     bic = structure.bic_above_lowest
     return not structure.pooled, bic is None, bic or 0.0

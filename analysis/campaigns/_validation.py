@@ -58,7 +58,7 @@ class LeftOutError:
 
 @dataclass(frozen=True, slots=True)
 class LostTrial:
-    """A session that could not be predicted from the others, and the reason."""
+    """A session that could not be predicted from the other sessions, and the reason."""
 
     path: Path
     """Path of the session file."""
@@ -168,7 +168,10 @@ def left_out_errors(
 def by_model(
     errors: Sequence[LeftOutError],
 ) -> list[tuple[str, str, str | None, tuple[LeftOutError, ...]]]:
-    """Group prediction errors by method, structure and weighting, the smallest mean error first."""
+    """Group prediction errors by method, damping structure and weighting.
+
+    The group of the smallest mean error comes first.
+    """
     errors_by_model: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
     for error in errors:
         errors_by_model.setdefault((error.method, error.name, error.weighting), []).append(error)

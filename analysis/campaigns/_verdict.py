@@ -97,7 +97,7 @@ def common_findings(sessions: Sequence[SessionAnalysis]) -> tuple[CommonFinding,
 
 
 def _common_finding(group: list[tuple[str, Finding]], sessions: int) -> CommonFinding:
-    """Return the common finding of sessions that show the same effect."""
+    """Return one effect with all sessions that show it."""
     files = tuple(dict.fromkeys(name for name, _ in group))
     sizes = [finding.value for _, finding in group if finding.value is not None]
     if len(sizes) < len(group):
@@ -112,7 +112,7 @@ def _common_finding(group: list[tuple[str, Finding]], sessions: int) -> CommonFi
 
 @dataclass(frozen=True, slots=True)
 class Dissent:
-    """A session that by itself excludes the structure that all sessions together select.
+    """A session that alone excludes the damping structure selected by all sessions together.
 
     Attributes
     ----------
@@ -191,7 +191,7 @@ def campaign_verdict(
     biases: Sequence[WelchBias] = (),
     modal: PooledModal | None = None,
 ) -> CampaignVerdict | None:
-    """Return the verdict on a campaign, or None if no structure could be pooled.
+    """Return the verdict on a campaign, or None if no damping structure could be pooled.
 
     Parameters
     ----------
@@ -332,7 +332,7 @@ def _withheld_orders(*orders: PooledOrder) -> frozenset[str]:
 def _dissenting_sessions(
     sessions: Sequence[SessionAnalysis], best: PooledEstimate
 ) -> tuple[Dissent, ...]:
-    """Return the sessions that by themselves exclude the structure of the lowest common BIC."""
+    """Return the sessions that alone exclude the damping structure of the lowest common BIC."""
     dissents = []
     for session in sessions:
         by_name = {estimate.name: estimate for estimate in session.record_estimates}

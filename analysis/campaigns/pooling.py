@@ -268,7 +268,7 @@ class PooledEstimate:
 
     @property
     def name(self) -> str:
-        """Name of the structure as shown in tables."""
+        """Name of the damping structure as shown in tables."""
         return self.structure
 
     @property
@@ -294,7 +294,9 @@ class PooledEstimate:
 
 
 def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimate, ...]:
-    """Pool each structure that was fitted to all sessions and that at least two determine.
+    """Pool the estimates of each damping structure fitted to all sessions.
+
+    A structure is left out if fewer than two sessions determine its damping.
 
     The estimates are sorted by BIC, the lowest first.
     """
@@ -314,7 +316,7 @@ def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimat
 
 
 def estimates_by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, list[RecordEstimate]]:
-    """Return the whole-record estimates of all sessions by the name of the structure."""
+    """Return the whole-record estimates of all sessions by the name of the damping structure."""
     estimates_by_name: dict[str, list[RecordEstimate]] = {}
     for session in sessions:
         for estimate in session.record_estimates:
@@ -323,12 +325,12 @@ def estimates_by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, lis
 
 
 def determines_damping(estimate: RecordEstimate) -> bool:
-    """Return whether an estimate determines all free parameters of its structure."""
+    """Return whether an estimate determines all free parameters of its damping structure."""
     return set(STRUCTURES[estimate.structure].free) <= set(estimate.determined)
 
 
 def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
-    """Pool the estimates of one structure; None if fewer than two determine its damping.
+    """Pool estimates of one damping structure; None if fewer than two determine its damping.
 
     A parameter of rig or specimen (mostly the tool inertia) that is at a bound in some session is
     not in the common covariance. The pooled plant has the unweighted mean of such a parameter.
@@ -370,7 +372,7 @@ def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None
 
 
 def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
-    """Return the Bayesian information criterion of one structure for all sessions together.
+    """Return the Bayesian information criterion of a damping structure for all sessions.
 
     Damping parameters belong to the specimen. Each has one common value, with a scatter between the
     sessions if these differ by more than their uncertainties, and costs the logarithm of the number

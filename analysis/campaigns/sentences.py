@@ -370,7 +370,7 @@ def _slope_clause(pooled_order: PooledOrder) -> str:
 
 
 def describe_structure(freest: PooledEstimate, best: PooledEstimate) -> str:
-    """Describe the structure whose parameters are reported, and a simpler one if it suffices.
+    """Describe the damping structure of the reported parameters, and a simpler one.
 
     Parameters
     ----------
@@ -425,7 +425,7 @@ def describe_selection(
     single_selections: Mapping[str, int],
     sessions: int,
 ) -> str:
-    """Describe which structure all sessions select together, and which ones single sessions select.
+    """Describe which damping structure all sessions together, and single sessions, select.
 
     Parameters
     ----------
@@ -454,7 +454,7 @@ def describe_selection(
 
 
 def describe_residual(best: PooledEstimate, adequate: int, sessions: int) -> str:
-    """Describe whether the residual of a structure is noise.
+    """Describe whether the residual of a damping structure's fit is noise.
 
     Parameters
     ----------
@@ -474,7 +474,7 @@ def describe_residual(best: PooledEstimate, adequate: int, sessions: int) -> str
 
 
 def describe_noise_sessions(adequate: int, sessions: int) -> str:
-    """State in how many sessions the residual is noise.
+    """State in how many sessions the residual of the fit is noise.
 
     Parameters
     ----------
@@ -554,7 +554,7 @@ def describe_welch_bias(
     *,
     comparable: bool,
 ) -> list[str]:
-    """Describe the bias of the Welch fits of the reported structure.
+    """Describe the bias of the Welch fits of the reported damping structure.
 
     Parameters
     ----------
@@ -617,7 +617,7 @@ def _bias_clause(parameter_bias: ParameterBias) -> str:
 
 
 def describe_dissent(sessions: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str]:
-    """List the sessions that by themselves exclude the structure selected by all sessions together.
+    """List the sessions that alone exclude the damping structure selected by all together.
 
     Parameters
     ----------
@@ -674,7 +674,7 @@ def describe_scatter(best: PooledEstimate) -> str:
 def describe_prediction_errors(
     best: PooledEstimate, validation: Sequence[LeftOutError], sessions: int
 ) -> list[str]:
-    """Describe how well a structure predicts a session from the other sessions.
+    """Describe how well a damping structure predicts a session from the other sessions.
 
     Parameters
     ----------
@@ -754,7 +754,7 @@ def describe_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
 
 
 def _describe_damping(structure: str) -> str:
-    """Describe the kinds of damping of a structure, and whether their orders are free."""
+    """Describe the kinds of damping of a damping structure, and whether orders are free."""
     damping_structure = STRUCTURES[structure]
     kinds = [
         f"{name} damping ({order} {'free' if order in damping_structure.free else '= 1'})"

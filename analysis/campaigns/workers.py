@@ -181,7 +181,7 @@ class Workers:
         return interrupted
 
     def _replace_executor(self, *, alone: bool = False) -> None:
-        """Replace the executor after a worker process ended, with a single process for `alone`."""
+        """Replace the executor after a worker process ended; `alone` requests one process."""
 
     def _convert_errors(self) -> AbstractContextManager[None]:
         """Convert other errors that mean the loss of all workers to `CampaignError`."""

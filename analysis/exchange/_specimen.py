@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SpecimenFile:
-    """Specimen and clamp of an imported record.
+    """Beam, clamp and uncertainties of an imported record's specimen, as a file states them.
 
     Attributes
     ----------

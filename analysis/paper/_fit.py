@@ -109,7 +109,7 @@ def fit_frf(
     *,
     tool_inertia_kg_m2: float = 0.0,
 ) -> FrfFit:
-    """Find the global minimum of Eq. (26) for one structure and weighting.
+    """Find the global minimum of the cost (Eq. 26) for one damping structure and weighting.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def fit_many(
     *,
     tool_inertia_kg_m2: float = 0.0,
 ) -> tuple[FrfFit, ...]:
-    """Fit several structures with several weightings to a frequency response (see `fit_frf`).
+    """Fit several damping structures and weightings to a frequency response (see `fit_frf`).
 
     Each fit has the result of `fit_frf`; only the preparation of the frequency grids is common.
 
@@ -220,7 +220,7 @@ class _FrequencyGrid:
 
 
 class _FrfProblem:
-    """Cost (Eq. 26) of one structure on a frequency grid, as a function of the unknowns."""
+    """Cost (Eq. 26) of a damping structure on a frequency grid, as a function of unknowns."""
 
     def __init__(self, unknowns: DampingUnknowns, grid: _FrequencyGrid) -> None:
         self.unknowns = unknowns
@@ -260,7 +260,7 @@ def _fit(
     few_points_grid: _FrequencyGrid,
     whole_grid: _FrequencyGrid,
 ) -> FrfFit:
-    """Fit a structure: descents on few points, then refinement of the best on all points."""
+    """Fit a damping structure: descents on few points, then refinement on all points."""
     unknowns = DampingUnknowns.of(structure, whole_grid.model.beam)
     bounds = Box(*unknowns.bounds)
     few_problem, whole_problem = (
@@ -410,7 +410,7 @@ _MOST_STARTS: Final = 8
 def starting_points(
     structure: Structure, cost: Callable[[NDArray[np.float64]], float]
 ) -> list[NDArray[np.float64]]:
-    """Choose starting points of the descents for a structure, by increasing cost.
+    """Choose starting points of the descents for a damping structure, by increasing cost.
 
     `cost` is a function of the vector of unknowns, shape (k,). Return at most eight points of the
     coarse grid, shape (k,), that have no neighbour of lower cost along any axis.
