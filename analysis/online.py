@@ -373,7 +373,7 @@ def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateReques
     received = queue.SimpleQueue()
 
     def receive_frames() -> None:
-        # In another thread than the fit, so that the sender never waits for it.
+        # This runs in a thread of its own, so that the sender never waits for the fit.
         end = None
         try:
             for frame in frames:
@@ -432,8 +432,8 @@ def main() -> None:
         if start.every_s is None:
             os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
         else:
-            give_way()  # nobody waits
-        with suppress(BrokenPipeError):  # nobody reads any more
+            give_way()  # estimates at intervals are not awaited
+        with suppress(BrokenPipeError):  # the reader of the estimates has ended
             serve(start, read_frames(stream))
     except SessionError as error:
         sys.exit(f"Error: {error}")

@@ -335,7 +335,7 @@ def _join_bins(
 
 
 def _empty_coherence() -> dict[str, Any]:
-    """Return the part of the JSON document on coherence, without values."""
+    """Return the coherence section of the JSON document with null values."""
     return {"mean": None, "low_bands": []}
 
 

@@ -167,7 +167,7 @@ class WholeRecord:
 
         file, findings = str(self.record.path), self.verdict.findings
         content = headline_json(file, self.headline, self.orders, findings, self.validity)
-        exact = content["exact_geometry"]  # None: the parameters are those of an exact geometry
+        exact = content["exact_geometry"]  # None if the parameters assume it
         (content if exact is None else exact)["covariance"] = self._covariance_json()
         return {
             **content,

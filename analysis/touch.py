@@ -358,7 +358,7 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
     if not filter_kind:
         return SensorFilter(corner_hz, order)
     delay_s = session.number("sensor_filter_delay_s", 0.0)
-    # A mean of n records of a tick is (n - 1) / 2n of a tick old, the triangle twice as much.
+    # A mean of n records per tick has a delay of (n - 1) / 2n ticks, a triangle twice as much.
     fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(filter_kind, inf)
     if not 0.0 <= fraction < _LONGEST_FILTER_TICKS:
         raise RecordError(

@@ -138,7 +138,7 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
     stated = tuple(sorted({session.uniformity for session in used}))
     tolerant = None
     if stated[-1]:
-        # Intervals are normal ones, and Student's t of few sessions is wider.
+        # The intervals assume a normal distribution, but Student's t of few sessions is wider.
         variance_factor = (student_t_quantile(0.95, len(used) - 1) / NORMAL_95) ** 2
         widened_estimate = replace(estimate, joint_covariance=variance_factor * effects.covariance)
         tolerant = tolerant_estimate(widened_estimate, nominal, stated[-1])
@@ -274,7 +274,7 @@ def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | Non
     difference, covariance = values[1] - values[0], covariances[0] + covariances[1]
     phases = difference[
         _RESIDUE_PHASE_INDEX : len(modes) * len(CONSTANTS) : len(CONSTANTS)
-    ]  # a view
+    ]  # a view into `difference`
     phases -= 2 * math.pi * np.round(phases / (2 * math.pi))
     changes = []
     for index, mode in enumerate(modes):

@@ -42,8 +42,8 @@ structure for it to be reported."""
 def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
     """Return the estimate of the freest damping structure that nearly all sessions determine.
 
-    A structure that far fewer sessions determine than the one of the lowest BIC does not represent
-    all sessions.
+    The freest structure has the largest number of free parameters. A structure that far fewer
+    sessions determine than the one of the lowest BIC does not represent all sessions.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ def _status_and_reason(
         and structure.fixed.get(order) == 1.0
         and next(iter(single_statuses)) == "compatible"
     ):
-        # No fitted structure has it free: only the sessions' own verdicts are available.
+        # The order is free in no fitted structure, so only the sessions' verdicts are available.
         return "compatible", None
     if parameter is None or _relative_width(parameter.interval) > WIDEST_FRACTION:
         return "not identifiable", "the sessions do not determine the order"

@@ -90,7 +90,8 @@ def random_effects(
         excess / (total_weight - (weight**2).sum(axis=0) / total_weight), 0.0
     )
 
-    # In units of a typical standard deviation: parameters differ by orders of magnitude.
+    # Values are in units of a typical standard deviation, as parameters differ by orders of
+    # magnitude.
     unit = 1 / np.sqrt(weight.mean(axis=0))
     units = np.outer(unit, unit)
     origin = estimates.mean(axis=0)
@@ -117,7 +118,10 @@ def random_effects(
 def _weighted_mean(
     values: NDArray[np.float64], covariances: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return the weighted mean, its covariance, and the weighted sum of squared deviations."""
+    """Return the mean weighted by inverse covariances, its covariance, and sum of squares.
+
+    The sum is that of the squared deviations from the mean, weighted in the same way.
+    """
     precision = np.linalg.inv(covariances)
     mean_covariance = np.linalg.inv(precision.sum(axis=0))
     mean = mean_covariance @ np.einsum("kij,kj->i", precision, values)

@@ -165,7 +165,7 @@ class Workers:
                 try:
                     in_progress[submit(queue[0])] = queue[0]
                 except BrokenExecutor:
-                    if not in_progress:  # a process that had nothing to do has ended
+                    if not in_progress:  # an idle process has ended
                         self._replace_executor()
                     break
                 queue.popleft()
@@ -353,7 +353,7 @@ class _DaskWorkers(Workers):
     )
 
     def __init__(self, client: Any, address: str) -> None:  # noqa: ANN401 - Dask has no types
-        # Each call counts, though arguments may be the same.
+        # With pure=False, Dask also repeats a call with the same arguments.
         super().__init__(client.get_executor(pure=False))
         self._client, self._address = client, address
         self._process_end_error = _import_distributed().KilledWorker
@@ -364,7 +364,7 @@ class _DaskWorkers(Workers):
             yield
         except CampaignError:
             raise
-        except Exception as error:  # Dask has many for a scheduler that went away
+        except Exception as error:  # Dask raises many types if a scheduler is lost
             expected = isinstance(
                 error, CancelledError | _import_distributed().comm.CommClosedError
             )

@@ -50,8 +50,8 @@ class DefaultCommandGroup(TyperGroup):
     Usage, help and errors of the default command are then those of a command without subcommands.
     """
 
-    # Typer's click is its own in some versions and the package of that name in others, so there is
-    # no one type of context to name.
+    # Some versions of Typer contain their own click, others use the package click, so the type of
+    # the context differs.
     def make_context(
         self,
         info_name: str | None,
@@ -149,8 +149,8 @@ def main() -> None:
     """Run the command `analyze` and end the process with its exit code."""
     raise_on(signal.SIGINT)
     use_one_thread()
-    # Figures consist of many objects that live until they are drawn: a garbage collection every 700
-    # takes a twentieth of all time.
+    # Figures consist of many objects that exist until they are drawn. A garbage collection after
+    # every 700 new objects would take 5 % of the computing time.
     gc.set_threshold(_COLLECTION_THRESHOLD)
     _suppress_library_warnings()
     with standard_streams():
@@ -168,7 +168,7 @@ def _suppress_library_warnings() -> None:
     """
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
-        os.environ["PYTHONWARNINGS"] = "ignore"  # of worker processes
+        os.environ["PYTHONWARNINGS"] = "ignore"  # for worker processes
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 

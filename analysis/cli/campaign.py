@@ -97,7 +97,7 @@ def campaign_command(
     )
     lines = [f"Report of the campaign: {folder / 'report.html'}"]
     if outputs.json is not None and not outputs.json_to_stdout:
-        # Before any output: the streams may be closed.
+        # The file is written before any output, because the streams may be closed.
         text = document_text(campaign_document(result, with_paper=with_paper))
         write_new(outputs.json, text, overwrite=outputs.overwrite)
         lines.insert(0, f"All results as JSON: {outputs.json}")

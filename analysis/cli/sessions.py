@@ -140,7 +140,7 @@ def session_command(
         return code
     results = document(record_results, {**(others or {}), **errors})
     if outputs.json is not None and not outputs.json_to_stdout:
-        # Before any output: the streams may be closed.
+        # The file is written before any output, because the streams may be closed.
         write_new(outputs.json, document_text(results), overwrite=outputs.overwrite)
     console = outputs.console()
     _print_tables(console, record_results, single=len(files) == 1, verbose=outputs.verbose)

@@ -62,7 +62,7 @@ def standard_streams() -> Iterator[None]:
     """
     for name in _STREAM_NAMES:
         stream = getattr(sys, name)
-        if not isinstance(stream, io.TextIOWrapper):  # closed, or a test's
+        if not isinstance(stream, io.TextIOWrapper):  # closed, or replaced by a test
             continue
         stream.reconfigure(errors="replace")
         # A terminal cannot lose its reader, and it is not just a file on Windows.
@@ -91,7 +91,7 @@ def _pipe_tolerant_stream(stream: io.TextIOWrapper) -> io.TextIOWrapper:
         io.BufferedWriter(raw),
         encoding=stream.encoding,
         errors=stream.errors,
-        # Standard error, with no buffer of its own, is written through.
+        # Standard error has no buffer of its own and is written at once.
         line_buffering=stream.line_buffering or stream.write_through,
     )
 

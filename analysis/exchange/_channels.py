@@ -336,8 +336,8 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
             f"({time_s[index]:.9g} s) to sample {index + 2} ({time_s[index + 1]:.9g} s); repair "
             "the times, or give --rate-hz instead of --time if the samples are equidistant."
         )
-    # The median distinguishes a step of one tick from a gap; the mean over all such steps is not at
-    # the mercy of how finely the file writes its times, as the median itself is.
+    # The median distinguishes a step of one tick from a gap. The mean over all steps of one tick,
+    # unlike the median, does not depend on the number of digits of the times.
     is_one_tick = steps_s < 1.5 * np.median(steps_s)
     steps = np.round(steps_s / steps_s[is_one_tick].mean())
     gap_fraction = np.count_nonzero(steps > 1) / len(steps)

@@ -209,7 +209,7 @@ class FileStatements:
         if (steps < 0.0).any():
             row_number = int(np.argmax(steps < 0.0)) + 2
             if (steps < 0.0).all():
-                return  # it runs backwards, as an index or a countdown may
+                return  # decreasing values are no times, but an index or a countdown
             self.report_contradiction(
                 f"the times {name} go back at sample {row_number}, so that another record begins "
                 "there",
@@ -228,7 +228,7 @@ class FileStatements:
             return
         step = float(values[-1] - values[0]) / (len(values) - 1)
         if step == 0.0 or (times.name == "#1" and step == 1.0):
-            return  # no times, or the numbers of the samples
+            return  # the values are constant or sample numbers
         unit_s = min(units_s, key=lambda unit: abs(np.log(rate_hz * step * unit)))
         tolerance = _COARSE_TOLERANCE + 2 * typical_step / float(values[-1] - values[0])
         missing = 0

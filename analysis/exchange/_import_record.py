@@ -160,7 +160,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
         source, plan.segments_s, timebase.rate_hz, int(timebase.ticks[-1]) + 1
     )
     columns = _si_columns(plan, channels)
-    del channels  # of the largest files, a quarter of a gigabyte
+    del channels  # frees up to a quarter of a gigabyte
     titles = {name: choice.channel for name, choice in plan.channels.items()}
     columns, status, first_sample = hold_last_values(source, titles, columns)
     ticks = timebase.ticks[first_sample:]
@@ -525,7 +525,7 @@ def write_session(
         counts["lost"] = scheduled - len(ticks)
         writer.close({name: str(count) for name, count in counts.items()})
     except BaseException:
-        # Unlike a recording, the source is still there: an incomplete copy of it is useless.
+        # The source still exists, so an incomplete copy of it is useless.
         try:
             writer.abandon()
         finally:

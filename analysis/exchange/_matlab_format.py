@@ -63,7 +63,7 @@ def _read_mat(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
             return _read_channels(path, names, whosmat(path), partial(loadmat, spmatrix=False))
     except (ExchangeError, OSError, MemoryError):
         raise
-    except Exception as error:  # scipy lets through whatever a damaged file provokes
+    except Exception as error:  # scipy raises many types on a damaged file
         raise ExchangeError(
             f"{path}: is not a MATLAB file of version 4 to 7, or is damaged ({error}); save it "
             "again with save('-v7', …)."
@@ -252,7 +252,7 @@ def _read_hdf5(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
             return {name: _read_hdf5_channel(path, file, name, names, h5py) for name in names}
     except (ExchangeError, MemoryError):
         raise
-    except Exception as error:  # h5py lets through whatever a damaged file provokes
+    except Exception as error:  # h5py raises many types on a damaged file
         raise ExchangeError(
             f"{path}: cannot be read as a MATLAB file of version 7.3 ({error}); save it with "
             "save('-v7', …)."
@@ -288,7 +288,7 @@ def _read_hdf5_channel(
 
 def _read_hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  # noqa: ANN401
     """Return the values of one vector of a MATLAB file of version 7.3."""
-    variables = list(file)  # their names alone: a link may lead into another file
+    variables = list(file)  # only names, as a link may lead into another file
     variable, fields, column = _split_name(name, variables)
     dataset = file
     for component in (variable, *fields):
@@ -324,7 +324,7 @@ def _read_hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[An
             "array or "
             "empty; save the values of one record as vectors, such as angle = log(1).angle."
         )
-    # MATLAB's columns are the rows of HDF5, which counts its dimensions from the other end.
+    # HDF5 stores dimensions in the reverse order, so that MATLAB's columns are its rows.
     return _vector_or_column(path, name, dataset[()].T, column)
 
 

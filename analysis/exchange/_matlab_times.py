@@ -53,7 +53,7 @@ def stated_times(
                 continue
             try:
                 values = vector(sibling)
-            except ExchangeError:  # texts, structs
+            except ExchangeError:  # the variable is a text or a struct
                 continue
             if len(values) == 1 and values[0] > 0 and field.lower() in _RATE_NAMES:
                 rate_hz = float(values[0])

@@ -78,7 +78,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
                 return _drop_relative_starts(source_channels)
     except (ExchangeError, OSError, MemoryError):
         raise
-    except Exception as error:  # npTDMS lets through whatever a damaged file provokes
+    except Exception as error:  # npTDMS raises many types on a damaged file
         raise ExchangeError(
             f"{path}: is not a TDMS file, or is damaged ({error}); copy it again from where it was "
             "recorded."
@@ -213,7 +213,7 @@ def _group_times(
             continue
         try:
             time_channel = _read_channel(path, other, channels, False)
-        except ExchangeError:  # texts, say
+        except ExchangeError:  # the channel has texts, for example
             continue
         return FileTimes(other, time_channel.values, time_unit_s(time_channel.unit_label))
     return None

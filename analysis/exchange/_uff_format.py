@@ -66,7 +66,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
             return _read_channels(path, names, pyuff.UFF)
     except (ExchangeError, OSError, MemoryError):
         raise
-    except Exception as error:  # pyuff raises plain exceptions, and lets through others
+    except Exception as error:  # pyuff raises many types
         raise ExchangeError(
             f"{path}: is not a universal file, or is damaged ({error}); export it again."
         ) from error
@@ -342,7 +342,7 @@ def _encode_body(
     formats = ["%20.12E"] * numbers.shape[1]
     if not is_even:
         formats[0] = "%13.5E"
-    # Four numbers to a line, but for abscissae with complex values: three.
+    # A line has four numbers, or three for complex values with their abscissa.
     rows_per_line = 1 if len(formats) == 3 else 4 // len(formats)
     full_rows = len(numbers) - len(numbers) % rows_per_line
     full_line, last_line = (

@@ -397,7 +397,7 @@ def analyse(
     )
     models: list[FittedModel] = []
     for name in settings.types:
-        # A type at a time, so that progress can be shown; sharing among types is not worth much.
+        # One type at a time, so that progress can be shown. Common grids would save little time.
         try:
             fits = fit_many(
                 response.frequency_hz,
