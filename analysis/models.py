@@ -460,7 +460,7 @@ class DampingUnknowns:
     """Logarithm of ``rho/EI omega²``, the inertia at the first mode, relative to stiffness."""
 
     @classmethod
-    def of(cls, structure: Structure, beam: Beam) -> DampingUnknowns:
+    def for_beam(cls, structure: Structure, beam: Beam) -> DampingUnknowns:
         """Return the unknowns with the undamped modes of a beam as reference frequencies.
 
         Parameters

@@ -373,6 +373,7 @@ def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateReques
     received = queue.SimpleQueue()
 
     def receive_frames() -> None:
+        """Put all frames of the stream into the queue, then an error or None."""
         # This runs in a thread of its own, so that the sender never waits for the fit.
         end = None
         try:

@@ -371,6 +371,7 @@ def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
     from numpy import generic
 
     def copy_value(value: Any) -> Any:  # noqa: ANN401
+        """Return a copy of one value, recursively."""
         if isinstance(value, dict):
             return {str(key).rstrip("_"): copy_value(item) for key, item in value.items()}
         if isinstance(value, list | tuple):

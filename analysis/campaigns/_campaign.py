@@ -193,6 +193,7 @@ def campaign(
     done, total = 0, 2 * len(paths)
 
     def report_step(name: str) -> None:
+        """Report the completion of a step for a file."""
         nonlocal done
         done += 1
         on_progress(done, total, name)

@@ -48,7 +48,7 @@ class WelchFit:
     indices: Indices | None = None
 
     @classmethod
-    def of(cls, model: FittedModel) -> WelchFit:
+    def from_model(cls, model: FittedModel) -> WelchFit:
         """Return the results of a fitted model that a campaign retains."""
         fit = model.fit
         return cls(
@@ -126,7 +126,7 @@ class RecordEstimate:
         return frozenset((*self.determined, *self.at_bounds))
 
     @classmethod
-    def of(cls, candidate: Candidate, indices: Indices) -> RecordEstimate:
+    def from_candidate(cls, candidate: Candidate, indices: Indices) -> RecordEstimate:
         """Return the results of a whole-record fit that a campaign retains: all but the residual.
 
         Parameters

@@ -108,7 +108,7 @@ class Experiment:
     added: Mapping[str, float | str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, record: Record) -> Experiment:
+    def from_record(cls, record: Record) -> Experiment:
         """Return the specimen and the excitation that a record states."""
         beam, metadata = record.beam, record.metadata
         excitation_facts = {

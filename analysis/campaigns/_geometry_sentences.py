@@ -158,14 +158,15 @@ def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
 def _describe_mode_change(mode_change: ModeInSweeps) -> str:
     """Describe how one mode differs in falling sweeps from rising ones."""
 
-    def percent(value: float, std: float) -> str:
+    def change_text(value: float, std: float) -> str:
+        """Format a relative change in per cent, with its 95 % interval and direction."""
         size, spread = to_uncertainty((abs(value), NORMAL_95 * std), std, 100.0)
         return f"{size} ± {spread} % {'higher' if value > 0 else 'lower'}"
 
     return (
         f"mode {mode_change.mode} (falling: frequency "
-        f"{percent(mode_change.frequency, mode_change.frequency_std)}, "
-        f"damping ratio {percent(mode_change.damping, mode_change.damping_std)}; "
+        f"{change_text(mode_change.frequency, mode_change.frequency_std)}, "
+        f"damping ratio {change_text(mode_change.damping, mode_change.damping_std)}; "
         f"{p_value_text(mode_change.chance)})"
     )
 

@@ -117,6 +117,7 @@ def _add_flags(
     flags, mixed = _order_flags(orders), campaign.homogeneity.is_mixed
 
     def mixture_flag(quantity: str) -> str | None:
+        """Return the flag of a quantity that differs between sessions, or None."""
         return _MIXTURE_FLAG if mixed(quantity) else None
 
     return replace(
@@ -214,6 +215,7 @@ def _reported_modes(
     t, mixed = student_t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
 
     def reported_value(value: float, std: float, quantity: str) -> ReportedValue:
+        """Return a quantity of a mode with its interval and flag."""
         flag = common_flag or (_MIXTURE_FLAG if mixed(quantity) else None)
         return ReportedValue(value, std, (value - t * std, value + t * std), flag)
 

@@ -199,7 +199,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionF
     experiment = None
     try:
         record = with_uniformity(load_record(path), task.uniformity)
-        experiment = Experiment.of(record)
+        experiment = Experiment.from_record(record)
         unfinished = experiment.unfinished_sweep_reason(record.outcome)
         if unfinished:
             return SessionFailure(path, f"{path}: {unfinished}", experiment)
@@ -257,7 +257,7 @@ def _session_result(
         frequency_hz=measured.frequency_hz,
         response=measured.response,
         peaks=() if welch is None else welch.peaks,
-        welch_fits=() if welch is None else tuple(map(WelchFit.of, welch.models)),
+        welch_fits=() if welch is None else tuple(map(WelchFit.from_model, welch.models)),
         record_estimates=()
         if whole is None
         else _record_estimates(whole, task.structures, measured, delay_s),
@@ -286,13 +286,16 @@ def _record_estimates(
     grid = ResponseGrid(1j * omega)
 
     def estimate_of(candidate: Candidate) -> RecordEstimate:
+        """Return the retained results of a fit, with its fit indices."""
         # The delay stated in the file is removed from the measured response.
         plant = candidate.fit.plant
         plant = replace(plant, delay_s=plant.delay_s - delay_s)
         if not omega.size:
-            return RecordEstimate.of(candidate, _NO_INDICES)
+            return RecordEstimate.from_candidate(candidate, _NO_INDICES)
         response = grid.evaluate(plant)[0]
-        return RecordEstimate.of(candidate, fit_indices(omega, measured.response, response))
+        return RecordEstimate.from_candidate(
+            candidate, fit_indices(omega, measured.response, response)
+        )
 
     order = list(STRUCTURES)
     requested = [

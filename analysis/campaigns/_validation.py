@@ -148,7 +148,8 @@ def left_out_errors(
     measured = comparison.torque_nm[comparison.retained]
     size = np.linalg.norm(comparison.spectrum(measured))
 
-    def error(plant: Plant) -> float:
+    def prediction_error(plant: Plant) -> float:
+        """Return the relative error of the torque that a plant predicts."""
         predicted, _ = comparison.prediction.torque(plant)
         return float(np.linalg.norm(comparison.spectrum(predicted - measured)) / size)
 
@@ -158,8 +159,8 @@ def left_out_errors(
             method=prediction.method,
             name=prediction.name,
             weighting=prediction.weighting,
-            error=error(prediction.plant),
-            own_error=None if prediction.own is None else error(prediction.own),
+            error=prediction_error(prediction.plant),
+            own_error=None if prediction.own is None else prediction_error(prediction.own),
         )
         for prediction in predictions
     )

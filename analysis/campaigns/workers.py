@@ -125,9 +125,11 @@ class Workers:
         results: dict[int, Result | LostTask] = {}
 
         def submit(index: int) -> Future[Result]:
+            """Start a task by its index."""
             return self._executor.submit(function, *arguments[index])
 
         def store_result(index: int, result: Result | LostTask) -> None:
+            """Store the result of a task and report its completion."""
             results[index] = result
             on_done(index)
 
@@ -234,6 +236,7 @@ class _LocalWorkers(Workers):
         self._most_in_progress = jobs
 
     def _replace_executor(self, *, alone: bool = False) -> None:
+        """Start a new pool after a worker process ended; `alone` requests one process."""
         self.close()
         self._executor = _spawn_pool(1 if alone else self._most_in_progress)
 
@@ -255,6 +258,7 @@ def _initialize_worker() -> None:
     parent = multiprocessing.parent_process()
 
     def end_with_parent() -> None:
+        """End this process when its parent process ends."""
         if parent is not None:
             parent.join()
             os._exit(1)
@@ -360,6 +364,7 @@ class _DaskWorkers(Workers):
 
     @contextmanager
     def _convert_errors(self) -> Iterator[None]:
+        """Convert errors that mean the loss of the scheduler to `CampaignError`."""
         try:
             yield
         except CampaignError:
@@ -373,6 +378,7 @@ class _DaskWorkers(Workers):
             raise CampaignError(self._cluster_lost_message("went away")) from error
 
     def _check_presence(self, last_seen_s: float) -> float:
+        """Return when workers were last present; raise if scheduler or workers are lost."""
         now = time.monotonic()
         if self._client.status != "running":
             raise CampaignError(self._cluster_lost_message("went away"))

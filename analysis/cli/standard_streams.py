@@ -45,6 +45,7 @@ class _PipeTolerantDescriptor(io.FileIO):
     """
 
     def write(self, data: bytes) -> int | None:  # type: ignore[override]
+        """Write data, or discard them if the pipe was closed."""
         try:
             return super().write(data)
         except BrokenPipeError:

@@ -216,6 +216,7 @@ class ChannelChoice:
     factor: float
 
     def __str__(self) -> str:
+        """Return the choice in the form ``CHANNEL:UNIT``."""
         return f"{self.channel}:{self.unit}"
 
 

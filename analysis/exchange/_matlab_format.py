@@ -90,6 +90,7 @@ def _read_channels(
     loaded = {name: contents[name] for name in shapes if name in contents}
 
     def names_in(parent: str) -> Sequence[str]:
+        """Return the names of the fields of a struct, or of all loaded variables."""
         if not parent:
             return list(loaded)
         value = _find_value(path, parent, loaded)
@@ -276,6 +277,7 @@ def _read_hdf5_channel(
     """Return one channel of a MATLAB file of version 7.3."""
 
     def names_in(parent: str) -> Sequence[str]:
+        """Return the names of the members of a group of the file."""
         group = file[parent.replace(".", "/")] if parent else file
         return list(group) if isinstance(group, h5py.Group) else ()
 

@@ -237,6 +237,7 @@ class _FrfProblem:
         return self._recent_linearizations.at(x, self._linearize)
 
     def _linearize(self, x: NDArray[np.float64]) -> _Linearization:
+        """Return model minus measurement and its derivatives with respect to x."""
         model, gradient = self.grid.model.evaluate_with_gradient(
             self.unknowns.damping(x), self.unknowns.structure.free
         )
@@ -261,7 +262,7 @@ def _fit(
     whole_grid: _FrequencyGrid,
 ) -> FrfFit:
     """Fit a damping structure: descents on few points, then refinement on all points."""
-    unknowns = DampingUnknowns.of(structure, whole_grid.model.beam)
+    unknowns = DampingUnknowns.for_beam(structure, whole_grid.model.beam)
     bounds = Box(*unknowns.bounds)
     few_problem, whole_problem = (
         _FrfProblem(unknowns, few_points_grid),
