@@ -1,7 +1,7 @@
 """Offline analyser of session files: frequency response and fractional damping models.
 
-It also offers `load`, `frf`, `fit`, `select` and `campaign` of `analysis.api` for scripts and
-notebooks.
+For scripts and notebooks, it provides `load`, `frf`, `fit`, `select` and `campaign` of
+`analysis.api`.
 """
 
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ __all__ = ["campaign", "fit", "frf", "load", "select"]
 
 
 def __getattr__(name: str) -> object:
-    # Late, so that a command that needs none of it starts at once.
+    # The import is deferred, so that a command that does not need it starts at once.
     if name in __all__:
         from analysis import api
 

@@ -1,11 +1,11 @@
-"""Entry point of ``analyze``, in a module that takes no time to import."""
+"""Entry point of the command ``analyze``, in a module that is fast to import."""
 
 import os
 import signal
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C ends it with 130 even while it is still being imported."""
+    """Run the command; Ctrl-C ends it with exit code 130, even during the imports."""
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
     from analysis.cli.app import main as run
     from rigd.runtime import ignore_handled_signals

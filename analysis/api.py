@@ -1,7 +1,7 @@
-"""The analyser for scripts and notebooks: `load`, `frf`, `fit`, `select` and `campaign`.
+"""Functions of the analyser for scripts: `load`, `frf`, `fit`, `select` and `campaign`.
 
-What the command `analyze` does, step by step, with results as arrays and plain objects. Messages of
-errors are those of the command; nothing is printed, drawn or written.
+They run the steps of the command `analyze` and return arrays and plain objects. Error messages are
+those of the command; nothing is printed, drawn or written.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ __all__ = ["campaign", "fit", "frf", "load", "select"]
 
 
 def load(path: Path | str) -> Record:
-    """Read a session file.
+    """Read a session file and return its record on a uniform time grid.
 
     Parameters
     ----------
     path : Path or str
-        A ``.mcap`` file in the format of ``docs/session_format.md``.
+        Session file (``.mcap``, see ``docs/session_format.md``).
 
     Returns
     -------
@@ -61,6 +61,7 @@ def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyRespo
     Parameters
     ----------
     record : Record
+        Record of a session.
     settings : WelchSettings, optional
         Estimator, segments and band; by default those of the reference paper, limited by the
         record's rate.
@@ -68,12 +69,12 @@ def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyRespo
     Returns
     -------
     FrequencyResponse
-        In N·m/rad, without the channels' delays that the file states; with its coherence.
+        Response in N·m/rad, without the channel delays stated in the file, and its coherence.
 
     Raises
     ------
     FrequencyResponseError
-        The settings do not suit the record, or its angle does not move.
+        The settings are not applicable to the record, or its angle does not move.
 
     Examples
     --------
@@ -122,34 +123,36 @@ def fit(
     weightings: Sequence[str] | None = None,
     band_hz: tuple[float, float] | None = None,
 ) -> RecordAnalysis | WelchAnalysis:
-    """Fit model types to a record.
+    """Fit damping structures to a record.
 
     Parameters
     ----------
     record : Record
+        Record of a session.
     types : sequence of str, optional
-        Names from "I" to "VII"; by default all seven, with "welch" the six of the reference paper.
+        Names of structures, "I" to "VII". The default is all seven, or the six of the reference
+        paper with "welch".
     method : {"record", "welch"}
-        Output error on the whole record, or the reference paper's fit to Welch's estimate.
+        Output-error fit to the whole record, or the reference paper's fit to Welch's estimate.
     fixed : iterable of str
-        With "record" only: settings of beam and rig that stay at the file's values, of
-        `analysis.identify.SETTINGS`.
+        Parameters of beam and rig that stay at the file's values, from
+        `analysis.identify.SETTINGS`; for "record" only.
     weightings : sequence of str, optional
-        With "welch" only: "const", "omega", "omega^K"; by default the first two.
+        Weightings "const", "omega" and "omega^K", by default the first two; for "welch" only.
     band_hz : tuple of float, optional
-        First and last frequency; by default 0 to 50 Hz, with "welch" the reference paper's band,
-        either up to 0.4 of the record's rate.
+        First and last frequency. The default is 0 to 50 Hz, or the reference paper's band with
+        "welch", both limited to 0.4 of the record's sampling rate.
 
     Returns
     -------
     RecordAnalysis or WelchAnalysis
-        By method.
+        Results of the method "record" or "welch".
 
     Raises
     ------
     ValueError
-        No such type, method or setting; among its kinds those of the methods:
-        `MeasurementError` and `FrequencyResponseError`, if the record cannot be used.
+        A type, method or parameter does not exist. Its subclasses `MeasurementError` and
+        `FrequencyResponseError` are raised if the record cannot be used.
 
     Examples
     --------
@@ -197,20 +200,22 @@ def select(
     fixed: Iterable[Setting] = (),
     band_hz: tuple[float, float] | None = None,
 ) -> Selection:
-    """Fit every structure to a record, and select the one that its data support.
+    """Fit every damping structure to a record, and select the best supported one.
 
     Parameters
     ----------
     record : Record
+        Record of a session.
     fixed : iterable of str
-        Settings that stay at the file's values.
+        Parameters of beam and rig that stay at the file's values.
     band_hz : tuple of float, optional
-        By default 0 to 50 Hz, up to 0.4 of the record's rate.
+        First and last frequency, by default 0 to 50 Hz, limited to 0.4 of the record's sampling
+        rate.
 
     Returns
     -------
     Selection
-        Selected fit, verdict in words, and all candidates.
+        Selected fit, verdict in sentences, and all candidates.
 
     Raises
     ------
@@ -243,25 +248,25 @@ def campaign(
     types : sequence of str, optional
         Structures fitted to the whole records; by default all seven.
     fixed : sequence of str
-        Settings that stay at the file's values in those fits.
+        Parameters of beam and rig that stay at the files' values in these fits.
     jobs : int, optional
-        Worker processes, by default one per core.
+        Number of worker processes, by default one per core.
     dask : str, optional
-        Address of a Dask scheduler to use instead.
+        Address of a Dask scheduler whose workers are used instead.
 
     Returns
     -------
     CampaignResult
-        Every session's results, statistics, nominal models, pooled estimate, validation.
+        Results of the sessions, statistics, nominal models, pooled estimates and validation.
 
     Raises
     ------
     CampaignError
-        No session could be analysed, or the workers could not be had.
+        No session could be analysed, or no workers are available.
 
     Notes
     -----
-    A script has to call this under ``if __name__ == "__main__":``; a notebook need not.
+    A script must call this function under ``if __name__ == "__main__":``; a notebook need not.
     """
     from analysis.campaigns import campaign as run
     from analysis.models import STRUCTURES

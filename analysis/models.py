@@ -1,13 +1,13 @@
 """Damping structures, their parametrization, and the settings with which they are fitted.
 
-A structure says which damping parameters are fitted and which stay fixed. Types I to VI have the
+A structure defines which damping parameters are fitted and which are fixed. Types I to VI have the
 fixed values of Table 2 of the reference paper. Type VII follows from its conclusions: internal
 damping of integer order (alpha = 1) with external damping of fractional order.
 
-A coefficient and its order are almost interchangeable near the frequencies where they act: a fit of
-``zeta`` and ``alpha`` themselves descends along a curved flat direction (their correlation is
--0.99). So the unknowns of a fit to a frequency response (`DampingUnknowns`) are the logarithm of
-the damping's size at one frequency, and the order:
+A coefficient and its order have almost the same effect near the frequencies where they act: a fit
+of ``zeta`` and ``alpha`` themselves would follow a curved flat direction (their correlation is
+-0.99). The unknowns of a fit to a frequency response (`DampingUnknowns`) are therefore the
+logarithm of the damping at one frequency, and the order:
 
 * ``ln(zeta omega_2^alpha)``: internal damping relative to the stiffness at the undamped second
   mode, and ``alpha``;
@@ -43,11 +43,13 @@ if TYPE_CHECKING:
 # Structures
 
 Parameter = Literal["zeta", "alpha", "gamma", "lambda"]
+"""Name of a damping parameter."""
 PARAMETERS: Final[tuple[Parameter, ...]] = ("zeta", "alpha", "gamma", "lambda")
+"""Names of the damping parameters: coefficient and order of internal and of external damping."""
 COEFFICIENT_OF: Final[Mapping[str, Parameter]] = MappingProxyType(
     {"alpha": "zeta", "lambda": "gamma"}
 )
-"""The coefficient that belongs to an order of the damping, and means nothing without it."""
+"""Coefficient of the damping whose order each parameter is."""
 
 QUANTITIES: Final[Mapping[str, tuple[str, str, str, float]]] = MappingProxyType(
     {
@@ -67,13 +69,13 @@ QUANTITIES: Final[Mapping[str, tuple[str, str, str, float]]] = MappingProxyType(
         "drag": ("C_D d", "drag of the air", "mm", 1e3),
     }
 )  # fmt: skip
-"""Parameters of damping, beam and rig: symbol, meaning, unit shown, and how many of that make one
-SI unit."""
+"""Symbol, meaning, display unit and display factor of each parameter of damping, beam and rig. A
+value in SI units times the factor is in the display unit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """Choice of free and fixed damping parameters.
+    """Damping structure: a choice of free and fixed damping parameters.
 
     Attributes
     ----------
@@ -82,7 +84,8 @@ class Structure:
     free : tuple of str
         Parameters to be fitted, in the order of `PARAMETERS`.
     fixed : mapping of str to float
-        The others with their values. An order of 0 belongs to a coefficient of 0: absent damping.
+        Values of the other parameters. A damping that the structure lacks has coefficient and order
+        0.
 
     Examples
     --------
@@ -99,21 +102,23 @@ class Structure:
 
     @property
     def internal(self) -> bool:
-        """Return whether the structure has internal damping (of the material)."""
+        """Whether the structure has internal damping (of the material)."""
         return "zeta" in self.free
 
     @property
     def external(self) -> bool:
-        """Return whether the structure has external damping (of the environment)."""
+        """Whether the structure has external damping (of the environment)."""
         return "gamma" in self.free
 
     def has(self, name: str) -> bool:
-        """Return whether a parameter has a meaning in the structure (always for beam and rig).
+        """Return whether the structure has the kind of damping to which a parameter belongs.
+
+        The result is True for a parameter of beam or rig.
 
         Parameters
         ----------
         name : str
-            A name of `PARAMETERS`, or a parameter of beam or rig.
+            Name of a damping parameter (`PARAMETERS`), or of a parameter of beam or rig.
         """
         if name in ("zeta", "alpha"):
             return self.internal
@@ -122,17 +127,18 @@ class Structure:
         return True
 
     def damping(self, values: Mapping[Parameter, float]) -> Damping:
-        """Complete the free parameters' `values` with the fixed ones."""
-        every = {**self.fixed, **{name: values[name] for name in self.free}}
+        """Return the damping with given values of the free parameters, and the fixed values."""
+        values_by_name = {**self.fixed, **{name: values[name] for name in self.free}}
         return Damping(
-            zeta=every["zeta"],
-            alpha=every["alpha"],
-            gamma=every["gamma"],
-            lambda_=every["lambda"],
+            zeta=values_by_name["zeta"],
+            alpha=values_by_name["alpha"],
+            gamma=values_by_name["gamma"],
+            lambda_=values_by_name["lambda"],
         )
 
 
 def _structure(name: str, fixed: dict[Parameter, float]) -> Structure:
+    """Return a damping structure with given fixed parameters; the other ones are free."""
     free = tuple(p for p in PARAMETERS if p not in fixed)
     return Structure(name, free, MappingProxyType(fixed))
 
@@ -151,6 +157,7 @@ STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
         )
     }
 )
+"""Damping structures by name, I to VII."""
 
 
 # Response of a structure
@@ -165,7 +172,9 @@ class FrequencyResponseModel:
     Parameters
     ----------
     frequency_hz : ndarray, shape (n,)
+        Frequencies of the grid.
     beam : Beam
+        Beam on the clamp.
     tool_inertia_kg_m2 : float
         Inertia between the sensor and the beam about the motor's axis.
 
@@ -180,7 +189,7 @@ class FrequencyResponseModel:
     [0.0688 0.0911]
     """
 
-    __slots__ = ("_grid", "_tool", "beam")
+    __slots__ = ("_grid", "_tool_response", "beam")
 
     def __init__(
         self, frequency_hz: NDArray[np.float64], beam: Beam, tool_inertia_kg_m2: float = 0.0
@@ -188,63 +197,65 @@ class FrequencyResponseModel:
         s = 2j * np.pi * frequency_hz
         self.beam = beam
         self._grid = TransferGrid(s)
-        self._tool = tool_inertia_kg_m2 * s * s
+        self._tool_response = tool_inertia_kg_m2 * s * s
 
     def evaluate(self, damping: Damping) -> NDArray[np.complex128]:
         """Return the response in N·m/rad, shape (n,)."""
-        return self._grid.evaluate(self.beam, damping) + self._tool
+        return self._grid.evaluate(self.beam, damping) + self._tool_response
 
     def evaluate_with_gradient(
         self, damping: Damping, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return the response, shape (n,), and its derivatives by the parameters `wrt`, (k, n).
+        """Return the response, shape (n,), and its derivatives by parameters, shape (k, n).
 
         Parameters
         ----------
         damping : Damping
-            Where the response is evaluated.
+            Damping at which response and derivatives are evaluated.
         wrt : sequence of str
-            Names of `rigd.beam.PARAMETERS`.
+            Names of the k parameters, from `rigd.beam.PARAMETERS`.
         """
         response, gradient = self._grid.evaluate_with_gradient(self.beam, damping, wrt)
-        return response + self._tool, gradient
+        return response + self._tool_response, gradient
 
 
 # Weights of the cost
 
 WeightingFunction = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Function from angular frequencies in rad/s to weights."""
 Weighting = str | WeightingFunction
+"""Name of a weighting, or its function."""
 
-_LARGEST_POWER = 10
-"""Beyond it, a handful of points at one end of the band would have all the weight."""
+_LARGEST_EXPONENT = 10
+"""Largest exponent K of a weighting omega^K; with a larger one, few points have all the weight."""
 
 
 class WeightingError(ValueError):
-    """The weighting does not exist, or is not positive and finite where it is used."""
+    """Error if a weighting does not exist, or if its values are negative or not finite."""
 
 
 def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[np.float64]:
-    """Return weights ``W_p = p(omega_p) / sum_i p(omega_i)`` on an evenly spaced grid (A5).
+    """Return the weights ``W_p = p(omega_p) / sum_i p(omega_i)`` of a frequency grid.
 
     Parameters
     ----------
     omega_rad_s : ndarray, shape (n,)
-        Positive.
+        Angular frequencies: positive, evenly spaced.
     weighting : str or callable
         ``"const"``: p = 1, the mean square error. ``"omega"``: p = 1/omega, the mean over a
         logarithmic frequency axis. ``"omega^K"`` with a number K: p = omega**K, so that
-        ``"omega"`` is ``"omega^-1"`` by another name. A callable is p itself: omega in rad/s,
-        shape (n,), to values of that shape that are not negative.
+        ``"omega"`` is the same as ``"omega^-1"``. A callable is the function p: it takes omega in
+        rad/s, shape (n,), and returns values of that shape that are not negative.
 
     Returns
     -------
     ndarray, shape (n,)
-        Not negative, of sum 1.
+        Weights: not negative, with a sum of 1.
 
     Raises
     ------
     WeightingError
-        If there is no such weighting, or its values are negative, not finite or all zero.
+        If the weighting does not exist, or its values are negative, not finite or all zero.
 
     Examples
     --------
@@ -273,12 +284,12 @@ def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[n
 
 
 def weighting_name(weighting: Weighting) -> str:
-    """Return the name of a weighting in results: its own name, or that of its function.
+    """Return the name of a weighting for results: its text, or the name of its function.
 
     Raises
     ------
     WeightingError
-        If there is no weighting of that name.
+        If no weighting has that name.
 
     Examples
     --------
@@ -293,6 +304,7 @@ def weighting_name(weighting: Weighting) -> str:
 
 
 def _exponent(weighting: str) -> float:
+    """Return the exponent K of a named weighting omega^K; raise if the name is not valid."""
     if weighting == "const":
         return 0.0
     if weighting == "omega":
@@ -302,10 +314,10 @@ def _exponent(weighting: str) -> float:
         exponent = float(power)
     except ValueError:
         exponent = math.nan
-    if base != "omega" or not separator or not abs(exponent) <= _LARGEST_POWER:
+    if base != "omega" or not separator or not abs(exponent) <= _LARGEST_EXPONENT:
         raise WeightingError(
             f"There is no weighting {weighting!r}; choose const, omega (which is 1/omega) or "
-            f"omega^K with a number K from -{_LARGEST_POWER} to {_LARGEST_POWER}, such as "
+            f"omega^K with a number K from -{_LARGEST_EXPONENT} to {_LARGEST_EXPONENT}, such as "
             "omega^-0.5."
         )
     return exponent
@@ -314,14 +326,17 @@ def _exponent(weighting: str) -> float:
 # Settings of the fits
 
 RECORD_BAND_HZ: Final = (0.0, 50.0)
-"""Band of the whole-record fits, where the record's rate holds it."""
+"""Default frequency band of the whole-record fits, if the sampling rate is high enough."""
 
 LARGEST_FRACTION_OF_RATE: Final = 0.4
-"""Highest frequency that is fitted, over the sampling rate: filters need room up to half of it."""
+"""Highest fitted frequency relative to the sampling rate; filters need the range above it."""
 
 PAPER_BAND_HZ: Final = (0.5875, 50.0)
+"""Frequency band of the Welch fits in the reference paper."""
 PAPER_TYPES: Final = ("I", "II", "III", "IV", "V", "VI")
+"""Structures fitted in the reference paper."""
 PAPER_WEIGHTINGS: Final = ("const", "omega")
+"""Weightings used in the reference paper."""
 
 ESTIMATOR_WORDS: Final[Mapping[Estimator, str]] = {
     "h1": "Welch's H1",
@@ -330,18 +345,18 @@ ESTIMATOR_WORDS: Final[Mapping[Estimator, str]] = {
     "iv": "Welch's Hiv",
     "fft": "whole-record FFT",
 }
-"""What reports and figures call an estimator."""
+"""Names of the estimators in reports and figures."""
 
 
 def estimate_text(estimator: Estimator, segmentation: Segmentation, segments: int | str) -> str:
-    """Describe how a frequency response was estimated.
+    """Describe the estimator and the segments of a frequency response.
 
     Parameters
     ----------
     estimator : str
-        As of `WelchSettings`.
+        Estimator as in `WelchSettings`.
     segmentation : Segmentation
-        Lengths in samples.
+        Segment length, overlap and FFT length in samples.
     segments : int or str
         Number of segments.
 
@@ -366,17 +381,17 @@ class WelchSettings:
     Attributes
     ----------
     estimator : {"h1", "h2", "hv", "iv", "fft"}
-        "iv" is Hiv, with the reference as instrument; "fft" is the ratio of two
+        Estimator: "iv" is Hiv, with the reference as instrument; "fft" is the ratio of the Fourier
         transforms of the whole record.
     segment_length, overlap, nfft : int, optional
-        In samples. None selects the durations of the reference paper at the record's rate; with a
-        given segment, 15 % of it as overlap and a transform no shorter than it.
+        Lengths of segment, overlap and FFT in samples. None selects the durations of the reference
+        paper; if only the segment is given, the overlap is 15 % of it and the FFT no shorter.
     band_hz : tuple of float
-        First and last frequency fitted, both included.
+        First and last fitted frequency, both included.
     types : tuple of str
-        Names of `analysis.models.STRUCTURES`.
+        Names of the fitted structures, from `analysis.models.STRUCTURES`.
     weightings : tuple of str
-        Names that `analysis.models.weights` knows.
+        Names of weightings, as for `analysis.models.weights`.
     """
 
     estimator: Estimator = "h1"
@@ -388,15 +403,15 @@ class WelchSettings:
     weightings: tuple[str, ...] = PAPER_WEIGHTINGS
 
     @property
-    def are_usual(self) -> bool:
-        """Return whether estimator and segments are those of the reference paper."""
-        chosen = self.segment_length or self.overlap or self.nfft
-        return self.estimator == "h1" and not chosen
+    def are_from_paper(self) -> bool:
+        """Whether estimator and segments are those of the reference paper."""
+        custom_length = self.segment_length or self.overlap or self.nfft
+        return self.estimator == "h1" and not custom_length
 
     def segmentation(self, rate_hz: float) -> Segmentation:
-        """Return the segmentation in samples at a rate.
+        """Return the lengths of segment, overlap and FFT in samples at a sampling rate.
 
-        The durations of the reference paper are the defaults.
+        Lengths that are not set have the durations of the reference paper.
 
         Examples
         --------
@@ -419,48 +434,53 @@ class WelchSettings:
 
 # Unknowns of a fit to a frequency response
 
-# Orders as the paper sweeps them, inside (0, 2). Sizes run from what no response could show to
-# far beyond what lets a beam vibrate, much wider than the paper's sweep, which its own results
-# leave (type IV with 1/omega weights has zeta = 2.4e-3, the sweep ends at 3.05e-4).
 ORDER_RANGE: Final = (0.001, 1.999)
+"""Range of the orders alpha and lambda, as in the reference paper."""
+
 SIZE_RANGE: Final = (1e-9, 1e3)
+"""Range of the damping relative to stiffness or inertia, from too small to be visible to too large
+for a vibration. It is much wider than the range of the reference paper, which its own results
+exceed (type IV with 1/omega weights has zeta = 2.4e-3, but the range ends at 3.05e-4)."""
 
 
 @dataclass(frozen=True, slots=True)
 class DampingUnknowns:
-    """Vector of unknowns of one structure on one beam, in the order of ``structure.free``."""
+    """Conversion between damping parameters and the unknowns of a fit to a frequency response.
+
+    The unknowns are in the order of ``structure.free`` (see `analysis.models`).
+    """
 
     structure: Structure
-    """Says which parameters are free."""
+    """Damping structure, which defines the free parameters."""
     ln_internal_rad_s: float
-    """ln of the undamped second mode, where internal damping is sized."""
+    """Logarithm of the undamped second mode's frequency, the reference of internal damping."""
     ln_external_rad_s: float
-    """ln of the undamped first mode, where external damping is sized."""
+    """Logarithm of the undamped first mode's frequency, the reference of external damping."""
     ln_external_unit: float
-    """ln of the inertia there, ``rho/EI omega²``."""
+    """Logarithm of ``rho/EI omega²``, the inertia at the first mode, relative to stiffness."""
 
     @classmethod
-    def of(cls, structure: Structure, beam: Beam) -> DampingUnknowns:
-        """Return the unknowns with the beam's own modes as reference frequencies of the damping.
+    def for_beam(cls, structure: Structure, beam: Beam) -> DampingUnknowns:
+        """Return the unknowns with the undamped modes of a beam as reference frequencies.
 
         Parameters
         ----------
         structure : Structure
-            Says which parameters are free.
+            Damping structure, which defines the free parameters.
         beam : Beam
-            Beam whose first two undamped modes are taken.
+            Beam whose first two undamped modes are the reference frequencies.
         """
-        first, second = (float(w) for w in undamped_frequencies_rad_s(beam, 2))
+        first_rad_s, second_rad_s = (float(w) for w in undamped_frequencies_rad_s(beam, 2))
         return cls(
             structure=structure,
-            ln_internal_rad_s=math.log(second),
-            ln_external_rad_s=math.log(first),
-            ln_external_unit=math.log(beam.density_over_stiffness * first**2),
+            ln_internal_rad_s=math.log(second_rad_s),
+            ln_external_rad_s=math.log(first_rad_s),
+            ln_external_unit=math.log(beam.density_over_stiffness * first_rad_s**2),
         )
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return lower and upper bounds, shape (k,)."""
+        """Lower and upper bounds of the unknowns, each of shape (k,)."""
         ranges = [
             ORDER_RANGE if name in ("alpha", "lambda") else tuple(map(math.log, SIZE_RANGE))
             for name in self.structure.free
@@ -468,34 +488,39 @@ class DampingUnknowns:
         return np.array([low for low, _ in ranges]), np.array([high for _, high in ranges])
 
     def parameters(self, x: NDArray[np.float64]) -> dict[Parameter, float]:
-        """Return all four damping parameters at `x`."""
+        """Return the four damping parameters for unknowns `x`, shape (k,)."""
         free: dict[Parameter, float] = dict(zip(self.structure.free, map(float, x), strict=True))
-        every = {**self.structure.fixed, **free}
+        parameters = {**self.structure.fixed, **free}
         if self.structure.internal:
-            every["zeta"] = math.exp(free["zeta"] - every["alpha"] * self.ln_internal_rad_s)
-        if self.structure.external:
-            every["gamma"] = math.exp(
-                free["gamma"] + self.ln_external_unit - every["lambda"] * self.ln_external_rad_s
+            parameters["zeta"] = math.exp(
+                free["zeta"] - parameters["alpha"] * self.ln_internal_rad_s
             )
-        return every
+        if self.structure.external:
+            parameters["gamma"] = math.exp(
+                free["gamma"]
+                + self.ln_external_unit
+                - parameters["lambda"] * self.ln_external_rad_s
+            )
+        return parameters
 
     def damping(self, x: NDArray[np.float64]) -> Damping:
-        """Return the damping at `x`."""
+        """Return the damping for unknowns `x`, shape (k,)."""
         return self.structure.damping(self.parameters(x))
 
     def derivative_of_parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Differentiate the free parameters by the unknowns, shape (k, k): [parameter, unknown].
+        """Return the derivatives of the free parameters by the unknowns, shape (k, k).
 
-        An order changes its coefficient too, since the size is constant.
+        Rows are parameters, columns unknowns. An order also changes its coefficient, because the
+        damping at the reference frequency is constant.
         """
         parameters = self.parameters(x)
-        row = {name: i for i, name in enumerate(self.structure.free)}
-        derivative = np.eye(len(row))
+        indices = {name: i for i, name in enumerate(self.structure.free)}
+        derivative = np.eye(len(indices))
         ln_rad_s = {"alpha": self.ln_internal_rad_s, "lambda": self.ln_external_rad_s}
         for order, coefficient in COEFFICIENT_OF.items():
-            if coefficient in row:
-                derivative[row[coefficient], row[coefficient]] = parameters[coefficient]
-                if order in row:
-                    slope = -parameters[coefficient] * ln_rad_s[order]
-                    derivative[row[coefficient], row[order]] = slope
+            if coefficient in indices:
+                derivative[indices[coefficient], indices[coefficient]] = parameters[coefficient]
+                if order in indices:
+                    coefficient_slope = -parameters[coefficient] * ln_rad_s[order]
+                    derivative[indices[coefficient], indices[order]] = coefficient_slope
         return derivative

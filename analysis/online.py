@@ -37,43 +37,46 @@ if TYPE_CHECKING:
     from rigd.session.online_fit import StreamStart
 
 _NOISE_POINTS: Final = 40
-_NICE: Final = 5
-"""Niceness of the program while its estimates are awaited: below the rig's own processes, a third
-of a processor in competition with another program."""
+"""Number of frequencies at which the noise spectrum is reported."""
+_NICENESS: Final = 5
+"""Niceness of the program while its estimates are awaited. Its priority is below that of the rig's
+processes; it receives a third of a processor in competition with another program."""
 
-_NEED_NO_MODE: Final = frozenset({"sign", "unit", "clipping", "stop", "hum", "sensor drift"})
-"""Kinds of findings that do not rest on a fitted beam."""
+_FINDINGS_WITHOUT_MODES: Final = frozenset(
+    {"sign", "unit", "clipping", "stop", "hum", "sensor drift"}
+)
+"""Kinds of findings that do not depend on a fitted beam."""
 
 
 @dataclass(frozen=True, slots=True)
 class OnlineEstimate:
-    """Estimate from the samples up to a tick.
+    """Estimate of a running session, from the samples up to a tick.
 
     Attributes
     ----------
     tick : int
-        First tick that was excluded.
+        First excluded tick.
     duration_s : float
-        Length of the record used.
+        Duration of the record used.
     whole : bool
-        Whether every structure was tested, as `analysis.select` does; otherwise the freest alone,
-        with the same tests of its residual.
+        Whether every structure was tested, as in `analysis.select`. If not, only the freest
+        structure was fitted, with the same tests of its residual.
     took_s : float
-        Computing time.
+        Computing time in seconds.
     headline : Headline or None
-        The numbers, with flags; None if there was no fit.
+        Reported estimates with flags; None without a fit.
     orders : tuple of OrderVerdict
         Verdicts on alpha and lambda; empty unless `whole`.
     findings : tuple of Finding
-        Effects in addition to the beam, and reasons against the numbers.
+        Effects in addition to the beam, and reasons against the estimates.
     analysis : RecordAnalysis or None
-        The fits with the noise.
+        Fits with the noise spectrum; None without a fit.
     warnings : tuple of str
-        Sentences on the samples: missing, stale, saturated.
+        Sentences on missing, stale and saturated samples.
     problem : str
-        Why there was no fit; else empty.
+        Reason why there is no fit; empty with a fit.
     validity : Validity
-        How exact the linear model is for the record.
+        Validity of the linear model for the record.
     """
 
     tick: int
@@ -90,23 +93,27 @@ class OnlineEstimate:
 
     @property
     def doubt(self) -> str | None:
-        """Return the reason against all numbers; None if some are valid."""
+        """Reason against all estimates; None if at least one has no flag."""
         headline = self.headline
         if headline is None:
             return self.problem
-        numbers = [
+        reported_values = [
             *headline.parameters.values(),
-            *(each for mode in headline.modes for each in (mode.frequency_hz, mode.damping_ratio)),
+            *(
+                reported_value
+                for mode in headline.modes
+                for reported_value in (mode.frequency_hz, mode.damping_ratio)
+            ),
         ]
-        flags = [each.flag for each in numbers]
+        flags = [reported_value.flag for reported_value in reported_values]
         return None if None in flags else flags[0]
 
     @property
     def predicting(self) -> RecordFit | None:
-        """Return the fit for predictions of the next excitation; None if there was no fit.
+        """Fit with which the next excitation is planned; None without a fit.
 
-        It has both dampings. An insignificant damping, or one without an identifiable order (which
-        may be a stiffness or an inertia), has order 1.
+        It has internal and external damping. A damping that is insignificant, or whose order is not
+        identifiable (so that it may be a stiffness or an inertia), has order 1.
         """
         from analysis.identify import INTEGER
         from analysis.models import COEFFICIENT_OF
@@ -118,14 +125,16 @@ class OnlineEstimate:
         flagged = {name for name in COEFFICIENT_OF if name in headline.flags}
         if not flagged or fit is not headline.fit:
             return fit
-        return next((each for each in analysis.fits if each.structure is INTEGER), fit)
+        return next(
+            (candidate for candidate in analysis.fits if candidate.structure is INTEGER), fit
+        )
 
     @property
     def plant(self) -> Plant | None:
-        """Return the plant of `predicting` with the measured modes; None if there was no fit.
+        """Plant with which the next excitation is planned; None without a fit.
 
-        If a uniform beam does not predict the modal constants, each mode has a stiffness of its
-        own.
+        It is the plant of the fit `predicting`. If a uniform beam does not predict the modal
+        constants, each mode has its own measured stiffness.
         """
         headline, fit = self.headline, self.predicting
         if headline is None or fit is None:
@@ -136,7 +145,7 @@ class OnlineEstimate:
         return headline.modal.plant_like(fit.plant)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the estimate as `json.dumps` takes it (docs/online_fit.md)."""
+        """Return the estimate as a JSON document (docs/online_fit.md)."""
         from analysis.identify import headline_json
         from analysis.results import finite
 
@@ -148,7 +157,7 @@ class OnlineEstimate:
             "problem": self.problem,
             "doubt": self.doubt,
             "warnings": self.warnings,
-            "findings": [each.sentence for each in self.findings],
+            "findings": [finding.sentence for finding in self.findings],
             "modes": [],
         }
         headline, fit, plant = self.headline, self.predicting, self.plant
@@ -158,14 +167,14 @@ class OnlineEstimate:
                 "predicting": fit.structure.name,
                 "plant": asdict(plant),
                 "covariance": {"names": fit.determined, "matrix": fit.covariance.tolist()},
-                "noise": _noise(self.analysis),
+                "noise": _noise_spectrum(self.analysis),
             }
             del content["file"]
         return dict(finite(content))
 
 
-def _noise(analysis: RecordAnalysis) -> dict[str, Any]:
-    """Return the noise spectrum on fewer points."""
+def _noise_spectrum(analysis: RecordAnalysis) -> dict[str, Any]:
+    """Return the noise spectrum, interpolated at a few frequencies, as a JSON document."""
     import numpy as np
 
     hz = analysis.frequency_hz
@@ -175,16 +184,16 @@ def _noise(analysis: RecordAnalysis) -> dict[str, Any]:
 
 
 class OnlineEstimator:
-    """Fit of the recorded part of a running session.
+    """Estimator that fits the recorded part of a running session.
 
     Parameters
     ----------
     metadata : mapping of str to str
-        The record ``session`` of its file (docs/session_format.md): rate, beam, delays.
+        Metadata ``session`` of its file (docs/session_format.md): rate, beam, delays.
     segments : mapping of str to (int, int), optional
-        Planned segments: name → first tick and end (exclusive).
+        First tick and end (exclusive) of the planned segments, by name.
     name : str
-        Name in messages.
+        Name of the session in messages.
 
     Examples
     --------
@@ -210,28 +219,28 @@ class OnlineEstimator:
         self._segments = dict(segments or {})
         self._path = Path(name)
         self._blocks: list[NDArray[np.void]] = []
-        self._count = 0
+        self._sample_count = 0
         self._last_selection: Selection | None = None
 
     def feed(self, samples: NDArray[np.void]) -> None:
-        """Append the next samples.
+        """Append the next samples of the session.
 
         Parameters
         ----------
         samples : ndarray of `rigd.session.layout.SAMPLE_DTYPE`, shape (n,)
-            In the order of their ticks.
+            Samples in the order of their ticks.
         """
         from analysis.record import MAX_SAMPLES, RECORD_FIELDS
 
-        if self._count <= MAX_SAMPLES:  # one more than that, and `record` says that it is too long
+        if self._sample_count <= MAX_SAMPLES:  # with more samples, `record` raises an error
             fields = samples[list(RECORD_FIELDS)]
             self._blocks.append(
                 fields.astype([(name, fields.dtype[name]) for name in RECORD_FIELDS])
             )
-            self._count += len(samples)
+            self._sample_count += len(samples)
 
     def record(self, up_to_tick: int | None = None) -> Record:
-        """Return the record so far, as `analysis.load` returns it for a file with these samples.
+        """Return the record of the samples so far, as `analysis.load` returns it for a file.
 
         Parameters
         ----------
@@ -241,7 +250,7 @@ class OnlineEstimator:
         Raises
         ------
         SessionError, RecordError
-            There is no record, or it cannot be analysed.
+            There are no samples, or they cannot be analysed.
         """
         import numpy as np
 
@@ -253,9 +262,9 @@ class OnlineEstimator:
         if up_to_tick is not None:
             samples = samples[: np.searchsorted(samples["tick"], max(up_to_tick, 0))]
         end = int(samples["tick"][-1]) + 1 if len(samples) else 0
-        # What is planned beyond was not cut short: it is still to come.
-        so_far = segments_until(self._segments, end)
-        if not end or ("sweep" in self._segments and "sweep" not in so_far):
+        # Segments after the last sample are still to come, and do not count as cut short.
+        past_segments = segments_until(self._segments, end)
+        if not end or ("sweep" in self._segments and "sweep" not in past_segments):
             raise RecordError("Nothing is excited yet.")
         return record_of(
             Session(
@@ -263,7 +272,7 @@ class OnlineEstimator:
                 samples=samples,
                 start_utc_ns=0,
                 metadata=self._metadata,
-                segments=so_far,
+                segments=past_segments,
                 outcome=None,
                 events=[],
                 attachments={},
@@ -280,22 +289,23 @@ class OnlineEstimator:
         up_to_tick : int, optional
             Samples from this tick on are excluded.
         whole : bool
-            Test every structure, as `analysis.select` does, in four times the time.
+            Whether every structure is tested, as in `analysis.select`, which takes four times as
+            long.
         from_last : bool
-            Allow such an estimate to start from the last one, if that explains these samples too.
-            This takes a third of the time, but may miss one of several minima.
+            Whether such an estimate may start from the last one, if that explains these samples,
+            too. This takes a third of the time, but may miss one of several minima.
 
         Returns
         -------
         OnlineEstimate
-            Estimate, or the reason why nothing can be fitted.
+            Estimate, or the reason why no fit is possible.
         """
         from analysis.identify import Measurement, MeasurementError, freest_alone, select
         from analysis.record import RecordError
         from analysis.suited import record_band_hz
         from analysis.validity import record_validity
 
-        began_s = time.monotonic()
+        started_s = time.monotonic()
         tick, duration_s = up_to_tick or 0, 0.0
         try:
             record = self.record(up_to_tick)
@@ -304,36 +314,36 @@ class OnlineEstimator:
             measurement, band_hz = Measurement.of_record(record), record_band_hz(record)
             orders: tuple[OrderVerdict, ...] = ()
             if whole:
-                before = self._last_selection if from_last else None
-                selection = select(measurement, band_hz=band_hz, earlier=before)
+                last_selection = self._last_selection if from_last else None
+                selection = select(measurement, band_hz=band_hz, earlier=last_selection)
                 self._last_selection = selection
                 headline, analysis = selection.headline, selection.analysis
-                found = selection.verdict.findings
+                findings = selection.verdict.findings
                 orders = (selection.verdict.alpha, selection.verdict.lambda_)
             else:
-                headline, found, analysis = freest_alone(measurement, band_hz)
+                headline, findings, analysis = freest_alone(measurement, band_hz)
         except (SessionError, RecordError, ArithmeticError, ValueError) as error:
-            # A running session gets the reason, and goes on; later samples may suffice.
-            foreseen = isinstance(error, SessionError | RecordError | MeasurementError)
+            # A running session receives the reason and continues, as later samples may suffice.
+            is_expected = isinstance(error, SessionError | RecordError | MeasurementError)
             problem = f"The record so far cannot be fitted ({error!r})."
-            problem = str(error).removeprefix(f"{self._path}: ") if foreseen else problem
-            took_s = time.monotonic() - began_s
+            problem = str(error).removeprefix(f"{self._path}: ") if is_expected else problem
+            took_s = time.monotonic() - started_s
             return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
-        shows = bool(headline.visible_modes)
+        has_modes = bool(headline.visible_modes)
         plant = headline.fit.plant
         return OnlineEstimate(
             tick=tick,
             duration_s=duration_s,
             whole=whole,
-            took_s=time.monotonic() - began_s,
-            headline=headline if shows else None,
-            orders=orders if shows else (),
-            findings=found
-            if shows
-            else tuple(each for each in found if each.kind in _NEED_NO_MODE),
-            analysis=analysis if shows else None,
+            took_s=time.monotonic() - started_s,
+            headline=headline if has_modes else None,
+            orders=orders if has_modes else (),
+            findings=findings
+            if has_modes
+            else tuple(finding for finding in findings if finding.kind in _FINDINGS_WITHOUT_MODES),
+            analysis=analysis if has_modes else None,
             warnings=record.warnings,
-            problem="" if shows else "No mode has been excited enough yet.",
+            problem="" if has_modes else "No mode has been excited enough yet.",
             validity=record_validity(
                 record.metadata, record.angle_rad, record.rate_hz, (plant.beam, plant.damping)
             ),
@@ -344,13 +354,14 @@ class OnlineEstimator:
 
 
 def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateRequest]) -> None:
-    """Answer requests until the stream ends.
+    """Fit a session's samples from a stream, and write the estimates to standard output.
 
     Parameters
     ----------
     start : StreamStart
+        Metadata and segments of the session, and the interval of estimates.
     frames : iterator
-        Frames from `rigd.session.read_frames`.
+        Samples and requests, from `rigd.session.online_fit.read_frames`.
 
     Raises
     ------
@@ -358,30 +369,33 @@ def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateReques
         The stream is broken.
     """
     fit = OnlineEstimator(start.metadata, start.segments)
-    came: queue.SimpleQueue[NDArray[np.void] | EstimateRequest | SessionError | None]
-    came = queue.SimpleQueue()
+    received: queue.SimpleQueue[NDArray[np.void] | EstimateRequest | SessionError | None]
+    received = queue.SimpleQueue()
 
-    def read() -> None:
-        # In another thread than the fit, so that the sender never waits for it.
+    def receive_frames() -> None:
+        """Put all frames of the stream into the queue, then an error or None."""
+        # This runs in a thread of its own, so that the sender never waits for the fit.
         end = None
         try:
             for frame in frames:
-                came.put(frame)
+                received.put(frame)
         except SessionError as error:
             end = error
-        came.put(end)
+        received.put(end)
 
-    threading.Thread(target=read, daemon=True).start()
+    threading.Thread(target=receive_frames, daemon=True).start()
     due_s = None if start.every_s is None else time.monotonic() + start.every_s
     number = 0
     while True:
         try:
-            frame = came.get(timeout=None if due_s is None else max(due_s - time.monotonic(), 0))
+            frame = received.get(
+                timeout=None if due_s is None else max(due_s - time.monotonic(), 0)
+            )
         except queue.Empty:
-            # All that came meanwhile is in: the estimate is as fresh as it can be.
+            # All samples received so far are in the estimate.
             assert start.every_s is not None
             due_s = time.monotonic() + start.every_s
-            _answer(fit, EstimateRequest(number, _ALL, whole=False))
+            _write_estimate(fit, EstimateRequest(number, _TICK_BEYOND_ALL, whole=False))
             number += 1
             continue
         if frame is None:
@@ -389,16 +403,17 @@ def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateReques
         if isinstance(frame, SessionError):
             raise frame
         if isinstance(frame, EstimateRequest):
-            _answer(fit, frame)
+            _write_estimate(fit, frame)
         else:
             fit.feed(frame)
 
 
-_ALL: Final = 1 << 32
-"""Beyond every tick."""
+_TICK_BEYOND_ALL: Final = 1 << 32
+"""Tick beyond all ticks of a session, for an estimate from all samples."""
 
 
-def _answer(fit: OnlineEstimator, request: EstimateRequest) -> None:
+def _write_estimate(fit: OnlineEstimator, request: EstimateRequest) -> None:
+    """Write the requested estimate as a line of JSON to standard output."""
     estimate = fit.estimate(request.tick, whole=request.whole, from_last=request.from_last)
     line = json.dumps({"id": request.id, **estimate.as_json()}, allow_nan=False)
     sys.stdout.write(line + "\n")
@@ -406,20 +421,20 @@ def _answer(fit: OnlineEstimator, request: EstimateRequest) -> None:
 
 
 def main() -> None:
-    """Answer the stream on standard input on standard output."""
-    # Ctrl-C stops the session safely; this ends with the stream.
+    """Read a session's samples from standard input, and write estimates to standard output."""
+    # Ctrl-C stops the session safely. This program ends with the stream.
     ignore()
     parser = argparse.ArgumentParser(prog="python -m analysis.online", description=__doc__)
     begin_background(parser)
     try:
-        # Not `sys.stdin`: the interpreter would wait at its end for who reads from that, and abort.
+        # With `sys.stdin`, the interpreter would wait for the reading thread at its end, and abort.
         stream = open(0, "rb", closefd=False)  # noqa: SIM115
         start = read_start(stream)
         if start.every_s is None:
-            os.setpriority(os.PRIO_PROCESS, 0, _NICE)
+            os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
         else:
-            give_way()  # nobody waits
-        with suppress(BrokenPipeError):  # nobody reads any more
+            give_way()  # estimates at intervals are not awaited
+        with suppress(BrokenPipeError):  # the reader of the estimates has ended
             serve(start, read_frames(stream))
     except SessionError as error:
         sys.exit(f"Error: {error}")

@@ -1,14 +1,14 @@
-"""Minimum of a sum of squares within bounds: damped Gauss-Newton steps on the normal equations.
+"""Minimization of a sum of squares within bounds by damped Gauss-Newton steps.
 
-For problems of a few unknowns and thousands of residuals the normal equations are cheap. The
-overhead of a general solver is not: its import takes longer than all fits of a session. Steps are
-damped after Nielsen [1]_.
+The normal equations are cheap for problems of a few unknowns and thousands of residuals. A general
+solver has a large overhead: its import takes longer than all fits of a session. Steps are damped by
+the method of Nielsen [1]_.
 
-The Hessian of a sum of squares is ``J'J`` and a second part: the residuals times their own second
-derivatives. Gauss-Newton and Levenberg-Marquardt leave the second part out. If the residual stays
-large, because the model does not fit the data, they converge slowly: each step reduces the
-remaining distance by the same fraction. Here the second part is estimated from the change of the
-gradient from step to step (NL2SOL [2]_), and used if it would have predicted the last step better.
+The Hessian of a sum of squares is the sum of ``J'J`` and a second part, the residuals times their
+second derivatives. Gauss-Newton and Levenberg-Marquardt omit the second part. If the residual
+remains large, because the model does not fit the data, they converge slowly: each step reduces the
+remaining distance by the same fraction. Here, the second part is estimated from the change of the
+gradient in each step (NL2SOL [2]_). It is used if it would have predicted the last step better.
 
 References
 ----------
@@ -35,16 +35,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Sum of squares at one point, with gradient and Hessian of a Gauss-Newton step.
+    """Sum of squares at one point, with its gradient and its Gauss-Newton Hessian.
 
     Attributes
     ----------
     cost : float
-        Sum of ``|r|²``.
+        Sum of the squares of the residuals, ``|r|²``.
     gradient : ndarray, shape (k,)
         Half the gradient of the cost, ``Re(Jᴴ r)``.
     hessian : ndarray, shape (k, k)
-        Half its Gauss-Newton Hessian, ``Re(Jᴴ J)``.
+        Half the Gauss-Newton Hessian of the cost, ``Re(Jᴴ J)``.
     """
 
     cost: float
@@ -52,19 +52,22 @@ class NormalEquations:
     hessian: NDArray[np.float64]
 
     def scaled_hessian(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the Hessian scaled to a unit diagonal, and the root of its diagonal, (k,)."""
+        """Return the Hessian scaled to a unit diagonal, and the scales, shape (k,).
+
+        The scales are the square roots of the diagonal of the Hessian.
+        """
         scale = np.sqrt(np.maximum(np.diag(self.hessian), np.finfo(float).tiny))
         return self.hessian / np.outer(scale, scale), scale
 
     def held(
         self, x: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Return which unknowns the cost pushes against a bound that they are at, shape (k,).
+        """Return whether each unknown is at a bound beyond which the cost would decrease, (k,).
 
         Parameters
         ----------
         x : ndarray, shape (k,)
-            Point at which these equations were formed.
+            Point at which the equations were evaluated.
         lower, upper : ndarray, shape (k,)
             Bounds of the unknowns.
         """
@@ -73,16 +76,18 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """End point of a descent.
+    """Local minimum at which a descent ended.
 
     Attributes
     ----------
     x : ndarray, shape (k,)
+        Unknowns at the minimum.
     equations : NormalEquations
-        Equations at `x`.
+        Cost, gradient and Hessian at `x`.
     evaluations : int
+        Number of evaluations of the problem.
     second_part : ndarray, shape (k, k)
-        Estimated half of the Hessian beyond Gauss-Newton.
+        Estimate of half the second part of the Hessian, which Gauss-Newton omits.
     """
 
     x: NDArray[np.float64]
@@ -92,26 +97,26 @@ class Minimum:
 
     @property
     def cost(self) -> float:
-        """Return the sum of squares."""
+        """Sum of squares at the minimum."""
         return self.equations.cost
 
 
 class Region(Protocol):
-    """Bounds of the unknowns, shape (k,), and the path of a step within them."""
+    """Bounds of the unknowns, shape (k,), and rule by which steps remain within the bounds."""
 
     @property
     def lower(self) -> NDArray[np.float64]:
-        """Return the lower bounds."""
+        """Lower bounds of the unknowns."""
 
     @property
     def upper(self) -> NDArray[np.float64]:
-        """Return the upper bounds."""
+        """Upper bounds of the unknowns."""
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and largest step from `x` in each unknown, shape (k,)."""
+        """Return the smallest and largest step from `x` of each unknown, shape (k,)."""
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the point within the bounds that a step leads to, shape (k,).
+        """Return the end point of a step within the bounds, shape (k,).
 
         Parameters
         ----------
@@ -124,23 +129,23 @@ class Region(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Bounds with straight steps: an unknown that a step would push beyond stays at its bound.
+    """Constant bounds, at which each unknown of a step is clipped.
 
-    An optimum of the other unknowns within the same step, as `_step` computes it within limits, has
-    no advantage here: the fits to a frequency response take 7 % more evaluations with it.
+    The other unknowns of a clipped step are not optimised again, as they are in `_compute_step`
+    within limits: the fits to a frequency response would need 7 % more evaluations.
     """
 
     lower: NDArray[np.float64]
-    """Least values, shape (k,)."""
+    """Lower bounds, shape (k,)."""
     upper: NDArray[np.float64]
-    """Largest values, shape (k,)."""
+    """Upper bounds, shape (k,)."""
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and largest step: unlimited, since `end` clips it."""
+        """Return infinite limits of a step, because `end` clips the step."""
         return np.full(x.size, -np.inf), np.full(x.size, np.inf)
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the end of a straight step, clipped to the bounds.
+        """Return the end point of a step, clipped to the bounds, shape (k,).
 
         Parameters
         ----------
@@ -155,13 +160,17 @@ class Box:
 # Descent
 
 _FIRST_DAMPING: Final = 1e-3
+"""Damping of the first step, relative to the curvature."""
 _LARGEST_DAMPING: Final = 1e16
-_LEAST_RELIEF: Final = 0.1
-"""Factor of the damping after a step with the predicted reduction."""
+"""Damping at which a descent ends without improvement."""
+_SMALLEST_DAMPING_FACTOR: Final = 0.1
+"""Smallest factor by which the damping is multiplied after a successful step."""
 
 _SHORTEST_STEP: Final = 1e-13
-_FLOOR: Final = 1e-14
-"""Least curvature, relative to the largest: an unknown without effect takes no huge step."""
+"""Length of a step, relative to the unknowns, below which it is as small as rounding errors."""
+_SMALLEST_CURVATURE: Final = 1e-14
+"""Smallest curvature used in the damping, relative to the largest one. It prevents huge steps of an
+unknown without effect."""
 
 
 def descend(
@@ -174,149 +183,155 @@ def descend(
     second_part: NDArray[np.float64] | None = None,
     hopeless: tuple[int, float] | None = None,
 ) -> Minimum:
-    """Descend to a local minimum.
+    """Find a local minimum of a sum of squares within bounds, by damped Gauss-Newton steps.
 
     Parameters
     ----------
     problem : callable
-        Normal equations at a point of shape (k,).
+        Function that returns the normal equations at a point of shape (k,).
     start : ndarray, shape (k,)
-        Unknowns scaled so that a change of 1 is large.
+        Starting point, in unknowns scaled so that a change of 1 is large.
     region : Region
-        Bounds and path of steps; a `Box` for bounds alone.
+        Bounds and rule for steps; a `Box` for constant bounds.
     relative_tolerance : float
-        Stop when the predicted reduction by a step is less than this fraction of the cost, or the
-        step is too short to be distinguished from rounding.
+        The descent ends when the predicted cost reduction of a step is less than this fraction of
+        the cost, or when the step is as small as rounding errors.
     max_evaluations : int
-        Most evaluations of `problem`, after which the best point so far is returned.
+        Largest number of evaluations of `problem`; the best point is then returned.
     second_part : ndarray, shape (k, k), optional
-        Estimate by a descent on a similar problem, used from the first step on. With that of few
-        points of a frequency response, fits to all take 39 evaluations instead of 57.
+        Second part of the Hessian, estimated by a descent on a similar problem, for the first
+        step. With the estimate from a few points of a frequency response, fits to all points need
+        39 evaluations instead of 57.
     hopeless : tuple of int and float, optional
-        Number of evaluations, and a cost: a descent that is still above this cost then ends, since
-        there are better explanations of the data.
+        Number of evaluations, and a cost. The descent ends if its cost is still higher after this
+        number of evaluations, because other descents explain the data better.
     """
     x = np.clip(start, region.lower, region.upper)
-    here = problem(x)
+    current = problem(x)
     evaluations = 1
     uses_second = second_part is not None
-    second = np.zeros_like(here.hessian) if second_part is None else second_part
-    damping, growth = _FIRST_DAMPING, 2.0
+    second_estimate = np.zeros_like(current.hessian) if second_part is None else second_part
+    damping, damping_growth = _FIRST_DAMPING, 2.0
     while evaluations < max_evaluations:
-        held = here.held(x, region.lower, region.upper)
-        free = ~held & (here.hessian.diagonal() > 0)
+        held = current.held(x, region.lower, region.upper)
+        free = ~held & (current.hessian.diagonal() > 0)
         if not free.any():
             break
-        if hopeless is not None and evaluations >= hopeless[0] and here.cost > hopeless[1]:
+        if hopeless is not None and evaluations >= hopeless[0] and current.cost > hopeless[1]:
             break
         limits = region.limits(x)
-        model = here.hessian + second if uses_second else here.hessian
-        step = _step(model, here, free, damping, limits)
+        model = current.hessian + second_estimate if uses_second else current.hessian
+        step = _compute_step(model, current, free, damping, limits)
         if step is None:  # not convex
-            uses_second, model = False, here.hessian
-            step = _step(model, here, free, damping, limits)
+            uses_second, model = False, current.hessian
+            step = _compute_step(model, current, free, damping, limits)
         if step is None:
             break
         trial = region.end(x, step)
-        step = trial - x  # clipped or bent: the prediction is for this step
-        predicted = -float(step @ (2 * here.gradient + model @ step))
+        step = trial - x  # the prediction is for the step after clipping
+        predicted = -float(step @ (2 * current.gradient + model @ step))
         if float(np.abs(step).max()) < _SHORTEST_STEP * (1 + float(np.abs(x).max())):
             break
-        if 0 <= predicted < relative_tolerance * here.cost and damping < 1:
+        if 0 <= predicted < relative_tolerance * current.cost and damping < 1:
             break
-        there = problem(trial)
+        next_equations = problem(trial)
         evaluations += 1
-        gained = here.cost - there.cost
-        if gained > 0:
-            foretold = -float(step @ (2 * here.gradient + here.hessian @ step))
-            bend = float(step @ second @ step)
-            uses_second = abs(gained - (foretold - bend)) <= abs(gained - foretold)
-            second = _learned(second, step, here, there)
-            quality = gained / predicted if predicted > 0 else 0.0
-            damping *= max(_LEAST_RELIEF, 1 - (2 * quality - 1) ** 3)
-            growth = 2.0
-            x, here = trial, there
+        reduction = current.cost - next_equations.cost
+        if reduction > 0:
+            gauss_newton_prediction = -float(step @ (2 * current.gradient + current.hessian @ step))
+            second_part_effect = float(step @ second_estimate @ step)
+            uses_second = abs(reduction - (gauss_newton_prediction - second_part_effect)) <= abs(
+                reduction - gauss_newton_prediction
+            )
+            second_estimate = _update_second_part(second_estimate, step, current, next_equations)
+            prediction_ratio = reduction / predicted if predicted > 0 else 0.0
+            damping *= max(_SMALLEST_DAMPING_FACTOR, 1 - (2 * prediction_ratio - 1) ** 3)
+            damping_growth = 2.0
+            x, current = trial, next_equations
         elif uses_second:
             uses_second = False
         else:
-            damping *= growth
-            growth *= 2
+            damping *= damping_growth
+            damping_growth *= 2
             if damping > _LARGEST_DAMPING:
                 break
-    return Minimum(x, here, evaluations, second)
+    return Minimum(x, current, evaluations, second_estimate)
 
 
-def _step(
+def _compute_step(
     model: NDArray[np.float64],
-    here: NormalEquations,
+    current: NormalEquations,
     free: NDArray[np.bool_],
     damping: float,
     limits: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64] | None:
-    """Return the lowest point of the model within the limits, (k,); None if it is not convex.
+    """Return the step to the minimum of a damped quadratic model, (k,); None if not convex.
 
-    An unknown that would exceed its limit stays there, and the others are optimised.
+    An unknown that would exceed its limit is set to the limit, and the others are optimised again.
     """
-    least, most = limits
+    smallest, largest = limits
     step = np.zeros(free.size)
-    curvature = here.hessian.diagonal()
-    damped = model + np.diag(damping * np.maximum(curvature, _FLOOR * curvature[free].max()))
-    moving = np.flatnonzero(free)
-    while moving.size:
-        block = damped[moving[:, None], moving]
-        step[moving] = 0.0
-        pull = here.gradient[moving] + model[moving] @ step
+    curvature = current.hessian.diagonal()
+    damped_model = model + np.diag(
+        damping * np.maximum(curvature, _SMALLEST_CURVATURE * curvature[free].max())
+    )
+    free_indices = np.flatnonzero(free)
+    while free_indices.size:
+        block = damped_model[free_indices[:, None], free_indices]
+        step[free_indices] = 0.0
+        gradient = current.gradient[free_indices] + model[free_indices] @ step
         try:
             np.linalg.cholesky(block)
-            found = np.linalg.solve(block, -pull)
+            solution = np.linalg.solve(block, -gradient)
         except np.linalg.LinAlgError:
             return None
-        step[moving] = np.clip(found, least[moving], most[moving])
-        beyond = step[moving] != found
-        if not beyond.any():
+        step[free_indices] = np.clip(solution, smallest[free_indices], largest[free_indices])
+        is_limited = step[free_indices] != solution
+        if not is_limited.any():
             break
-        moving = moving[~beyond]
+        free_indices = free_indices[~is_limited]
     return step
 
 
-def _learned(
-    second: NDArray[np.float64],
+def _update_second_part(
+    second_estimate: NDArray[np.float64],
     step: NDArray[np.float64],
-    here: NormalEquations,
-    there: NormalEquations,
+    current: NormalEquations,
+    next_equations: NormalEquations,
 ) -> NDArray[np.float64]:
-    """Return the second part of the Hessian after a step, by the secant update of NL2SOL."""
-    change = there.gradient - here.gradient
-    along = float(change @ step)
-    if along <= 0:
-        return second
-    bend = change - (here.hessian + there.hessian) @ step / 2
-    turned = second @ step
-    size = abs(float(step @ turned))
-    if size > 0:  # what was learned farther up may be too large here
-        overlap = min(1.0, abs(float(step @ bend)) / size)
-        second, turned = overlap * second, overlap * turned
-    miss = bend - turned
-    both = np.outer(miss, change)
+    """Return the second part of the Hessian, updated after a step by the secant rule of NL2SOL."""
+    gradient_change = next_equations.gradient - current.gradient
+    curvature = float(gradient_change @ step)
+    if curvature <= 0:
+        return second_estimate
+    second_change = gradient_change - (current.hessian + next_equations.hessian) @ step / 2
+    predicted_change = second_estimate @ step
+    size = abs(float(step @ predicted_change))
+    if size > 0:  # an estimate from a higher cost may be too large here
+        overlap = min(1.0, abs(float(step @ second_change)) / size)
+        second_estimate, predicted_change = overlap * second_estimate, overlap * predicted_change
+    error = second_change - predicted_change
+    update = np.outer(error, gradient_change)
     return (
-        second
-        + (both + both.T) / along
-        - (float(miss @ step) / along**2) * np.outer(change, change)
+        second_estimate
+        + (update + update.T) / curvature
+        - (float(error @ step) / curvature**2) * np.outer(gradient_change, gradient_change)
     )
 
 
 # Values at the last points
 
 _Value = TypeVar("_Value")
+"""Type of the cached values."""
 
-_STORED: Final = 2
-"""The last step of a descent may have been taken back."""
+_CACHED_POINTS: Final = 2
+"""Number of points whose values are cached: the last step of a descent may have been rejected."""
 
 
 class Recent(Generic[_Value]):
-    """Values at the last two points, cached for repeated evaluation.
+    """Cache of a function's values at the last two points of a descent.
 
-    Covariances are evaluated at the end of a descent, and the next descent begins there.
+    Covariances are evaluated at the last point of a descent, and the next descent begins there.
     """
 
     __slots__ = ("_values",)
@@ -327,18 +342,18 @@ class Recent(Generic[_Value]):
     def at(
         self, x: NDArray[np.float64], compute: Callable[[NDArray[np.float64]], _Value]
     ) -> _Value:
-        """Return the value at `x`, computed unless it is one of the last.
+        """Return the value at `x` from the cache, or compute and store it.
 
         Parameters
         ----------
         x : ndarray, shape (k,)
-            Point.
+            Point at which the function is evaluated.
         compute : callable
             Function that returns the value at a point.
         """
         key = x.tobytes()
         if key not in self._values:
-            if len(self._values) == _STORED:
+            if len(self._values) == _CACHED_POINTS:
                 del self._values[next(iter(self._values))]
             self._values[key] = compute(x)
         return self._values[key]

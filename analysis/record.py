@@ -1,7 +1,7 @@
-"""Session file as arrays on a uniform time grid, with its known faults.
+"""Session file as arrays on a uniform time grid, with a report of missing and stale samples.
 
-The estimators want uniform samples; a session may have missed ticks, held (stale) values or a
-sweep that was cut short. This module decides on their treatment, limits it, counts and reports it.
+The estimators need uniform samples, but a session may have missing ticks, held (stale) values or an
+incomplete sweep. This module interpolates such samples within limits, counts and reports them.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ __all__ = [
 ]
 
 MAX_SAMPLES = MAX_TICKS
-"""Most samples of a session that are read."""
+"""Largest number of samples of a session that are read."""
 
 RECORD_FIELDS = ("t_ns", "tick", "angle_reference_rad", "angle_rad", "coupling_torque_nm", "status")
 """Fields of the samples that an analysis needs."""
@@ -70,14 +70,19 @@ _REPORTED_FLAGS = (
     (Status.TORQUE_OFF, "torque off"),
     (Status.LATE, "late tick"),
 )
+"""Flags of a sample that are counted, with their meanings."""
 
-_UNKNOWN = "do not count in the whole-record fits; for the Welch fits they are interpolated."
+_UNKNOWN_SAMPLES_TEXT = (
+    "do not count in the whole-record fits; for the Welch fits they are interpolated."
+)
+"""End of the sentence on missing or stale samples."""
 
-_CONSEQUENCES: tuple[tuple[str, str], ...] = (
+_FLAG_CONSEQUENCES: tuple[tuple[str, str], ...] = (
     ("wrench saturated", "The torque is clipped there and the estimate is wrong near it."),
     ("torque command saturated", "The angle did not follow its reference there."),
     ("torque off", "The motor was not driven there."),
 )
+"""Consequence for the analysis of each flag that causes a warning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +94,11 @@ class Gaps:
     missing_ticks
         Ticks between the first and the last sample that have no sample.
     longest_gap_ticks
-        Length of the longest run of them.
+        Number of ticks in the longest gap.
     sweep_missing_ticks
-        Those of them inside the sweep.
+        Missing ticks inside the sweep.
     sweep_stale_angles, sweep_stale_torques
-        Recorded samples of the sweep whose value was flagged as held from an earlier tick.
+        Recorded samples of the sweep whose angle or torque is flagged as held from an earlier tick.
     """
 
     missing_ticks: int
@@ -105,56 +110,57 @@ class Gaps:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One session on a uniform time grid.
+    """Record of one session on a uniform time grid.
 
     Attributes
     ----------
     path
-        The file.
+        Session file.
     time_s
-        (n,) scheduled time of each tick since the session's start.
+        Scheduled time of each tick since the session's start, shape (n,).
     reference_rad, angle_rad
-        (n,) requested angle, and angle measured at the output shaft.
+        Requested angle, and angle measured at the output shaft, shape (n,).
     torque_nm
-        (n,) coupling torque, positive when the motor pushes the beam.
+        Coupling torque, positive when the motor pushes the beam, shape (n,).
     angle_known, torque_known
-        (n,) whether the value was measured at that very tick, and within the sensor's range.
+        Whether the value was measured at its tick, and within the sensor's range, shape (n,).
     rate_hz
         Ticks per second.
     beam
-        Specimen in the file.
+        Beam stated in the file.
     angle_delay_s, torque_delay_s
-        Age of either value at its time stamp.
+        Age of angle and torque at their time stamps.
     tool_inertia_kg_m2
         Inertia between torque sensor and beam.
     torque_filter_s
-        Time constants of the torque channel's low-pass filter, of first and of second order.
+        Time constants of the torque channel's first- and second-order low-pass filter.
     uncertainty
-        Relative standard uncertainties of `record_checks.UNCERTAIN`, those that the file states.
+        Relative standard uncertainties stated in the file, by quantity
+        (`record_checks.UNCERTAIN_QUANTITIES`).
     uniformity
-        Relative standard deviation of each mode's frequency from that of a uniform beam, 0.001 if
-        the file states none.
+        Relative standard deviation of mode frequencies from those of a uniform beam; 0.001 if not
+        stated.
     tip_mass_kg
-        Point mass at the beam's tip, None if the file states none.
+        Point mass at the beam's tip; None if not stated.
     axis_tilt_deg
-        Inclination of the plane of motion along the beam at rest, positive where the tip is lower
-        than the motor's axis; None if the file states none.
+        Inclination of the plane of motion along the beam at rest, positive if the tip is lower than
+        the motor's axis; None if not stated.
     sweep
         Range of samples with the excitation.
     there
         Range of samples of the first sweep of a chirp there and back; None if there is one sweep.
     rest_angle_rad
-        Angle held before the sweep, None if the file has no segment ``rest``.
+        Angle held before the sweep; None if the file has no segment ``rest``.
     gaps
         Counts of interpolated samples.
     flags
-        Count of flagged samples in the sweep, by the flag's meaning, only those that occur.
+        Number of flagged samples in the sweep by the flag's meaning, for flags that occur.
     warnings
         Warnings for the analyst, in sentences.
     metadata
         Metadata `session` of the file, as strings.
     outcome
-        How the session ended: ``complete``, ``stopped``, ``fault`` or ``unknown``.
+        End of the session: ``complete``, ``stopped``, ``fault`` or ``unknown``.
     """
 
     path: Path
@@ -185,32 +191,32 @@ class Record:
 
     @property
     def sweep_samples(self) -> int:
-        """Return the number of samples in the sweep."""
+        """Number of samples in the sweep."""
         return int(self.sweep.stop - self.sweep.start)
 
     @property
     def first_sweep(self) -> slice:
-        """Return the range for Welch's method: the sweep there, or all of a single sweep."""
+        """Range of samples for Welch's method: the single sweep, or the first of two sweeps."""
         return self.sweep if self.there is None else self.there
 
     @property
     def first_sweep_samples(self) -> int:
-        """Return the number of samples in the first sweep."""
+        """Number of samples in the first sweep."""
         return int(self.first_sweep.stop - self.first_sweep.start)
 
 
 def load_record(path: Path) -> Record:
-    """Read a session file and put it on a uniform time grid.
+    """Read a session file and return its record on a uniform time grid.
 
     Missing ticks, and values flagged as stale, are replaced by linear interpolation between their
-    fresh neighbours, up to `MAX_UNKNOWN_FRACTION` of the sweep and `MAX_GAP_S` at a time. The
-    result has their counts and masks. Without segments the whole record is the sweep; a sweep that
-    was stopped ends with the recorded samples.
+    known neighbours, up to `MAX_UNKNOWN_FRACTION` of the sweep and gaps of `MAX_GAP_S`. The result
+    has their counts and masks. Without segments, the whole record is the sweep. A sweep that was
+    stopped ends with the recorded samples.
 
     Parameters
     ----------
     path
-        A session file (docs/session_format.md).
+        Session file (docs/session_format.md).
 
     Raises
     ------
@@ -231,19 +237,19 @@ def load_record(path: Path) -> Record:
 
 
 def record_of(session: Session) -> Record:
-    """Put a session on a uniform time grid, as `load_record` does.
+    """Return the record of a session on a uniform time grid (see `load_record`).
 
     Parameters
     ----------
     session
-        Session from a file, or recorded so far; its samples need `RECORD_FIELDS`.
+        Session from a file, or a running one so far. Its samples need the `RECORD_FIELDS`.
 
     Raises
     ------
     rigd.session.SessionError
-        It lacks a required key.
+        The metadata lack a required key.
     RecordError
-        Its samples cannot be analysed.
+        The samples cannot be analysed.
     """
     path, samples = session.path, session.samples
     if len(samples) == 0:
@@ -259,7 +265,7 @@ def record_of(session: Session) -> Record:
     first_tick = int(ticks[0])
     index = ticks - first_tick
     length = int(index[-1]) + 1
-    sweep, cut = _sweep(session, first_tick, length)
+    sweep, unrecorded_ticks = _sweep_range(session, first_tick, length)
     status = np.zeros(length, dtype=np.uint32)  # bits of `Status`; 0 where a tick is missing
     status[index] = samples["status"]
     missing = np.ones(length, dtype=bool)
@@ -285,9 +291,9 @@ def record_of(session: Session) -> Record:
     return Record(
         path=path,
         time_s=(first_tick + np.arange(length)) / rate_hz,
-        reference_rad=_filled(samples["angle_reference_rad"], index, missing),
-        angle_rad=_filled(samples["angle_rad"], index, missing | stale_angle),
-        torque_nm=_filled(samples["coupling_torque_nm"], index, missing | stale_torque),
+        reference_rad=_fill_grid(samples["angle_reference_rad"], index, missing),
+        angle_rad=_fill_grid(samples["angle_rad"], index, missing | stale_angle),
+        torque_nm=_fill_grid(samples["coupling_torque_nm"], index, missing | stale_torque),
         angle_known=~(missing | stale_angle),
         torque_known=~(missing | stale_torque | ((status & Status.WRENCH_SATURATED) != 0)),
         rate_hz=rate_hz,
@@ -301,12 +307,12 @@ def record_of(session: Session) -> Record:
         tip_mass_kg=stated_tip_mass_kg(session),
         axis_tilt_deg=stated_axis_tilt_deg(session),
         sweep=sweep,
-        there=_there(session, first_tick, sweep),
+        there=_first_sweep_range(session, first_tick, sweep),
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,
         flags=flags,
         warnings=(
-            *_warnings(gaps, flags, cut, outcome, rate_hz, sweep),
+            *_describe_faults(gaps, flags, unrecorded_ticks, outcome, rate_hz, sweep),
             *(f"Of the file: {sentence}." for sentence in (*unread, *unread_outcome)),
         ),
         metadata=metadata,
@@ -314,96 +320,99 @@ def record_of(session: Session) -> Record:
     )
 
 
-def _sweep(session: Session, first_tick: int, length: int) -> tuple[slice, int]:
-    """Return the samples of the sweep, and the number of its ticks without a sample."""
+def _sweep_range(session: Session, first_tick: int, length: int) -> tuple[slice, int]:
+    """Return the range of the sweep's samples, and the number of ticks not recorded at its ends."""
     if "sweep" not in session.segments:
         return slice(0, length), 0
-    first, end = session.segments["sweep"]
-    start = max(first - first_tick, 0)
+    planned_first, end = session.segments["sweep"]
+    start = max(planned_first - first_tick, 0)
     stop = min(end - first_tick, length)
     if stop <= start:
         raise RecordError(
-            f"{session.path}: segment 'sweep' covers ticks {first} to {end - 1}, but the record "
+            f"{session.path}: segment 'sweep' covers ticks {planned_first} to {end - 1}, but the "
+            "record "
             f"holds ticks {first_tick} to {first_tick + length - 1}, so nothing of the sweep was "
             "recorded."
         )
-    return slice(start, stop), (end - first) - (stop - start)
+    return slice(start, stop), (end - planned_first) - (stop - start)
 
 
-def _there(session: Session, first_tick: int, sweep: slice) -> slice | None:
-    """Return the samples of the first of two sweeps; None if there is one."""
-    first, end = session.segments.get("there", (0, 0))
-    start, stop = max(first - first_tick, sweep.start), min(end - first_tick, sweep.stop)
+def _first_sweep_range(session: Session, first_tick: int, sweep: slice) -> slice | None:
+    """Return the range of the first of two sweeps; None if there is only one sweep."""
+    planned_first, end = session.segments.get("there", (0, 0))
+    start, stop = max(planned_first - first_tick, sweep.start), min(end - first_tick, sweep.stop)
     return slice(start, stop) if stop > start else None
 
 
 def _rest_angle(session: Session, ticks: NDArray[np.int64]) -> float | None:
-    """Return the median of the angle over the segment ``rest``, None without one."""
-    first, end = session.segments.get("rest", (0, 0))
-    at_rest = (ticks >= first) & (ticks < end)
+    """Return the median angle in rad over the segment ``rest``; None without this segment."""
+    first_tick, end = session.segments.get("rest", (0, 0))
+    at_rest = (ticks >= first_tick) & (ticks < end)
     return float(np.median(session.samples["angle_rad"][at_rest])) if at_rest.any() else None
 
 
 def _flag_counts(status: NDArray[np.uint32]) -> dict[str, int]:
+    """Return the number of samples with each flag that occurs."""
     counts = {meaning: int(np.count_nonzero(status & flag)) for flag, meaning in _REPORTED_FLAGS}
     return {meaning: count for meaning, count in counts.items() if count}
 
 
-def _filled(
+def _fill_grid(
     values: NDArray[np.float64], index: NDArray[np.int64], unknown: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return values on the whole grid, unknown ones interpolated linearly (held at the ends)."""
-    full = np.zeros(len(unknown))
-    full[index] = values
+    """Return values on the whole grid, with linear interpolation of unknown ones."""
+    grid_values = np.zeros(len(unknown))
+    grid_values[index] = values
     if unknown.any() and not unknown.all():
         known = np.flatnonzero(~unknown)
-        full[unknown] = np.interp(np.flatnonzero(unknown), known, full[known])
-    return full
+        grid_values[unknown] = np.interp(np.flatnonzero(unknown), known, grid_values[known])
+    return grid_values
 
 
-def _warnings(
+def _describe_faults(
     gaps: Gaps,
     flags: Mapping[str, int],
-    cut: int,
+    unrecorded_ticks: int,
     outcome: Mapping[str, str],
     rate_hz: float,
     sweep: slice,
 ) -> tuple[str, ...]:
-    found = []
+    """Return sentences on an incomplete session, missing samples and flags."""
+    sentences = []
     ending = outcome.get("outcome", "unknown")
     if ending in ("stopped", "fault"):
         reason = outcome.get("reason")
-        found.append(
+        sentences.append(
             f"The session's outcome is '{ending}', not 'complete'"
             + (f": {reason}" if reason else ".")
         )
     elif "recovered_from" in outcome:
-        found.append(
+        sentences.append(
             f"The file was recovered from {outcome['recovered_from']}, without loss of samples."
         )
     if outcome.get("recovered_protected") == "false":
-        found.append(
+        sentences.append(
             "The file was recovered from one whose metadata no checksum covered: compare rate, "
             "beam and segments with what is known of the session."
         )
-    if cut:
+    if unrecorded_ticks:
         recorded_s = (sweep.stop - sweep.start) / rate_hz
-        found.append(
+        sentences.append(
             f"The sweep was cut short: {recorded_s:.6g} s of it were recorded, "
-            f"{cut / rate_hz:.6g} s were not."
+            f"{unrecorded_ticks / rate_hz:.6g} s were not."
         )
     if gaps.sweep_missing_ticks:
-        found.append(
+        sentences.append(
             f"{gaps.sweep_missing_ticks} missing ticks in the sweep (longest gap of the record "
-            f"{gaps.longest_gap_ticks} ticks) {_UNKNOWN}"
+            f"{gaps.longest_gap_ticks} ticks) {_UNKNOWN_SAMPLES_TEXT}"
         )
     for channel, count in (
         ("angle", gaps.sweep_stale_angles),
         ("torque", gaps.sweep_stale_torques),
     ):
         if count:
-            found.append(f"{count} stale values of the {channel} {_UNKNOWN}")
-    for flag, consequence in _CONSEQUENCES:
+            sentences.append(f"{count} stale values of the {channel} {_UNKNOWN_SAMPLES_TEXT}")
+    for flag, consequence in _FLAG_CONSEQUENCES:
         if flag in flags:
-            found.append(f"{flags[flag]} samples of the sweep: {flag}. {consequence}")
-    return tuple(found)
+            sentences.append(f"{flags[flag]} samples of the sweep: {flag}. {consequence}")
+    return tuple(sentences)

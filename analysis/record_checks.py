@@ -1,9 +1,9 @@
 """Checks of a session before its analysis: values that its file states, and samples.
 
-These checks report a wrong unit, or a file of another program, by its key, more clearly than an
-estimator could; some would overflow. Samples that cannot be analysed raise an error: an empty or
-endless span, a clock that contradicts the rate, values that are not finite, a dead sensor, gaps too
-long to be interpolated.
+These checks report the key of a value that is in a wrong unit or written by another program. An
+estimator would report it less clearly, or overflow. Samples that cannot be analysed raise an error:
+a span that is almost empty or too long, a clock that contradicts the rate, values that are not
+finite, a sensor without data, and gaps that are too long for interpolation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class RecordError(ValueError):
-    """The session was read but cannot be analysed; the message states file, cause and remedy."""
+    """Error if a session was read but cannot be analysed; the message states the remedy."""
 
 
 # Values that the file states
@@ -36,60 +36,73 @@ _BEAM_RANGES: Final = {
     "beam_density_kg_per_m": (1e-6, 1e6),
     "beam_bending_stiffness_n_m2": (1e-9, 1e15),
 }
+"""Plausible range of each property of the beam, by its key."""
 _MAX_INERTIA_KG_M2: Final = 1e3
+"""Largest plausible tool inertia."""
 _MAX_DELAY_S: Final = 1.0
+"""Largest plausible delay of a channel."""
 MAX_TIP_MASS_KG: Final = 1e3
+"""Largest plausible mass at the tip."""
 MAX_AXIS_TILT_DEG: Final = 90.0
+"""Largest inclination of the plane of motion."""
 MAX_UNCERTAINTY_PERCENT: Final = 50.0
+"""Largest relative standard uncertainty that a file may state."""
 MAX_UNIFORMITY_PERCENT: Final = 10.0
+"""Largest deviation of mode frequencies that a model of a uniform beam allows."""
 _DEFAULT_UNIFORMITY_PERCENT: Final = 0.1
-_FIRST_ROOT: Final = 1.8751040687119611
+"""Deviation of mode frequencies of a carefully made antenna."""
+_FIRST_EIGENVALUE: Final = 1.8751040687119611
 """First root of 1 + cos z cosh z: mode 1 is at (root / length)² √(EI/rho) rad/s."""
 
-_LEAST_PERIODS: Final = 0.1
-"""Periods of the first mode that a record holds at least, with a beam's data ten times off."""
+_LEAST_MODE_PERIODS: Final = 0.1
+"""Least number of periods of the first mode in a record. It tolerates a frequency of the stated
+beam that is wrong by a factor of ten."""
 
 
 def stated_rate_hz(session: Session) -> float:
-    """Return the rate of the ticks in Hz.
+    """Return the sampling rate that a session states, in Hz.
 
     Raises
     ------
     RecordError
-        It is not positive.
+        The rate is not positive.
     """
     rate_hz = session.number("rate_hz")
     if not rate_hz > 0.0:
-        raise _wrong(session, "rate_hz", rate_hz, "must be positive")
+        raise _invalid_value_error(session, "rate_hz", rate_hz, "must be positive")
     return rate_hz
 
 
 def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
-    """Return the specimen, if the record is long enough for its first mode.
+    """Return the beam that a session states, after checking that its first mode can be measured.
 
     Parameters
     ----------
     session : Session
+        Session as read.
     rate_hz : float
+        Sampling rate.
     ticks : int
-        Length of the record.
+        Length of the record in ticks.
 
     Raises
     ------
     RecordError
-        A value, or the mode's frequency that they give together, cannot be.
+        A value, or the frequency of the first mode that follows, is impossible.
     """
     values = []
     for key, (low, high) in _BEAM_RANGES.items():
         value = session.number(key)
         if not value > 0.0:
-            raise _wrong(session, key, value, "must be positive")
+            raise _invalid_value_error(session, key, value, "must be positive")
         if not low <= value <= high:
-            raise _wrong(session, key, value, f"must lie between {low:g} and {high:g}")
+            raise _invalid_value_error(
+                session, key, value, f"must lie between {low:g} and {high:g}"
+            )
         values.append(value)
     length_m, density, stiffness = values
     beam = Beam(length_m=length_m, density_kg_per_m=density, bending_stiffness_n_m2=stiffness)
-    first_hz, lowest_hz = first_mode_hz(beam), _LEAST_PERIODS * rate_hz / ticks
+    first_hz, lowest_hz = first_mode_hz(beam), _LEAST_MODE_PERIODS * rate_hz / ticks
     if not lowest_hz < first_hz < rate_hz / 2:
         raise RecordError(
             f"{session.path}: with beam_length_m {length_m:g} m, beam_density_kg_per_m {density:g} "
@@ -106,153 +119,164 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
 
 
 def first_mode_hz(beam: Beam) -> float:
-    """Return the frequency of the first mode of an undamped beam with locked hub.
+    """Return the frequency in Hz of the first mode of an undamped clamped–free beam.
 
     Parameters
     ----------
     beam : Beam
+        Beam with a locked hub.
     """
-    return (_FIRST_ROOT / beam.length_m) ** 2 / math.sqrt(beam.density_over_stiffness) / math.tau
+    return (
+        (_FIRST_EIGENVALUE / beam.length_m) ** 2 / math.sqrt(beam.density_over_stiffness) / math.tau
+    )
 
 
 def stated_tool_inertia_kg_m2(session: Session) -> float:
-    """Return the inertia between torque sensor and beam, 0 if the file has none.
+    """Return the inertia between torque sensor and beam in kg·m², 0 if not stated.
 
     Raises
     ------
     RecordError
-        It is negative, or implausibly large.
+        The inertia is negative, or implausibly large.
     """
     key = "tool_inertia_kg_m2"
     inertia_kg_m2 = session.number(key, 0.0)
     if inertia_kg_m2 < 0.0:
-        raise _wrong(session, key, inertia_kg_m2, "an inertia cannot be negative")
+        raise _invalid_value_error(session, key, inertia_kg_m2, "an inertia cannot be negative")
     if inertia_kg_m2 > _MAX_INERTIA_KG_M2:
-        raise _wrong(session, key, inertia_kg_m2, f"must not exceed {_MAX_INERTIA_KG_M2:g}")
+        raise _invalid_value_error(
+            session, key, inertia_kg_m2, f"must not exceed {_MAX_INERTIA_KG_M2:g}"
+        )
     return inertia_kg_m2
 
 
 def stated_tip_mass_kg(session: Session) -> float | None:
-    """Return the point mass at the beam's tip, None if the file states none.
+    """Return the point mass at the beam's tip in kg, or None if not stated.
 
     Raises
     ------
     RecordError
-        It is negative, or implausibly large.
+        The mass is negative, or implausibly large.
     """
-    return _stated_between(session, "tip_mass_kg", 0.0, MAX_TIP_MASS_KG)
+    return _stated_in_range(session, "tip_mass_kg", 0.0, MAX_TIP_MASS_KG)
 
 
 def stated_axis_tilt_deg(session: Session) -> float | None:
-    """Return the inclination of the plane of motion at rest, None if the file states none.
+    """Return the inclination of the plane of motion at rest in degrees, or None if not stated.
 
-    Positive where the tip is lower than the motor's axis.
+    It is positive if the tip is lower than the motor's axis.
 
     Raises
     ------
     RecordError
-        It is more than a right angle.
+        The inclination is more than a right angle.
     """
-    return _stated_between(session, "axis_tilt_deg", -MAX_AXIS_TILT_DEG, MAX_AXIS_TILT_DEG)
+    return _stated_in_range(session, "axis_tilt_deg", -MAX_AXIS_TILT_DEG, MAX_AXIS_TILT_DEG)
 
 
-def _stated_between(session: Session, key: str, low: float, high: float) -> float | None:
+def _stated_in_range(session: Session, key: str, low: float, high: float) -> float | None:
+    """Return a number in the metadata, or None if not stated; raise if it is outside a range."""
     if key not in session.metadata:
         return None
     value = session.number(key)
     if not low <= value <= high:
-        raise _wrong(session, key, value, f"must lie between {low:g} and {high:g}")
+        raise _invalid_value_error(session, key, value, f"must lie between {low:g} and {high:g}")
     return value
 
 
 def stated_delay_s(session: Session, key: str) -> float:
-    """Return the age of a channel's values at their time stamps in s, 0 if not stated.
+    """Return the age of a channel's values at their time stamps in seconds, 0 if not stated.
 
     Parameters
     ----------
     session : Session
         Session as read.
     key : str
-        Key of the metadata.
+        Key of the delay in the metadata.
 
     Raises
     ------
     RecordError
-        It is longer than that of any device.
+        The delay is longer than that of any device.
     """
     delay_s = session.number(key, 0.0)
     if abs(delay_s) > _MAX_DELAY_S:
-        raise _wrong(session, key, delay_s, f"must lie within ±{_MAX_DELAY_S:g}")
+        raise _invalid_value_error(session, key, delay_s, f"must lie within ±{_MAX_DELAY_S:g}")
     return delay_s
 
 
 def stated_torque_filter_s(session: Session) -> tuple[float, float]:
-    """Return the time constants of the torque channel's first- and second-order filter.
+    """Return the time constants in seconds of the torque channel's first- and second-order filter.
 
-    ``1 / (2 pi torque_filter_hz)`` for the order stated (`torque_filter_order`, 1 without it), 0
-    for the other; both 0 if the file states no filter.
+    The filter of the stated order (`torque_filter_order`, by default 1) has the time constant
+    ``1 / (2 pi torque_filter_hz)``, the other filter has 0. Both are 0 if no filter is stated.
 
     Raises
     ------
     RecordError
-        There is no such corner frequency, or the order is neither 1 nor 2.
+        The corner frequency is not positive, or the order is neither 1 nor 2.
     """
     corner_hz = session.number("torque_filter_hz", math.inf)
     order = session.number("torque_filter_order", 1.0)
     if not corner_hz > 0.0:
-        raise _wrong(session, "torque_filter_hz", corner_hz, "must be positive")
+        raise _invalid_value_error(session, "torque_filter_hz", corner_hz, "must be positive")
     if order not in (1.0, 2.0):
-        raise _wrong(session, "torque_filter_order", order, "must be 1 or 2 (Butterworth)")
+        raise _invalid_value_error(
+            session, "torque_filter_order", order, "must be 1 or 2 (Butterworth)"
+        )
     constant_s = 1 / (2 * math.pi * corner_hz)
     return (constant_s, 0.0) if order == 1.0 else (0.0, constant_s)
 
 
-SCALES: Final = ("torque_scale", "length", "density")
-"""Quantities that no session determines; the file may state their uncertainty."""
+SCALE_QUANTITIES: Final = ("torque_scale", "length", "density")
+"""Quantities that no session can determine, and whose uncertainty a file may state."""
 
-UNCERTAIN: Final = (*SCALES, "tip_mass")
-"""All values whose uncertainty a file may state."""
+UNCERTAIN_QUANTITIES: Final = (*SCALE_QUANTITIES, "tip_mass")
+"""All quantities whose uncertainty a file may state."""
 
 
 def stated_uncertainty(session: Session) -> dict[str, float]:
-    """Return the stated relative standard uncertainties of `UNCERTAIN` values, by their names.
+    """Return the relative standard uncertainties that a session states, by quantity.
+
+    The quantities are those of `UNCERTAIN_QUANTITIES`.
 
     Raises
     ------
     RecordError
-        One is negative, or so large that the value would be unknown.
+        An uncertainty is negative, or so large that the value would be unknown.
     """
     stated = {}
-    for name in UNCERTAIN:
+    for name in UNCERTAIN_QUANTITIES:
         key = f"uncertainty_{name}_percent"
         percent = session.number(key, 0.0)
         if not 0.0 <= percent <= MAX_UNCERTAINTY_PERCENT:
             rule = f"must lie between 0 and {MAX_UNCERTAINTY_PERCENT:g}"
-            raise _wrong(session, key, percent, rule)
+            raise _invalid_value_error(session, key, percent, rule)
         if percent:
             stated[name] = percent / 100
     return stated
 
 
 def stated_uniformity(session: Session) -> float:
-    """Return the relative standard deviation of mode frequencies from a uniform beam.
+    """Return the relative standard deviation of mode frequencies from those of a uniform beam.
 
-    0.001, typical of a carefully made antenna, if the file states none.
+    If not stated, it is 0.001, which is typical of a carefully made antenna.
 
     Raises
     ------
     RecordError
-        It is negative, or larger than a model of a uniform beam allows.
+        The value is negative, or larger than a model of a uniform beam allows.
     """
     key = "uniformity_percent"
     percent = session.number(key, _DEFAULT_UNIFORMITY_PERCENT)
     if not 0.0 <= percent <= MAX_UNIFORMITY_PERCENT:
         rule = f"must lie between 0 and {MAX_UNIFORMITY_PERCENT:g}"
-        raise _wrong(session, key, percent, rule)
+        raise _invalid_value_error(session, key, percent, rule)
     return percent / 100
 
 
-def _wrong(session: Session, key: str, value: float, rule: str) -> RecordError:
+def _invalid_value_error(session: Session, key: str, value: float, rule: str) -> RecordError:
+    """Return the error for an invalid value in the metadata."""
     return RecordError(
         f"{session.path}: {key} is {f'{value:g} {unit_of(key)}'.rstrip()}, but {rule}; correct the "
         "file's metadata."
@@ -262,28 +286,28 @@ def _wrong(session: Session, key: str, value: float, rule: str) -> RecordError:
 # Samples
 
 MAX_UNKNOWN_FRACTION = 0.05
-"""Largest fraction of angle or torque that may be missing or flagged: one limit for import, loading
-and estimation. Whole-record fits stand so much of it (within their own uncertainty at 4.5 %)."""
+"""Largest fraction of angle or torque that may be missing or flagged, in import, loading and
+estimation. Whole-record fits remain within their uncertainty at 4.5 %."""
 
 MAX_GAP_S = 0.1
-"""Longest single gap in the sweep that is interpolated; a longer one is refused."""
+"""Longest gap in the sweep that is interpolated, in seconds; a longer one raises an error."""
 
-MAX_SPAN = 10
-"""Most ticks per recorded sample: a file with next to no samples in its span would only fill the
-memory, and no sweep in it could be analysed."""
+MAX_TICKS_PER_SAMPLE = 10
+"""Largest number of ticks per recorded sample. A file with almost no samples in its span would only
+fill the memory, and no sweep in it could be analysed."""
 
 MAX_TICKS = MAX_SAMPLES
-"""Longest record: missing ticks count, as they are interpolated."""
+"""Longest record in ticks, including missing ones, which are interpolated."""
 
-MAX_VALUE = 1e9
-"""Largest angle in rad, or torque in N·m: squares of what is far beyond would overflow."""
+MAX_ABSOLUTE_VALUE = 1e9
+"""Largest angle in rad or torque in N·m; the squares of much larger values would overflow."""
 
 MAX_CLOCK_ERROR = 1e-3
-"""Largest relative difference between the rate stated and the rate of the time stamps."""
+"""Largest relative difference between the stated rate and the rate of the time stamps."""
 
 
 def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
-    """Raise if a span of ticks is almost empty, or too long.
+    """Raise if a record's span of ticks is almost empty, or too long.
 
     Parameters
     ----------
@@ -298,7 +322,7 @@ def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
         The span is unusable.
     """
     span = int(ticks[-1] - ticks[0]) + 1
-    if span > MAX_SPAN * len(ticks):
+    if span > MAX_TICKS_PER_SAMPLE * len(ticks):
         raise RecordError(
             f"{path}: only {len(ticks)} of the {span} ticks from {ticks[0]} to {ticks[-1]} have a "
             "sample, too few to analyse; record the session again."
@@ -314,7 +338,7 @@ def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
 def check_clock(
     path: Path, ticks: NDArray[np.int64], t_ns: NDArray[np.int64], rate_hz: float
 ) -> None:
-    """Raise if time stamps run backwards or contradict the rate.
+    """Raise if time stamps do not increase, or contradict the sampling rate.
 
     Parameters
     ----------
@@ -323,25 +347,26 @@ def check_clock(
     ticks : ndarray of int, shape (n,)
         Numbers of the recorded ticks.
     t_ns : ndarray of int, shape (n,)
-        Their time stamps.
+        Time stamps of these ticks in nanoseconds.
     rate_hz : float
-        Rate that the file states.
+        Sampling rate that the file states.
 
     Raises
     ------
     RecordError
-        They are unusable.
+        The time stamps are unusable.
     """
     if len(ticks) < 2:
         return
-    # Compared, not subtracted: a difference of what a file states may overflow.
-    back = np.flatnonzero(t_ns[1:] <= t_ns[:-1])
-    if back.size:
-        index = int(back[0])
+    # The values are compared, because a difference of values from a file may overflow.
+    not_increasing = np.flatnonzero(t_ns[1:] <= t_ns[:-1])
+    if not_increasing.size:
+        index = int(not_increasing[0])
         raise RecordError(
             f"{path}: the time stamp t_ns goes from {t_ns[index]} ns at tick {ticks[index]} to "
             f"{t_ns[index + 1]} ns at tick {ticks[index + 1]}, but time must go forward; it does "
-            f"not at {back.size} of {len(ticks)} samples. Correct the program that wrote the file."
+            f"not at {not_increasing.size} of {len(ticks)} samples. Correct the program that wrote "
+            "the file."
         )
     elapsed_ns = max(int(t_ns[-1]) - int(t_ns[0]), 1)
     rate_of_stamps_hz = 1e9 * int(ticks[-1] - ticks[0]) / elapsed_ns
@@ -355,7 +380,7 @@ def check_clock(
 def check_finite(
     path: Path, field: str, values: NDArray[np.float64], ticks: NDArray[np.int64]
 ) -> None:
-    """Raise if values are not finite, or implausible for any rig.
+    """Raise if values of a channel are not finite, or implausible for any rig.
 
     Parameters
     ----------
@@ -364,32 +389,34 @@ def check_finite(
     field : str
         Name of the channel.
     values : ndarray, shape (n,)
-        In rad or N·m.
+        Values in rad or N·m.
     ticks : ndarray of int, shape (n,)
         Numbers of the recorded ticks.
 
     Raises
     ------
     RecordError
-        There are such values.
+        Some values are not finite or implausible.
     """
-    large = np.flatnonzero(np.abs(values) > MAX_VALUE)
-    bad = np.flatnonzero(~np.isfinite(values))
-    if bad.size:
+    too_large = np.flatnonzero(np.abs(values) > MAX_ABSOLUTE_VALUE)
+    not_finite = np.flatnonzero(~np.isfinite(values))
+    if not_finite.size:
         raise RecordError(
-            f"{path}: {field} is {values[bad[0]]} at tick {ticks[bad[0]]} and not finite in "
-            f"{bad.size} of {len(values)} samples; such a record cannot be analysed."
+            f"{path}: {field} is {values[not_finite[0]]} at tick {ticks[not_finite[0]]} and not "
+            "finite in "
+            f"{not_finite.size} of {len(values)} samples; such a record cannot be analysed."
         )
-    if large.size:
+    if too_large.size:
         raise RecordError(
-            f"{path}: {field} is {values[large[0]]:g} at tick {ticks[large[0]]} and beyond "
-            f"±{MAX_VALUE:g} in {large.size} of {len(values)} samples; no rig has such values; "
+            f"{path}: {field} is {values[too_large[0]]:g} at tick {ticks[too_large[0]]} and beyond "
+            f"±{MAX_ABSOLUTE_VALUE:g} in {too_large.size} of {len(values)} samples; no rig has "
+            "such values; "
             "correct the program that wrote the file."
         )
 
 
 def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
-    """Raise if the torque is constant throughout: noise alone would change it.
+    """Raise if the torque is constant, because noise alone would change it.
 
     Parameters
     ----------
@@ -401,7 +428,7 @@ def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
     Raises
     ------
     RecordError
-        It is constant.
+        The torque is constant.
     """
     if torque_nm.size > 1 and np.ptp(torque_nm) == 0.0:
         raise RecordError(
@@ -413,52 +440,59 @@ def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
 def check_fillable(
     path: Path, channel: str, unknown: NDArray[np.bool_], first_tick: int, rate_hz: float
 ) -> None:
-    """Raise if too much of a channel in the sweep, in total or at once, would be interpolated.
+    """Raise if too many samples of a channel in the sweep would have to be interpolated.
+
+    The limits are `MAX_UNKNOWN_FRACTION` for all samples and `MAX_GAP_S` for a single gap.
 
     Parameters
     ----------
     path : Path
+        File that messages name.
     channel : str
-        Name in messages.
+        Name of the channel in messages.
     unknown : ndarray of bool, shape (n,)
         Samples of the sweep without a new value.
     first_tick : int
         First tick of the sweep.
     rate_hz : float
+        Sampling rate.
     """
-    much = too_much_unknown(f"the {channel} in the sweep", int(unknown.sum()), len(unknown))
-    if much:
-        raise RecordError(f"{path}: {much}")
-    run, start = longest_run(unknown)
-    if run > MAX_GAP_S * rate_hz:
+    problem = too_much_unknown(f"the {channel} in the sweep", int(unknown.sum()), len(unknown))
+    if problem:
+        raise RecordError(f"{path}: {problem}")
+    gap_ticks, start = longest_run(unknown)
+    if gap_ticks > MAX_GAP_S * rate_hz:
         raise RecordError(
-            f"{path}: {run} ticks of the {channel} in a row are missing or stale from tick "
-            f"{first_tick + start} on ({1e3 * run / rate_hz:.0f} ms), longer than the "
+            f"{path}: {gap_ticks} ticks of the {channel} in a row are missing or stale from tick "
+            f"{first_tick + start} on ({1e3 * gap_ticks / rate_hz:.0f} ms), longer than the "
             f"{1e3 * MAX_GAP_S:g} ms that are interpolated; record the session again."
         )
 
 
-def too_much_unknown(what: str, unknown: int, of: int) -> str | None:
-    """Return the message that more than `MAX_UNKNOWN_FRACTION` of a channel is unknown, or None.
+def too_much_unknown(channel_text: str, unknown: int, total: int) -> str | None:
+    """Return an error message if too many samples of a channel are unknown, or None.
+
+    The limit is the fraction `MAX_UNKNOWN_FRACTION`.
 
     Parameters
     ----------
-    what : str
-        The channel, as the message calls it.
-    unknown, of : int
-        Samples without a new value, and all.
+    channel_text : str
+        Name of the channel in the message.
+    unknown, total : int
+        Number of samples without a new value, and number of all samples.
     """
-    if unknown <= MAX_UNKNOWN_FRACTION * of:
+    if unknown <= MAX_UNKNOWN_FRACTION * total:
         return None
     return (
-        f"{unknown} of {of} samples ({100 * unknown / of:.2g} %) of {what} are missing or flagged, "
+        f"{unknown} of {total} samples ({100 * unknown / total:.2g} %) of {channel_text} are "
+        "missing or flagged, "
         f"more than the {100 * MAX_UNKNOWN_FRACTION:g} % that an analysis tolerates; record the "
         "session again."
     )
 
 
 def longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
-    """Return length and start of the longest run of True, (0, 0) without any.
+    """Return length and start index of the longest run of True; (0, 0) if no element is True.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""Results of one record, for all outputs: text, page, files.
+"""Results of the analyses of one record, from which texts, pages and files are made.
 
-`record_result` makes a `RecordResult` from a session file. A campaign retains the parts of each
-that it needs (`analysis.campaigns.SessionAnalysis`) and combines them in an
+`record_result` analyses a session file and returns a `RecordResult`. A campaign retains part of
+each result (`analysis.campaigns.SessionAnalysis`) and combines these in an
 `analysis.campaigns.CampaignResult`.
 """
 
@@ -24,33 +24,37 @@ if TYPE_CHECKING:
     from rigd.beam import Beam, Damping
     from rigd.session import Validity
 
-_ORDERS: Final = frozenset({"alpha", "lambda"})
+_ORDER_NAMES: Final = frozenset({"alpha", "lambda"})
+"""Names of the orders of the damping."""
 
 
 FigureFormat = Literal["png", "svg", "pdf"]
+"""File format of figures."""
 FIGURE_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg", "pdf")
+"""File formats in which figures can be written."""
 DEFAULT_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg")
-"""Default formats of the figures: PDF takes as long as PNG and SVG together."""
+"""Default file formats of the figures. PDF takes as long as PNG and SVG together."""
 
 
 @dataclass(frozen=True, slots=True)
 class Routes:
-    """Selection of analyses of a record: Welch's fits, and those of the whole record.
+    """Selected analyses of a record, with their settings.
 
     Attributes
     ----------
     settings : WelchSettings
+        Settings of the Welch fits.
     paper, whole_record : bool
-        Selected analyses.
+        Whether the Welch fits of the paper, and the fits to the whole record, are run.
     fixed : tuple of str
-        Settings of rig and specimen that stay at the file's values.
+        Parameters of rig and specimen that stay at the file's values.
     band_hz : tuple of float or None
-        Band of both; None selects the largest suitable band.
+        Frequency band of all fits; None selects the largest suitable band.
     figures : tuple of str
-        Formats of the report's figures.
+        File formats of the report's figures.
     uniformity : float or None
-        Relative standard deviation of each mode's frequency from that of a uniform beam; None takes
-        the file's.
+        Relative standard deviation of mode frequencies from those of a uniform beam; None uses the
+        value in the file.
     """
 
     settings: WelchSettings
@@ -64,18 +68,20 @@ class Routes:
 
 @dataclass(frozen=True, slots=True)
 class WholeRecord:
-    """Results of the whole record: all structures fitted, and the selected one.
+    """Fits of all damping structures to a whole record, and the selected structure.
 
     Attributes
     ----------
     record : Record
+        Analysed record.
     selection : Selection
+        Candidates, selected fit and verdict.
     band_hz : tuple of float
-        Band of the fits.
+        Frequency band of the fits.
     fixed : tuple of str
-        Settings that stayed at the file's values in them.
+        Parameters that stayed at the file's values.
     validity : Validity
-        How exact the linear model is for the record.
+        Validity of the linear model for the record.
     """
 
     record: Record
@@ -86,37 +92,37 @@ class WholeRecord:
 
     def __post_init__(self) -> None:
         plant = self.fit.plant
-        validity = _validity(self.record, (plant.beam, plant.damping))
+        validity = _record_validity(self.record, (plant.beam, plant.damping))
         if (test := self.headline.uniform_beam) is not None:
             validity = replace(validity, uniform_beam=test.summary)
         object.__setattr__(self, "validity", validity)
 
     @property
     def analysis(self) -> RecordAnalysis:
-        """Return the fits with their noise, lines and bins."""
+        """Fits with the noise spectrum, the disturbing lines and the frequency bins."""
         return self.selection.analysis
 
     @property
     def fits(self) -> Mapping[str, RecordFit]:
-        """Return the fits by their names in tables, the lowest BIC first."""
-        return {each.name: each.fit for each in self.selection.candidates}
+        """Fits by their names in tables, the lowest BIC first."""
+        return {candidate.name: candidate.fit for candidate in self.selection.candidates}
 
     @property
     def delta_bic(self) -> Mapping[str, float]:
-        """Return the BIC above the lowest by the name of the fit."""
+        """Difference of each fit's BIC from the lowest BIC, by the name of the fit."""
         best, *_ = self.selection.candidates
-        return {each.name: each.bic - best.bic for each in self.selection.candidates}
+        return {candidate.name: candidate.bic - best.bic for candidate in self.selection.candidates}
 
     @property
     def headline(self) -> Headline:
-        """Return the reported numbers; their fit is one of `fits`."""
+        """Reported estimates, which follow from one of `fits`."""
         return self.selection.headline
 
     @property
     def verdict(self) -> Verdict:
-        """Return the verdict in sentences for the operator.
+        """Verdict on the record, in sentences for the operator.
 
-        Its second sentence states the validity of the numbers.
+        The second sentence states the validity of the estimates.
         """
         verdict = self.selection.verdict
         first, others = verdict.sentences[:1], verdict.sentences[1:]
@@ -124,29 +130,29 @@ class WholeRecord:
 
     @property
     def orders(self) -> tuple[OrderVerdict, OrderVerdict]:
-        """Return the verdicts on both orders."""
+        """Verdicts on the orders of internal and external damping."""
         return self.verdict.alpha, self.verdict.lambda_
 
     @property
     def fit(self) -> RecordFit:
-        """Return the fit behind the numbers of the headline."""
+        """Fit from which the reported estimates follow."""
         return self.headline.fit
 
     @property
     def visible_modes(self) -> tuple[int, ...]:
-        """Return the numbers of the modes that the record shows."""
+        """Numbers of the modes that are visible in the record."""
         return self.headline.visible_modes
 
     @property
     def withheld(self) -> frozenset[str]:
-        """Return the orders of that fit whose numbers carry a flag."""
-        return frozenset(_ORDERS & self.headline.flags.keys())
+        """Orders of the reported fit whose estimates have a flag against them."""
+        return frozenset(_ORDER_NAMES & self.headline.flags.keys())
 
     @property
     def combined(self) -> dict[str, ReportedValue]:
-        """Return the headline's parameters that depend on a scale of stated uncertainty.
+        """Reported parameters that depend on a scale whose uncertainty the file states.
 
-        Their standard uncertainties and intervals include that of the scale.
+        Their standard uncertainties and intervals include the uncertainty of the scale.
         """
         from analysis.identify.scales import scales_absorbed, with_scales
 
@@ -155,39 +161,47 @@ class WholeRecord:
         return with_scales(self.headline.parameters, self.record.uncertainty)
 
     def headline_json(self) -> dict[str, Any]:
-        """Return the headline as the content of the JSON document."""
+        """Return the reported estimates as the content of a JSON document."""
         from analysis.identify import headline_json
-        from analysis.record_checks import SCALES
+        from analysis.record_checks import SCALE_QUANTITIES
 
         file, findings = str(self.record.path), self.verdict.findings
         content = headline_json(file, self.headline, self.orders, findings, self.validity)
-        exact = content["exact_geometry"]  # None: the parameters are those of an exact geometry
+        exact = content["exact_geometry"]  # None if the parameters assume it
         (content if exact is None else exact)["covariance"] = self._covariance_json()
         return {
             **content,
             "scale_uncertainty": {
-                name: value for name, value in self.record.uncertainty.items() if name in SCALES
+                name: value
+                for name, value in self.record.uncertainty.items()
+                if name in SCALE_QUANTITIES
             },
-            "combined": {name: each.as_json() for name, each in self.combined.items()},
+            "combined": {
+                name: reported_value.as_json() for name, reported_value in self.combined.items()
+            },
         }
 
     def _covariance_json(self) -> dict[str, Any]:
-        """Return the covariance of the fit, with ``ln_`` before the names of logarithms."""
+        """Return names and covariance matrix of the fit; ``ln_`` marks a logarithm."""
         from analysis.identify import LOGARITHMIC
 
         return {
             "names": [
-                f"ln_{each}" if each in LOGARITHMIC else each for each in self.fit.determined
+                f"ln_{parameter}" if parameter in LOGARITHMIC else parameter
+                for parameter in self.fit.determined
             ],
             "matrix": self.fit.covariance.tolist(),
         }
 
     @property
     def unsupported(self) -> frozenset[str]:
-        """Return the orders with a flag on an exactly uniform beam, or of absent damping."""
+        """Orders that the record does not support.
+
+        These have a flag for an exactly uniform beam, or belong to absent damping.
+        """
         exact = (self.headline.exact or self.headline).parameters
-        flagged = {name for name in _ORDERS & exact.keys() if exact[name].flag is not None}
-        return frozenset(flagged | {each.order for each in self.orders if each.value is None})
+        flagged = {name for name in _ORDER_NAMES & exact.keys() if exact[name].flag is not None}
+        return frozenset(flagged | {order.order for order in self.orders if order.value is None})
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,12 +211,13 @@ class RecordResult:
     Attributes
     ----------
     record : Record
+        Analysed record.
     whole : WholeRecord or None
         Fits to the whole record; None if they were not run.
     welch : WelchAnalysis or None
         Fits to Welch's estimate, as in the reference paper; None if they were not run.
     validity : Validity
-        How exact the linear model is for the record.
+        Validity of the linear model for the record.
     """
 
     record: Record
@@ -214,29 +229,32 @@ class RecordResult:
         if self.whole is not None:
             validity = self.whole.validity
         else:
-            # Welch's fits differ: the slope is up to the largest of theirs.
+            # The Welch fits differ, and the largest slope of the tip among them is used.
             models = () if self.welch is None else self.welch.models
-            dampings = [each.fit.damping for each in models]
-            validity = _validity(self.record, *((self.record.beam, each) for each in dampings))
+            dampings = [model.fit.damping for model in models]
+            validity = _record_validity(
+                self.record, *((self.record.beam, damping) for damping in dampings)
+            )
         object.__setattr__(self, "validity", validity)
 
     @property
     def name(self) -> str:
-        """Return the name of the record for titles."""
+        """Name of the session file, for titles."""
         return self.record.path.name
 
     @property
     def unsupported(self) -> frozenset[str]:
-        """Return the orders that the whole record does not support; none without its fits."""
+        """Orders that the whole record does not support; empty without whole-record fits."""
         return frozenset() if self.whole is None else self.whole.unsupported
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return the warnings for the analyst."""
+        """Warnings for the analyst."""
         return self.record.warnings if self.welch is None else self.welch.warnings
 
 
-def _validity(record: Record, *models: tuple[Beam, Damping]) -> Validity:
+def _record_validity(record: Record, *models: tuple[Beam, Damping]) -> Validity:
+    """Return the validity of the linear model for a record and models estimated from it."""
     from analysis.validity import record_validity
 
     return record_validity(record.metadata, record.angle_rad, record.rate_hz, *models)
@@ -245,15 +263,16 @@ def _validity(record: Record, *models: tuple[Beam, Damping]) -> Validity:
 def whole_record(
     record: Record, fixed: tuple[Setting, ...] = (), band_hz: tuple[float, float] | None = None
 ) -> WholeRecord:
-    """Fit every structure to a whole record, and select the one that its data support.
+    """Fit every damping structure to a whole record, and select the best supported one.
 
     Parameters
     ----------
     record : Record
+        Record of a session.
     fixed : tuple of str
-        Settings that stay at the file's values.
+        Parameters that stay at the file's values.
     band_hz : tuple of float, optional
-        By default the largest suitable band.
+        Frequency band, by default the largest suitable one.
 
     Raises
     ------
@@ -275,42 +294,44 @@ def record_result(
     on_step: Callable[[str], None] = lambda _done: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> RecordResult:
-    """Analyse a session file.
+    """Run the selected analyses of a session file.
 
     Parameters
     ----------
     path : Path
+        Session file.
     routes : Routes
+        Selected analyses and their settings.
     on_step : callable, optional
-        Called with a few words after each step.
+        Called with the name of each step after it.
     warn : callable, optional
-        Called with a sentence on an omitted analysis.
+        Called with a sentence on each omitted analysis.
 
     Raises
     ------
     SessionError, RecordError
-        The file cannot be read, or holds no record that can be analysed.
+        The file cannot be read, or contains no record that can be analysed.
     FrequencyResponseError, MeasurementError
-        No analysis suits the record, or the settings do not.
+        No analysis is applicable to the record, or the settings are not.
     """
     from analysis.identify import MeasurementError
     from analysis.record import load_record
     from analysis.suited import check_record_band, remarks, welch_analysis
 
     record = with_uniformity(load_record(path), routes.uniformity)
-    record = _with_warnings(record, remarks(record, routes.band_hz))
+    record = _add_warnings(record, remarks(record, routes.band_hz))
     on_step("read")
     if not routes.paper:
         check_record_band(record, routes.band_hz)
-    welch, left_out = None, None
+    welch, omission_remark = None, None
     if routes.paper:
-        welch, left_out = welch_analysis(
+        welch, omission_remark = welch_analysis(
             record, routes.settings, routes.band_hz,
             optional=routes.whole_record, on_step=on_step,
         )  # fmt: skip
-    if left_out:
-        warn(f"{path}: {left_out}")
-        record = _with_warnings(record, (left_out,))
+    if omission_remark:
+        warn(f"{path}: {omission_remark}")
+        record = _add_warnings(record, (omission_remark,))
     whole = None
     if routes.whole_record:
         on_step("whole record")
@@ -324,34 +345,39 @@ def record_result(
 
 
 def with_uniformity(record: Record, uniformity: float | None) -> Record:
-    """Return a record with a stated uniformity; None retains that of the file.
+    """Return a record with another uniformity of the beam.
 
     Parameters
     ----------
     record : Record
+        Record with the uniformity stated in its file.
     uniformity : float or None
+        Relative standard deviation of mode frequencies; None retains the record's value.
     """
     return record if uniformity is None else replace(record, uniformity=uniformity)
 
 
-def _with_warnings(record: Record, more: tuple[str, ...]) -> Record:
-    return replace(record, warnings=(*record.warnings, *more)) if more else record
+def _add_warnings(record: Record, warnings: tuple[str, ...]) -> Record:
+    """Return a record with additional warnings."""
+    return replace(record, warnings=(*record.warnings, *warnings)) if warnings else record
 
 
 def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
-    """Return a copy of a JSON value with null for non-finite numbers, and without numpy types.
+    """Return a copy of a JSON value with null for non-finite numbers, and without NumPy types.
 
-    Keys lose the underscore that distinguishes an attribute from a Python keyword (``lambda_``).
+    A trailing underscore, which distinguishes an attribute from a Python keyword (``lambda_``), is
+    removed from keys.
     """
     from numpy import generic
 
-    def copy(value: Any) -> Any:  # noqa: ANN401
+    def copy_value(value: Any) -> Any:  # noqa: ANN401
+        """Return a copy of one value, recursively."""
         if isinstance(value, dict):
-            return {str(key).rstrip("_"): copy(item) for key, item in value.items()}
+            return {str(key).rstrip("_"): copy_value(item) for key, item in value.items()}
         if isinstance(value, list | tuple):
-            return [copy(item) for item in value]
+            return [copy_value(item) for item in value]
         if isinstance(value, generic):
             value = value.item()
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    return copy(value)
+    return copy_value(value)

@@ -1,4 +1,4 @@
-"""p-values and quantiles of the analyzer's test distributions; the fit in per cent.
+"""p-values and quantiles of the distributions used in tests; the fit in per cent.
 
 They use `scipy.special`, since `scipy.stats` takes four times as long to import. It is imported on
 first use, since a command that prints its help needs none.
@@ -14,23 +14,25 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 NORMAL_95: Final = 1.959963984540054
-"""Two-sided 95 % point of the standard normal distribution."""
+"""Two-sided 95 % quantile of the standard normal distribution."""
 KOLMOGOROV_95: Final = 1.3581
-"""95 % point of the Kolmogorov statistic times the root of the count."""
+"""95 % quantile of the Kolmogorov statistic times the square root of the number of values."""
 
-_SMALLEST: Final = 1e-290
-"""Tail probability below which its logarithm is taken from the tail's asymptotic expansion."""
+_SMALLEST_TAIL: Final = 1e-290
+"""Tail probability below which its logarithm is computed from an asymptotic expansion."""
 
 
 def chi_square_p_value(value: ArrayLike, degrees_of_freedom: float) -> NDArray[np.float64]:
-    """Return the probability that a chi-square is at least `value`, of the shape of `value`.
+    """Return the probability that a chi-square variable is at least `value`.
+
+    The result has the shape of `value`.
 
     Parameters
     ----------
     value : array_like
-        Chi-square, not negative.
+        Value of the chi-square variable, not negative.
     degrees_of_freedom : float
-        Above 0.
+        Degrees of freedom, above 0.
 
     Examples
     --------
@@ -45,16 +47,16 @@ def chi_square_p_value(value: ArrayLike, degrees_of_freedom: float) -> NDArray[n
 
 
 def chi_square_deviate(value: float, degrees_of_freedom: float) -> float:
-    """Return the standard normal deviate with the tail probability of a chi-square.
+    """Return the standard normal deviate with the same upper tail probability as a chi-square.
 
-    It is finite for any `value`, also where the probability underflows.
+    The deviate is finite for any `value`, even if the probability underflows.
 
     Parameters
     ----------
     value : float
-        Chi-square, not negative.
+        Value of the chi-square variable, not negative.
     degrees_of_freedom : float
-        Above 0.
+        Degrees of freedom, above 0.
 
     Examples
     --------
@@ -65,22 +67,22 @@ def chi_square_deviate(value: float, degrees_of_freedom: float) -> float:
     from scipy.special import chdtr, chdtrc, gammaln, ndtri_exp
 
     a, x = degrees_of_freedom / 2, max(value / 2, np.finfo(float).tiny)
-    above = x > a
-    tail = float((chdtrc if above else chdtr)(2 * a, 2 * x))
-    if tail > _SMALLEST:
+    in_upper_tail = x > a
+    tail = float((chdtrc if in_upper_tail else chdtr)(2 * a, 2 * x))
+    if tail > _SMALLEST_TAIL:
         log_tail = np.log(tail)
-    elif above:
+    elif in_upper_tail:
         # Leading terms of the incomplete gamma functions far from their middle, summed as geometric
         # series (NIST DLMF 8.11.2 and 8.11.4): the deviate is off by less than 1e-4 there.
         log_tail = (a - 1) * np.log(x) - x - np.log1p(-(a - 1) / x) - gammaln(a)
     else:
         log_tail = a * np.log(x) - x - np.log1p(-x / (a + 1)) - gammaln(a + 1)
     deviate = float(ndtri_exp(log_tail))
-    return -deviate if above else deviate
+    return -deviate if in_upper_tail else deviate
 
 
 def kolmogorov_p_value(statistic: float) -> float:
-    """Return the p-value of the Kolmogorov statistic times the root of the count.
+    """Return the p-value of a Kolmogorov statistic that is scaled by the root of the sample size.
 
     Examples
     --------
@@ -94,14 +96,14 @@ def kolmogorov_p_value(statistic: float) -> float:
 
 
 def student_t_quantile(level: float, degrees_of_freedom: float) -> float:
-    """Return the two-sided quantile of Student's t: ± it holds a fraction `level`.
+    """Return the half width of the central interval of Student's t with probability `level`.
 
     Parameters
     ----------
     level : float
-        Fraction, 0 to 1.
+        Probability of the interval, 0 to 1.
     degrees_of_freedom : float
-        Above 0.
+        Degrees of freedom, above 0.
 
     Examples
     --------
@@ -117,15 +119,15 @@ def student_t_quantile(level: float, degrees_of_freedom: float) -> float:
 def nrmse_percent(residual: NDArray[Any], measured: NDArray[Any]) -> float:
     """Return the fit in %, as ``compare`` of MATLAB's System Identification Toolbox defines it.
 
-    ``100 (1 - |residual| / |measured - its mean|)``: 100 for a perfect model, 0 for one that is no
-    better than the mean, below 0 for one that is worse.
+    It is ``100 (1 - |residual| / |measured - mean|)``: 100 for a perfect model, 0 for a model that
+    is as good as the mean, and negative for a worse model.
 
     Parameters
     ----------
     residual : ndarray, shape (n,)
-        Measured less modelled, real or complex.
+        Measured less modelled values, real or complex.
     measured : ndarray, shape (n,)
-        The mean already taken out, such as the part of a spectrum without its first bin.
+        Measured values without their mean, such as a spectrum without its first bin.
 
     Examples
     --------

@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from analysis.record import Record
 
 Band = tuple[float, float]
+"""First and last frequency of a band in Hz."""
 
 LEFT_OUT: Final = "Welch fits left out: "
-"""Beginning of the sentence with the reason why there are none."""
+"""Start of the sentence that states why the Welch fits were omitted."""
 
-_NO_SWEEP: Final = {
+_WELCH_EXCLUSIONS: Final = {
     "step": "a step excites all frequencies at one moment, which averaging over segments loses",
     "move": "a move excites all frequencies at one moment, which averaging over segments loses",
     "touch": "a touch excites little, and a beam that meets something responds as another one",
@@ -31,50 +32,54 @@ _NO_SWEEP: Final = {
     "modes": "narrow sweeps excite the modes alone, and the response between them is noise",
     "until": "a search excites little beside the modes, and the response between them is noise",
 }
-"""Excitation → why Welch's method does not suit it."""
+"""Reason why Welch's method is not applicable, by the name of the excitation."""
 
-_TOUCH: Final = (
+_TOUCH_REMARK: Final = (
     "The session is a touch, but the fits take the beam to be free: they hold only if it met "
     "nothing. analyze touch finds where, when and how hard it did."
 )
+"""Remark on a session with a planned touch."""
 
-_TWO_SWEEPS: Final = (
+_TWO_SWEEPS_REMARK: Final = (
     "The session sweeps there and back: the Welch fits use the way there alone, those of the whole "
     "record use both."
 )
+"""Remark on a session with a sweep in both directions."""
 
-_WHOLE: Final = 0.99
-"""Fraction of the planned sweep from which it counts as complete: ticks may be missing at its
+_COMPLETE_FRACTION: Final = 0.99
+"""Fraction of the planned sweep from which it counts as complete, as samples may be missing at the
 end."""
 
 
 def record_band_hz(record: Record, requested_hz: Band | None = None) -> Band:
-    """Return the band of the whole-record fits: the requested one, or the usual one.
+    """Return the frequency band in Hz of the whole-record fits.
 
-    The usual band is limited by the record's rate.
+    It is the requested band, or else the default band limited by the record's sampling rate.
 
     Parameters
     ----------
     record : Record
+        Record of a session.
     requested_hz : tuple of float, optional
         Requested band in Hz; used unchanged.
     """
-    return requested_hz or _within(RECORD_BAND_HZ, record.rate_hz)
+    return requested_hz or _limit_band(RECORD_BAND_HZ, record.rate_hz)
 
 
 def check_record_band(record: Record, requested_hz: Band | None) -> None:
-    """Raise if the record's rate does not support a band.
+    """Raise if a record's sampling rate is too low for a band.
 
     Parameters
     ----------
     record : Record
+        Record of a session.
     requested_hz : tuple of float or None
         Requested band, in Hz.
 
     Raises
     ------
     SettingsError
-        The band ends too high.
+        The upper end of the band is too high.
     """
     from analysis.paper import SettingsError
 
@@ -92,37 +97,40 @@ def welch_settings(
 ) -> WelchSettings:
     """Return the settings of the Welch fits with the requested band or the default one.
 
-    The default is the band of the reference paper; another band in the settings is a requested one,
-    too. A band from 0 Hz begins at the first frequency above it, since a constant has no
-    information.
+    The default is the band of the reference paper, limited by the record's sampling rate. Another
+    band in the settings counts as requested. A band from 0 Hz begins at the first frequency above
+    it, because a constant contains no information.
 
     Parameters
     ----------
     record : Record
+        Record of a session.
     settings : WelchSettings
+        Requested settings.
     requested_hz : tuple of float, optional
         Requested band, in Hz.
     """
     if requested_hz is None and settings.band_hz != PAPER_BAND_HZ:
         requested_hz = settings.band_hz
-    first_hz, last_hz = requested_hz or _within(PAPER_BAND_HZ, record.rate_hz)
+    first_hz, last_hz = requested_hz or _limit_band(PAPER_BAND_HZ, record.rate_hz)
     if first_hz == 0.0:
         first_hz = record.rate_hz / settings.segmentation(record.rate_hz).nfft
     return replace(settings, band_hz=(first_hz, last_hz))
 
 
 def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]:
-    """Return sentences on the adaptations of the analysis to the record.
+    """Return sentences on adaptations of the analysis to a record, such as a lower band.
 
     Parameters
     ----------
     record : Record
+        Record of a session.
     requested_hz : tuple of float, optional
         Requested band, in Hz.
     """
-    sentences = (_TOUCH,) if record.metadata.get("excitation") == "touch" else ()
+    sentences = (_TOUCH_REMARK,) if record.metadata.get("excitation") == "touch" else ()
     if record.there is not None:
-        sentences = (*sentences, _TWO_SWEEPS)
+        sentences = (*sentences, _TWO_SWEEPS_REMARK)
     _, last_hz = record_band_hz(record, requested_hz)
     if requested_hz is not None or last_hz == RECORD_BAND_HZ[1]:
         return sentences
@@ -141,35 +149,38 @@ def welch_analysis(
     optional: bool,
     on_step: Callable[[str], None] = lambda _done: None,
 ) -> tuple[WelchAnalysis | None, str | None]:
-    """Run Welch's fits if they suit the record.
+    """Run the Welch fits if they are applicable to a record.
 
     Parameters
     ----------
     record : Record
+        Record of a session.
     settings : WelchSettings
+        Requested settings.
     requested_hz : tuple of float, optional
         Requested band, in Hz.
     optional : bool
-        Whether the record is analysed without them, too. Even then segments or an estimator that
-        were chosen for it are not ignored silently.
+        Whether the Welch fits may be omitted. Fits with a chosen estimator or chosen segments are
+        not omitted.
     on_step : callable, optional
-        Callback of `analysis.paper._route.analyse`.
+        Called with the name of each step after it (see `analysis.paper.analyse`).
 
     Returns
     -------
     analysis : WelchAnalysis or None
+        Results of the fits; None if they were omitted.
     left_out : str or None
-        Sentence with the reason why there is none.
+        Sentence on the reason why they were omitted; None if they were run.
 
     Raises
     ------
     FrequencyResponseError
-        The fits were requested, and cannot be run.
+        The fits may not be omitted, and cannot be run.
     """
     from analysis.paper import FrequencyResponseError, SettingsError, analyse
 
-    optional = optional and settings.are_usual
-    reason = against_welch(record, requested_hz) if optional else None
+    optional = optional and settings.are_from_paper
+    reason = welch_exclusion_reason(record, requested_hz) if optional else None
     if reason is None:
         try:
             return analyse(record, welch_settings(record, settings, requested_hz), on_step), None
@@ -180,27 +191,30 @@ def welch_analysis(
     return None, f"{LEFT_OUT}{reason}."
 
 
-def against_welch(record: Record, requested_hz: Band | None = None) -> str | None:
-    """Return why Welch's method does not suit a record, as the end of a sentence, or None.
+def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> str | None:
+    """Return why Welch's method is not applicable to a record, or None if it is.
+
+    The reason is the end of a sentence.
 
     Parameters
     ----------
     record : Record
+        Record of a session.
     requested_hz : tuple of float, optional
         Requested band, in Hz.
     """
-    kind = record.metadata.get("excitation", "")
-    if kind in _NO_SWEEP:
-        usual = WelchSettings().segmentation(record.rate_hz)
-        fits = record.sweep_samples >= usual.segment_length
-        option = "--method welch" if fits else "--method welch --frf fft"
-        return f"{_NO_SWEEP[kind]} ({option} makes them nevertheless)"
-    planned_s = _number(record, "duration_s")
+    excitation = record.metadata.get("excitation", "")
+    if excitation in _WELCH_EXCLUSIONS:
+        paper_segmentation = WelchSettings().segmentation(record.rate_hz)
+        is_long_enough = record.sweep_samples >= paper_segmentation.segment_length
+        option = "--method welch" if is_long_enough else "--method welch --frf fft"
+        return f"{_WELCH_EXCLUSIONS[excitation]} ({option} makes them nevertheless)"
+    planned_s = _metadata_number(record, "duration_s")
     swept_s = record.first_sweep_samples / record.rate_hz
-    if requested_hz is not None or planned_s is None or swept_s >= _WHOLE * planned_s:
+    if requested_hz is not None or planned_s is None or swept_s >= _COMPLETE_FRACTION * planned_s:
         return None
-    reached_hz = _reached_hz(record, swept_s / planned_s)
-    first_hz, last_hz = _within(PAPER_BAND_HZ, record.rate_hz)
+    reached_hz = _reached_frequency_hz(record, swept_s / planned_s)
+    first_hz, last_hz = _limit_band(PAPER_BAND_HZ, record.rate_hz)
     if reached_hz is None or not first_hz < reached_hz < last_hz:
         return None
     return (
@@ -209,23 +223,27 @@ def against_welch(record: Record, requested_hz: Band | None = None) -> str | Non
     )
 
 
-def _reached_hz(record: Record, fraction: float) -> float | None:
-    """Return the frequency that an upward sweep reaches after a fraction of its duration."""
-    start_hz, stop_hz = _number(record, "start_hz"), _number(record, "stop_hz")
+def _reached_frequency_hz(record: Record, fraction: float) -> float | None:
+    """Return the frequency in Hz that a rising sweep reaches after a fraction of its duration.
+
+    Return None if the sweep does not rise, or its ends are not stated.
+    """
+    start_hz, stop_hz = _metadata_number(record, "start_hz"), _metadata_number(record, "stop_hz")
     if start_hz is None or stop_hz is None or stop_hz <= start_hz:
         return None
     return start_hz + fraction * (stop_hz - start_hz)
 
 
-def _number(record: Record, key: str) -> float | None:
+def _metadata_number(record: Record, key: str) -> float | None:
+    """Return a number in the metadata of a record; None if it is not stated."""
     try:
         return float(record.metadata[key])
     except (KeyError, ValueError):
         return None
 
 
-def _within(band_hz: Band, rate_hz: float) -> Band:
-    """Return a band limited by a rate; the whole band if nothing remained."""
+def _limit_band(band_hz: Band, rate_hz: float) -> Band:
+    """Return a band limited by a sampling rate; the whole band if nothing would remain."""
     first_hz, last_hz = band_hz
     limit_hz = min(last_hz, LARGEST_FRACTION_OF_RATE * rate_hz)
     return (first_hz, limit_hz) if first_hz < limit_hz else band_hz

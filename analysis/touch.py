@@ -1,7 +1,7 @@
 """Touches of a recorded session: position, time and force of contacts of the antenna.
 
-Detections of the control loop are marked in the samples. Without marks, the loop's own test runs
-over the record: a session that was no search may have had contacts as well. Each touch is then
+The control loop marks its detections in the samples. Without such marks, the loop's test is applied
+to the record, because a session that was no search may have had contacts, too. Each touch is then
 estimated as during a session (`rigd.touch`).
 """
 
@@ -62,52 +62,55 @@ if TYPE_CHECKING:
     Real = NDArray[np.float64]
 
 _LEAST_BEFORE_S: Final = 0.3
+"""Least duration of the record before a detection that an estimate needs."""
 _LEAST_AFTER_S: Final = 0.02
-"""Least record around a detection for an estimate."""
+"""Least duration of the record after a detection that an estimate needs."""
 _LEAST_REST_S: Final = 0.5
-"""Beginning from which the test estimates the noise, if the file states no longer rest."""
-_QUIET_S: Final = 0.5
-"""Time without a detection after which the next one is another touch: the beam bounces."""
-_MOST_OF_TICK: Final = 0.99
-"""Filters of more than a hundred records a tick are treated as that."""
-_MOST_FOUND: Final = 20
-"""With more touches in a record that was no search the model does not fit."""
-_MOST_OF_MODEL: Final = 5.0
-"""Sum of squared residuals per degree of freedom from which the model is doubtful."""
-_LEAST_NOISE: Final = 1e-9
-_LEAST_QUIET: Final = 100
-"""Number of samples for the fit of the vibration before a touch."""
-_POINTS: Final = 41
-"""Number of points along the antenna."""
-_DESCRIPTIONS: Final = ("specimen.toml", "profile.toml")
-"""Attachments with the damping; the first one that has it is used."""
+"""Least duration at the start from which the test estimates the noise."""
+_LEAST_PAUSE_S: Final = 0.5
+"""Time without a detection after which the next one is another touch, as the beam bounces."""
+_LONGEST_FILTER_TICKS: Final = 0.99
+"""Limit of the averaging filter's span in ticks, which is that of a hundred records per tick."""
+_MOST_TOUCHES: Final = 20
+"""Largest number of touches found in a record; with more, the model does not fit the record."""
+_LARGEST_CHI2_PER_DEGREE: Final = 5.0
+"""Sum of squared residuals per degree of freedom above which the model is doubtful."""
+_LEAST_NOISE_STD: Final = 1e-9
+"""Least standard deviation of a channel's noise."""
+_LEAST_FIT_SAMPLES: Final = 100
+"""Least number of samples for the fit of the vibration before a touch."""
+_ANTENNA_POINTS: Final = 41
+"""Number of points along the antenna at which its deflection is computed."""
+_DAMPING_ATTACHMENTS: Final = ("specimen.toml", "profile.toml")
+"""Attachments of a session file that may state the damping, in the order of preference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """Touch of a session with its estimate.
+    """Contact of the antenna during a session, with the estimate of its position and time.
 
     Attributes
     ----------
     number
-        From 1 on, in the order of time.
+        Number of the touch, from 1, in the order of time.
     tick
         Tick of the detection.
     noticed_s
-        Its time, from the beginning of the estimate's record.
+        Time of the detection after the start of the record used for the estimate.
     angle_rad
-        Angle of the motor at the touch.
+        Motor angle at the touch.
     start_s
-        Time of the estimate's record in the session.
+        Time in the session at which the record used for the estimate starts.
     estimate
-        Estimate; None, like the following ones, if the record around it is too short.
+        Estimate of the touch. It is None, like the following attributes, if the record around the
+        touch is too short.
     antenna_m
-        The bent antenna at the touch, seen from above with the motor's axis in (0, 0), shape
-        (points, 2).
+        Points of the bent antenna at the touch, seen from above with the motor's axis at (0, 0),
+        shape (points, 2).
     point_m
-        The point of contact there, shape (2,); None if it is not known.
+        Point of contact in this plane, shape (2,); None if it is not known.
     ends_m
-        The ends of its 95 % interval, shape (2, 2); None likewise.
+        Ends of the 95 % interval of the point of contact, shape (2, 2); None if it is not known.
     """
 
     number: int
@@ -136,26 +139,26 @@ class Touch:
 
 @dataclass(frozen=True, slots=True)
 class TouchedSession:
-    """A session with its touches.
+    """Touches found in one session.
 
     Attributes
     ----------
     path
-        The file.
+        Session file.
     touches
-        In the order of time.
+        Touches in the order of time.
     found
-        Source of the detections: ``loop``, during the session; ``record``, this analysis.
+        Source of the detections: ``loop`` during the session, or ``record`` for this analysis.
     model
-        Beam of the estimates.
+        Model of the beam used for the estimates.
     rate_hz
-        Ticks a second.
+        Ticks per second.
     has_shear
-        Whether the file has the base shear.
+        Whether the file has the base shear force.
     warnings
-        Remarks on the result, in sentences.
+        Sentences on restrictions of the result.
     validity
-        How exact the linear model is for the session.
+        Validity of the linear model for the session.
     """
 
     path: Path
@@ -169,18 +172,18 @@ class TouchedSession:
 
 
 class TouchAnalysis:
-    """Detection and estimates of touches; one model serves several sessions.
+    """Detection and estimation of touches in sessions, with one model for several sessions.
 
     Parameters
     ----------
     model
-        JSON document of ``analyze … --json`` with the beam to assume; None: the nominal beam of
-        the profile that each file has attached.
+        JSON document of ``analyze … --json`` with the beam to assume. With None, the nominal beam
+        of the profile attached to each file is used.
     """
 
     def __init__(self, model: Path | None = None) -> None:
         self._model = model
-        self._prepared: dict[tuple[object, ...], _Prepared] = {}
+        self._prepared: dict[tuple[object, ...], _PreparedModel] = {}
 
     def session(
         self, path: Path, on_step: Callable[[str], None] = lambda _: None
@@ -190,24 +193,24 @@ class TouchAnalysis:
         Parameters
         ----------
         path
-            A session file.
+            Session file.
         on_step
-            Called with a few words when something begins that takes a second or more.
+            Called with the name of a step before each step that takes a second or more.
 
         Raises
         ------
         SessionError
             The file cannot be read, or lacks a key.
         RecordError
-            Its samples cannot be analysed.
+            The samples of the file cannot be analysed.
         IdentifiedBeamError
-            The file of the model cannot be read, or holds none.
+            The model file cannot be read, or contains no model.
         """
         on_step("reading")
         session = read_session(path)
         samples = session.samples
-        rate_hz = _checked_rate_hz(session)
-        model = _model(session, rate_hz, self._model)
+        rate_hz = _check_samples(session)
+        model = _touch_model(session, rate_hz, self._model)
         shear = _shear_projection(session)
         warnings = []
         if shear is None:
@@ -215,63 +218,65 @@ class TouchAnalysis:
                 "The file states no shear_projection: the touches are estimated by the torque "
                 "alone, which tells little of the instant and the point."
             )
-        marked = samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist()
-        contact = round(CONTACT_S * rate_hz)
-        free_from = [0, *(tick + contact for tick in marked)]
-        found, detected = "loop", list(zip(marked, free_from, strict=False))
-        if not marked:
+        marked_ticks = samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist()
+        contact_ticks = round(CONTACT_S * rate_hz)
+        free_from = [0, *(tick + contact_ticks for tick in marked_ticks)]
+        source, detected = "loop", list(zip(marked_ticks, free_from, strict=False))
+        if not marked_ticks:
             on_step("looking for touches")
-            found, detected = "record", _detections(session, model, rate_hz, shear)
-            if len(detected) > _MOST_FOUND:
+            source, detected = "record", _detect_touches(session, model, rate_hz, shear)
+            if len(detected) > _MOST_TOUCHES:
                 warnings.append(
-                    f"More than {_MOST_FOUND} touches were found, of which the first are shown: "
+                    f"More than {_MOST_TOUCHES} touches were found, of which the first are shown: "
                     "the model does not fit the record. Take an identified one (--model)."
                 )
-                detected = detected[:_MOST_FOUND]
+                detected = detected[:_MOST_TOUCHES]
         touches = []
         for number, (tick, free_from) in enumerate(detected, start=1):
             on_step(f"touch {number} of {len(detected)}")
-            part = around_touch(samples, tick, rate_hz, free_from)
-            touches.append(self._touch(part, number, tick, model, rate_hz, shear))
-        warnings += _doubts(touches)
+            touch_samples = around_touch(samples, tick, rate_hz, free_from)
+            touches.append(self._estimate_touch(touch_samples, number, tick, model, rate_hz, shear))
+        warnings += _describe_doubts(touches)
         validity = record_validity(
             readable_texts(session.metadata, "keys of the metadata")[0],
             samples["angle_rad"], rate_hz, (model.beam, model.damping),
         )  # fmt: skip
         return TouchedSession(
-            path, tuple(touches), found, model, rate_hz, shear is not None, tuple(warnings),
+            path, tuple(touches), source, model, rate_hz, shear is not None, tuple(warnings),
             validity,
         )  # fmt: skip
 
-    def _touch(
+    def _estimate_touch(
         self,
-        part: NDArray[np.void],
+        touch_samples: NDArray[np.void],
         number: int,
         tick: int,
         model: TouchModel,
         rate_hz: float,
         shear: Sequence[float] | None,
     ) -> Touch:
-        """Estimate a touch from the samples around it."""
-        start_s = int(part["tick"][0]) / rate_hz
-        record = touch_record(part, tick, rate_hz, shear)
+        """Return a touch with its estimate from the samples around its detection."""
+        start_s = int(touch_samples["tick"][0]) / rate_hz
+        record = touch_record(touch_samples, tick, rate_hz, shear)
         time_s = record.detected / rate_hz
         after_s = (record.angle_rad.size - 1 - record.detected) / rate_hz
         angles_rad = record.angle_rad
         if time_s < _LEAST_BEFORE_S or after_s < _LEAST_AFTER_S:
             return Touch(number, tick, time_s, float(angles_rad[record.detected]), start_s)
-        prepared = self._prepared_for(model, rate_hz)
+        prepared = self._prepare_model(model, rate_hz)
         estimate = prepared.estimator.estimate(record)
         if estimate.time_s is not None:
             time_s = estimate.time_s.value
         angle_rad = float(np.interp(time_s, np.arange(angles_rad.size) / rate_hz, angles_rad))
         x_m = prepared.free.x_m
-        deflection_m = _deflection_m(prepared.free, record, time_s)
+        deflection_m = _free_deflection_m(prepared.free, record, time_s)
         point = ends = None
         if estimate.x_m is not None:
-            along = np.array([estimate.x_m.value, *estimate.x_m.interval_95])
-            there = _from_above(angle_rad, along, np.interp(along, x_m, deflection_m))
-            point, ends = there[0], there[1:]
+            positions_m = np.array([estimate.x_m.value, *estimate.x_m.interval_95])
+            contact_points = _top_view(
+                angle_rad, positions_m, np.interp(positions_m, x_m, deflection_m)
+            )
+            point, ends = contact_points[0], contact_points[1:]
         return Touch(
             number,
             tick,
@@ -279,28 +284,29 @@ class TouchAnalysis:
             angle_rad,
             start_s,
             estimate,
-            _from_above(angle_rad, x_m, deflection_m),
+            _top_view(angle_rad, x_m, deflection_m),
             point,
             ends,
         )
 
-    def _prepared_for(self, model: TouchModel, rate_hz: float) -> _Prepared:
+    def _prepare_model(self, model: TouchModel, rate_hz: float) -> _PreparedModel:
+        """Return estimator and free motion of a model, computed at the first use."""
         key = (
             model.beam, model.damping, model.tool_inertia_kg_m2, model.angle_delay_s,
             model.torque_delay_s, model.sensor_filter, rate_hz,
         )  # fmt: skip
         if key not in self._prepared:
-            x_m = np.linspace(0.0, model.beam.length_m, _POINTS)
+            x_m = np.linspace(0.0, model.beam.length_m, _ANTENNA_POINTS)
             samples = round((HISTORY_S + FINAL_S) * rate_hz) + 1
-            self._prepared[key] = _Prepared(
+            self._prepared[key] = _PreparedModel(
                 TouchEstimator(model, rate_hz), FreeBeam(model, x_m, rate_hz, samples)
             )
         return self._prepared[key]
 
 
 @dataclass(frozen=True, slots=True)
-class _Prepared:
-    """Prepared data for all touches of one model."""
+class _PreparedModel:
+    """Estimator and free motion of one model, computed once for all touches."""
 
     estimator: TouchEstimator
     free: FreeBeam
@@ -309,7 +315,8 @@ class _Prepared:
 # What the file states
 
 
-def _checked_rate_hz(session: Session) -> float:
+def _check_samples(session: Session) -> float:
+    """Return the sampling rate of a session; raise if its samples cannot be analysed."""
     path, samples = session.path, session.samples
     if len(samples) == 0:
         raise RecordError(f"{path}: the session holds no samples, so there is nothing to analyse.")
@@ -322,8 +329,8 @@ def _checked_rate_hz(session: Session) -> float:
     return rate_hz
 
 
-def _model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
-    """Return the identified model, or the one in the file's attachments."""
+def _touch_model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
+    """Return the identified model from a file, or the nominal model of a session."""
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
     stated: dict[str, Any] = {
@@ -333,7 +340,7 @@ def _model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
     stated["tool_inertia_kg_m2"] = stated_tool_inertia_kg_m2(session)
     if path is not None:
         return TouchModel.from_analysis(path, length_m=beam.length_m, **stated)
-    attached = (session.attachments.get(name, b"") for name in _DESCRIPTIONS)
+    attached = (session.attachments.get(name, b"") for name in _DAMPING_ATTACHMENTS)
     damping: Damping | None = next(filter(None, map(nominal_damping, attached)), None)
     if damping is None:
         raise SessionError(
@@ -344,32 +351,33 @@ def _model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
 
 
 def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
-    """Return the sensor's low-pass filter, and the one that forms samples of its records."""
+    """Return the sensor's low-pass filter and the filter that averages its records."""
     order, constant_s = max(enumerate(stated_torque_filter_s(session), start=1), key=itemgetter(1))
     corner_hz = 1 / (2 * pi * constant_s) if constant_s else 0.0
-    kind = session.metadata.get("sensor_filter", "")
-    if not kind:
+    filter_kind = session.metadata.get("sensor_filter", "")
+    if not filter_kind:
         return SensorFilter(corner_hz, order)
     delay_s = session.number("sensor_filter_delay_s", 0.0)
-    # A mean of n records of a tick is (n - 1) / 2n of a tick old, the triangle twice as much.
-    fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(kind, inf)
-    if not 0.0 <= fraction < _MOST_OF_TICK:
+    # A mean of n records per tick has a delay of (n - 1) / 2n ticks, a triangle twice as much.
+    fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(filter_kind, inf)
+    if not 0.0 <= fraction < _LONGEST_FILTER_TICKS:
         raise RecordError(
-            f"{session.path}: sensor_filter is {kind[:100]!r} with sensor_filter_delay_s = "
+            f"{session.path}: sensor_filter is {filter_kind[:100]!r} with sensor_filter_delay_s = "
             f"{delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} s) "
             f"or a triangle (shorter than a period); correct the file's metadata."
         )
     records = round(1 / (1 - fraction))
     spacing_s = fraction / rate_hz / max(records - 1, 1)
-    return SensorFilter.of_records(corner_hz, order, kind, records, spacing_s)
+    return SensorFilter.of_records(corner_hz, order, filter_kind, records, spacing_s)
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:
+    """Return the coefficients that yield the base shear from the wrench; None without them."""
     text = session.metadata.get("shear_projection", "")
     if not text:
         return None
     try:
-        numbers = tuple(float(part) for part in text.split(","))
+        numbers = tuple(float(number_text) for number_text in text.split(","))
     except ValueError:
         numbers = ()
     if len(numbers) != 6 or not np.isfinite(numbers).all():
@@ -383,36 +391,33 @@ def _shear_projection(session: Session) -> tuple[float, ...] | None:
 # Detection
 
 
-def _detections(
+def _detect_touches(
     session: Session, model: TouchModel, rate_hz: float, shear: Sequence[float] | None
 ) -> list[tuple[int, int]]:
-    """Run the loop's test over the record.
+    """Detect touches by applying the control loop's test to a record.
 
-    Returns
-    -------
-    list of tuple
-        For each touch the tick of the detection, and the tick from which the beam was free before
-        it.
+    Return for each touch the tick of its detection, and the earlier tick from which the beam was
+    free.
     """
     samples = session.samples
     ticks = samples["tick"].astype(np.int64)
     torque_nm = samples["coupling_torque_nm"]
     shear_n = np.zeros(len(samples)) if shear is None else base_shear_n(samples, shear)
     rest = session.segments.get("rest", (0, 0))[1]
-    judged = max(rest, int(ticks[0]) + round(_LEAST_REST_S * rate_hz))
-    resting = ticks < judged
+    noise_end_tick = max(rest, int(ticks[0]) + round(_LEAST_REST_S * rate_hz))
+    resting = ticks < noise_end_tick
     noise = ChannelNoise(
-        _noise(torque_nm[resting]),
-        None if shear is None else _noise(shear_n[resting]),
-        _angle_noise(samples["angle_rad"], resting),
+        _white_noise_std(torque_nm[resting]),
+        None if shear is None else _white_noise_std(shear_n[resting]),
+        _angle_noise_std(samples["angle_rad"], resting),
     )
     beam = watched_beam(model, rate_hz, noise)
     detector = TouchDetector(beam, rate_hz, DetectorSettings())
-    armed = False
-    found: list[tuple[int, int]] = []
-    quiet = round(_QUIET_S * rate_hz)
-    last = int(ticks[0]) - quiet - 1
-    before = int(ticks[0]) - 1
+    is_armed = False
+    detections: list[tuple[int, int]] = []
+    pause_ticks = round(_LEAST_PAUSE_S * rate_hz)
+    last_detection = int(ticks[0]) - pause_ticks - 1
+    previous_tick = int(ticks[0]) - 1
     columns = (
         ticks, samples["angle_rad"], torque_nm, shear_n,
         (samples["status"] & Status.ANGLE_STALE) != 0,
@@ -421,84 +426,85 @@ def _detections(
     for tick, angle, torque, force, angle_stale, wrench_stale in zip(
         *(column.tolist() for column in columns), strict=True
     ):
-        if not armed and tick >= judged:
+        if not is_armed and tick >= noise_end_tick:
             detector.arm()
-            armed = True
+            is_armed = True
         if detector.step(
             angle, torque, force,
-            missed=tick - before - 1, angle_stale=angle_stale, wrench_stale=wrench_stale,
+            missed=tick - previous_tick - 1, angle_stale=angle_stale, wrench_stale=wrench_stale,
         ):  # fmt: skip
-            if tick - last > quiet:
-                found.append((tick, last + 1))
-            last = tick
-        before = tick
-    return found
+            if tick - last_detection > pause_ticks:
+                detections.append((tick, last_detection + 1))
+            last_detection = tick
+        previous_tick = tick
+    return detections
 
 
-def _noise(values: Real) -> float:
-    """Return the standard deviation of white noise in values that otherwise change slowly."""
+def _white_noise_std(values: Real) -> float:
+    """Return the standard deviation of the white noise in a slowly changing signal."""
     steps = np.diff(values)
-    return max(float(np.std(steps)) / sqrt(2), _LEAST_NOISE) if steps.size else _LEAST_NOISE
+    return max(float(np.std(steps)) / sqrt(2), _LEAST_NOISE_STD) if steps.size else _LEAST_NOISE_STD
 
 
-def _angle_noise(angle_rad: Real, resting: NDArray[np.bool_]) -> float:
-    """Return the noise of the angle: its scatter at rest, or that of its resolution."""
+def _angle_noise_std(angle_rad: Real, resting: NDArray[np.bool_]) -> float:
+    """Return the standard deviation of the angle's noise, from rest or from its resolution."""
     steps = np.abs(np.diff(angle_rad))
-    steps = steps[steps > _LEAST_NOISE]
+    steps = steps[steps > _LEAST_NOISE_STD]
     resolution_rad = float(steps.min()) if steps.size else 0.0
-    return max(_noise(angle_rad[resting]), resolution_rad / sqrt(12))
+    return max(_white_noise_std(angle_rad[resting]), resolution_rad / sqrt(12))
 
 
-def _doubts(touches: Sequence[Touch]) -> list[str]:
+def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
+    """Return sentences on touches that are not estimated or not explained by the model."""
     sentences = []
-    short = [each.number for each in touches if each.estimate is None]
-    if short:
+    without_estimate = [touch.number for touch in touches if touch.estimate is None]
+    if without_estimate:
         sentences.append(
-            f"Touch {_listed(short)}: not estimated; it takes {_LEAST_BEFORE_S:g} s of record "
+            f"Touch {_number_list(without_estimate)}: not estimated; it takes {_LEAST_BEFORE_S:g} "
+            "s of record "
             f"before a touch and {1e3 * _LEAST_AFTER_S:g} ms after it."
         )
-    poor = [
-        each.number
-        for each in touches
-        if each.estimate is not None and each.estimate.chi2_per_degree > _MOST_OF_MODEL
+    not_explained = [
+        touch.number
+        for touch in touches
+        if touch.estimate is not None and touch.estimate.chi2_per_degree > _LARGEST_CHI2_PER_DEGREE
     ]
-    if poor:
+    if not_explained:
         sentences.append(
-            f"Touch {_listed(poor)}: the record is not explained by the model (residuals more than "
-            f"{sqrt(_MOST_OF_MODEL):.1f} times the noise). Take an identified model (--model); "
+            f"Touch {_number_list(not_explained)}: the record is not explained by the model "
+            "(residuals more than "
+            f"{sqrt(_LARGEST_CHI2_PER_DEGREE):.1f} times the noise). Take an identified model "
+            "(--model); "
             "without a contact, such a touch is the model's error."
         )
     return sentences
 
 
-def _listed(numbers: Sequence[int]) -> str:
+def _number_list(numbers: Sequence[int]) -> str:
+    """Return numbers as text, separated by commas."""
     return ", ".join(map(str, numbers))
 
 
 # Seen from above
 
 
-def _deflection_m(free: FreeBeam, record: TouchRecord, time_s: float) -> Real:
-    """Return the beam's deflection at a time relative to its root line, if it was free.
+def _free_deflection_m(free: FreeBeam, record: TouchRecord, time_s: float) -> Real:
+    """Return the deflection in metres of a beam that moves freely, relative to its undeformed line.
 
-    Parameters
-    ----------
-    free
-        Free motion at the points along the beam; the first is at the axis.
-    record
-        Record; the vibration is fitted to its samples before the time.
-    time_s
-        From the record's beginning.
+    `free` has the free motion at points along the beam, the first at the motor's axis. The
+    vibration is fitted to the samples of `record` before `time_s`, which counts from its start.
     """
-    quiet = min(max(int(time_s * record.rate_hz) - 1, _LEAST_QUIET), record.detected)
-    motion = free.motion(record, quiet, quiet - 4)
+    fit_samples = min(max(int(time_s * record.rate_hz) - 1, _LEAST_FIT_SAMPLES), record.detected)
+    motion = free.motion(record, fit_samples, fit_samples - 4)
     step = round((time_s - motion.first_s) / motion.step_s)
-    moved: Real = motion.displacement_m[:, min(max(step, 0), motion.displacement_m.shape[1] - 1)]
+    displacement_m: Real = motion.displacement_m[
+        :, min(max(step, 0), motion.displacement_m.shape[1] - 1)
+    ]
     times_s = np.arange(record.angle_rad.size) / record.rate_hz
-    return moved - float(np.interp(time_s, times_s, record.angle_rad)) * free.x_m
+    return displacement_m - float(np.interp(time_s, times_s, record.angle_rad)) * free.x_m
 
 
-def _from_above(angle_rad: float, along_m: Real, across_m: Real) -> Real:
-    """Return points of the bent beam in the plane, shape (points, 2), zero angle along x."""
+def _top_view(angle_rad: float, along_m: Real, across_m: Real) -> Real:
+    """Return points of the bent beam seen from above, shape (points, 2); angle 0 is along x."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     return np.column_stack([cos * along_m - sin * across_m, sin * along_m + cos * across_m])

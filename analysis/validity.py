@@ -1,4 +1,4 @@
-"""Validity of a record: the largest slope of the antenna's tip, and the linear model's error there.
+"""Validity of the linear model for a record: the antenna's largest tip slope and its model error.
 
 The plan of a session predicts the slope, and its file states it (``predicted_peak_tip_slope_rad``).
 If the file does not state it, it is computed from the measured angle with the beam and damping that
@@ -22,11 +22,12 @@ if TYPE_CHECKING:
 
     from rigd.beam import Beam, Damping
 
-_KEY: Final = "predicted_peak_tip_slope_rad"
+_TIP_SLOPE_KEY: Final = "predicted_peak_tip_slope_rad"
+"""Key of the predicted tip slope in the metadata."""
 
 
 def stated_validity(metadata: Mapping[str, str]) -> Validity:
-    """Return the stated validity of a file; unknown if it states none.
+    """Return the validity of the linear model that a file states; unknown if not stated.
 
     Parameters
     ----------
@@ -34,10 +35,10 @@ def stated_validity(metadata: Mapping[str, str]) -> Validity:
         Metadata ``session`` of the file.
     """
     try:
-        slope_rad = float(metadata.get(_KEY, "nan"))
+        slope_rad = float(metadata.get(_TIP_SLOPE_KEY, "nan"))
     except ValueError:
         slope_rad = math.nan
-    return _of_slope(slope_rad)
+    return _validity_of_slope(slope_rad)
 
 
 def record_validity(
@@ -46,7 +47,7 @@ def record_validity(
     rate_hz: float,
     *models: tuple[Beam, Damping],
 ) -> Validity:
-    """Return the validity of a record: the stated one, else from the measured angle.
+    """Return the validity of the linear model for a record, as stated or from the measured angle.
 
     Parameters
     ----------
@@ -55,34 +56,36 @@ def record_validity(
     angle_rad : ndarray, shape (n,)
         Measured angle at consecutive ticks.
     rate_hz : float
-        Ticks a second.
+        Ticks per second.
     *models : tuple of Beam and Damping
-        Estimated from the record, of which the largest slope counts; without any, a file that
-        states nothing leaves it unknown.
+        Models estimated from the record; the largest slope among them is used. Without a model, the
+        validity is unknown unless the file states it.
     """
     stated = stated_validity(metadata)
     if stated.predicted_peak_tip_slope_rad is not None:
         return stated
-    with np.errstate(all="ignore"):  # an estimate that does not suit may overflow: then unknown
-        return worst(
-            _of_slope(tip_motion(beam, damping, angle_rad, rate_hz).slope_rad)
+    with np.errstate(all="ignore"):  # a wrong model may overflow, and the validity is then unknown
+        return combined_validity(
+            _validity_of_slope(tip_motion(beam, damping, angle_rad, rate_hz).slope_rad)
             for beam, damping in models
         )
 
 
-def worst(validities: Iterable[Validity]) -> Validity:
+def combined_validity(validities: Iterable[Validity]) -> Validity:
     """Return the combined validity of several records; unknown if any of them is unknown.
 
     Parameters
     ----------
     validities : iterable of Validity
+        Validities of the single records.
     """
-    slopes = [each.predicted_peak_tip_slope_rad for each in validities]
+    slopes = [validity.predicted_peak_tip_slope_rad for validity in validities]
     known = [slope for slope in slopes if slope is not None]
-    return _of_slope(max(known)) if known and len(known) == len(slopes) else Validity()
+    return _validity_of_slope(max(known)) if known and len(known) == len(slopes) else Validity()
 
 
-def _of_slope(slope_rad: float) -> Validity:
+def _validity_of_slope(slope_rad: float) -> Validity:
+    """Return the validity for a tip slope in rad; unknown if the slope is not valid."""
     if not 0.0 <= slope_rad < math.inf:
         return Validity()
     error = linear_model_error(slope_rad)

@@ -102,7 +102,7 @@ def searched(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
     found = {}
     for fit in result.welch_fits:
         structure = STRUCTURES[fit.structure]
-        unknowns = DampingUnknowns.of(structure, result.beam)
+        unknowns = DampingUnknowns.for_beam(structure, result.beam)
         low, high = unknowns.bounds
         low = np.maximum(low, math.log(1e-5))
         weight = weights(2 * np.pi * result.frequency_hz, fit.weighting)

@@ -1,9 +1,9 @@
-"""Many sessions of one specimen together: statistics, nominal models, pooled estimate, validation.
+"""Joint analysis of many sessions of one specimen: statistics, pooled estimates, validation.
 
 `campaign` analyses the files in parallel (`SessionTask`, `process_pool`) and returns a
-`CampaignResult`: what each session gives, the pooled estimate of every structure, whether the
-sessions are of one specimen, and a verdict. It computes only; tables, pages and files are made by
-`analysis.report`.
+`CampaignResult`: the result of each session, the pooled estimate of each structure, whether the
+sessions are of one specimen, and a verdict. The package only computes; `analysis.report` writes
+tables, pages and files.
 """
 
 import lazy_loader as lazy

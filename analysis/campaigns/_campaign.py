@@ -1,4 +1,4 @@
-"""A campaign: all sessions analysed in parallel, then their combined results."""
+"""Analysis of a campaign: all sessions in parallel, then their combined results."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from analysis.campaigns._experiment import (
     CampaignError,
+    complete_labels,
     distinct_names,
-    labelled,
-    most_common,
+    most_common_index,
     stated_specimens,
 )
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
@@ -32,13 +32,13 @@ from analysis.campaigns._statistics import (
     parameter_statistics,
     ranked_structures,
 )
-from analysis.campaigns._validation import FEWEST, LeftOutError, LostTrial, validate
+from analysis.campaigns._validation import FEWEST_SESSIONS, LeftOutError, LostTrial, validate
 from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns._welch_bias import WelchBias, welch_biases
 from analysis.campaigns.pooling import PooledEstimate, PooledMode, pooled_estimates
-from analysis.campaigns.workers import Lost, available_cores, dask_cluster, process_pool
+from analysis.campaigns.workers import LostTask, available_cores, dask_cluster, process_pool
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.validity import worst
+from analysis.validity import combined_validity
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -52,40 +52,42 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CampaignResult:
-    """Results of all sessions, and of all together.
+    """Results of the single sessions of a campaign, and of all sessions together.
 
     Attributes
     ----------
     settings : WelchSettings
+        Settings of the Welch fits.
     record_band_hz : tuple of float
-        Band of the whole-record fits of most sessions.
-    sessions : tuple of SessionResult
-        In the order of the paths.
+        Frequency band of the whole-record fits of most sessions.
+    sessions : tuple of SessionAnalysis
+        Sessions that are used, in the order of the paths.
     failures : tuple of SessionFailure
-        Sessions of which nothing is used.
+        Sessions that are not used.
     statistics : tuple of ParameterStatistics
-        Table 3; empty where Welch's method does not suit some session, as the following.
+        Statistics of the Welch fits (Table 3 of the paper). Empty, like `nominal` and
+        `welch_biases`, if Welch's method is not applicable to some session.
     nominal : tuple of NominalModel
-        By type, then by weighting: Table 4 and Figures 6 and 7.
+        Nominal models by type, then by weighting (Table 4 and Figures 6 and 7 of the paper).
     welch_biases : tuple of WelchBias
         Differences of the Welch fits from the pooled estimates, by type, then by weighting.
     homogeneity : Homogeneity
         Whether the sessions are of one specimen.
     structures : tuple of RankedStructure
-        Every structure fitted to the whole records, those pooled first.
+        Every structure fitted to the whole records, the pooled structures first.
     pooled : tuple of PooledEstimate
-        Structures that two sessions or more determine, the lowest BIC first; empty without
-        whole-record fits.
+        Pooled estimates of the structures that two sessions or more determine, the lowest BIC
+        first; empty without whole-record fits.
     modal : PooledModal or None
         Modal model of all sessions, and the nearly uniform beam estimated from it; None unless two
         sessions show a common mode.
     verdict : CampaignVerdict or None
-        Structure that the data support, and further findings; None without any.
+        Structure that the data support, and further findings; None without pooled estimates.
     validation : tuple of LeftOutError
-        Session by session; empty with fewer than three sessions.
+        Errors of each session predicted from the others; empty with fewer than three sessions.
     lost_trials : tuple of LostTrial
-        Sessions that were to be predicted and were not. With three sessions or more, each has its
-        errors in `validation` or is here.
+        Sessions that could not be predicted from the others. With three sessions or more, each
+        session is in `validation` or in `lost_trials`.
     """
 
     settings: WelchSettings
@@ -105,25 +107,25 @@ class CampaignResult:
 
     @property
     def headline(self) -> PooledEstimate | None:
-        """Pooled estimate whose numbers are reported, None without any: see `freest_estimate`."""
+        """Pooled estimate whose parameters are reported (`freest_estimate`); None without one."""
         return freest_estimate(self.pooled)
 
     @property
     def modes(self) -> tuple[PooledMode, ...]:
-        """Modes over all sessions: of the modal model, or of an exactly uniform beam."""
+        """Modes pooled over all sessions, of the modal model or of an exactly uniform beam."""
         if self.modal is not None and self.modal.leads:
             return self.modal.modes
         return self.headline.modes if self.headline else ()
 
     @property
     def validity(self) -> Validity:
-        """Validity of the linear model for the sessions: that of the worst."""
-        return worst(each.validity for each in self.sessions)
+        """Validity of the linear model for the campaign: the combined_validity of its sessions."""
+        return combined_validity(session.validity for session in self.sessions)
 
     @property
     def trials(self) -> int:
-        """Sessions that were to be predicted from the others."""
-        return len(self.sessions) if len(self.sessions) >= FEWEST else 0
+        """Number of sessions that were to be predicted from the others."""
+        return len(self.sessions) if len(self.sessions) >= FEWEST_SESSIONS else 0
 
 
 def campaign(
@@ -141,8 +143,9 @@ def campaign(
 ) -> CampaignResult:
     """Analyse a campaign of sessions of one specimen on one rig.
 
-    Every session goes by Welch's method (`analysis.paper`), where that suits all of them, and
-    by the whole record (`analysis.identify`); each is then predicted from the others.
+    Every session is analysed by Welch's method (`analysis.paper`), if it is applicable to all
+    sessions, and by a fit to the whole record (`analysis.identify`). Each session is then predicted
+    from the others.
 
     Parameters
     ----------
@@ -151,29 +154,30 @@ def campaign(
     settings : WelchSettings, optional
         Settings of the Welch fits, by default the paper's.
     structures : sequence of str
-        Types of the whole-record estimate to choose from; none leaves that estimate, the verdict
-        and the estimate's validation out.
+        Structures of the whole-record fits to choose from. An empty sequence omits these fits,
+        the verdict and the validation of the fits.
     fixed : sequence of str
-        Settings of rig and specimen that stay at the file's values in those fits.
+        Parameters of rig and specimen that stay at the file's values in the whole-record fits.
     band_hz : tuple of float, optional
-        Band of all fits and of the validation; by default what suits each record.
+        Frequency band of all fits and of the validation; by default chosen for each record.
     jobs : int, optional
-        Worker processes, by default one per core.
+        Number of worker processes, by default one per core.
     dask : str, optional
-        Address of a Dask scheduler whose workers are used instead; they find the files under the
-        same absolute paths.
+        Address of a Dask scheduler whose workers are used instead of processes on this machine.
+        These workers need the files under the same absolute paths.
     uniformity : float, optional
-        Relative standard deviation of each mode's frequency from that of a uniform beam, instead of
-        that stated in the files.
+        Relative standard deviation of each mode's frequency from the frequency of a uniform beam,
+        instead of the value stated in the files.
     workers : Workers, optional
-        Existing workers, used instead of `jobs` and `dask`; they are left open.
+        Existing workers, used instead of `jobs` and `dask`. They remain open.
     on_progress : callable, optional
-        Called with the steps done, their number and a file's name.
+        Called after each step with the number of finished steps, the number of all steps, and the
+        name of the file.
 
     Raises
     ------
     CampaignError
-        No session could be analysed, or the workers could not be had.
+        No session could be analysed, or no workers are available.
 
     Notes
     -----
@@ -188,26 +192,27 @@ def campaign(
     task = SessionTask(settings, tuple(structures), tuple(fixed), band_hz, uniformity)
     done, total = 0, 2 * len(paths)
 
-    def step(name: str) -> None:
+    def report_step(name: str) -> None:
+        """Report the completion of a step for a file."""
         nonlocal done
         done += 1
         on_progress(done, total, name)
 
-    made: AbstractContextManager[Workers]
+    worker_context: AbstractContextManager[Workers]
     if workers is not None:
-        made = nullcontext(workers)
+        worker_context = nullcontext(workers)
     elif dask is not None:
-        made = dask_cluster(dask)
+        worker_context = dask_cluster(dask)
     else:
-        made = process_pool(min(jobs or available_cores(), len(paths)))
-    with made as ready:
-        results = ready.run(
-            analyse_session, [(path, task) for path in paths], lambda i: step(paths[i].name)
+        worker_context = process_pool(min(jobs or available_cores(), len(paths)))
+    with worker_context as ready_workers:
+        results = ready_workers.run(
+            analyse_session, [(path, task) for path in paths], lambda i: report_step(paths[i].name)
         )
-        sessions, failures = _of_one_experiment(
+        sessions, failures = _separate_experiments(
             [
                 SessionFailure(path, f"{path}: {result.reason}; analyse it by itself.")
-                if isinstance(result, Lost)
+                if isinstance(result, LostTask)
                 else result
                 for path, result in zip(paths, results, strict=True)
             ]
@@ -218,10 +223,12 @@ def campaign(
             )
         validation: tuple[LeftOutError, ...] = ()
         lost: tuple[LostTrial, ...] = ()
-        if len(sessions) >= FEWEST:
+        if len(sessions) >= FEWEST_SESSIONS:
             total = len(paths) + len(sessions)
             names = [session.path.name for session in sessions]
-            validation, lost = validate(ready, sessions, band_hz, lambda i: step(names[i]))
+            validation, lost = validate(
+                ready_workers, sessions, band_hz, lambda i: report_step(names[i])
+            )
     return campaign_result(sessions, failures, validation, lost)
 
 
@@ -235,26 +242,28 @@ def campaign_result(
 
     Parameters
     ----------
-    sessions : sequence of SessionResult
-        At least one.
+    sessions : sequence of SessionAnalysis
+        Results of the sessions, at least one.
     failures : sequence of SessionFailure, optional
-        Sessions of which nothing is used.
+        Sessions that are not used.
     validation : sequence of LeftOutError, optional
         Errors of the sessions that were predicted from the others.
     lost : sequence of LostTrial, optional
-        Sessions that were to be predicted and were not.
+        Sessions that could not be predicted from the others.
     """
-    names = distinct_names([*(each.path for each in sessions), *(each.path for each in failures)])
-    sessions = [replace(each, name=name) for each, name in zip(sessions, names, strict=False)]
+    names = distinct_names(
+        [*(session.path for session in sessions), *(session.path for session in failures)]
+    )
+    sessions = [replace(session, name=name) for session, name in zip(sessions, names, strict=False)]
     failures = [
-        replace(each, name=name)
-        for each, name in zip(failures, names[len(sessions) :], strict=True)
+        replace(session, name=name)
+        for session, name in zip(failures, names[len(sessions) :], strict=True)
     ]
     pooled = pooled_estimates(sessions)
-    usable = [(each.name, each.experiment) for each in sessions]
-    left_out = [(each.name, each.experiment) for each in failures]
+    usable = [(session.name, session.experiment) for session in sessions]
+    left_out = [(session.name, session.experiment) for session in failures]
     specimens = stated_specimens([*usable, *left_out], sessions[0].experiment)
-    alike = homogeneity(sessions, pooled, specimens)
+    homogeneity_test = homogeneity(sessions, pooled, specimens)
     biases = welch_biases(sessions, pooled)
     modal = pooled_modal(sessions)
     return CampaignResult(
@@ -265,33 +274,35 @@ def campaign_result(
         statistics=parameter_statistics(sessions),
         nominal=nominal_models(sessions),
         welch_biases=biases,
-        homogeneity=alike,
+        homogeneity=homogeneity_test,
         structures=ranked_structures(sessions, pooled),
         pooled=pooled,
         modal=modal,
-        verdict=campaign_verdict(sessions, pooled, alike, validation, lost, biases, modal),
+        verdict=campaign_verdict(
+            sessions, pooled, homogeneity_test, validation, lost, biases, modal
+        ),
         validation=tuple(validation),
         lost_trials=tuple(lost),
     )
 
 
-def _of_one_experiment(
+def _separate_experiments(
     results: Sequence[SessionAnalysis | SessionFailure],
 ) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
-    """Set aside failures, and sessions that differ from the most common experiment."""
+    """Separate the usable sessions of the most common experiment from all other sessions."""
     usable = [result for result in results if isinstance(result, SessionAnalysis)]
     if not usable:
         return [], [result for result in results if isinstance(result, SessionFailure)]
-    results = _labelled(results)
+    results = _complete_labels(results)
     usable = [result for result in results if isinstance(result, SessionAnalysis)]
-    common = usable[most_common([session.experiment for session in usable])]
+    common = usable[most_common_index([session.experiment for session in usable])]
     stated = [result.experiment for result in results if result.experiment]
-    alike = sum(common.experiment.difference(each) is None for each in stated)
-    as_in = ", as in most" if 2 * alike > len(stated) else ""
+    agreeing = sum(common.experiment.difference(experiment) is None for experiment in stated)
+    majority_text = ", as in most" if 2 * agreeing > len(stated) else ""
     sessions: list[SessionAnalysis] = []
     failures: list[SessionFailure] = []
     for result in results:
-        reason = _reason_against(result, common, as_in, sessions)
+        reason = _exclusion_reason(result, common, majority_text, sessions)
         if reason is None and isinstance(result, SessionAnalysis):
             sessions.append(result)
         elif reason is None and isinstance(result, SessionFailure):
@@ -300,61 +311,69 @@ def _of_one_experiment(
             failures.append(
                 SessionFailure(result.path, f"{result.path}: {reason}", result.experiment)
             )
-    return _alike_by_welch(sessions, failures)
+    return _equalize_welch_fits(sessions, failures)
 
 
-def _alike_by_welch(
+def _equalize_welch_fits(
     sessions: list[SessionAnalysis], failures: list[SessionFailure]
 ) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
-    """Use Welch's fits for all sessions or for none: set aside exceptions, or omit the fits.
+    """Use Welch's method for all sessions or for none.
 
-    A search is never set aside: its record is as informative as any.
+    If only a few sessions have no Welch fits, these sessions are excluded; otherwise, the fits of
+    all sessions are omitted. A session that planned its own excitation is never excluded, because
+    its record is as informative as any other.
     """
-    without = [each for each in sessions if not each.frequency_hz.size]
-    if not without:
+    without_fits = [session for session in sessions if not session.frequency_hz.size]
+    if not without_fits:
         return sessions, failures
-    searched = any(each.experiment.searched for each in without)
-    if searched or 2 * len(without) >= len(sessions):
-        return [each.without_welch() for each in sessions], failures
-    odd = [
+    any_searched = any(session.experiment.planned_itself for session in without_fits)
+    if any_searched or 2 * len(without_fits) >= len(sessions):
+        return [session.without_welch() for session in sessions], failures
+    excluded = [
         SessionFailure(
-            each.path,
-            f"{each.path}: {each.warnings[-1]} Most others have them: analyse this one by itself.",
-            each.experiment,
+            session.path,
+            f"{session.path}: {session.warnings[-1]} Most others have them: analyse this one by "
+            "itself.",
+            session.experiment,
         )
-        for each in without
+        for session in without_fits
     ]
-    return [each for each in sessions if each.frequency_hz.size], [*failures, *odd]
+    return [session for session in sessions if session.frequency_hz.size], [*failures, *excluded]
 
 
-def _labelled(
+def _complete_labels(
     results: Sequence[SessionAnalysis | SessionFailure],
 ) -> list[SessionAnalysis | SessionFailure]:
-    """Use the specimens' labels: see `labelled`."""
-    stated = iter(labelled([each.experiment for each in results if each.experiment]))
-    return [replace(each, experiment=next(stated)) if each.experiment else each for each in results]
+    """Return the results with the specimens' labels completed (see `complete_labels`)."""
+    stated = iter(complete_labels([result.experiment for result in results if result.experiment]))
+    return [
+        replace(result, experiment=next(stated)) if result.experiment else result
+        for result in results
+    ]
 
 
-def _reason_against(
+def _exclusion_reason(
     result: SessionAnalysis | SessionFailure,
     common: SessionAnalysis,
-    as_in: str,
-    before: Sequence[SessionAnalysis],
+    majority_text: str,
+    accepted: Sequence[SessionAnalysis],
 ) -> str | None:
-    """Return why a session does not belong to the others, None if it does.
+    """Return why a session does not belong to the campaign, or None if it does.
 
-    `as_in` states whether the common one represents most of them.
+    `common` is a session of the most common experiment, `accepted` are the sessions accepted so
+    far. `majority_text` says in words whether most sessions agree with `common`.
     """
     experiment = result.experiment
     difference = experiment and common.experiment.difference(experiment)
     if difference:
         return (
-            f"{difference} in {common.path}{as_in}; a campaign repeats one experiment on one "
+            f"{difference} in {common.path}{majority_text}; a campaign repeats one experiment on "
+            "one "
             "specimen: analyse this one by itself, or correct the metadata."
         )
     if isinstance(result, SessionFailure):
         return None
-    for other in before:
+    for other in accepted:
         if result.path == other.path:
             return "the file is given more than once, and counts once."
         if result.experiment.identity == other.experiment.identity:
@@ -365,8 +384,8 @@ def _reason_against(
                 "or a part of that file, or a simulation with the same seed; analyse this one by "
                 "itself."
             )
-    both = common.frequency_hz.size and result.frequency_hz.size
-    if both and not np.array_equal(common.frequency_hz, result.frequency_hz):
+    both_have_welch = common.frequency_hz.size and result.frequency_hz.size
+    if both_have_welch and not np.array_equal(common.frequency_hz, result.frequency_hz):
         return (
             f"its estimate has {len(result.frequency_hz)} bins from {result.frequency_hz[0]:g} Hz, "
             f"but that of {common.path} {len(common.frequency_hz)} from "

@@ -1,4 +1,4 @@
-"""Estimates of one session that a campaign retains: Welch fits and whole-record fits."""
+"""Results of one session's Welch fits and whole-record fits that a campaign retains."""
 
 from __future__ import annotations
 
@@ -18,23 +18,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class WelchFit:
-    """One structure fitted to one session by the Welch method, with one weighting.
+    """Fit of one damping structure and weighting to a session's response by the Welch method.
 
     Attributes
     ----------
     structure, weighting : str
-        Names.
+        Names of damping structure and weighting.
     damping : Damping
+        Fitted damping.
     parameters : dict
-        zeta, alpha, gamma and lambda, the fixed ones included.
+        Values of zeta, alpha, gamma and lambda, fixed parameters included.
     cost : float
-        Eq. (26) at the minimum, in (N·m/rad)².
+        Minimum of the cost function (Eq. 26), in (N·m/rad)².
     at_bounds : tuple of str
-        Free parameters at the bounds of the range searched.
+        Free parameters at a bound of the range searched.
     std : dict or None
-        See `analysis.paper._fit.FrfFit`.
+        Standard deviations of the free parameters, as in `analysis.paper.FrfFit`.
     indices : Indices or None
-        Distance of this fit from the session's own response.
+        Fit indices relative to the session's response.
     """
 
     structure: str
@@ -47,8 +48,8 @@ class WelchFit:
     indices: Indices | None = None
 
     @classmethod
-    def of(cls, model: FittedModel) -> WelchFit:
-        """Return the part of a fit that a campaign needs."""
+    def from_model(cls, model: FittedModel) -> WelchFit:
+        """Return the results of a fitted model that a campaign retains."""
         fit = model.fit
         return cls(
             structure=fit.structure.name,
@@ -64,31 +65,39 @@ class WelchFit:
 
 @dataclass(frozen=True, slots=True)
 class RecordEstimate:
-    """One structure, fitted to one whole record.
+    """Fit of one damping structure to one whole record (see `analysis.identify.RecordFit`).
 
     Attributes
     ----------
     structure : str
-        Its name.
+        Name of the structure, "I" to "VII".
     plant : Plant
+        Fitted plant.
     parameters : dict of str to float
-        See `analysis.identify.RecordFit`, as for the following.
+        Values of all parameters, fixed parameters included.
     std : dict of str to (float or None)
+        Standard deviations: 0 of a fixed parameter, None of a parameter at a bound.
     determined : tuple of str
+        The k free parameters in the order of `covariance`, without those at a bound.
     covariance : ndarray, shape (k, k)
+        Covariance of the determined parameters, of the logarithms of positive ones.
     at_bounds : tuple of str
+        Free parameters at a bound of their range.
     modes : tuple of ModeEstimate
+        Frequencies and damping ratios of the modes in the band.
     cost : float
+        Sum of squares of the whitened residual.
     degrees_of_freedom : int
+        Expectation of `cost` if the residual is only noise.
     deviance : float
         ``-2 ln`` likelihood, up to a constant common to all estimates of the session.
     bic : float
-        Criterion of the session by itself.
+        Bayesian information criterion of this session alone.
     values : int
-        Real values compared.
+        Number of real values compared.
     indices : Indices
-        Distance of its response from the session's by Welch's method: on the same bins as for the
-        paper's fits, and so with the bias of that method in it.
+        Fit indices relative to the session's response by Welch's method, on the same bins as for
+        the Welch fits. They contain the bias of that method.
     """
 
     structure: str
@@ -108,24 +117,24 @@ class RecordEstimate:
 
     @property
     def name(self) -> str:
-        """Name in tables."""
+        """Name of the damping structure as shown in tables."""
         return self.structure
 
     @property
     def free(self) -> frozenset[str]:
-        """Parameters that were sought, found or not."""
+        """Names of the free parameters, determined or at a bound."""
         return frozenset((*self.determined, *self.at_bounds))
 
     @classmethod
-    def of(cls, candidate: Candidate, indices: Indices) -> RecordEstimate:
-        """Return the part of a fit that a campaign needs: all but the residual.
+    def from_candidate(cls, candidate: Candidate, indices: Indices) -> RecordEstimate:
+        """Return the results of a whole-record fit that a campaign retains: all but the residual.
 
         Parameters
         ----------
         candidate : Candidate
             Fit of one session.
         indices : Indices
-            Its indices against the measured response.
+            Fit indices relative to the measured response.
         """
         fit = candidate.fit
         return cls(

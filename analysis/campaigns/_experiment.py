@@ -1,4 +1,4 @@
-"""Experiment of a campaign: what its sessions have in common, and errors of a campaign."""
+"""Comparison of the sessions of a campaign by specimen and excitation; errors of a campaign."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ if TYPE_CHECKING:
 
 
 class CampaignError(ValueError):
-    """A campaign that cannot be analysed; the message says why and what to do."""
+    """Error that prevents the analysis of a campaign, with a message that names the remedy."""
 
 
 class SingleSessionError(CampaignError):
-    """Only one file of a campaign can be used.
+    """Error if only one file of a campaign can be used.
 
     Parameters
     ----------
     path : Path
-        Session that can be used.
+        File of the session that can be used.
     failures : tuple of SessionFailure
-        The others, and why.
+        The other sessions, with the reasons why they cannot be used.
 
     Attributes
     ----------
     path : Path
-        That one.
+        File of the session that can be used.
     failures : tuple of SessionFailure
-        The others, and why.
+        The other sessions, with the reasons why they cannot be used.
     """
 
     def __init__(self, path: Path, failures: tuple[SessionFailure, ...]) -> None:
@@ -47,8 +47,8 @@ class SingleSessionError(CampaignError):
         self.failures = failures
 
 
-def task_errors() -> tuple[type[Exception], ...]:
-    """Errors that concern one session and leave the others as they are."""
+def session_error_types() -> tuple[type[Exception], ...]:
+    """Return the exceptions that make one session unusable and do not affect the others."""
     from analysis.identify import MeasurementError
     from analysis.paper import FrequencyResponseError
     from analysis.record import RecordError
@@ -57,22 +57,25 @@ def task_errors() -> tuple[type[Exception], ...]:
     return SessionError, RecordError, FrequencyResponseError, MeasurementError
 
 
-_STATED: Final = ("excitation", "amplitude_rad", "start_hz", "stop_hz", "duration_s", "taper_s",
-                  "there_and_back")  # fmt: skip
-LABEL: Final = "specimen"
-"""Key of what the operator calls the specimen."""
+_EXCITATION_KEYS: Final = ("excitation", "amplitude_rad", "start_hz", "stop_hz", "duration_s",
+                           "taper_s", "there_and_back")  # fmt: skip
+"""Keys of the excitation in a session file that must agree over a campaign."""
+LABEL_KEY: Final = "specimen"
+"""Key of the operator's label of the specimen in a session file."""
 
-_OF_SPECIMEN: Final = (LABEL, "beam_length_m", "beam_density_kg_per_m",
-                       "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
-_ENDS: Final = ("start_hz", "stop_hz")
+_SPECIMEN_KEYS: Final = (LABEL_KEY, "beam_length_m", "beam_density_kg_per_m",
+                         "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
+"""Keys of the specimen in a session file that must agree over a campaign."""
+_SWEEP_END_KEYS: Final = ("start_hz", "stop_hz")
 """Keys of the ends of a sweep. The same band in the other direction is the same experiment."""
 
-_SWEEP: Final = "chirp"
-_SEARCH: Final = "until"
-"""Excitation that was planned while it ran: each is another one."""
+_SWEEP_NAME: Final = "chirp"
+"""Name of the excitation by a sweep."""
+_SEARCH_NAME: Final = "until"
+"""Name of the excitation that is planned while it runs, so that each such session has its own."""
 
-_WHOLE: Final = 0.99
-"""Fraction of the planned sweep from which it counts as complete: ticks may be missing at its
+_COMPLETE_FRACTION: Final = 0.99
+"""Fraction of the planned sweep from which it counts as complete, as samples may be missing at its
 end."""
 
 
@@ -83,15 +86,15 @@ class Experiment:
     Attributes
     ----------
     facts : mapping of str to (str or float)
-        By the key of the session file; of what is optional there, what is stated.
+        Values by their keys in the session file. Optional values that are not stated are absent.
     sweep_s : float
-        How long the sweep in the file is.
+        Duration of the recorded sweep in seconds.
     identity : tuple of str
-        By which a copy of the file is recognised: the session's, or without one the file's path.
+        Identity of the session, the same in a copy of the file; the file's path without one.
     start_utc : str
-        When it was recorded, to the second; empty if the file does not say.
+        Start of the recording in UTC, to the second; empty if the file does not state it.
     operator, note : str
-        What the file says of either, or nothing.
+        Operator and note stated in the file; empty if not stated.
     added : mapping of str to (float or str)
         Metadata that the user added, by its names, such as ``temperature_c``.
     """
@@ -105,19 +108,21 @@ class Experiment:
     added: Mapping[str, float | str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, record: Record) -> Experiment:
-        """Collect what a record states."""
+    def from_record(cls, record: Record) -> Experiment:
+        """Return the specimen and the excitation that a record states."""
         beam, metadata = record.beam, record.metadata
-        stated = {key: _number(metadata[key]) for key in _STATED if key in metadata}
-        label = metadata.get(LABEL, "").strip()
+        excitation_facts = {
+            key: _parse_number(metadata[key]) for key in _EXCITATION_KEYS if key in metadata
+        }
+        label = metadata.get(LABEL_KEY, "").strip()
         return cls(
             facts={
-                **({LABEL: label} if label else {}),
+                **({LABEL_KEY: label} if label else {}),
                 "beam_length_m": beam.length_m,
                 "beam_density_kg_per_m": beam.density_kg_per_m,
                 "beam_bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
                 "tool_inertia_kg_m2": record.tool_inertia_kg_m2,
-                **stated,
+                **excitation_facts,
             },
             sweep_s=record.sweep_samples / record.rate_hz,
             identity=(
@@ -125,7 +130,7 @@ class Experiment:
                 if {"id", "start_utc_ns"} <= metadata.keys()
                 else (str(record.path.resolve()),)
             ),
-            start_utc=_time(metadata.get("start_utc_ns", "")),
+            start_utc=_utc_text(metadata.get("start_utc_ns", "")),
             operator=metadata.get("operator", "").strip(),
             note=metadata.get("note", "").strip(),
             added=added_metadata(metadata),
@@ -133,22 +138,22 @@ class Experiment:
 
     @property
     def label(self) -> str:
-        """What the file calls the specimen; empty if nothing."""
-        return str(self.facts.get(LABEL, ""))
+        """Label of the specimen stated in the file; empty without a label."""
+        return str(self.facts.get(LABEL_KEY, ""))
 
     @property
-    def searched(self) -> bool:
-        """Whether the session planned its own excitation, which agrees with any other."""
-        return self.facts.get("excitation") == _SEARCH
+    def planned_itself(self) -> bool:
+        """Whether the excitation was planned while it ran, which is compatible with any other."""
+        return self.facts.get("excitation") == _SEARCH_NAME
 
-    def unfinished(self, outcome: str) -> str:
-        """Describe, as the end of a sentence, that the sweep ended early; empty if it did not."""
+    def unfinished_sweep_reason(self, outcome: str) -> str:
+        """Return the end of a sentence about a sweep that ended early; empty if it was complete."""
         planned_s = self.facts.get("duration_s")
         if not isinstance(planned_s, float):
             return ""
         if self.facts.get("there_and_back") == 1.0:
             planned_s *= 2
-        if self.sweep_s >= _WHOLE * planned_s:
+        if self.sweep_s >= _COMPLETE_FRACTION * planned_s:
             return ""
         return (
             f"its sweep ended after {self.sweep_s:.4g} s of {planned_s:g} s (outcome: {outcome}), "
@@ -156,48 +161,57 @@ class Experiment:
         )
 
     def difference(self, other: Experiment) -> str | None:
-        """Describe the first difference from another experiment, None if there is none."""
-        planned = self.searched or other.searched
-        stated = dict(other.facts)
+        """Describe the first difference from another experiment; None if there is no difference."""
+        excitation_free = self.planned_itself or other.planned_itself
+        other_facts = dict(other.facts)
         if {self.rising, other.rising} == {True, False}:
-            first, last = _ENDS
-            stated[first], stated[last] = stated[last], stated[first]
-        for key, mine in self.facts.items():
-            theirs = mine if planned and key in _STATED else stated.get(key, mine)
-            if not _same(theirs, mine):
-                return f"{key} is {fact_text(key, theirs)}, but {fact_text(key, mine)}"
+            start_key, stop_key = _SWEEP_END_KEYS
+            other_facts[start_key], other_facts[stop_key] = (
+                other_facts[stop_key],
+                other_facts[start_key],
+            )
+        for key, own_value in self.facts.items():
+            other_value = (
+                own_value
+                if excitation_free and key in _EXCITATION_KEYS
+                else other_facts.get(key, own_value)
+            )
+            if not _equal_values(other_value, own_value):
+                return f"{key} is {fact_text(key, other_value)}, but {fact_text(key, own_value)}"
         return None
 
     @property
     def rising(self) -> bool | None:
-        """Whether the frequency of its sweep rises; None if it is no sweep, or does both."""
-        if self.facts.get("excitation") != _SWEEP or "there_and_back" in self.facts:
+        """Whether the sweep rises in frequency; None without a sweep or with both directions."""
+        if self.facts.get("excitation") != _SWEEP_NAME or "there_and_back" in self.facts:
             return None
-        first, last = (self.facts.get(key) for key in _ENDS)
-        if not isinstance(first, float) or not isinstance(last, float) or first == last:
+        start_hz, stop_hz = (self.facts.get(key) for key in _SWEEP_END_KEYS)
+        if not isinstance(start_hz, float) or not isinstance(stop_hz, float) or start_hz == stop_hz:
             return None
-        return first < last
+        return start_hz < stop_hz
 
     def same_specimen(self, other: Experiment) -> bool:
-        """Whether another one states the same beam and the same tool inertia."""
+        """Return whether another experiment states the same beam and the same tool inertia."""
         return not any(
-            key in self.facts and not _same(other.facts.get(key, self.facts[key]), self.facts[key])
-            for key in _OF_SPECIMEN
+            key in self.facts
+            and not _equal_values(other.facts.get(key, self.facts[key]), self.facts[key])
+            for key in _SPECIMEN_KEYS
         )
 
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:
-    """Return the shortest end of each path that no other one has.
+    """Return for each path the shortest trailing part that identifies it among the paths.
 
     Parameters
     ----------
     paths : sequence of Path
+        Paths of session files.
     """
     names = [path.name for path in paths]
     for depth in range(2, max((len(path.parts) for path in paths), default=0) + 1):
-        often = Counter(names)
+        counts = Counter(names)
         names = [
-            str(Path(*path.parts[-depth:])) if often[name] > 1 else name
+            str(Path(*path.parts[-depth:])) if counts[name] > 1 else name
             for path, name in zip(paths, names, strict=True)
         ]
     return names
@@ -205,14 +219,14 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class StatedSpecimen:
-    """One specimen, as files state it.
+    """One specimen as stated in session files.
 
     Attributes
     ----------
     facts : mapping of str to (str or float)
-        Beam and tool inertia by the keys of the session files.
+        Properties of beam and tool by their keys in the session files.
     files : tuple of str
-        Names of the files that state it, whether they can be used or not.
+        Names of the files that state this specimen, whether they can be used or not.
     """
 
     facts: Mapping[str, str | float]
@@ -220,99 +234,104 @@ class StatedSpecimen:
 
 
 def stated_specimens(
-    stated: Iterable[tuple[str, Experiment | None]], of_campaign: Experiment
+    stated: Iterable[tuple[str, Experiment | None]], campaign_experiment: Experiment
 ) -> tuple[StatedSpecimen, ...]:
-    """Group files by the specimen that they state; first that of the campaign, then as they come.
+    """Group files by the specimen that they state, the specimen of the campaign first.
 
     Parameters
     ----------
     stated : iterable of (str, Experiment or None)
-        Name of each file, with None of one that could not be read.
+        Name and experiment of each file; None for a file that could not be read.
     of_campaign : Experiment
         Experiment of the sessions that are pooled.
     """
-    found: list[tuple[Experiment, list[str]]] = [(of_campaign, [])]
+    files_by_specimen: list[tuple[Experiment, list[str]]] = [(campaign_experiment, [])]
     for file, experiment in stated:
         if experiment is None:
             continue
-        for specimen, files in found:
+        for specimen, files in files_by_specimen:
             if specimen.same_specimen(experiment):
                 files.append(file)
                 break
         else:
-            found.append((experiment, [file]))
+            files_by_specimen.append((experiment, [file]))
     return tuple(
         StatedSpecimen(
-            {key: specimen.facts[key] for key in _OF_SPECIMEN if key in specimen.facts},
+            {key: specimen.facts[key] for key in _SPECIMEN_KEYS if key in specimen.facts},
             tuple(files),
         )
-        for specimen, files in found
+        for specimen, files in files_by_specimen
     )
 
 
-def labelled(experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Distinguish unlabelled from labelled sessions if there are several labels.
+def complete_labels(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Give sessions without a specimen label an empty label, if there are several labels.
 
-    With one label alone, a session without it is taken for the same specimen. With several labels
-    its specimen is unknown.
+    With a single label in the campaign, a session without a label is taken to be of that specimen.
+    With several labels, its specimen is unknown.
     """
-    if len({each.label for each in experiments if each.label}) < 2:
+    if len({experiment.label for experiment in experiments if experiment.label}) < 2:
         return list(experiments)
-    return [replace(each, facts={LABEL: each.label, **each.facts}) for each in experiments]
+    return [
+        replace(experiment, facts={LABEL_KEY: experiment.label, **experiment.facts})
+        for experiment in experiments
+    ]
 
 
 def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
-    """Return the keys in which specimens differ."""
-    first = specimens[0].facts
+    """Return the keys of the properties in which specimens differ."""
+    first_facts = specimens[0].facts
     return tuple(
         key
-        for key, value in first.items()
-        if not all(_same(each.facts.get(key, value), value) for each in specimens)
+        for key, value in first_facts.items()
+        if not all(_equal_values(specimen.facts.get(key, value), value) for specimen in specimens)
     )
 
 
-def most_common(experiments: Sequence[Experiment]) -> int:
-    """Return the index of the experiment with which most others agree, the first of several.
+def most_common_index(experiments: Sequence[Experiment]) -> int:
+    """Return the index of the first experiment with which most other experiments agree.
 
-    A search agrees with any excitation, so it does not count as a candidate.
+    A session that planned its own excitation agrees with any other, so it is no candidate.
     """
-    indices = [i for i, each in enumerate(experiments) if not each.searched]
+    indices = [i for i, experiment in enumerate(experiments) if not experiment.planned_itself]
     return max(
         indices or range(len(experiments)),
         key=lambda i: sum(experiments[i].difference(two) is None for two in experiments),
     )
 
 
-def _same(one: str | float, two: str | float) -> bool:
-    if isinstance(one, str) or isinstance(two, str):
-        return one == two
-    return math.isclose(one, two, rel_tol=1e-9)
+def _equal_values(first: str | float, second: str | float) -> bool:
+    """Return whether two stated values are equal, numbers up to rounding."""
+    if isinstance(first, str) or isinstance(second, str):
+        return first == second
+    return math.isclose(first, second, rel_tol=1e-9)
 
 
 def fact_text(key: str, value: str | float) -> str:
-    """Write a fact with its unit.
+    """Format a value of a session file with its unit.
 
     Parameters
     ----------
     key : str
-        Name of the fact, with its unit as a suffix.
+        Key of the value, with the unit as a suffix.
     value : str or float
-        The fact.
+        The value.
     """
     if isinstance(value, str):
-        return (f"“{value}”" if value else "not stated") if key == LABEL else value
+        return (f"“{value}”" if value else "not stated") if key == LABEL_KEY else value
     return f"{value:g} {unit_of(key)}".rstrip()
 
 
-def _time(utc_ns: str) -> str:
-    """Write the wall clock's time as in ISO 8601, to the second; nothing where there is none."""
+def _utc_text(utc_ns: str) -> str:
+    """Format nanoseconds since 1970 in UTC as ISO 8601, to the second; empty if not a time."""
     try:
         return f"{datetime.fromtimestamp(int(utc_ns) // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}"
     except (ValueError, OverflowError, OSError):
         return ""
 
 
-def _number(text: str) -> str | float:
+def _parse_number(text: str) -> str | float:
+    """Return a text as a number if it is one."""
     try:
         return float(text)
     except ValueError:

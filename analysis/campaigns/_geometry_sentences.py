@@ -1,10 +1,10 @@
-"""Sentences of a campaign on modes and damping with a tolerance of the geometry."""
+"""Sentences on modes and damping estimated from all sessions with a tolerance of the geometry."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns.sentences import in_single_sessions, probability
+from analysis.campaigns.sentences import describe_single_sessions, probability
 from analysis.identify.headline import EXACT_CONDITION
 from analysis.identify.sentences import LOSSES, slope_of_loss
 from analysis.statistics import NORMAL_95
@@ -20,90 +20,107 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify.uniform_beam import TolerantEstimate
 
-_BASES: Final = {
+_OTHER_BASES: Final = {
     "losses": "damping ratios and residue phases alone",
     "none": "no beam with one order of each damping, which do not explain the losses",
 }
+"""Descriptions of the estimates that do not rely on the frequencies of a uniform beam."""
 
 
-def chance(p_value: float) -> str:
-    """Write a p-value."""
-    written = probability(p_value)
-    return f"p {written}" if written.startswith("<") else f"p = {written}"
+def p_value_text(p_value: float) -> str:
+    """Format a p-value as an equation or inequality."""
+    probability_text = probability(p_value)
+    return (
+        f"p {probability_text}" if probability_text.startswith("<") else f"p = {probability_text}"
+    )
 
 
-def tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
-    """Describe the basis of the parameters, and their tolerance of the geometry."""
+def describe_tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
+    """Describe the basis of the parameters and the tolerated deviation from a uniform beam."""
     stated = modal.stated[-1]
-    given = f"{100 * stated:g} % as the files state it"
+    tolerance_text = f"{100 * stated:g} % as the files state it"
     if len(modal.stated) > 1:
-        every = listed([f"{100 * each:g}" for each in modal.stated])
-        given = f"{100 * stated:g} %, the largest of the {every} % that the files state"
+        stated_texts = listed([f"{100 * uniformity:g}" for uniformity in modal.stated])
+        tolerance_text = (
+            f"{100 * stated:g} %, the largest of the {stated_texts} % that the files state"
+        )
     sentence = (
         f"Parameters are those of a beam with both dampings, from the modal constants of "
         f"{modal.sessions} sessions"
     )
     if estimate.basis != "geometry":
         return (
-            f"{sentence}, by {_BASES[estimate.basis]}: the frequencies are not those of a uniform "
-            f"beam to {given}, nor with a wider tolerance."
+            f"{sentence}, by {_OTHER_BASES[estimate.basis]}: the frequencies are not those of a "
+            "uniform "
+            f"beam to {tolerance_text}, nor with a wider tolerance."
         )
-    used = given
+    used_text = tolerance_text
     if estimate.uniformity > stated:
-        used = f"{100 * estimate.uniformity:g} % ({given} does not suffice)"
+        used_text = f"{100 * estimate.uniformity:g} % ({tolerance_text} does not suffice)"
     return (
-        f"{sentence}; each mode lies where that of a uniform beam does, to {used}. An unevenness "
+        f"{sentence}; each mode lies where that of a uniform beam does, to {used_text}. An "
+        "unevenness "
         "of the specimen is common to all sessions and does not average out."
     )
 
 
-def slope(found: PooledOrder, modal: PooledModal) -> str:
-    """Describe an order as the slope of a loss over the visible modes.
+def describe_slope(pooled_order: PooledOrder, modal: PooledModal) -> str:
+    """Describe an order of the damping as the slope of a loss over the visible modes.
 
     Parameters
     ----------
-    found : PooledOrder
-        The order as `modal.tolerant` has it.
+    pooled_order : PooledOrder
+        Order estimated with a tolerance of the geometry.
     modal : PooledModal
+        Modal model of all sessions, with the estimate `tolerant`.
     """
     estimate = modal.tolerant
     assert estimate is not None
-    counts = {f"“{status}”": count for status, count in found.alone.items()}
-    alone = in_single_sessions(counts, sum(counts.values()))
-    if found.value is None or found.interval is None:
+    counts = {f"“{status}”": count for status, count in pooled_order.alone.items()}
+    sessions_sentence = describe_single_sessions(counts, sum(counts.values()))
+    if pooled_order.value is None or pooled_order.interval is None:
         return (
-            f"The slope of the {LOSSES[found.order]} ({found.order}) is not identifiable: "
-            f"{found.reason}. {alone}"
+            f"The slope of the {LOSSES[pooled_order.order]} ({pooled_order.order}) is not "
+            "identifiable: "
+            f"{pooled_order.reason}. {sessions_sentence}"
         )
     shown_hz = [mode.frequency_hz for mode in modal.modes]
     sentence = slope_of_loss(
-        found.order, found.value, found.interval, shown_hz, estimate, found.status, found.reason
+        pooled_order.order,
+        pooled_order.value,
+        pooled_order.interval,
+        shown_hz,
+        estimate,
+        pooled_order.status,
+        pooled_order.reason,
     )
-    return f"{sentence} {alone}"
+    return f"{sentence} {sessions_sentence}"
 
 
-def if_exact(
+def describe_orders_if_exact(
     freest: PooledEstimate, orders: Sequence[PooledOrder], modal: PooledModal | None
 ) -> list[str]:
-    """Describe the orders on condition that the beam is exactly uniform.
+    """Describe the orders of the damping on condition that the beam is exactly uniform.
 
-    Empty if a uniform beam does not predict the modes.
+    The list is empty if a uniform beam does not predict the modes.
     """
     if modal is None or modal.uniform_beam.status == "refused":
         return []
     orders_shown = []
-    for each in orders:
-        exact = each.exact
+    for order in orders:
+        exact = order.exact
         if exact is None or exact.reason or exact.value is None or exact.interval is None:
             continue
-        half = (exact.interval[1] - exact.interval[0]) / 2
-        value, low, high = to_uncertainty((exact.value, *exact.interval), exact.std or half)
-        end = {
+        half_width = (exact.interval[1] - exact.interval[0]) / 2
+        value, low, high = to_uncertainty((exact.value, *exact.interval), exact.std or half_width)
+        conclusions = {
             "compatible": "consistent with 1",
             "fractional": "which would exclude 1",
             "open": "1 would be doubtful",
         }
-        orders_shown.append(f"{each.order} {value} (95 %: {low} to {high}; {end[exact.status]})")
+        orders_shown.append(
+            f"{order.order} {value} (95 %: {low} to {high}; {conclusions[exact.status]})"
+        )
     return (
         [f"{EXACT_CONDITION.capitalize()} (type {freest.name}): {'; '.join(orders_shown)}."]
         if orders_shown
@@ -114,53 +131,64 @@ def if_exact(
 # Rising and falling sweeps
 
 
-def sweeps(found: OppositeSweeps | None) -> list[str]:
+def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
     """Describe whether rising and falling sweeps show the same modes."""
-    if found is None:
+    if sweeps is None:
         return []
-    which = f"{found.rising} rising and {found.falling} falling sweeps"
-    if not found.changed:
-        least = min(each.chance for each in found.modes)
-        most = max(abs(each.frequency) + NORMAL_95 * each.frequency_std for each in found.modes)
+    sweep_counts = f"{sweeps.rising} rising and {sweeps.falling} falling sweeps"
+    if not sweeps.changed:
+        lowest_p_value = min(mode_change.chance for mode_change in sweeps.modes)
+        largest_change = max(
+            abs(mode_change.frequency) + NORMAL_95 * mode_change.frequency_std
+            for mode_change in sweeps.modes
+        )
         return [
-            f"Nothing changed along the records: {which} have the same modal constants (lowest "
-            f"{chance(least)}; frequencies to {100 * most:.1g} %)."
+            f"Nothing changed along the records: {sweep_counts} have the same modal constants "
+            "(lowest "
+            f"{p_value_text(lowest_p_value)}; frequencies to {100 * largest_change:.1g} %)."
         ]
-    each = "; ".join(map(_difference, found.changed))
+    mode_change = "; ".join(map(_describe_mode_change, sweeps.changed))
     return [
-        f"Something changes along the records, or with the direction of the sweep: {which} differ "
-        f"in {each}. Each mode is as it was when the sweep passed it."
+        f"Something changes along the records, or with the direction of the sweep: {sweep_counts} "
+        "differ "
+        f"in {mode_change}. Each mode is as it was when the sweep passed it."
     ]
 
 
-def _difference(each: ModeInSweeps) -> str:
-    def percent(value: float, std: float) -> str:
+def _describe_mode_change(mode_change: ModeInSweeps) -> str:
+    """Describe how one mode differs in falling sweeps from rising ones."""
+
+    def change_text(value: float, std: float) -> str:
+        """Format a relative change in per cent, with its 95 % interval and direction."""
         size, spread = to_uncertainty((abs(value), NORMAL_95 * std), std, 100.0)
         return f"{size} ± {spread} % {'higher' if value > 0 else 'lower'}"
 
     return (
-        f"mode {each.mode} (falling: frequency {percent(each.frequency, each.frequency_std)}, "
-        f"damping ratio {percent(each.damping, each.damping_std)}; {chance(each.chance)})"
+        f"mode {mode_change.mode} (falling: frequency "
+        f"{change_text(mode_change.frequency, mode_change.frequency_std)}, "
+        f"damping ratio {change_text(mode_change.damping, mode_change.damping_std)}; "
+        f"{p_value_text(mode_change.chance)})"
     )
 
 
-def experiments(
-    found: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionAnalysis]
+def recommend_sweeps(
+    sweeps: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionAnalysis]
 ) -> list[str]:
-    """Recommend sweeps that decide whether the specimen changes during the records."""
-    if found is not None and found.changed:
-        modes = listed([str(each.mode) for each in found.changed])
+    """Recommend further sweeps that show whether the specimen changes during the records."""
+    if sweeps is not None and sweeps.changed:
+        modes = listed([str(mode_change.mode) for mode_change in sweeps.changed])
         return [
             "To tell a change in time from one with amplitude, repeat both sweeps with half the "
             f"amplitude: a difference in mode {modes} that stays is a change in time. Then check "
             "clamp and temperature."
         ]
-    one_way = {each.experiment.rising for each in sessions}
+    directions = {session.experiment.rising for session in sessions}
     refused = modal is not None and modal.uniform_beam.status == "refused"
-    if found is None and refused and one_way in ({True}, {False}):
-        other = "falling" if True in one_way else "rising"
+    if sweeps is None and refused and directions in ({True}, {False}):
+        missing_direction = "falling" if True in directions else "rising"
         return [
-            f"Add {other} sweeps (start_hz and stop_hz exchanged): in sweeps of one direction a "
+            f"Add {missing_direction} sweeps (start_hz and stop_hz exchanged): in sweeps of one "
+            "direction a "
             "change along the record looks like a beam that is not uniform."
         ]
     return []

@@ -1,4 +1,4 @@
-"""Headline numbers of a campaign, for programs: of each session, then of all together."""
+"""Headline results of a campaign as JSON: of each session, then of all sessions together."""
 
 from __future__ import annotations
 
@@ -26,106 +26,128 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify.headline import StructureStatus
 
-_UNEXPLAINED: Final = "part of the records is unexplained"
-_MIXTURE: Final = "the mean of a mixture: sessions differ significantly"
-_ON_BOUND: Final = "the unweighted mean: at its bound in at least one session"
-_NOT_SHOWN: Final = "computed from the model: too few records show this mode"
-_ADEQUATE: Final = 0.9
+_UNEXPLAINED_FLAG: Final = "part of the records is unexplained"
+"""Flag of all estimates if too many sessions have a residual that is not noise."""
+_MIXTURE_FLAG: Final = "the mean of a mixture: sessions differ significantly"
+"""Flag of a quantity that differs significantly between sessions."""
+_ON_BOUND_FLAG: Final = "the unweighted mean: at its bound in at least one session"
+"""Flag of a parameter that is at a bound in at least one session."""
+_NOT_SHOWN_FLAG: Final = "computed from the model: too few records show this mode"
+"""Flag of a mode that too few records show."""
+_ADEQUATE_FRACTION: Final = 0.9
+"""Fraction of the sessions whose residual must be noise for estimates without a flag."""
 
 
 def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
-    """Collect the headlines of a campaign.
+    """Collect the reported estimates of each session and of all sessions together, as JSON.
 
     Parameters
     ----------
     campaign : CampaignResult
+        The analysed campaign.
 
     Returns
     -------
     list of dict
-        As of single files; the last one, with ``file`` null, is of all sessions together. Without
-        whole-record fits there are none.
+        Headlines as for single files. The last one, with ``file`` null, is that of all sessions
+        together. Without whole-record fits the list is empty.
     """
-    found = [dict(each.headline) for each in campaign.sessions if each.headline]
+    documents = [dict(session.headline) for session in campaign.sessions if session.headline]
     numbers, verdict = campaign_numbers(campaign), campaign.verdict
     if numbers is not None and verdict is not None:
         orders = (verdict.alpha, verdict.lambda_)
-        named = (
-            replace(each.example, sentence=each.sentence, interval=None)
-            for each in verdict.findings
+        named_findings = (
+            replace(finding.example, sentence=finding.sentence, interval=None)
+            for finding in verdict.findings
         )
-        found.append(headline_json(None, numbers, orders, named, campaign.validity))
-    return found
+        documents.append(headline_json(None, numbers, orders, named_findings, campaign.validity))
+    return documents
 
 
 def campaign_numbers(campaign: CampaignResult) -> Estimates | None:
-    """Collect the numbers of all sessions together, with flags.
+    """Collect the estimates from all sessions together, with flags on doubtful ones.
 
     Parameters
     ----------
     campaign : CampaignResult
+        The analysed campaign.
 
     Returns
     -------
-    Numbers or None
-        None without whole-record fits.
+    Estimates or None
+        The estimates; None without whole-record fits.
     """
     pooled, verdict, modal = campaign.headline, campaign.verdict, campaign.modal
     if pooled is None or verdict is None:
         return None
     orders = (verdict.alpha, verdict.lambda_)
-    exactly = tuple(each.exact or each for each in orders)
-    explained = verdict.adequate >= _ADEQUATE * verdict.sessions
-    every = None if explained else _UNEXPLAINED
+    exact_orders = tuple(order.exact or order for order in orders)
+    are_explained = verdict.adequate >= _ADEQUATE_FRACTION * verdict.sessions
+    common_flag = None if are_explained else _UNEXPLAINED_FLAG
     exact = Estimates(
         name=pooled.name,
-        parameters=_parameters(campaign, pooled, exactly, every),
-        sizes=_sizes(pooled, exactly, every),
-        modes=_modes(campaign, pooled, every),
-        structures=tuple((each.name, _status(each, pooled)) for each in campaign.structures),
-        simpler=_simpler(campaign, pooled),
+        parameters=_reported_parameters(campaign, pooled, exact_orders, common_flag),
+        sizes=_reported_loss_factors(pooled, exact_orders, common_flag),
+        modes=_reported_modes(campaign, pooled, common_flag),
+        structures=tuple(
+            (structure.name, _structure_status(structure, pooled))
+            for structure in campaign.structures
+        ),
+        simpler=_simpler_estimate(campaign, pooled),
         drag_speed_m_s=None,
     )
     if modal is None:
         return exact
     numbers = with_modal_model(
-        exact, modal, modal.uniform_beam, modal.tolerant, every, every, half_width=modal.half_width
+        exact,
+        modal,
+        modal.uniform_beam,
+        modal.tolerant,
+        common_flag,
+        common_flag,
+        half_width=modal.half_width,
     )
-    return _flagged(numbers, campaign, orders)
+    return _add_flags(numbers, campaign, orders)
 
 
-def _flagged(
+def _add_flags(
     numbers: Estimates, campaign: CampaignResult, orders: tuple[PooledOrder, ...]
 ) -> Estimates:
-    """Flag quantities that differ between sessions, doubtful orders, and hidden modes."""
-    flags, mixed = _flags(orders), campaign.homogeneity.is_mixed
+    """Flag quantities that differ between sessions, doubtful orders, and modes not shown."""
+    flags, mixed = _order_flags(orders), campaign.homogeneity.is_mixed
 
-    def of_mixture(quantity: str) -> str | None:
-        return _MIXTURE if mixed(quantity) else None
+    def mixture_flag(quantity: str) -> str | None:
+        """Return the flag of a quantity that differs between sessions, or None."""
+        return _MIXTURE_FLAG if mixed(quantity) else None
 
     return replace(
         numbers,
         parameters={
-            name: each.flagged(of_mixture(name) or flags.get(name))
-            for name, each in numbers.parameters.items()
+            name: parameter.flagged(mixture_flag(name) or flags.get(name))
+            for name, parameter in numbers.parameters.items()
         },
         modes=tuple(
             replace(
-                each,
-                frequency_hz=each.frequency_hz.flagged(
-                    of_mixture(f"frequency_hz_{each.number}") if each.shown else _NOT_SHOWN
+                mode,
+                frequency_hz=mode.frequency_hz.flagged(
+                    mixture_flag(f"frequency_hz_{mode.number}") if mode.shown else _NOT_SHOWN_FLAG
                 ),
-                damping_ratio=each.damping_ratio.flagged(
-                    of_mixture(f"damping_ratio_{each.number}") if each.shown else _NOT_SHOWN
+                damping_ratio=mode.damping_ratio.flagged(
+                    mixture_flag(f"damping_ratio_{mode.number}") if mode.shown else _NOT_SHOWN_FLAG
                 ),
             )
-            for each in numbers.modes
+            for mode in numbers.modes
         ),
     )
 
 
-def _simpler(campaign: CampaignResult, pooled: PooledEstimate) -> ConditionalEstimate | None:
-    """Return the estimate of the lowest BIC, on condition that its orders are true."""
+def _simpler_estimate(
+    campaign: CampaignResult, pooled: PooledEstimate
+) -> ConditionalEstimate | None:
+    """Return the estimate of the lowest BIC; it is valid if its fixed orders are true.
+
+    Return None if that estimate is the reported one.
+    """
     conditional = campaign.pooled[0]
     if conditional is pooled:
         return None
@@ -134,75 +156,87 @@ def _simpler(campaign: CampaignResult, pooled: PooledEstimate) -> ConditionalEst
         name=conditional.name,
         fixed={name: value for name, value in fixed.items() if name in COEFFICIENT_OF},
         parameters={
-            each.name: ReportedValue(each.value, each.std, each.interval)
-            for each in conditional.parameters
+            parameter.name: ReportedValue(parameter.value, parameter.std, parameter.interval)
+            for parameter in conditional.parameters
         },
     )
 
 
-def _parameters(
+def _reported_parameters(
     campaign: CampaignResult,
     pooled: PooledEstimate,
     orders: tuple[PooledOrder, ...],
-    every: str | None,
+    common_flag: str | None,
 ) -> dict[str, ReportedValue]:
+    """Return the pooled parameters with their flags."""
     mixed = campaign.homogeneity.is_mixed
-    flags = _flags(orders)
-    found = {
-        each.name: ReportedValue(
-            each.value,
-            each.std,
-            each.interval,
-            every or (_MIXTURE if mixed(each.name) else flags.get(each.name)),
+    flags = _order_flags(orders)
+    reported = {
+        parameter.name: ReportedValue(
+            parameter.value,
+            parameter.std,
+            parameter.interval,
+            common_flag or (_MIXTURE_FLAG if mixed(parameter.name) else flags.get(parameter.name)),
         )
-        for each in pooled.parameters
+        for parameter in pooled.parameters
     }
     free = STRUCTURES[pooled.structure].free
     for name, value in pooled.plant.parameters.items():
-        if name not in found and (name not in PARAMETERS or name in free):
-            found[name] = ReportedValue(value, None, None, every or _ON_BOUND)
-    return found
+        if name not in reported and (name not in PARAMETERS or name in free):
+            reported[name] = ReportedValue(value, None, None, common_flag or _ON_BOUND_FLAG)
+    return reported
 
 
-def _flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
-    """Return the reasons against each order, also for its coefficient."""
+def _order_flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
+    """Return the reason against each doubtful order, also for the coefficient of the order."""
     return {
-        name: each.reason
-        for each in orders
-        if each.reason is not None
-        for name in (each.order, COEFFICIENT_OF[each.order])
+        name: order.reason
+        for order in orders
+        if order.reason is not None
+        for name in (order.order, COEFFICIENT_OF[order.order])
     }
 
 
-def _sizes(
-    pooled: PooledEstimate, orders: tuple[PooledOrder, ...], every: str | None
+def _reported_loss_factors(
+    pooled: PooledEstimate, orders: tuple[PooledOrder, ...], common_flag: str | None
 ) -> tuple[ReportedLossFactor, ...]:
-    flags = _flags(orders)
-    return tuple(each.flagged(every or flags.get(each.order)) for each in pooled.sizes)
+    """Return the loss factors with their flags."""
+    flags = _order_flags(orders)
+    return tuple(
+        loss_factor.flagged(common_flag or flags.get(loss_factor.order))
+        for loss_factor in pooled.sizes
+    )
 
 
-def _modes(
-    campaign: CampaignResult, pooled: PooledEstimate, every: str | None
+def _reported_modes(
+    campaign: CampaignResult, pooled: PooledEstimate, common_flag: str | None
 ) -> tuple[ReportedMode, ...]:
+    """Return frequency and damping ratio of each pooled mode, with their flags."""
     t, mixed = student_t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
 
-    def quantity_of(value: float, std: float, quantity: str) -> ReportedValue:
-        flag = every or (_MIXTURE if mixed(quantity) else None)
+    def reported_value(value: float, std: float, quantity: str) -> ReportedValue:
+        """Return a quantity of a mode with its interval and flag."""
+        flag = common_flag or (_MIXTURE_FLAG if mixed(quantity) else None)
         return ReportedValue(value, std, (value - t * std, value + t * std), flag)
 
     return tuple(
         ReportedMode(
             mode.number,
-            quantity_of(mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"),
-            quantity_of(mode.damping_ratio, mode.damping_ratio_std, f"damping_ratio_{mode.number}"),
+            reported_value(mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"),
+            reported_value(
+                mode.damping_ratio, mode.damping_ratio_std, f"damping_ratio_{mode.number}"
+            ),
             shown=True,
         )
         for mode in pooled.modes
     )
 
 
-def _status(each: RankedStructure, pooled: PooledEstimate) -> StructureStatus:
-    if each.name == pooled.name:
+def _structure_status(structure: RankedStructure, pooled: PooledEstimate) -> StructureStatus:
+    """Return whether a damping structure is selected, compatible with the data, or excluded."""
+    if structure.name == pooled.name:
         return "selected"
-    above = each.bic_above_lowest
-    return "compatible" if above is not None and above < BIC_DECISIVE else "excluded"
+    bic_difference = structure.bic_above_lowest
+    return (
+        "compatible" if bic_difference is not None and bic_difference < BIC_DECISIVE else "excluded"
+    )

@@ -1,7 +1,7 @@
 """Homogeneity of a campaign: whether its sessions are of one specimen, by files and by estimates.
 
-Cochran's Q and I², the fraction of the variance between sessions that their own uncertainties do
-not explain [1]_, of each mode and of each parameter by itself.
+Each mode and each parameter is tested by itself with Cochran's Q and with I², the fraction of the
+variance between sessions that their own uncertainties do not explain [1]_.
 
 References
 ----------
@@ -32,49 +32,54 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
 
-Values = tuple[tuple[str, float, float], ...]
-"""File, estimate and its standard deviation, session by session."""
+SessionValues = tuple[tuple[str, float, float], ...]
+"""Types of file, estimate and its standard deviation, one entry for each session."""
 
-SIGNIFICANT: Final = 0.01
-"""Level of all quantities together: one alarm in a hundred campaigns that repeat is false."""
+SIGNIFICANCE_LEVEL: Final = 0.01
+"""Significance level of all quantities together: one false alarm in a hundred campaigns of one
+specimen."""
 
-_LARGE: Final = 0.9
-"""I² from which sessions count as a mixture: a scatter of three own standard deviations."""
+_MIXTURE_I_SQUARED: Final = 0.9
+"""I² from which sessions count as a mixture: a scatter of three times a session's own standard
+deviation."""
 
-_CLEAR: Final = 5.0
+_CLEAR_GAP_STDS: Final = 5.0
 """Gap from which groups are distinguished, in standard deviations within groups."""
 
-_FEWEST: Final = 2
-_OF_MODES: Final = {"frequency_hz": "frequency_std_hz", "damping_ratio": "damping_ratio_std"}
-_OF_RIG: Final = frozenset({"delay_s", "tool_inertia_kg_m2"})
+_FEWEST_SESSIONS: Final = 2
+"""Smallest number of sessions that can be compared."""
+_MODE_QUANTITIES: Final = {"frequency_hz": "frequency_std_hz", "damping_ratio": "damping_ratio_std"}
+"""Quantities of a mode that are tested, with the names of their standard deviations."""
+_RIG_PARAMETERS: Final = frozenset({"delay_s", "tool_inertia_kg_m2"})
+"""Parameters of the rig, whose scatter does not indicate different specimens."""
 
 
 @dataclass(frozen=True, slots=True)
 class Heterogeneity:
-    """One mode's or parameter's scatter between sessions.
+    """Scatter of one parameter or of one mode's quantity between sessions.
 
     Attributes
     ----------
     quantity : str
-        Parameter, or ``frequency_hz_1``, ``damping_ratio_1`` and so on by the number of the mode.
+        Name of the parameter, or ``frequency_hz_N`` or ``damping_ratio_N`` of mode N.
     values : tuple of (str, float, float)
-        File, estimate and its standard deviation, session by session.
+        File, estimate and its standard deviation, one entry for each session.
     mean : float
-        Pooled; of a positive parameter the geometric mean.
+        Pooled mean; the geometric mean of a positive parameter.
     between_std : float
-        Scatter between sessions beyond their own uncertainties, tau.
+        Standard deviation between sessions beyond their own uncertainties, tau.
     cochran_q : float
-        About `degrees_of_freedom` without such scatter.
+        Cochran's Q; about `degrees_of_freedom` without such scatter.
     chance : float
-        Probability of that Q without such scatter.
+        p-value of `cochran_q`.
     mixed : bool
-        Whether sessions differ so much that the mean is that of a mixture.
+        Whether the sessions differ so much that the mean is that of a mixture of specimens.
     groups : tuple of tuple of str
-        Files of each group, the lowest first; empty without clear gaps.
+        Files of each group of sessions, by increasing value; empty without clear gaps.
     """
 
     quantity: str
-    values: Values
+    values: SessionValues
     mean: float
     between_std: float
     cochran_q: float
@@ -84,37 +89,38 @@ class Heterogeneity:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Sessions less one."""
+        """Degrees of freedom of Cochran's Q: the number of sessions less one."""
         return len(self.values) - 1
 
     @property
     def own_stds(self) -> float:
-        """Scatter between sessions, tau, in standard deviations that a typical session states."""
+        """Scatter between sessions, tau, divided by the standard deviation of a typical session."""
         return math.sqrt(max(self.cochran_q / self.degrees_of_freedom - 1, 0.0))
 
     @property
     def i_squared(self) -> float:
-        """Fraction of the variance between sessions that their own uncertainty does not explain."""
+        """Fraction of the variance between sessions that their uncertainties do not explain."""
         return self.own_stds**2 / (1 + self.own_stds**2)
 
     @property
     def of_rig(self) -> bool:
-        """Whether it is the rig's, and says nothing of the specimen."""
-        return self.quantity in _OF_RIG
+        """Whether the quantity is a property of the rig and not of the specimen."""
+        return self.quantity in _RIG_PARAMETERS
 
 
 @dataclass(frozen=True, slots=True)
 class Homogeneity:
-    """Evidence for and against one specimen.
+    """Result of the test of whether the sessions of a campaign are of one specimen.
 
     Attributes
     ----------
     specimens : tuple of StatedSpecimen
-        That the files state, the one of this campaign first.
+        Different specimens stated in the files, the specimen of this campaign first.
     quantities : tuple of Heterogeneity
-        Modes, then parameters, all by the structure by which sessions are compared.
+        Scatter of the modes, then of the parameters.
     structure : str or None
-        Its name, as tables call it; None without whole-record fits.
+        Structure by which the sessions are compared, as named in tables; None without whole-record
+        fits.
     """
 
     specimens: tuple[StatedSpecimen, ...]
@@ -123,29 +129,34 @@ class Homogeneity:
 
     @property
     def leading(self) -> Heterogeneity | None:
-        """Quantity in which sessions differ most, modes before parameters; None if they do not."""
-        found = [each for each in self.quantities if each.mixed and not each.of_rig]
-        of_modes = [each for each in found if each.quantity.startswith(tuple(_OF_MODES))]
-        return max(of_modes or found, key=lambda each: each.own_stds, default=None)
+        """Quantity that shows most clearly that the sessions differ; None if they do not differ.
+
+        Modes take precedence over parameters.
+        """
+        mixed = [scatter for scatter in self.quantities if scatter.mixed and not scatter.of_rig]
+        mode_scatters = [
+            scatter for scatter in mixed if scatter.quantity.startswith(tuple(_MODE_QUANTITIES))
+        ]
+        return max(mode_scatters or mixed, key=lambda scatter: scatter.own_stds, default=None)
 
     @property
     def mixed(self) -> bool:
-        """Whether the pooled values are means of a mixture."""
+        """Whether the pooled values are means of a mixture of specimens."""
         return self.leading is not None
 
     @property
     def one_specimen(self) -> bool:
-        """Whether neither the files nor the estimates contradict one specimen."""
-        return len(self.specimens) < _FEWEST and not self.mixed
+        """Whether neither the files nor the estimates contradict a single specimen."""
+        return len(self.specimens) < _FEWEST_SESSIONS and not self.mixed
 
-    def of(self, quantity: str) -> Heterogeneity | None:
-        """Return the between-session scatter of one quantity, None if it is not known."""
-        return next((each for each in self.quantities if each.quantity == quantity), None)
+    def scatter_of(self, quantity: str) -> Heterogeneity | None:
+        """Return the between-session scatter of a quantity, or None if it is not known."""
+        return next((scatter for scatter in self.quantities if scatter.quantity == quantity), None)
 
     def is_mixed(self, quantity: str) -> bool:
-        """Whether one pooled value is the mean of a mixture."""
-        found = self.of(quantity)
-        return found is not None and found.mixed
+        """Return whether the pooled value of a quantity is the mean of a mixture."""
+        scatter = self.scatter_of(quantity)
+        return scatter is not None and scatter.mixed
 
 
 def homogeneity(
@@ -153,67 +164,85 @@ def homogeneity(
     pooled: Sequence[PooledEstimate],
     specimens: Sequence[StatedSpecimen],
 ) -> Homogeneity:
-    """Test whether sessions are of one specimen, all by one structure (`common_structure`).
+    """Test whether sessions are of one specimen, by their fits of one damping structure.
 
     Parameters
     ----------
-    sessions : sequence of SessionResult
+    sessions : sequence of SessionAnalysis
+        Sessions of the campaign.
     pooled : sequence of PooledEstimate
-        The lowest BIC first.
+        Pooled estimates, the lowest BIC first.
     specimens : sequence of StatedSpecimen
+        Different specimens stated in the files.
     """
     name = common_structure(sessions)
-    by_name = [
-        (session.name, each)
+    common_estimates = [
+        (session.name, estimate)
         for session in sessions
-        for each in session.record_estimates
-        if each.name == name
+        for estimate in session.record_estimates
+        if estimate.name == name
     ]
-    every = dict(_of_modes(by_name))
-    shared = freest_estimate(pooled)
-    if shared is not None:
-        every |= dict(_of_parameters(sessions, shared))
-    every = {quantity: values for quantity, values in every.items() if len(values) >= _FEWEST}
-    level = SIGNIFICANT / max(len(every), 1)
+    values_by_quantity = dict(_mode_values(common_estimates))
+    freest = freest_estimate(pooled)
+    if freest is not None:
+        values_by_quantity |= dict(_parameter_values(sessions, freest))
+    values_by_quantity = {
+        quantity: values
+        for quantity, values in values_by_quantity.items()
+        if len(values) >= _FEWEST_SESSIONS
+    }
+    level = SIGNIFICANCE_LEVEL / max(len(values_by_quantity), 1)
     return Homogeneity(
         tuple(specimens),
-        tuple(_judged(quantity, values, level) for quantity, values in every.items()),
+        tuple(
+            _test_heterogeneity(quantity, values, level)
+            for quantity, values in values_by_quantity.items()
+        ),
         name,
     )
 
 
-def _of_modes(estimates: Sequence[tuple[str, RecordEstimate]]) -> Iterator[tuple[str, Values]]:
+def _mode_values(
+    estimates: Sequence[tuple[str, RecordEstimate]],
+) -> Iterator[tuple[str, SessionValues]]:
     """Yield frequencies and damping ratios of the modes that all sessions have."""
-    count = min((len(each.modes) for _, each in estimates), default=0)
-    for quantity, std in _OF_MODES.items():
+    count = min((len(estimate.modes) for _, estimate in estimates), default=0)
+    for quantity, std in _MODE_QUANTITIES.items():
         for index in range(count):
             values = (
-                (file, getattr(each.modes[index], quantity), getattr(each.modes[index], std))
-                for file, each in estimates
+                (
+                    file,
+                    getattr(estimate.modes[index], quantity),
+                    getattr(estimate.modes[index], std),
+                )
+                for file, estimate in estimates
             )
-            yield f"{quantity}_{index + 1}", _known(values)
+            yield f"{quantity}_{index + 1}", _with_known_std(values)
 
 
-def _of_parameters(
-    sessions: Sequence[SessionAnalysis], shared: PooledEstimate
-) -> Iterator[tuple[str, Values]]:
-    for parameter in shared.parameters:
+def _parameter_values(
+    sessions: Sequence[SessionAnalysis], freest: PooledEstimate
+) -> Iterator[tuple[str, SessionValues]]:
+    """Yield the estimates of each pooled parameter, one for each session."""
+    for parameter in freest.parameters:
         name = parameter.name
         values = (
-            (session.name, each.parameters[name], each.std[name] or 0.0)
+            (session.name, estimate.parameters[name], estimate.std[name] or 0.0)
             for session in sessions
-            for each in session.record_estimates
-            if each.name == shared.name and name in each.determined
+            for estimate in session.record_estimates
+            if estimate.name == freest.name and name in estimate.determined
         )
-        yield name, _known(values)
+        yield name, _with_known_std(values)
 
 
-def _known(values: Iterator[tuple[str, float, float]]) -> Values:
-    return tuple(each for each in values if math.isfinite(each[2]) and each[2] > 0)
+def _with_known_std(values: Iterator[tuple[str, float, float]]) -> SessionValues:
+    """Return the entries with a finite and positive standard deviation."""
+    return tuple(entry for entry in values if math.isfinite(entry[2]) and entry[2] > 0)
 
 
-def _judged(quantity: str, values: Values, level: float) -> Heterogeneity:
-    estimate, std = np.array([each[1:] for each in values]).T
+def _test_heterogeneity(quantity: str, values: SessionValues, level: float) -> Heterogeneity:
+    """Return the between-session scatter of a quantity, tested at a significance level."""
+    estimate, std = np.array([entry[1:] for entry in values]).T
     logarithmic = quantity in LOGARITHMIC
     if logarithmic:
         estimate, std = np.log(estimate), std / estimate
@@ -221,7 +250,7 @@ def _judged(quantity: str, values: Values, level: float) -> Heterogeneity:
     chance = float(chi_square_p_value(effects.cochran_q[0], len(values) - 1))
     mean = math.exp(effects.mean[0]) if logarithmic else float(effects.mean[0])
     significant = chance < level
-    apart = groups(estimate, std) if significant else ()
+    split = split_groups(estimate, std) if significant else ()
     q = float(effects.cochran_q[0])
     return Heterogeneity(
         quantity=quantity,
@@ -230,32 +259,42 @@ def _judged(quantity: str, values: Values, level: float) -> Heterogeneity:
         between_std=float(effects.between_std[0]) * (mean if logarithmic else 1.0),
         cochran_q=q,
         chance=chance,
-        mixed=significant and (bool(apart) or q * (1 - _LARGE) >= len(values) - 1),
-        groups=tuple(tuple(values[index][0] for index in sorted(part)) for part in apart),
+        mixed=significant and (bool(split) or q * (1 - _MIXTURE_I_SQUARED) >= len(values) - 1),
+        groups=tuple(tuple(values[index][0] for index in sorted(group)) for group in split),
     )
 
 
-def groups(estimate: NDArray[np.float64], std: NDArray[np.float64]) -> tuple[tuple[int, ...], ...]:
-    """Split estimates at clear gaps into groups of indices, lowest first; empty without gaps.
+def split_groups(
+    estimate: NDArray[np.float64], std: NDArray[np.float64]
+) -> tuple[tuple[int, ...], ...]:
+    """Split estimates at clear gaps into groups of session indices, the lowest values first.
 
-    No more groups than half the sessions, so that one at least has two members, and gaps of
-    `_CLEAR` standard deviations within the groups, or of single sessions where these are larger.
+    There are at most half as many groups as sessions, so that at least one group has two members.
+    A gap is clear if it exceeds `_CLEAR_GAP_STDS` times the standard deviation within the groups,
+    or the standard deviation of a single session if this is larger. Without clear gaps, there are
+    no groups.
 
     Parameters
     ----------
     estimate, std : ndarray, shape (K,)
+        Estimate of each session, and its standard deviation.
     """
     order = np.argsort(estimate)
     gaps = np.diff(estimate[order])
-    floor = math.sqrt(float(np.mean(std**2)))
-    found: tuple[tuple[int, ...], ...] = ()
-    clearest = _CLEAR
+    session_std = math.sqrt(float(np.mean(std**2)))
+    best_groups: tuple[tuple[int, ...], ...] = ()
+    clearest = _CLEAR_GAP_STDS
     for count in range(2, (order.size + 1) // 2 + 1):
-        cuts = np.sort(np.argsort(gaps)[1 - count :]) + 1
-        parts = np.split(order, cuts)
-        squares = sum(float(((estimate[p] - estimate[p].mean()) ** 2).sum()) for p in parts)
-        within = max(math.sqrt(squares / (order.size - count)), floor)
-        apart = float(gaps[cuts - 1].min()) / within
-        if apart > clearest:
-            clearest, found = apart, tuple(tuple(part.tolist()) for part in parts)
-    return found
+        cut_indices = np.sort(np.argsort(gaps)[1 - count :]) + 1
+        candidate_groups = np.split(order, cut_indices)
+        squares = sum(
+            float(((estimate[p] - estimate[p].mean()) ** 2).sum()) for p in candidate_groups
+        )
+        group_std = max(math.sqrt(squares / (order.size - count)), session_std)
+        smallest_gap = float(gaps[cut_indices - 1].min()) / group_std
+        if smallest_gap > clearest:
+            clearest, best_groups = (
+                smallest_gap,
+                tuple(tuple(group.tolist()) for group in candidate_groups),
+            )
+    return best_groups

@@ -1,7 +1,7 @@
 """Modal constants of all sessions together, and a beam with a tolerance of the geometry.
 
-Each session's noise averages out, an unevenness of the specimen does not: it is common to all. So
-the tolerance of the geometry is added to the covariance of the pooled constants, whatever the
+The noise of the sessions averages out. An unevenness of the specimen is common to all sessions and
+does not, so the geometry tolerance is added to the covariance of the pooled constants, whatever the
 number of sessions. Rising and falling sweeps pass each mode at different times, so their constants
 differ if the specimen changes during the records.
 """
@@ -33,35 +33,39 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import RandomEffects
 
-_FEWEST: Final = 2
-_NEARLY_ALL: Final = 0.9
-"""Fraction of the sessions that must show a mode."""
+_FEWEST_SESSIONS: Final = 2
+"""Smallest number of sessions that can be pooled."""
+_COMMON_MODE_FRACTION: Final = 0.9
+"""Fraction of the sessions that must show a mode for it to be pooled."""
 
-_SIGNIFICANT: Final = 0.01
-"""Level of all modes together at which rising and falling sweeps differ."""
+_SIGNIFICANCE_LEVEL: Final = 0.01
+"""Level, for all modes together, at which rising and falling sweeps differ significantly."""
 
-_LN_FREQUENCY: Final = CONSTANTS.index("ln_frequency")
-_LN_RATIO: Final = CONSTANTS.index("ln_damping_ratio")
-_PHASE: Final = CONSTANTS.index("residue_phase_rad")
+_LN_FREQUENCY_INDEX: Final = CONSTANTS.index("ln_frequency")
+"""Index of the logarithm of the frequency among the constants of a mode."""
+_LN_DAMPING_RATIO_INDEX: Final = CONSTANTS.index("ln_damping_ratio")
+"""Index of the logarithm of the damping ratio among the constants of a mode."""
+_RESIDUE_PHASE_INDEX: Final = CONSTANTS.index("residue_phase_rad")
+"""Index of the phase of the residue among the constants of a mode."""
 
 
 @dataclass(frozen=True, slots=True)
 class PooledModal(ModalEstimate):
-    """Modal model of all sessions together.
+    """Modal model (frequencies, damping ratios, residues) pooled over all sessions.
 
     Attributes
     ----------
     sessions : int
-        Used: those that show all of its modes.
+        Number of sessions used: those that show all modes of the model.
     between_std : ndarray, shape (4 n,)
-        Scatter of each constant between sessions, beyond their own uncertainties.
+        Scatter of each modal constant between sessions beyond their own uncertainties.
     stated : tuple of float
-        Uniformities that the files state, each once, the largest last.
+        Different uniformities stated in the files, in increasing order.
     uniform_beam : UniformBeamTest
-        Whether a uniform beam predicts the pooled constants.
+        Test of whether a uniform beam predicts the pooled constants.
     tolerant : TolerantEstimate or None
-        Parameters at the largest uniformity stated. None with a uniformity of 0 in all files, or
-        with a single mode.
+        Parameters estimated with the largest stated uniformity as tolerance. None if all files
+        state a uniformity of 0, or with a single mode.
     """
 
     sessions: int
@@ -77,56 +81,67 @@ class PooledModal(ModalEstimate):
 
     @property
     def leads(self) -> bool:
-        """Whether the reported modes are its own, and not those of an exactly uniform beam."""
+        """Whether the modes of this model are reported, and not those of a uniform beam."""
         return self.tolerant is not None or self.uniform_beam.status == "refused"
 
     @property
     def modes(self) -> tuple[PooledMode, ...]:
-        """Its modes."""
-        found = []
+        """Frequency, damping ratio and inertia of each mode, with their standard deviations."""
+        pooled_modes = []
         for number in self.numbers:
             mode, (inertia, relative_std) = self.mode(number), self.inertia(number)
             between = self.between_std[self.rows([number])]
-            found.append(
+            pooled_modes.append(
                 PooledMode(
                     number=number,
                     frequency_hz=mode.frequency_hz,
                     frequency_std_hz=mode.frequency_std_hz,
-                    frequency_between_std_hz=mode.frequency_hz * float(between[_LN_FREQUENCY]),
+                    frequency_between_std_hz=mode.frequency_hz
+                    * float(between[_LN_FREQUENCY_INDEX]),
                     damping_ratio=mode.damping_ratio,
                     damping_ratio_std=mode.damping_ratio_std,
-                    damping_ratio_between_std=mode.damping_ratio * float(between[_LN_RATIO]),
+                    damping_ratio_between_std=mode.damping_ratio
+                    * float(between[_LN_DAMPING_RATIO_INDEX]),
                     source="modal",
                     participation_kg_m2=inertia,
                     participation_std_kg_m2=inertia * relative_std,
                 )
             )
-        return tuple(found)
+        return tuple(pooled_modes)
 
 
 def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
-    """Pool the modal constants of sessions; None unless two of them show a common mode.
+    """Pool the modal constants of the sessions; None unless two sessions show a common mode.
 
     Parameters
     ----------
-    sessions : sequence of SessionResult
+    sessions : sequence of SessionAnalysis
+        Sessions of the campaign.
     """
-    shown = [each for each in sessions if each.modal is not None and each.nominal is not None]
-    modes = _common_modes([each.modal for each in shown if each.modal is not None])
-    used = [each for each in shown if each.modal and set(modes) <= set(each.modal.visible)]
-    if not modes or len(used) < _FEWEST:
+    with_modes = [
+        session for session in sessions if session.modal is not None and session.nominal is not None
+    ]
+    modes = _common_modes([session.modal for session in with_modes if session.modal is not None])
+    used = [
+        session
+        for session in with_modes
+        if session.modal and set(modes) <= set(session.modal.visible)
+    ]
+    if not modes or len(used) < _FEWEST_SESSIONS:
         return None
-    effects = _pooled_constants([each.modal for each in used if each.modal is not None], modes)
-    estimate = _estimate(modes, effects.mean, effects.covariance)
+    effects = _pooled_constants(
+        [session.modal for session in used if session.modal is not None], modes
+    )
+    estimate = _modal_estimate(modes, effects.mean, effects.covariance)
     nominal = used[0].nominal
     assert nominal is not None
-    stated = tuple(sorted({each.uniformity for each in used}))
+    stated = tuple(sorted({session.uniformity for session in used}))
     tolerant = None
     if stated[-1]:
-        # Intervals are normal ones, and Student's t of few sessions is wider.
-        widened = (student_t_quantile(0.95, len(used) - 1) / NORMAL_95) ** 2
-        wide = replace(estimate, joint_covariance=widened * effects.covariance)
-        tolerant = tolerant_estimate(wide, nominal, stated[-1])
+        # The intervals assume a normal distribution, but Student's t of few sessions is wider.
+        variance_factor = (student_t_quantile(0.95, len(used) - 1) / NORMAL_95) ** 2
+        widened_estimate = replace(estimate, joint_covariance=variance_factor * effects.covariance)
+        tolerant = tolerant_estimate(widened_estimate, nominal, stated[-1])
     return PooledModal(
         model=estimate.model,
         numbers=modes,
@@ -140,43 +155,45 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
     )
 
 
-def _estimate(
+def _modal_estimate(
     modes: tuple[int, ...], joint: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> ModalEstimate:
-    """Return the estimate with given constants and background, and their covariance."""
+    """Return the modal estimate with given constants and background, and their covariance."""
     constants, background = np.split(joint, [len(modes) * len(CONSTANTS)])
     model = ModalModel.of_constants(constants, background.tolist())
     return ModalEstimate(model, modes, constants, covariance)
 
 
 def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
-    """Modes that nearly all sessions show."""
-    count = Counter(number for each in estimates for number in each.visible)
-    least = max(_NEARLY_ALL * len(estimates), _FEWEST)
-    return tuple(sorted(number for number, often in count.items() if often >= least))
+    """Return the numbers of the modes that nearly all sessions show."""
+    mode_counts = Counter(number for estimate in estimates for number in estimate.visible)
+    fewest = max(_COMMON_MODE_FRACTION * len(estimates), _FEWEST_SESSIONS)
+    return tuple(sorted(number for number, sessions in mode_counts.items() if sessions >= fewest))
 
 
 def _pooled_constants(estimates: Sequence[ModalEstimate], modes: Sequence[int]) -> RandomEffects:
-    """Pool `CONSTANTS` of some modes, and the background with them.
+    """Pool the `CONSTANTS` of some modes, and the background, over estimates.
 
-    Phases are as near to those of the first as whole turns allow.
+    Whole turns are removed from the phase differences to the first estimate.
     """
-    values, covariances = map(np.array, zip(*(_joint(e, modes) for e in estimates), strict=True))
-    phases = values[:, _PHASE : len(modes) * len(CONSTANTS) : len(CONSTANTS)]
+    values, covariances = map(
+        np.array, zip(*(_constants_and_background(e, modes) for e in estimates), strict=True)
+    )
+    phases = values[:, _RESIDUE_PHASE_INDEX : len(modes) * len(CONSTANTS) : len(CONSTANTS)]
     phases -= 2 * math.pi * np.round((phases - phases[0]) / (2 * math.pi))
     return random_effects(values, covariances)
 
 
-def _joint(
+def _constants_and_background(
     estimate: ModalEstimate, modes: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Constants of some modes and background of one session, with their covariance."""
+    """Return constants of some modes and background of one session, with covariance."""
     rows = estimate.rows(modes)
-    joint = np.concatenate(
+    indices = np.concatenate(
         [rows, np.arange(estimate.constants.size, len(estimate.joint_covariance))]
     )
     values = np.concatenate([estimate.constants[rows], estimate.model.background])
-    return values, estimate.joint_covariance[np.ix_(joint, joint)]
+    return values, estimate.joint_covariance[np.ix_(indices, indices)]
 
 
 # Rising and falling sweeps
@@ -184,19 +201,20 @@ def _joint(
 
 @dataclass(frozen=True, slots=True)
 class ModeInSweeps:
-    """One mode in falling sweeps against rising ones.
+    """Difference of one mode between falling and rising sweeps.
 
     Attributes
     ----------
     mode : int
+        Number of the mode, from 1.
     frequency, frequency_std : float
         Relative difference of the frequency, falling less rising, and its standard deviation.
     damping, damping_std : float
-        Likewise of the damping ratio.
+        Relative difference of the damping ratio, falling less rising, and its standard deviation.
     chance : float
-        Probability of constants that differ as much by chance.
+        p-value of the difference of the modal constants.
     changed : bool
-        Whether they differ significantly, over all modes.
+        Whether the difference is significant, at a level for all modes together.
     """
 
     mode: int
@@ -210,13 +228,14 @@ class ModeInSweeps:
 
 @dataclass(frozen=True, slots=True)
 class OppositeSweeps:
-    """Whether rising and falling sweeps show the same modes.
+    """Comparison of the modes of rising and falling sweeps.
 
     Attributes
     ----------
     rising, falling : int
-        Sessions of either.
+        Number of sessions with rising and with falling sweeps.
     modes : tuple of ModeInSweeps
+        Differences of the modes common to all these sessions.
     """
 
     rising: int
@@ -225,53 +244,68 @@ class OppositeSweeps:
 
     @property
     def changed(self) -> tuple[ModeInSweeps, ...]:
-        """Modes that differ."""
-        return tuple(each for each in self.modes if each.changed)
+        """Modes that differ significantly between rising and falling sweeps."""
+        return tuple(mode for mode in self.modes if mode.changed)
 
 
 def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | None:
-    """Compare the modes of rising with those of falling sweeps; None without both.
+    """Compare the modes of rising and falling sweeps; None without both directions.
 
     Parameters
     ----------
-    sessions : sequence of SessionResult
+    sessions : sequence of SessionAnalysis
+        Sessions of the campaign.
     """
-    rising = [each.modal for each in sessions if each.modal and each.experiment.rising is True]
-    falling = [each.modal for each in sessions if each.modal and each.experiment.rising is False]
+    rising = [
+        session.modal for session in sessions if session.modal and session.experiment.rising is True
+    ]
+    falling = [
+        session.modal
+        for session in sessions
+        if session.modal and session.experiment.rising is False
+    ]
     if not rising or not falling:
         return None
-    common = set.intersection(*(set(each.visible) for each in (*rising, *falling)))
+    common = set.intersection(*(set(estimate.visible) for estimate in (*rising, *falling)))
     modes = tuple(sorted(common))
     if not modes:
         return None
-    values, covariances = zip(*_of_groups((rising, falling), modes), strict=True)
+    values, covariances = zip(*_pool_groups((rising, falling), modes), strict=True)
     difference, covariance = values[1] - values[0], covariances[0] + covariances[1]
-    phases = difference[_PHASE : len(modes) * len(CONSTANTS) : len(CONSTANTS)]  # a view
+    phases = difference[
+        _RESIDUE_PHASE_INDEX : len(modes) * len(CONSTANTS) : len(CONSTANTS)
+    ]  # a view into `difference`
     phases -= 2 * math.pi * np.round(phases / (2 * math.pi))
-    found = []
+    changes = []
     for index, mode in enumerate(modes):
         rows = slice(len(CONSTANTS) * index, len(CONSTANTS) * (index + 1))
-        off, spread = difference[rows], covariance[rows, rows]
-        chance = float(chi_square_p_value(off @ np.linalg.solve(spread, off), len(CONSTANTS)))
-        std = np.sqrt(np.diag(spread))
-        found.append(
+        mode_difference, mode_covariance = difference[rows], covariance[rows, rows]
+        chance = float(
+            chi_square_p_value(
+                mode_difference @ np.linalg.solve(mode_covariance, mode_difference), len(CONSTANTS)
+            )
+        )
+        std = np.sqrt(np.diag(mode_covariance))
+        changes.append(
             ModeInSweeps(
                 mode,
-                float(off[_LN_FREQUENCY]), float(std[_LN_FREQUENCY]),
-                float(off[_LN_RATIO]), float(std[_LN_RATIO]),
-                chance, chance < _SIGNIFICANT / len(modes),
+                float(mode_difference[_LN_FREQUENCY_INDEX]),
+                float(std[_LN_FREQUENCY_INDEX]),
+                float(mode_difference[_LN_DAMPING_RATIO_INDEX]),
+                float(std[_LN_DAMPING_RATIO_INDEX]),
+                chance, chance < _SIGNIFICANCE_LEVEL / len(modes),
             )
         )  # fmt: skip
-    return OppositeSweeps(len(rising), len(falling), tuple(found))
+    return OppositeSweeps(len(rising), len(falling), tuple(changes))
 
 
-def _of_groups(
+def _pool_groups(
     groups: Iterable[Sequence[ModalEstimate]], modes: Sequence[int]
 ) -> Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield constants and background of each group with their covariance."""
+    """Yield pooled constants and background of each group of estimates, with their covariance."""
     for group in groups:
-        if len(group) < _FEWEST:
-            yield _joint(group[0], modes)
+        if len(group) < _FEWEST_SESSIONS:
+            yield _constants_and_background(group[0], modes)
         else:
             effects = _pooled_constants(group, modes)
             yield effects.mean, effects.covariance

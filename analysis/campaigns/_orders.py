@@ -1,9 +1,10 @@
-"""Common structure of all sessions, and their joint result on the orders of the damping.
+"""Freest common structure of all sessions, and their joint result on the orders of the damping.
 
-The structure by which all sessions are compared and pooled is the freest that they support. What a
-session selects by itself depends on its noise. Sessions compared by what each of them selected
-differ by the difference between structures, and forty sessions of one beam then seem to be of two.
-Intervals of the freest structure hold whichever simpler one is true.
+All sessions are compared and pooled by the freest structure that they support. The structure that a
+session selects by itself depends on its noise. If each session were compared by the structure that
+it selects, the sessions would differ by the difference between structures, and forty sessions of
+one beam would seem to be of two beams. The intervals of the freest structure are valid for any
+simpler structure, too.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
-from analysis.campaigns.pooling import by_structure
+from analysis.campaigns.pooling import estimates_by_structure
 from analysis.identify import effective_reason, tolerant_status
 from analysis.identify.profile_likelihood import WIDEST_FRACTION
 from analysis.identify.verdict import BIC_DECISIVE, too_few_modes
@@ -33,91 +34,104 @@ if TYPE_CHECKING:
 
 # Common structure
 
-_NEARLY_ALL: Final = 0.9
-"""Fraction of the sessions determining the selected structure that must determine a freer one."""
+_DETERMINING_FRACTION: Final = 0.9
+"""Fraction of the sessions determining the structure of the lowest BIC that must determine a freer
+structure for it to be reported."""
 
 
 def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
-    """Return the freest pooled structure on the beam that all sessions together support.
+    """Return the estimate of the freest damping structure that nearly all sessions determine.
 
-    The beam is that of the lowest BIC; a structure that far fewer sessions determine does not
-    stand for all. None without any.
+    The freest structure has the largest number of free parameters. A structure that far fewer
+    sessions determine than the one of the lowest BIC does not represent all sessions.
 
     Parameters
     ----------
     pooled : sequence of PooledEstimate
-        The lowest BIC first.
+        Pooled estimates, the lowest BIC first; None is returned if there are none.
     """
     if not pooled:
         return None
     best = pooled[0]
     return max(
-        (each for each in pooled if each.sessions >= _NEARLY_ALL * best.sessions),
-        key=lambda each: len(STRUCTURES[each.structure].free),
+        (
+            estimate
+            for estimate in pooled
+            if estimate.sessions >= _DETERMINING_FRACTION * best.sessions
+        ),
+        key=lambda estimate: len(STRUCTURES[estimate.structure].free),
     )
 
 
 def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
-    """Name the structure by which the modes of all sessions are compared.
+    """Return the name of the damping structure by which all sessions are compared.
 
     Parameters
     ----------
-    sessions : sequence of SessionResult
+    sessions : sequence of SessionAnalysis
+        Sessions of the campaign.
 
     Returns
     -------
     str or None
-        The freest of those fitted to every session. None without whole-record fits.
+        The freest structure that was fitted to every session. None without whole-record fits.
     """
-    fitted = by_structure(sessions)
-    tried = max(map(len, fitted.values()), default=0)
-    found = [each[0] for each in fitted.values() if len(each) == tried]
-    return max(found, key=_freedom).name if found else None
+    fitted = estimates_by_structure(sessions)
+    fitted_sessions = max(map(len, fitted.values()), default=0)
+    candidates = [
+        estimates[0] for estimates in fitted.values() if len(estimates) == fitted_sessions
+    ]
+    return max(candidates, key=_free_parameter_count).name if candidates else None
 
 
-def _freedom(estimate: RecordEstimate) -> int:
+def _free_parameter_count(estimate: RecordEstimate) -> int:
+    """Return the number of free parameters of an estimate's damping structure."""
     return len(STRUCTURES[estimate.structure].free)
 
 
 # Orders
 
 PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
+"""Result of the test whether an order is 1 (see `PooledOrder`)."""
 
-_UNEXPLAINED: Final = "part of the records is unexplained"
-_ADEQUATE: Final = 0.9
+_UNEXPLAINED_REASON: Final = "part of the records is unexplained"
+"""Reason for doubt in an order if too many sessions have a residual that is not noise."""
+_ADEQUATE_FRACTION: Final = 0.9
 """Fraction of the sessions whose residual must be noise before an order is reported."""
 
-_SURE: Final = 0.999
-"""Two-sided level at which 1 is excluded: falsely so in one campaign of a thousand."""
+_EXCLUSION_LEVEL: Final = 0.999
+"""Confidence level at which 1 must be excluded: one false exclusion in a thousand campaigns."""
 
 
 @dataclass(frozen=True, slots=True)
 class PooledOrder:
-    """One order of the damping over all sessions, in the freest structure.
+    """One order of the damping, estimated from all sessions in the freest structure.
 
     Attributes
     ----------
     order : str
         "alpha" or "lambda".
     status : str
-        "compatible": the 95 % interval holds 1; "fractional": 1 is excluded; "open": 1 is doubtful
-        but not excluded, or something else explains as much; "not identifiable": it could be almost
-        anything; "absent": such damping does not show.
+        "compatible": the 95 % interval contains 1; "fractional": 1 is excluded; "open": 1 is
+        doubtful but not excluded, or something else explains the records as well; "not
+        identifiable": the order could have almost any value; "absent": the sessions show no such
+        damping.
     value : float or None
-        Pooled estimate, where the order is identifiable.
+        Pooled estimate; None if the order is not identifiable.
     interval : tuple of float or None
-        Its 95 % interval, scatter between sessions included; None also if it was fixed at 1.
+        95 % interval of the order, scatter between sessions included; None also if the order was
+        fixed at 1.
     std : float or None
-        Its standard deviation; None as above.
+        Standard deviation of the order; None in the same cases as `interval`.
     exact : PooledOrder or None
-        The same on condition that the beam is uniform to 1e-5; None where that is what it is.
+        The order on condition that the beam is uniform to 1e-5; None if this object states it.
     reason : str or None
-        Why the number is not a property of the specimen; None if it is.
+        Why the value is not a property of the specimen; None if it is.
     alone : mapping of str to int
         Number of sessions with each status by themselves.
     mixture : bool
-        Whether the reason is that sessions differ in it in kind, or are of different specimens and
-        do not all determine it.
+        Whether `reason` is that the sessions differ significantly in this order, or that they are
+        of different specimens and do not all determine it.
     """
 
     order: Order
@@ -131,7 +145,7 @@ class PooledOrder:
     exact: PooledOrder | None = None
 
     def doubted(self, reason: str) -> PooledOrder:
-        """Return the order with a reason for doubt, unless it has one."""
+        """Return the order with a reason for doubt; unchanged if it already has a reason."""
         if self.reason is not None:
             return self
         return replace(self, status="open" if self.interval else self.status, reason=reason)
@@ -141,40 +155,51 @@ def pooled_order(
     order: Order,
     ranked: Sequence[PooledEstimate],
     verdicts: Sequence[Verdict],
-    alike: Homogeneity,
+    homogeneity: Homogeneity,
 ) -> PooledOrder:
-    """Assess one order by all sessions, by the same rules as for one record.
+    """Assess one order of the damping from all sessions, by the same rules as for one record.
 
     Parameters
     ----------
     order : str
+        "alpha" or "lambda".
     ranked : sequence of PooledEstimate
-        The lowest BIC first; not empty.
+        Pooled estimates, the lowest BIC first; not empty.
     verdicts : sequence of Verdict
         Verdicts of the sessions.
-    alike : Homogeneity
-        Whether they are of one specimen.
+    homogeneity : Homogeneity
+        Whether the sessions are of one specimen.
     """
-    each = [verdict.alpha if order == "alpha" else verdict.lambda_ for verdict in verdicts]
-    alone: dict[str, int] = dict(Counter(str(one.status) for one in each).most_common())
+    session_orders = [
+        verdict.alpha if order == "alpha" else verdict.lambda_ for verdict in verdicts
+    ]
+    single_statuses: dict[str, int] = dict(
+        Counter(str(one.status) for one in session_orders).most_common()
+    )
     freest = freest_estimate(ranked)
     assert freest is not None
-    free = freest.by_name.get(order)
-    status, reason = _judged(order, ranked, freest, verdicts, alone)
-    known = free is not None and status not in ("not identifiable", "absent")
-    mixture = known and (alike.is_mixed(order) or (alike.mixed and freest.sessions < len(verdicts)))
+    parameter = freest.by_name.get(order)
+    status, reason = _status_and_reason(order, ranked, freest, verdicts, single_statuses)
+    is_known = parameter is not None and status not in ("not identifiable", "absent")
+    mixture = is_known and (
+        homogeneity.is_mixed(order) or (homogeneity.mixed and freest.sessions < len(verdicts))
+    )
     if mixture:
         status = "open"
         reason = "the sessions are not of one specimen and do not all share it"
     return PooledOrder(
         order=order,
         status=status,
-        value=free.value if free and known else 1.0 if status == "compatible" else None,
-        interval=free.interval if free and known else None,
+        value=parameter.value
+        if parameter and is_known
+        else 1.0
+        if status == "compatible"
+        else None,
+        interval=parameter.interval if parameter and is_known else None,
         reason=reason,
-        alone=alone,
+        alone=single_statuses,
         mixture=mixture,
-        std=free.std if free and known else None,
+        std=parameter.std if parameter and is_known else None,
     )
 
 
@@ -185,7 +210,7 @@ def tolerant_pooled_order(
     *,
     refused: bool,
 ) -> PooledOrder:
-    """Assess one order with a tolerance of the geometry.
+    """Assess one order of the damping, with a tolerance for deviations from a uniform beam.
 
     Parameters
     ----------
@@ -200,7 +225,7 @@ def tolerant_pooled_order(
     """
     order = exact.order
     status, reason = tolerant_status(order, estimate, refused=refused)
-    found = PooledOrder(
+    pooled = PooledOrder(
         order=order,
         status=status,
         value=estimate.values[order] if reason is None else None,
@@ -211,63 +236,72 @@ def tolerant_pooled_order(
         exact=exact,
     )
     if exact.mixture and exact.reason is not None:
-        return replace(found.doubted(exact.reason), mixture=True)
-    if not _adequate(verdicts):
-        return found.doubted(_UNEXPLAINED)
+        return replace(pooled.doubted(exact.reason), mixture=True)
+    if not _nearly_all_adequate(verdicts):
+        return pooled.doubted(_UNEXPLAINED_REASON)
     effective = effective_reason(order, refused=refused)
-    return found if effective is None else found.doubted(effective)
+    return pooled if effective is None else pooled.doubted(effective)
 
 
-def _adequate(verdicts: Sequence[Verdict]) -> bool:
+def _nearly_all_adequate(verdicts: Sequence[Verdict]) -> bool:
     """Return whether the residuals of nearly all sessions are noise."""
-    return sum(each.adequate for each in verdicts) >= _ADEQUATE * len(verdicts)
+    return sum(verdict.adequate for verdict in verdicts) >= _ADEQUATE_FRACTION * len(verdicts)
 
 
-def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstimate, ...]:
-    """Return those whose BIC is less than so much above the lowest, without the best."""
-    return tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + within)
+def rival_estimates(ranked: Sequence[PooledEstimate], margin: float) -> tuple[PooledEstimate, ...]:
+    """Return the estimates, except the first, whose BIC is less than `margin` above the lowest."""
+    return tuple(estimate for estimate in ranked[1:] if estimate.bic < ranked[0].bic + margin)
 
 
-def _judged(
+def _status_and_reason(
     order: Order,
     ranked: Sequence[PooledEstimate],
     freest: PooledEstimate,
     verdicts: Sequence[Verdict],
-    alone: Mapping[str, int],
+    single_statuses: Mapping[str, int],
 ) -> tuple[PooledStatus, str | None]:
+    """Return the status of one order of the damping, and the reason against reporting it."""
     structure = STRUCTURES[freest.structure]
     modes = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[0][0]
     several_modes = 2 * sum(len(v.visible_modes) > 1 for v in verdicts) > len(verdicts)
-    if few := too_few_modes(structure, max(modes, 2) if several_modes else 1):
-        return "not identifiable", few
+    if few_modes_reason := too_few_modes(structure, max(modes, 2) if several_modes else 1):
+        return "not identifiable", few_modes_reason
     if not structure.has(order):
         return "absent", "no such damping shows"
-    free = freest.by_name.get(order)
-    if free is None and structure.fixed.get(order) == 1.0 and next(iter(alone)) == "compatible":
-        # No fitted structure has it free: only the sessions' own verdicts are available.
+    parameter = freest.by_name.get(order)
+    if (
+        parameter is None
+        and structure.fixed.get(order) == 1.0
+        and next(iter(single_statuses)) == "compatible"
+    ):
+        # The order is free in no fitted structure, so only the sessions' verdicts are available.
         return "compatible", None
-    if free is None or _wide(free.interval) > WIDEST_FRACTION:
+    if parameter is None or _relative_width(parameter.interval) > WIDEST_FRACTION:
         return "not identifiable", "the sessions do not determine the order"
-    if not _adequate(verdicts):
-        return "open", _UNEXPLAINED
-    integer = [each for each in (ranked[0], *rivals(ranked, BIC_DECISIVE)) if _integer(each, order)]
-    low, high = free.interval
+    if not _nearly_all_adequate(verdicts):
+        return "open", _UNEXPLAINED_REASON
+    integer_rivals = [
+        estimate
+        for estimate in (ranked[0], *rival_estimates(ranked, BIC_DECISIVE))
+        if _has_order_one(estimate, order)
+    ]
+    low, high = parameter.interval
     if low <= 1 <= high:
         return "compatible", None
-    excluded = not integer and _excludes_one(free, freest.sessions)
+    excluded = not integer_rivals and _excludes_one(parameter, freest.sessions)
     return ("fractional" if excluded else "open"), None
 
 
-def _integer(estimate: PooledEstimate, order: Order) -> bool:
-    """Whether a structure has this damping with an order of 1."""
+def _has_order_one(estimate: PooledEstimate, order: Order) -> bool:
+    """Return whether a damping structure has this kind of damping with a fixed order of 1."""
     return STRUCTURES[estimate.structure].fixed.get(order) == 1.0
 
 
 def _excludes_one(order: PooledParameter, sessions: int) -> bool:
-    """Whether 1 lies outside the interval of the level at which it is called excluded."""
-    return abs(order.value - 1) > student_t_quantile(_SURE, sessions - 1) * order.std
+    """Return whether an order differs from 1 at the level `_EXCLUSION_LEVEL`."""
+    return abs(order.value - 1) > student_t_quantile(_EXCLUSION_LEVEL, sessions - 1) * order.std
 
 
-def _wide(interval: tuple[float, float]) -> float:
-    """Return the fraction of the range of orders that an interval spans."""
+def _relative_width(interval: tuple[float, float]) -> float:
+    """Return the width of an interval as a fraction of the range of orders."""
     return (interval[1] - interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])

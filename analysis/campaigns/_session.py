@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from analysis.campaigns._estimates import RecordEstimate, WelchFit
-from analysis.campaigns._experiment import Experiment, task_errors
+from analysis.campaigns._experiment import Experiment, session_error_types
 from analysis.models import RECORD_BAND_HZ, WelchSettings
 from analysis.paper import Indices, fit_indices
 from analysis.results import RecordResult, whole_record, with_uniformity
@@ -29,28 +29,31 @@ if TYPE_CHECKING:
     from rigd.beam import Beam
 
 
-_MISREAD: Final = ("sign", "unit")
-"""Findings that invalidate all numbers of the specimen."""
+_INVALIDATING_FINDINGS: Final = ("sign", "unit")
+"""Kinds of findings (wrong sign or unit of a channel) that invalidate all results of a session."""
 
 _NO_RESPONSE: Final = FrequencyResponse(
     np.zeros(0), np.zeros(0, dtype=np.complex128), coherence=None, segments=0, estimator="h1"
 )
-_USUAL: Final = WelchSettings()
-_NOT_COMPARED: Final = Indices(math.nan, math.nan, math.nan)
+"""Empty frequency response, for a session without Welch's method."""
+_PAPER_SETTINGS: Final = WelchSettings()
+"""Welch settings of the paper."""
+_NO_INDICES: Final = Indices(math.nan, math.nan, math.nan)
+"""Fit indices of a model without a measured response."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionFailure:
-    """A session that is not used, the reason, and its experiment if known."""
+    """A session that a campaign does not use, and the reason."""
 
     path: Path
-    """The file."""
+    """Path of the session file."""
     message: str
-    """Why, a sentence for the operator."""
+    """Sentence that states for the operator why the session is not used."""
     experiment: Experiment | None = None
-    """Specimen and rig, None if nothing is known of them."""
+    """Specimen and excitation stated in the file; None if the file could not be read."""
     name: str = ""
-    """Name in tables: see `distinct_names`; for a single session that of its file."""
+    """Name in tables (see `distinct_names`); the name of the file by default."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.path.name)
@@ -58,49 +61,52 @@ class SessionFailure:
 
 @dataclass(frozen=True, slots=True)
 class SessionAnalysis:
-    """One session of a campaign: some 200 kB for the paper's settings.
+    """Results of one session of a campaign, about 200 kB with the paper's settings.
 
     Attributes
     ----------
     path : Path
+        Path of the session file.
     experiment : Experiment
+        Specimen and excitation stated in the file.
     beam : Beam
-        As the file states it.
+        Beam stated in the file.
     tool_inertia_kg_m2, delay_s : float
-        As the file states them; the delay is by how much the torque is older than the angle.
+        Tool inertia, and delay of the torque channel relative to the angle, stated in the file.
     frequency_hz : ndarray, shape (n,)
-        Bins in the band; none if Welch's method does not suit the session.
+        Frequency bins in the band; empty if Welch's method is not applicable to the session.
     response : ndarray of complex, shape (n,)
         Measured torque per angle in N·m/rad, without the channels' delays.
     peaks : tuple of Peak or None
-        Measured resonant peaks, mode by mode.
+        Measured resonant peaks, one for each mode.
     welch_fits : tuple of WelchFit
-        By type, then by weighting; none if Welch's method does not suit the session.
+        Welch fits by type, then by weighting; empty if Welch's method is not applicable.
     record_estimates : tuple of RecordEstimate
-        By type; empty if none was requested, or the record could not be used.
+        Whole-record fits by type; empty if none was requested, or the record could not be used.
     verdict : Verdict or None
-        Verdict on the whole record by itself, None without estimates.
+        Verdict on the whole record of this session alone; None without estimates.
     warnings : tuple of str
+        Warnings for the operator.
     headline : mapping or None
-        Headline of the session, as in a single file's document; None without a verdict.
+        Headline of the session, as in the document of a single file; None without a verdict.
     settings : WelchSettings
-        As used, the segments in samples.
+        Welch settings as used, with segment lengths in samples.
     segments : int
-        Segments that were averaged; 0 without a response by Welch's method.
+        Number of segments averaged by Welch's method; 0 without a response.
     record_band_hz : tuple of float
-        Band of the whole-record fits.
+        Frequency band of the whole-record fits.
     name : str
-        Name in tables and sentences: see `distinct_names`; for a single session that of its file.
+        Name in tables and sentences (see `distinct_names`); the name of the file by default.
     digests : frozenset of bytes
-        Digests of its samples: see `rigd.session.sample_digests`.
+        Digests of the session's samples (see `rigd.session.sample_digests`).
     validity : Validity
         Validity of the linear model for the session.
     modal : ModalEstimate or None
-        Modes that the whole record shows; None without any.
+        Modal model of the modes visible in the whole record; None without visible modes.
     nominal : Plant or None
-        Rig and specimen as the file states them; None without whole-record fits.
+        Plant with rig and specimen as stated in the file; None without whole-record fits.
     uniformity : float
-        Stated relative standard deviation of each mode's frequency from that of a uniform beam.
+        Stated relative standard deviation of mode frequencies from those of a uniform beam.
     """
 
     path: Path
@@ -116,7 +122,7 @@ class SessionAnalysis:
     verdict: Verdict | None
     warnings: tuple[str, ...]
     headline: Mapping[str, Any] | None = None
-    settings: WelchSettings = _USUAL
+    settings: WelchSettings = _PAPER_SETTINGS
     segments: int = 0
     record_band_hz: tuple[float, float] = RECORD_BAND_HZ
     name: str = ""
@@ -142,28 +148,29 @@ class SessionAnalysis:
 
     @property
     def selected(self) -> str | None:
-        """Name of the structure that the session selects by itself, None without a verdict."""
+        """Name of the damping structure that this session selects; None without a verdict."""
         if self.verdict is None:
             return None
-        return min(self.record_estimates, key=lambda each: each.bic).name
+        return min(self.record_estimates, key=lambda estimate: estimate.bic).name
 
 
 @dataclass(frozen=True, slots=True)
 class SessionTask:
-    """Settings common to the analyses of all sessions.
+    """Settings common to the analyses of all sessions of a campaign.
 
     Attributes
     ----------
     settings : WelchSettings
+        Settings of the Welch fits.
     structures : tuple of str
-        Names of the whole-record fits to retain; empty for no such fits.
+        Structures of the whole-record fits to retain; empty for no such fits.
     fixed : tuple of str
-        Settings that stay at the file's values in those fits.
+        Parameters that stay at the file's values in the whole-record fits.
     band_hz : tuple of float or None
-        Band of all fits; None takes what suits each record.
+        Frequency band of all fits; None chooses it for each record.
     uniformity : float or None
-        Relative standard deviation of each mode's frequency from that of a uniform beam; None takes
-        each file's.
+        Relative standard deviation of mode frequencies from those of a uniform beam; None uses the
+        value stated in each file.
     """
 
     settings: WelchSettings
@@ -174,7 +181,7 @@ class SessionTask:
 
 
 def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionFailure:
-    """Read a session, analyse it by both routes, or by the whole record where that suits alone.
+    """Read and analyse a session by a fit to the whole record, and by Welch's method if applicable.
 
     An error of one session is returned, not raised, because the others are still usable.
 
@@ -188,44 +195,50 @@ def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionF
     from analysis.record import load_record
     from analysis.suited import remarks, welch_analysis
 
-    failures = task_errors()
+    session_errors = session_error_types()
     experiment = None
     try:
         record = with_uniformity(load_record(path), task.uniformity)
-        experiment = Experiment.of(record)
-        unfinished = experiment.unfinished(record.outcome)
+        experiment = Experiment.from_record(record)
+        unfinished = experiment.unfinished_sweep_reason(record.outcome)
         if unfinished:
             return SessionFailure(path, f"{path}: {unfinished}", experiment)
-        welch, left_out = welch_analysis(
+        welch, omission_remark = welch_analysis(
             record, task.settings, task.band_hz, optional=bool(task.structures)
         )
-    except failures as error:
+    except session_errors as error:
         return SessionFailure(path, str(error), experiment)
     except MemoryError:
         return SessionFailure(path, f"{path}: not enough memory to analyse it; use fewer --jobs.")
     warnings = record.warnings if welch is None else welch.warnings
-    warnings = (*warnings, *remarks(record, task.band_hz), *((left_out,) if left_out else ()))
-    whole = None
+    warnings = (
+        *warnings,
+        *remarks(record, task.band_hz),
+        *((omission_remark,) if omission_remark else ()),
+    )
+    record_result = None
     if task.structures:
         try:
-            whole = whole_record(record, task.fixed, task.band_hz)
-        except failures as error:
+            record_result = whole_record(record, task.fixed, task.band_hz)
+        except session_errors as error:
             if welch is None:
                 return SessionFailure(path, str(error), experiment)
             warnings = (*warnings, f"Not in the whole-record estimate: {error}")
         except (MemoryError, np.linalg.LinAlgError) as error:
-            why = "not enough memory" if isinstance(error, MemoryError) else error
-            warnings = (*warnings, f"Not in the whole-record estimate: {path}: {why}")
-    found = whole.verdict.findings if whole else ()
-    if wrong := next((each.sentence for each in found if each.kind in _MISREAD), None):
-        return SessionFailure(path, f"{path}: {wrong}", experiment)
-    return _session_result(RecordResult(record, whole, welch), task, experiment, warnings)
+            reason = "not enough memory" if isinstance(error, MemoryError) else error
+            warnings = (*warnings, f"Not in the whole-record estimate: {path}: {reason}")
+    findings = record_result.verdict.findings if record_result else ()
+    if invalidating := next(
+        (finding.sentence for finding in findings if finding.kind in _INVALIDATING_FINDINGS), None
+    ):
+        return SessionFailure(path, f"{path}: {invalidating}", experiment)
+    return _session_result(RecordResult(record, record_result, welch), task, experiment, warnings)
 
 
 def _session_result(
     result: RecordResult, task: SessionTask, experiment: Experiment, warnings: tuple[str, ...]
 ) -> SessionAnalysis:
-    """Return the part of a record's result that a campaign needs."""
+    """Return the results of a session that a campaign retains."""
     from analysis.suited import record_band_hz, welch_settings
 
     record, whole, welch = result.record, result.whole, result.welch
@@ -244,10 +257,10 @@ def _session_result(
         frequency_hz=measured.frequency_hz,
         response=measured.response,
         peaks=() if welch is None else welch.peaks,
-        welch_fits=() if welch is None else tuple(map(WelchFit.of, welch.models)),
+        welch_fits=() if welch is None else tuple(map(WelchFit.from_model, welch.models)),
         record_estimates=()
         if whole is None
-        else _estimates(whole, task.structures, measured, delay_s),
+        else _record_estimates(whole, task.structures, measured, delay_s),
         verdict=None if whole is None else whole.verdict,
         warnings=warnings,
         headline=None if whole is None else whole.headline_json(),
@@ -262,10 +275,10 @@ def _session_result(
     )
 
 
-def _estimates(
+def _record_estimates(
     whole: WholeRecord, structures: Collection[str], measured: FrequencyResponse, delay_s: float
 ) -> tuple[RecordEstimate, ...]:
-    """Return the estimates of the selected fit to a whole record and of the requested ones."""
+    """Return the fits of the requested damping structures and of the selected one."""
     from analysis.identify import ResponseGrid
     from analysis.models import STRUCTURES
 
@@ -273,18 +286,21 @@ def _estimates(
     grid = ResponseGrid(1j * omega)
 
     def estimate_of(candidate: Candidate) -> RecordEstimate:
+        """Return the retained results of a fit, with its fit indices."""
         # The delay stated in the file is removed from the measured response.
         plant = candidate.fit.plant
         plant = replace(plant, delay_s=plant.delay_s - delay_s)
         if not omega.size:
-            return RecordEstimate.of(candidate, _NOT_COMPARED)
+            return RecordEstimate.from_candidate(candidate, _NO_INDICES)
         response = grid.evaluate(plant)[0]
-        return RecordEstimate.of(candidate, fit_indices(omega, measured.response, response))
+        return RecordEstimate.from_candidate(
+            candidate, fit_indices(omega, measured.response, response)
+        )
 
     order = list(STRUCTURES)
     requested = [
-        estimate_of(each)
-        for each in whole.selection.candidates
-        if each.fit.structure.name in structures or each.fit is whole.fit
+        estimate_of(candidate)
+        for candidate in whole.selection.candidates
+        if candidate.fit.structure.name in structures or candidate.fit is whole.fit
     ]
-    return tuple(sorted(requested, key=lambda each: order.index(each.structure)))
+    return tuple(sorted(requested, key=lambda estimate: order.index(estimate.structure)))

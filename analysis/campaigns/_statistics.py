@@ -1,8 +1,9 @@
 """Statistics of the Welch fits over the sessions: parameters, nominal models, ranking.
 
-Scatter of the parameters (the paper's Table 3); nominal models, of the mean parameters, and how far
-each session's response is from them: Figure 7 (mean square error, its weighted kind, maximum
-deviation: Eqs. 28-30) and Table 4 (mean deviation of the resonant peaks: Eqs. 31 and 32).
+The scatter of the parameters is Table 3 of the paper. A nominal model has the mean parameters. The
+distance of each session's response from it is in Figure 7 (mean square error, weighted mean square
+error, maximum deviation: Eqs. 28-30) and Table 4 (mean deviation of the resonant peaks: Eqs. 31 and
+32).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns.pooling import by_structure, determines_damping, pooled_bic
+from analysis.campaigns.pooling import determines_damping, estimates_by_structure, pooled_bic
 from analysis.models import PARAMETERS, STRUCTURES, FrequencyResponseModel
 from analysis.paper import fit_indices, peak_deviation, resonant_peaks
 from rigd.beam import undamped_frequencies_rad_s
@@ -36,15 +37,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ParameterStatistics:
-    """One free parameter of one type and weighting, over all sessions.
+    """Statistics over all sessions of one free parameter, with one structure and weighting.
 
     Attributes
     ----------
     structure, weighting, parameter : str
+        Names of damping structure, weighting and parameter.
     mean, median, std, min, max : float
-        std with K − 1 in the denominator, NaN of a single session.
+        Statistics of the parameter; `std` has K − 1 in the denominator and is NaN for one session.
     at_bounds : int
-        Sessions in which it is at a bound of the range searched.
+        Number of sessions in which the parameter is at a bound of the range searched.
     """
 
     structure: str
@@ -61,18 +63,18 @@ class ParameterStatistics:
 def fits_by_model(
     sessions: Sequence[SessionAnalysis],
 ) -> dict[tuple[str, str], tuple[WelchFit, ...]]:
-    """All sessions' fits by type and weighting, session by session."""
+    """Return the Welch fits of all sessions by damping structure and weighting."""
     rows = zip(*(session.welch_fits for session in sessions), strict=True)
     return {(row[0].structure, row[0].weighting): row for row in rows}
 
 
 def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[ParameterStatistics, ...]:
-    """Statistics of the free parameters of every type and weighting (Table 3)."""
-    found = []
+    """Return statistics of the free parameters of all Welch fits (Table 3 of the paper)."""
+    statistics = []
     for (structure, weighting), fits in fits_by_model(sessions).items():
         for parameter in STRUCTURES[structure].free:
             values = np.array([fit.parameters[parameter] for fit in fits])
-            found.append(
+            statistics.append(
                 ParameterStatistics(
                     structure=structure,
                     weighting=weighting,
@@ -85,27 +87,28 @@ def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[Parameter
                     at_bounds=sum(parameter in fit.at_bounds for fit in fits),
                 )
             )
-    return tuple(found)
+    return tuple(statistics)
 
 
 # Nominal models
 
-BEST: Final = (("III", "omega"), ("VI", "omega"))
-"""Types and weightings of the paper's two best models: its Table 5 and Figure 8."""
+PAPER_BEST_MODELS: Final = (("III", "omega"), ("VI", "omega"))
+"""Structure and weighting of the paper's two best models (its Table 5 and Figure 8)."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeanPeakDeviation:
-    """Mean deviation of one resonance (MDR), Eqs. (31) and (32).
+    """Mean deviation of a nominal model's resonant peak from the sessions' (Eqs. 31 and 32).
 
     Attributes
     ----------
     mode : int
-        From 1 on.
+        Number of the mode, from 1.
     frequency_rad_s, magnitude_db : float
-        NaN if no session or the model has no such peak.
+        Mean deviation of the peak's frequency and magnitude; NaN if no session or the model has no
+        such peak.
     sessions : int
-        How many have the peak.
+        Number of sessions that have the peak.
     """
 
     mode: int
@@ -116,22 +119,24 @@ class MeanPeakDeviation:
 
 @dataclass(frozen=True, slots=True)
 class NominalModel:
-    """Model with the mean of the sessions' parameters.
+    """Model with the means of the parameters of the sessions' Welch fits.
 
     Attributes
     ----------
     structure, weighting : str
+        Names of damping structure and weighting.
     damping : Damping
+        Damping with the mean parameters.
     parameters : dict
-        zeta, alpha, gamma and lambda, the fixed ones included.
+        Mean of zeta, alpha, gamma and lambda, fixed parameters included.
     response : ndarray of complex, shape (n,)
-        With the tool inertia, in N·m/rad.
+        Response of the model, with the tool inertia, in N·m/rad.
     peaks : tuple of Peak or None
-        Peaks of that response, mode by mode.
+        Peaks of that response, one for each mode.
     indices : tuple of Indices
-        Its distance from each session's response, session by session.
+        Distance of the model from the response of each session.
     deviations : tuple of MeanPeakDeviation
-        Mode by mode.
+        Mean deviation of each mode's resonant peak.
     """
 
     structure: str
@@ -145,65 +150,74 @@ class NominalModel:
 
     @property
     def mean_wmse(self) -> float:
-        """Mean over the sessions of the weighted mean square error, in (N·m/rad)²."""
-        return float(np.mean([each.wmse for each in self.indices]))
+        """Weighted mean square error in (N·m/rad)², averaged over the sessions."""
+        return float(np.mean([index_set.wmse for index_set in self.indices]))
 
 
 def mean_damping(structure: str, fits: Sequence[WelchFit]) -> Damping:
-    """Damping with the mean of each free parameter."""
-    return STRUCTURES[structure].damping(_means(fits))
+    """Return the damping whose parameters are the means over the sessions' fits."""
+    return STRUCTURES[structure].damping(_mean_parameters(fits))
 
 
 def nominal_models(sessions: Sequence[SessionAnalysis]) -> tuple[NominalModel, ...]:
-    """Nominal model of every type and weighting, compared with every session."""
-    first = sessions[0]
-    if not first.frequency_hz.size:
+    """Return the nominal model for each damping structure and weighting."""
+    first_session = sessions[0]
+    if not first_session.frequency_hz.size:
         return ()
-    frequency_hz, beam = first.frequency_hz, first.beam
-    model = FrequencyResponseModel(frequency_hz, beam, first.tool_inertia_kg_m2)
+    frequency_hz, beam = first_session.frequency_hz, first_session.beam
+    model = FrequencyResponseModel(frequency_hz, beam, first_session.tool_inertia_kg_m2)
     return tuple(
-        _nominal(structure, weighting, fits, sessions, model, frequency_hz, beam)
+        _nominal_model(structure, weighting, fits, sessions, model, frequency_hz, beam)
         for (structure, weighting), fits in fits_by_model(sessions).items()
     )
 
 
 def best_models(models: Sequence[NominalModel]) -> tuple[NominalModel, ...]:
-    """Return the models of Table 5 and Figure 8: the paper's two, else the two of least WMSE."""
-    named = tuple(m for m in models if (m.structure, m.weighting) in BEST)
-    return named if len(named) == len(BEST) else tuple(sorted(models, key=_wmse)[:2])
+    """Return the models of Table 5 and Figure 8 of the paper.
+
+    These are the paper's two best models if they were fitted, else the two of lowest mean WMSE.
+    """
+    paper_models = tuple(m for m in models if (m.structure, m.weighting) in PAPER_BEST_MODELS)
+    return (
+        paper_models
+        if len(paper_models) == len(PAPER_BEST_MODELS)
+        else tuple(sorted(models, key=_wmse_key)[:2])
+    )
 
 
 def mean_deviations(
     measured: Sequence[Sequence[Peak | None]], modelled: Sequence[Peak | None]
 ) -> tuple[MeanPeakDeviation, ...]:
-    """Mean deviation of each resonant peak over the sessions, Eqs. (31) and (32).
+    """Return the mean deviation of each resonant peak over the sessions (Eqs. 31 and 32).
 
     Parameters
     ----------
     measured : sequence of sequence of Peak or None
-        Peaks of each session, mode by mode.
+        Peaks of each session, one for each mode.
     modelled : sequence of Peak or None
-        Mode by mode.
+        Peaks of the model, one for each mode.
     """
-    found = []
-    for number, (model, seen) in enumerate(
+    deviations = []
+    for number, (model, session_peaks) in enumerate(
         zip(modelled, zip(*measured, strict=True), strict=True), start=1
     ):
         terms = [
-            peak_deviation(peak, model) for peak in seen if peak is not None and model is not None
+            peak_deviation(peak, model)
+            for peak in session_peaks
+            if peak is not None and model is not None
         ]
-        found.append(
+        deviations.append(
             MeanPeakDeviation(
                 mode=number,
-                frequency_rad_s=_mean([term.frequency_rad_s for term in terms]),
-                magnitude_db=_mean([term.magnitude_db for term in terms]),
+                frequency_rad_s=_mean_or_nan([term.frequency_rad_s for term in terms]),
+                magnitude_db=_mean_or_nan([term.magnitude_db for term in terms]),
                 sessions=len(terms),
             )
         )
-    return tuple(found)
+    return tuple(deviations)
 
 
-def _nominal(
+def _nominal_model(
     structure: str,
     weighting: str,
     fits: Sequence[WelchFit],
@@ -212,6 +226,7 @@ def _nominal(
     frequency_hz: NDArray[np.float64],
     beam: Beam,
 ) -> NominalModel:
+    """Return the nominal model of one damping structure and weighting."""
     damping = mean_damping(structure, fits)
     response = model.evaluate(damping)
     count = len(sessions[0].peaks)
@@ -223,7 +238,7 @@ def _nominal(
         structure=structure,
         weighting=weighting,
         damping=damping,
-        parameters=_means(fits),
+        parameters=_mean_parameters(fits),
         response=response,
         peaks=peaks,
         indices=tuple(fit_indices(omega, session.response, response) for session in sessions),
@@ -231,15 +246,18 @@ def _nominal(
     )
 
 
-def _means(fits: Sequence[WelchFit]) -> dict[Parameter, float]:
+def _mean_parameters(fits: Sequence[WelchFit]) -> dict[Parameter, float]:
+    """Return the mean of each damping parameter over the sessions' fits."""
     return {name: float(np.mean([fit.parameters[name] for fit in fits])) for name in PARAMETERS}
 
 
-def _wmse(model: NominalModel) -> float:
+def _wmse_key(model: NominalModel) -> float:
+    """Return the mean weighted mean square error of a model, as a key for sorting."""
     return model.mean_wmse
 
 
-def _mean(values: Sequence[float]) -> float:
+def _mean_or_nan(values: Sequence[float]) -> float:
+    """Return the mean of values, or NaN without values."""
     return float(np.mean(values)) if values else float("nan")
 
 
@@ -248,24 +266,27 @@ def _mean(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RankedStructure:
-    """Rank of one structure over all sessions.
+    """One damping structure with its BIC over all sessions, for the ranking of structures.
 
     Attributes
     ----------
     structure : str
+        Name of the structure.
     fitted : int
-        Sessions to which it was fitted.
+        Number of sessions to which the structure was fitted.
     determined : int
-        Those of them that determine its damping.
+        Number of these sessions that determine the structure's damping.
     selected_alone : int
-        Those that select it by themselves.
+        Number of sessions that select the structure by themselves.
     misfit : float
-        As of `PooledEstimate`, over the sessions to which it was fitted if it is not pooled.
+        Misfit of the pooled estimate (see `PooledEstimate`). If the structure is not pooled, the
+        same median over the sessions to which it was fitted.
     bic_above_lowest : float or None
-        BIC of all sessions together above the lowest of those pooled; None if it was fitted to
-        some sessions only. Below zero where it would fit better, but too few determine it.
+        BIC of all sessions together less the lowest BIC of a pooled structure; None if the
+        structure was fitted to some sessions only. Negative if the structure fits better, but too
+        few sessions determine it.
     pooled : bool
-        Whether two sessions or more determine it, and all tried it.
+        Whether the structure was fitted to all sessions, and at least two determine it.
     """
 
     structure: str
@@ -278,43 +299,49 @@ class RankedStructure:
 
     @property
     def name(self) -> str:
-        """Name in tables."""
+        """Name of the damping structure as shown in tables."""
         return self.structure
 
 
 def ranked_structures(
     sessions: Sequence[SessionAnalysis], pooled: Sequence[PooledEstimate]
 ) -> tuple[RankedStructure, ...]:
-    """Rank every structure fitted: those pooled, by BIC, then the others.
+    """Rank all fitted damping structures: first the pooled ones by BIC, then the others.
 
     Parameters
     ----------
-    sessions : sequence of SessionResult
+    sessions : sequence of SessionAnalysis
+        Sessions of the campaign.
     pooled : sequence of PooledEstimate
-        The lowest BIC first.
+        Pooled estimates, the lowest BIC first.
     """
-    fits = by_structure(sessions)
-    tried = max(map(len, fits.values()), default=0)
-    bic = {name: pooled_bic(each) for name, each in fits.items() if len(each) == tried}
-    alone = Counter(session.selected for session in sessions)
-    misfit = {each.name: each.misfit for each in pooled}
+    fits = estimates_by_structure(sessions)
+    fitted_sessions = max(map(len, fits.values()), default=0)
+    bic = {
+        name: pooled_bic(estimates)
+        for name, estimates in fits.items()
+        if len(estimates) == fitted_sessions
+    }
+    single_selections = Counter(session.selected for session in sessions)
+    misfit = {pooled_estimate.name: pooled_estimate.misfit for pooled_estimate in pooled}
     lowest = pooled[0].bic if pooled else min(bic.values(), default=0.0)
-    found = [
+    ranked = [
         RankedStructure(
-            structure=each[0].structure,
-            fitted=len(each),
-            determined=sum(map(determines_damping, each)),
-            selected_alone=alone[name],
+            structure=estimates[0].structure,
+            fitted=len(estimates),
+            determined=sum(map(determines_damping, estimates)),
+            selected_alone=single_selections[name],
             misfit=misfit.get(name)
-            or float(np.median([one.cost / one.degrees_of_freedom for one in each])),
+            or float(np.median([one.cost / one.degrees_of_freedom for one in estimates])),
             bic_above_lowest=bic[name] - lowest if name in bic else None,
             pooled=name in misfit,
         )
-        for name, each in fits.items()
+        for name, estimates in fits.items()
     ]
-    return tuple(sorted(found, key=_rank))
+    return tuple(sorted(ranked, key=_rank_key))
 
 
-def _rank(each: RankedStructure) -> tuple[bool, bool, float]:
-    bic = each.bic_above_lowest
-    return not each.pooled, bic is None, bic or 0.0
+def _rank_key(structure: RankedStructure) -> tuple[bool, bool, float]:
+    """Return the sorting key of a damping structure: pooled ones first, then by BIC."""
+    bic = structure.bic_above_lowest
+    return not structure.pooled, bic is None, bic or 0.0

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns._experiment import CampaignError, task_errors
+from analysis.campaigns._experiment import CampaignError, session_error_types
 from analysis.campaigns._statistics import mean_damping
 from analysis.campaigns.pooling import pooled_estimates
-from analysis.campaigns.workers import Lost
+from analysis.campaigns.workers import LostTask
 from analysis.identify import Measurement, Plant
 
 if TYPE_CHECKING:
@@ -20,31 +20,32 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.workers import Workers
 
-FEWEST: Final = 3
-"""Sessions from which each can be predicted from the others: two are the fewest to be pooled."""
+FEWEST_SESSIONS: Final = 3
+"""Smallest number of sessions for which each can be predicted from the others, as pooling needs
+two."""
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOutError:
-    """Error of one model in a session that was not used for it.
+    """Prediction error of a model for a session that was not used to estimate the model.
 
     Attributes
     ----------
     path : Path
         File of the session.
     method : {"record", "welch"}
-        Whose parameters: pooled whole-record estimates of the other sessions, or the nominal model
-        of the others by the Welch method.
+        Source of the parameters: pooled whole-record estimates of the other sessions, or their
+        nominal model by the Welch method.
     name : str
-        The structure, as tables call it.
+        Damping structure, as named in tables.
     weighting : str or None
-        None with "record".
+        Weighting of the Welch fits; None with "record".
     error : float
-        Root mean square of predicted minus measured torque over that of the measured torque, in
-        the band, without means.
+        Root mean square of predicted minus measured torque, divided by that of the measured
+        torque, in the band and without means.
     own_error : float or None
-        The same with the session's own whole-record fit of that structure, None with "welch". What
-        noise there is, it holds too: an error no larger shows that the sessions agree.
+        The same error of the session's own whole-record fit of that structure; None with "welch".
+        It contains the noise, too, so an `error` that is no larger shows that the sessions agree.
     """
 
     path: Path
@@ -57,17 +58,17 @@ class LeftOutError:
 
 @dataclass(frozen=True, slots=True)
 class LostTrial:
-    """A session that was to be predicted from the others, and why it was not."""
+    """A session that could not be predicted from the other sessions, and the reason."""
 
     path: Path
-    """The session."""
+    """Path of the session file."""
     reason: str
-    """Why, as the rest of a sentence."""
+    """Reason, as the end of a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlantPrediction:
-    """Plant predicted for a session by the other sessions, with the session's own estimate."""
+    """Model estimated from the other sessions, with which one session is predicted."""
 
     method: str
     name: str
@@ -76,21 +77,23 @@ class PlantPrediction:
     own: Plant | None
 
 
-def forecasts(sessions: Sequence[SessionAnalysis], left_out: int) -> tuple[PlantPrediction, ...]:
-    """Return the models of all sessions but one, for the prediction of that one."""
+def models_without_session(
+    sessions: Sequence[SessionAnalysis], left_out: int
+) -> tuple[PlantPrediction, ...]:
+    """Return the models estimated from all sessions but one, to predict that session."""
     session = sessions[left_out]
     others = [*sessions[:left_out], *sessions[left_out + 1 :]]
-    own = {each.name: each.plant for each in session.record_estimates}
-    found = [
-        PlantPrediction("record", each.name, None, each.plant, own[each.name])
-        for each in pooled_estimates(others)
-        if each.name in own
+    own = {estimate.name: estimate.plant for estimate in session.record_estimates}
+    predictions = [
+        PlantPrediction("record", estimate.name, None, estimate.plant, own[estimate.name])
+        for estimate in pooled_estimates(others)
+        if estimate.name in own
     ]
     for number, fit in enumerate(session.welch_fits):
         damping = mean_damping(fit.structure, [other.welch_fits[number] for other in others])
         plant = Plant(session.beam, damping, session.delay_s, session.tool_inertia_kg_m2)
-        found.append(PlantPrediction("welch", fit.structure, fit.weighting, plant, None))
-    return tuple(found)
+        predictions.append(PlantPrediction("welch", fit.structure, fit.weighting, plant, None))
+    return tuple(predictions)
 
 
 def validate(
@@ -99,19 +102,22 @@ def validate(
     band_hz: tuple[float, float] | None,
     on_done: Callable[[int], None],
 ) -> tuple[tuple[LeftOutError, ...], tuple[LostTrial, ...]]:
-    """Predict every session from the others; return the errors, and the lost trials with reasons.
+    """Predict every session from the others; return prediction errors and sessions not predicted.
 
-    Results so far are retained even if all workers are lost.
+    If all workers are lost, all sessions count as not predicted.
     """
-    trials = [(each.path, forecasts(sessions, i), band_hz) for i, each in enumerate(sessions)]
+    prediction_tasks = [
+        (session.path, models_without_session(sessions, i), band_hz)
+        for i, session in enumerate(sessions)
+    ]
     try:
-        results = workers.run(left_out_errors, trials, on_done)
+        results = workers.run(left_out_errors, prediction_tasks, on_done)
     except CampaignError as error:
         return (), tuple(LostTrial(session.path, str(error)) for session in sessions)
     errors: list[LeftOutError] = []
     lost: list[LostTrial] = []
     for session, result in zip(sessions, results, strict=True):
-        if isinstance(result, Lost):
+        if isinstance(result, LostTask):
             lost.append(LostTrial(session.path, result.reason))
         elif isinstance(result, LostTrial):
             lost.append(result)
@@ -121,9 +127,9 @@ def validate(
 
 
 def left_out_errors(
-    path: Path, tried: Sequence[PlantPrediction], band_hz: tuple[float, float] | None
+    path: Path, predictions: Sequence[PlantPrediction], band_hz: tuple[float, float] | None
 ) -> tuple[LeftOutError, ...] | LostTrial:
-    """Read a session and compare its torque with what each model predicts from its angle.
+    """Return the error of each model in predicting a session's torque from its angle.
 
     An error of one session is returned, not raised, because the others are still usable.
     """
@@ -135,36 +141,40 @@ def left_out_errors(
         record = load_record(path)
         band_hz = record_band_hz(record, band_hz)
         comparison = Comparison.of(Measurement.of_record(record), band_hz)
-    except task_errors() as why:
+    except session_error_types() as why:
         return LostTrial(path, str(why))
     except MemoryError:
         return LostTrial(path, "not enough memory to predict it; use fewer --jobs")
     measured = comparison.torque_nm[comparison.retained]
     size = np.linalg.norm(comparison.spectrum(measured))
 
-    def error(plant: Plant) -> float:
+    def prediction_error(plant: Plant) -> float:
+        """Return the relative error of the torque that a plant predicts."""
         predicted, _ = comparison.prediction.torque(plant)
         return float(np.linalg.norm(comparison.spectrum(predicted - measured)) / size)
 
     return tuple(
         LeftOutError(
             path=path,
-            method=each.method,
-            name=each.name,
-            weighting=each.weighting,
-            error=error(each.plant),
-            own_error=None if each.own is None else error(each.own),
+            method=prediction.method,
+            name=prediction.name,
+            weighting=prediction.weighting,
+            error=prediction_error(prediction.plant),
+            own_error=None if prediction.own is None else prediction_error(prediction.own),
         )
-        for each in tried
+        for prediction in predictions
     )
 
 
 def by_model(
     errors: Sequence[LeftOutError],
 ) -> list[tuple[str, str, str | None, tuple[LeftOutError, ...]]]:
-    """Group errors by method, name and weighting, the smallest mean error first."""
-    found: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
-    for each in errors:
-        found.setdefault((each.method, each.name, each.weighting), []).append(each)
-    groups = [(*key, tuple(group)) for key, group in found.items()]
-    return sorted(groups, key=lambda group: float(np.mean([each.error for each in group[3]])))
+    """Group prediction errors by method, damping structure and weighting.
+
+    The group of the smallest mean error comes first.
+    """
+    errors_by_model: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
+    for error in errors:
+        errors_by_model.setdefault((error.method, error.name, error.weighting), []).append(error)
+    groups = [(*key, tuple(group)) for key, group in errors_by_model.items()]
+    return sorted(groups, key=lambda group: float(np.mean([error.error for error in group[3]])))

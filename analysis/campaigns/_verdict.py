@@ -16,7 +16,7 @@ from analysis.campaigns._orders import (
     PooledOrder,
     freest_estimate,
     pooled_order,
-    rivals,
+    rival_estimates,
     tolerant_pooled_order,
 )
 from analysis.identify import refused_reason, tolerant_sizes
@@ -39,27 +39,28 @@ if TYPE_CHECKING:
 
 # Findings in common
 
-_FIGURE: Final = re.compile(r"(?<!mode )[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-"""A number, but not that of a mode, which identifies what is meant."""
+_NUMBER_PATTERN: Final = re.compile(r"(?<!mode )[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+"""Pattern of a number, except the number of a mode, which is part of the effect's identity."""
 
-_SHOWN: Final = {"s": (1e3, "ms"), "N·m": (1e3, "mN·m"), "1": (100.0, "%"),
+_DISPLAY_UNITS: Final = {"s": (1e3, "ms"), "N·m": (1e3, "mN·m"), "1": (100.0, "%"),
                  "kg·m²": (1e6, "10⁻⁶ kg·m²")}  # fmt: skip
+"""Display factor and display unit of the size of a finding, by its unit."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommonFinding:
-    """Effect other than the beam that one or more sessions show.
+    """Effect other than the beam (such as drag) that is found in one or more sessions.
 
     Attributes
     ----------
     example : Finding
-        Finding of the session in the middle, by size.
+        Finding of the session with the median size of the effect.
     files : tuple of str
-        Names of the sessions that have it.
+        Names of the sessions that show the effect.
     sessions : int
         Number of sessions examined.
     span : tuple of float or None
-        Least and largest size, in the finding's unit.
+        Smallest and largest size of the effect, in the finding's unit; None if a size is missing.
     """
 
     example: Finding
@@ -69,39 +70,40 @@ class CommonFinding:
 
     @property
     def sentence(self) -> str:
-        """The finding in words, with the number of sessions and the range of its size."""
+        """Sentence that states the effect, the number of sessions, and the range of its size."""
         count = len(self.files)
-        which = f" ({', '.join(self.files)})" if count < min(self.sessions, 3) else ""
-        words = f"In {count} of {self.sessions} sessions{which}: {self.example.sentence}"
+        files_text = f" ({', '.join(self.files)})" if count < min(self.sessions, 3) else ""
+        statement = f"In {count} of {self.sessions} sessions{files_text}: {self.example.sentence}"
         if self.span is None or count == 1:
-            return words
-        factor, unit = _SHOWN.get(self.example.unit, (1.0, self.example.unit))
+            return statement
+        factor, unit = _DISPLAY_UNITS.get(self.example.unit, (1.0, self.example.unit))
         span = interval_text(self.span, factor)
-        return f"{words} (Median session; range over all sessions: {span} {unit}.)"
+        return f"{statement} (Median session; range over all sessions: {span} {unit}.)"
 
 
 def common_findings(sessions: Sequence[SessionAnalysis]) -> tuple[CommonFinding, ...]:
-    """Count the findings of all sessions, the most common first.
+    """Group the findings of all sessions by effect, the most common effect first.
 
-    Two findings are of the same thing if their sentences are the same but for the figures in them.
+    Two findings describe the same effect if their sentences differ only in numbers.
     """
-    found: dict[tuple[str, str], list[tuple[str, Finding]]] = {}
-    judged = [session for session in sessions if session.verdict is not None]
-    for session in judged:
+    findings_by_effect: dict[tuple[str, str], list[tuple[str, Finding]]] = {}
+    examined = [session for session in sessions if session.verdict is not None]
+    for session in examined:
         for finding in session.verdict.findings if session.verdict else ():
-            kind = finding.kind, _FIGURE.sub("#", finding.sentence)
-            found.setdefault(kind, []).append((session.name, finding))
-    counted = [_counted(group, len(judged)) for group in found.values()]
-    return tuple(sorted(counted, key=lambda each: -len(each.files)))
+            effect_key = finding.kind, _NUMBER_PATTERN.sub("#", finding.sentence)
+            findings_by_effect.setdefault(effect_key, []).append((session.name, finding))
+    counted = [_common_finding(group, len(examined)) for group in findings_by_effect.values()]
+    return tuple(sorted(counted, key=lambda effect: -len(effect.files)))
 
 
-def _counted(group: list[tuple[str, Finding]], sessions: int) -> CommonFinding:
+def _common_finding(group: list[tuple[str, Finding]], sessions: int) -> CommonFinding:
+    """Return one effect with all sessions that show it."""
     files = tuple(dict.fromkeys(name for name, _ in group))
     sizes = [finding.value for _, finding in group if finding.value is not None]
     if len(sizes) < len(group):
         return CommonFinding(group[0][1], files, sessions, None)
-    middle = median_low(sizes)
-    example = next(finding for _, finding in group if finding.value == middle)
+    median_size = median_low(sizes)
+    example = next(finding for _, finding in group if finding.value == median_size)
     return CommonFinding(example, files, sessions, (min(sizes), max(sizes)))
 
 
@@ -110,16 +112,16 @@ def _counted(group: list[tuple[str, Finding]], sessions: int) -> CommonFinding:
 
 @dataclass(frozen=True, slots=True)
 class Dissent:
-    """A session that by itself dismisses what all together select.
+    """A session that alone excludes the damping structure selected by all sessions together.
 
     Attributes
     ----------
     file : str
-        Name.
+        Name of the session.
     structure : str
-        What it selects, as tables call it.
+        Structure that the session selects, as named in tables.
     margin : float
-        By how much its own BIC is lower so.
+        BIC of the common structure in this session less the BIC of the session's own structure.
     """
 
     file: str
@@ -134,23 +136,26 @@ class CampaignVerdict:
     Attributes
     ----------
     headline : str
-        Structure that the numbers are of, as tables call it: the freest on the beam selected.
+        Structure whose parameters are reported, as named in tables: the freest structure that
+        nearly all sessions determine.
     structure : str
         Structure of the lowest BIC: "I" to "VII".
     rivals : tuple of str
-        Structures, by their names in tables, that all data together do not distinguish from it.
+        Structures, as named in tables, whose BIC is not distinguishable from the lowest.
     sessions : int
-        Those with their own verdict, on which this one rests.
+        Number of sessions with a verdict of their own, on which this verdict is based.
     alone : mapping of str to int
-        How many sessions select which structure by themselves.
+        Number of sessions that select each structure by themselves.
     adequate : int
-        Sessions in which what it leaves is noise.
+        Number of sessions whose residual is noise.
     alpha, lambda_ : PooledOrder
+        Orders of internal and external damping.
     findings : tuple of CommonFinding
-        What else is in the records.
+        Other effects found in the records.
     dissent : tuple of Dissent
+        Sessions that exclude `structure` by themselves.
     sweeps : OppositeSweeps or None
-        Whether rising and falling sweeps show the same modes; None without both.
+        Comparison of the modes of rising and falling sweeps; None without both directions.
     sentences : tuple of str
         The verdict in words, the most important first.
     experiments : tuple of str
@@ -173,30 +178,33 @@ class CampaignVerdict:
 
     @property
     def withheld(self) -> frozenset[str]:
-        """Orders that are not to be reported of an exactly uniform beam."""
-        return _withheld(self.alpha, self.lambda_)
+        """Orders that are not to be reported for an exactly uniform beam."""
+        return _withheld_orders(self.alpha, self.lambda_)
 
 
 def campaign_verdict(
     sessions: Sequence[SessionAnalysis],
     pooled: Sequence[PooledEstimate],
-    alike: Homogeneity,
+    homogeneity: Homogeneity,
     validation: Sequence[LeftOutError],
     lost: Sequence[LostTrial],
     biases: Sequence[WelchBias] = (),
     modal: PooledModal | None = None,
 ) -> CampaignVerdict | None:
-    """Return the verdict; None if fewer than two sessions determine any structure's damping.
+    """Return the verdict on a campaign, or None if no damping structure could be pooled.
 
     Parameters
     ----------
-    sessions : sequence of SessionResult
+    sessions : sequence of SessionAnalysis
+        Sessions of the campaign.
     pooled : sequence of PooledEstimate
-        The lowest BIC first.
-    alike : Homogeneity
-        Whether they are of one specimen.
+        Pooled estimates, the lowest BIC first.
+    homogeneity : Homogeneity
+        Whether the sessions are of one specimen.
     validation : sequence of LeftOutError
+        Errors of sessions predicted from the others.
     lost : sequence of LostTrial
+        Sessions that could not be predicted from the others.
     biases : sequence of WelchBias, optional
         Differences of the Welch fits from the pooled estimates.
     modal : PooledModal, optional
@@ -208,56 +216,63 @@ def campaign_verdict(
     best, freest = pooled[0], freest_estimate(pooled)
     assert freest is not None
     alpha, lambda_ = (
-        _order(pooled_order(order, pooled, verdicts, alike), verdicts, modal)
+        _final_order(pooled_order(order, pooled, verdicts, homogeneity), verdicts, modal)
         for order in ("alpha", "lambda")
     )
     sweeps = opposite_sweeps(sessions)
     refused = modal is not None and modal.uniform_beam.status == "refused"
-    found = common_findings(sessions)
-    close = rivals(pooled, BIC_TIE)
-    alone = dict(Counter(each.selected for each in sessions if each.selected).most_common())
+    findings = common_findings(sessions)
+    close_rivals = rival_estimates(pooled, BIC_TIE)
+    single_selections = dict(
+        Counter(session.selected for session in sessions if session.selected).most_common()
+    )
     adequate = sum(verdict.adequate for verdict in verdicts)
-    dissent = _dissent(sessions, best)
-    counted = Counter(advice for verdict in verdicts for advice in verdict.experiments)
-    advice = [what for what, count in counted.most_common() if 2 * count > len(verdicts)]
+    dissent = _dissenting_sessions(sessions, best)
+    advice_counts = Counter(advice for verdict in verdicts for advice in verdict.experiments)
+    advice = [what for what, count in advice_counts.most_common() if 2 * count > len(verdicts)]
     return CampaignVerdict(
         headline=freest.name,
         structure=best.structure,
-        rivals=tuple(each.name for each in close),
+        rivals=tuple(rival.name for rival in close_rivals),
         sessions=len(verdicts),
-        alone=alone,
+        alone=single_selections,
         adequate=adequate,
         alpha=alpha,
         lambda_=lambda_,
-        findings=found,
+        findings=findings,
         dissent=dissent,
         sweeps=sweeps,
         sentences=(
-            *specimen_sentences.specimens(alike),
-            sentences.answer(freest, alpha, lambda_, validation),
-            *_numbers(freest, best, modal, adequate, len(verdicts)),
-            *_modes(freest, modal, mixed=alike.mixed),
-            *_slopes(alpha, lambda_, modal),
-            *geometry.sweeps(sweeps),
-            *geometry.if_exact(freest, (alpha, lambda_), modal),
-            *sentences.welch_bias(
-                freest, biases, _withheld(alpha, lambda_), comparable=not (alike.mixed or refused)
+            *specimen_sentences.specimens(homogeneity),
+            sentences.describe_orders(freest, alpha, lambda_, validation),
+            *_describe_parameters(freest, best, modal, adequate, len(verdicts)),
+            *_describe_modes(freest, modal, mixed=homogeneity.mixed),
+            *_describe_slopes(alpha, lambda_, modal),
+            *geometry.describe_sweeps(sweeps),
+            *geometry.describe_orders_if_exact(freest, (alpha, lambda_), modal),
+            *sentences.describe_welch_bias(
+                freest,
+                biases,
+                _withheld_orders(alpha, lambda_),
+                comparable=not (homogeneity.mixed or refused),
             ),
-            sentences.selected(pooled, close, alone, len(verdicts)),
-            *(finding.sentence for finding in found),
-            *sentences.dissenting([(each.file, each.structure) for each in dissent], best),
-            *([] if alike.mixed else [sentences.scatter(freest)]),
-            *sentences.foresight(freest, validation, len(sessions)),
+            sentences.describe_selection(pooled, close_rivals, single_selections, len(verdicts)),
+            *(finding.sentence for finding in findings),
+            *sentences.describe_dissent(
+                [(dissenter.file, dissenter.structure) for dissenter in dissent], best
+            ),
+            *([] if homogeneity.mixed else [sentences.describe_scatter(freest)]),
+            *sentences.describe_prediction_errors(freest, validation, len(sessions)),
             *sentences.lost_trials(lost, len(sessions)),
         ),
-        experiments=(*geometry.experiments(sweeps, modal, sessions), *advice),
+        experiments=(*geometry.recommend_sweeps(sweeps, modal, sessions), *advice),
     )
 
 
-def _order(
+def _final_order(
     exact: PooledOrder, verdicts: Sequence[Verdict], modal: PooledModal | None
 ) -> PooledOrder:
-    """Return the order by the modal constants if these determine more than an exact beam."""
+    """Return an order estimated from the modal constants, or from a uniform beam without them."""
     if modal is None:
         return exact
     if modal.tolerant is not None:
@@ -267,50 +282,63 @@ def _order(
     return exact if reason is None else exact.doubted(reason)
 
 
-def _numbers(
+def _describe_parameters(
     freest: PooledEstimate,
     best: PooledEstimate,
     modal: PooledModal | None,
     adequate: int,
     sessions: int,
 ) -> tuple[str, ...]:
-    """Describe the model of the numbers, whether it explains the records, and the losses."""
-    gate = uniformity(modal.uniform_beam if modal else None)
+    """Describe the model of the reported parameters, how well it fits, and the loss factors."""
+    uniformity_sentences = uniformity(modal.uniform_beam if modal else None)
     if modal is None or modal.tolerant is None:
-        left = sentences.left_over(freest, adequate, sessions)
-        return sentences.headline(freest, best), *gate, left, *sentences.sizes(freest.sizes)
-    left = sentences.noise_alone(adequate, sessions)
+        residual_sentence = sentences.describe_residual(freest, adequate, sessions)
+        return (
+            sentences.describe_structure(freest, best),
+            *uniformity_sentences,
+            residual_sentence,
+            *sentences.describe_loss_factors(freest.sizes),
+        )
+    residual_sentence = sentences.describe_noise_sessions(adequate, sessions)
     return (
-        geometry.tolerance(modal, modal.tolerant),
-        *gate,
-        left,
-        *sentences.sizes(tolerant_sizes(modal.uniform_beam, modal.tolerant)),
+        geometry.describe_tolerance(modal, modal.tolerant),
+        *uniformity_sentences,
+        residual_sentence,
+        *sentences.describe_loss_factors(tolerant_sizes(modal.uniform_beam, modal.tolerant)),
     )
 
 
-def _modes(freest: PooledEstimate, modal: PooledModal | None, *, mixed: bool) -> list[str]:
+def _describe_modes(freest: PooledEstimate, modal: PooledModal | None, *, mixed: bool) -> list[str]:
+    """Describe the modes of the modal model if these are reported, else of the uniform beam."""
     if modal is not None and modal.leads:
-        return sentences.modes(modal.modes, modal.sessions, mixed=mixed)
-    return sentences.modes(freest.modes, freest.sessions, mixed=mixed)
+        return sentences.describe_modes(modal.modes, modal.sessions, mixed=mixed)
+    return sentences.describe_modes(freest.modes, freest.sessions, mixed=mixed)
 
 
-def _slopes(alpha: PooledOrder, lambda_: PooledOrder, modal: PooledModal | None) -> tuple[str, str]:
+def _describe_slopes(
+    alpha: PooledOrder, lambda_: PooledOrder, modal: PooledModal | None
+) -> tuple[str, str]:
+    """Describe both orders of the damping, as slopes of the losses if a tolerance is used."""
     if modal is None or modal.tolerant is None:
-        return sentences.order(alpha), sentences.order(lambda_)
-    return geometry.slope(alpha, modal), geometry.slope(lambda_, modal)
+        return sentences.describe_order(alpha), sentences.describe_order(lambda_)
+    return geometry.describe_slope(alpha, modal), geometry.describe_slope(lambda_, modal)
 
 
-def _withheld(*orders: PooledOrder) -> frozenset[str]:
-    return frozenset(each.order for each in orders if (each.exact or each).reason is not None)
+def _withheld_orders(*orders: PooledOrder) -> frozenset[str]:
+    """Return the orders with a reason against reporting them for an exactly uniform beam."""
+    return frozenset(order.order for order in orders if (order.exact or order).reason is not None)
 
 
-def _dissent(sessions: Sequence[SessionAnalysis], best: PooledEstimate) -> tuple[Dissent, ...]:
-    found = []
+def _dissenting_sessions(
+    sessions: Sequence[SessionAnalysis], best: PooledEstimate
+) -> tuple[Dissent, ...]:
+    """Return the sessions that alone exclude the damping structure of the lowest common BIC."""
+    dissents = []
     for session in sessions:
-        by_name = {each.name: each for each in session.record_estimates}
+        by_name = {estimate.name: estimate for estimate in session.record_estimates}
         if by_name:
-            own = min(by_name.values(), key=lambda each: each.bic)
+            own = min(by_name.values(), key=lambda estimate: estimate.bic)
             margin = by_name[best.name].bic - own.bic
             if margin > BIC_DECISIVE:
-                found.append(Dissent(session.name, own.name, margin))
-    return tuple(sorted(found, key=lambda each: -each.margin))
+                dissents.append(Dissent(session.name, own.name, margin))
+    return tuple(sorted(dissents, key=lambda dissenter: -dissenter.margin))

@@ -1,7 +1,7 @@
 """Bias of the Welch fits: their means over the sessions less the pooled whole-record estimates.
 
 Windows and leakage shift the parameters of a fit to Welch's response by the same amount in every
-session: their scatter does not show it, and more sessions do not reduce it.
+session. The scatter between sessions does not show this shift, and more sessions do not reduce it.
 """
 
 from __future__ import annotations
@@ -23,19 +23,23 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooling import PooledEstimate
 
 LARGEST_MISFIT: Final = 1.5
-"""Residual, in units of the noise, above which a structure does not describe the records."""
+"""Largest misfit (residual power relative to the noise) of a structure that describes the
+records."""
 
-_LEVEL: Final = 0.999
-_FEWEST: Final = 2
+_CONFIDENCE_LEVEL: Final = 0.999
+"""Confidence level at which a bias is significant."""
+_FEWEST_SESSIONS: Final = 2
+"""Smallest number of sessions with Welch fits."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterBias:
-    """One parameter of a Welch fit against the same structure's pooled whole-record estimate.
+    """Difference of a parameter's Welch fits from its pooled whole-record estimate.
 
     Attributes
     ----------
     parameter : str
+        Name of the parameter.
     welch, welch_std : float
         Mean of the Welch fits, and their standard deviation between sessions.
     record, record_std : float
@@ -43,11 +47,11 @@ class ParameterBias:
     bias : float
         `welch` minus `record`.
     bias_std : float
-        Standard deviation of that difference.
+        Standard deviation of `bias`.
     significant : bool
-        Whether it is not zero at the level of 0.1 % (Student's t).
+        Whether `bias` differs from zero at the level of 0.1 % (Student's t).
     at_bounds : int
-        Sessions in which the Welch fit has it at the edge of the range searched.
+        Number of sessions whose Welch fit has the parameter at a bound of the range searched.
     """
 
     parameter: str
@@ -68,12 +72,14 @@ class WelchBias:
     Attributes
     ----------
     structure, weighting : str
+        Names of damping structure and weighting.
     parameters : tuple of ParameterBias
-        The free parameters.
+        Biases of the free parameters.
     wmse : float
-        Mean WMSE of the Welch fits, in (N·m/rad)².
+        Mean over the sessions of the weighted mean square error of the Welch fits, in (N·m/rad)².
     record_wmse : float
-        The same of the whole-record fits: both against Welch's response, which has the bias too.
+        The same error of the whole-record fits. Both are relative to Welch's response, which has
+        the same bias as the Welch fits.
     """
 
     structure: str
@@ -84,8 +90,8 @@ class WelchBias:
 
     @property
     def significant(self) -> tuple[ParameterBias, ...]:
-        """Parameters with a significant bias."""
-        return tuple(each for each in self.parameters if each.significant)
+        """Parameters whose bias is significant."""
+        return tuple(parameter for parameter in self.parameters if parameter.significant)
 
 
 def welch_biases(
@@ -95,22 +101,28 @@ def welch_biases(
 
     Parameters
     ----------
-    sessions : sequence of SessionResult
+    sessions : sequence of SessionAnalysis
+        Sessions of the campaign.
     pooled : sequence of PooledEstimate
+        Pooled whole-record estimates, which serve as references.
 
     Returns
     -------
     tuple of WelchBias
-        By type, then by weighting. None of a type whose whole-record residual is more than noise:
-        neither of its estimates is then a reference for the other.
+        Biases by type, then by weighting. A type whose whole-record residual is more than noise is
+        left out, because its pooled estimate is no reference.
     """
-    found = []
-    by_name = {each.name: each for each in pooled if each.misfit <= LARGEST_MISFIT}
+    biases = []
+    by_name = {
+        record_estimate.name: record_estimate
+        for record_estimate in pooled
+        if record_estimate.misfit <= LARGEST_MISFIT
+    }
     for (structure, weighting), fits in fits_by_model(sessions).items():
         estimate = by_name.get(structure)
-        if estimate is None or len(fits) < _FEWEST:
+        if estimate is None or len(fits) < _FEWEST_SESSIONS:
             continue
-        limit = student_t_quantile(_LEVEL, len(fits) - 1)
+        limit = student_t_quantile(_CONFIDENCE_LEVEL, len(fits) - 1)
         parameters = []
         for name in STRUCTURES[structure].free:
             if name not in estimate.by_name:
@@ -132,24 +144,25 @@ def welch_biases(
                     at_bounds=sum(name in fit.at_bounds for fit in fits),
                 )
             )
-        found.append(
+        biases.append(
             WelchBias(
                 structure,
                 weighting,
                 tuple(parameters),
-                _mean([fit.indices.wmse for fit in fits if fit.indices]),
-                _mean(
+                _mean_or_nan([fit.indices.wmse for fit in fits if fit.indices]),
+                _mean_or_nan(
                     [
-                        each.indices.wmse
+                        record_estimate.indices.wmse
                         for session in sessions
-                        for each in session.record_estimates
-                        if each.name == structure
+                        for record_estimate in session.record_estimates
+                        if record_estimate.name == structure
                     ]
                 ),
             )
         )
-    return tuple(found)
+    return tuple(biases)
 
 
-def _mean(values: Sequence[float]) -> float:
+def _mean_or_nan(values: Sequence[float]) -> float:
+    """Return the mean of values, or NaN without values."""
     return float(np.mean(values)) if values else math.nan

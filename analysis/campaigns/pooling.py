@@ -1,10 +1,10 @@
 """Pooled whole-record estimates of all sessions, by a random-effects model.
 
-``y_k ~ N(mu, S_k + diag(tau²))``: S_k is the covariance that session k states for itself, tau the
-scatter of each parameter between sessions, by the moments of DerSimonian and Laird [1]_. A full
-matrix instead of ``diag(tau²)`` would have more numbers than a campaign has sessions: by maximum
-likelihood, five sessions that do repeat then show two thirds of their own standard deviations as
-scatter in each of eight parameters.
+The estimates y_k of session k follow ``y_k ~ N(mu, S_k + diag(tau²))``. S_k is the covariance that
+session k states for its estimates. tau is the scatter of each parameter between sessions, by the
+moments of DerSimonian and Laird [1]_. A full matrix instead of ``diag(tau²)`` would have more
+elements than a campaign has sessions. By maximum likelihood, it would show a scatter of two thirds
+of the standard deviation in each of eight parameters for five sessions without any scatter.
 
 References
 ----------
@@ -50,16 +50,17 @@ class RandomEffects:
     covariance : ndarray, shape (k, k)
         Covariance of the mean.
     between_std : ndarray, shape (k,)
-        Scatter between sessions, tau; 0 where the sessions' own uncertainties explain all.
+        Standard deviation of each parameter between sessions, tau; 0 where the sessions' own
+        uncertainties explain the whole scatter.
     cochran_q : ndarray, shape (k,)
-        Squares of the deviations from the weighted mean over the sessions' variances, summed:
-        about K − 1 without scatter between sessions.
+        Sum over the sessions of the squared deviation from the weighted mean, divided by the
+        session's variance: about K − 1 without scatter between sessions.
     deviance : float
-        ``-2 ln`` likelihood of the mean and tau, above that with a separate value for each
-        session: ``sum_k ln|I + S_k⁻¹ diag(tau²)| + r_kᵀ (S_k + diag(tau²))⁻¹ r_k``. Of the tau by
-        moments and of none, the one that is likelier: parameters that each session correlates
-        closely do not scatter one by one, and a tau of a third of their standard deviations then
-        makes forty sessions that repeat less likely by a factor of e⁶⁵.
+        ``-2 ln`` likelihood of the mean and tau, less that of a separate value for each session:
+        ``sum_k ln|I + S_k⁻¹ diag(tau²)| + r_kᵀ (S_k + diag(tau²))⁻¹ r_k``. It is evaluated with
+        the tau estimated by moments and with a tau of 0, and the lower value is taken: closely
+        correlated parameters do not scatter independently, so that a tau of a third of their
+        standard deviations makes forty sessions without scatter less likely by a factor of e⁶⁵.
     """
 
     mean: NDArray[np.float64]
@@ -72,47 +73,60 @@ class RandomEffects:
 def random_effects(
     estimates: NDArray[np.float64], covariances: NDArray[np.float64]
 ) -> RandomEffects:
-    """Pool estimates by the random-effects model.
+    """Pool the sessions' estimates of k parameters by the random-effects model.
 
     Parameters
     ----------
     estimates : ndarray, shape (K, k)
-        Estimates of two sessions at least.
+        Estimates of at least two sessions.
     covariances : ndarray, shape (K, k, k)
-        Positive definite, of each estimate.
+        Positive definite covariance of each session's estimates.
     """
     weight = 1 / np.diagonal(covariances, axis1=1, axis2=2)
-    total = weight.sum(axis=0)
-    q = (weight * (estimates - (weight * estimates).sum(axis=0) / total) ** 2).sum(axis=0)
+    total_weight = weight.sum(axis=0)
+    q = (weight * (estimates - (weight * estimates).sum(axis=0) / total_weight) ** 2).sum(axis=0)
     excess = q - (len(estimates) - 1)
-    between = np.maximum(excess / (total - (weight**2).sum(axis=0) / total), 0.0)
+    between_variance = np.maximum(
+        excess / (total_weight - (weight**2).sum(axis=0) / total_weight), 0.0
+    )
 
-    # In units of a typical standard deviation: parameters differ by orders of magnitude.
+    # Values are in units of a typical standard deviation, as parameters differ by orders of
+    # magnitude.
     unit = 1 / np.sqrt(weight.mean(axis=0))
     units = np.outer(unit, unit)
     origin = estimates.mean(axis=0)
-    own, every = covariances / units, covariances / units + np.diag(between / unit**2)
-    away = (estimates - origin) / unit
-    shift, spread, squares = _combined(away, every)
-    widening = float((np.linalg.slogdet(every)[1] - np.linalg.slogdet(own)[1]).sum())
+    own_covariances, total_covariances = (
+        covariances / units,
+        covariances / units + np.diag(between_variance / unit**2),
+    )
+    deviations = (estimates - origin) / unit
+    shift, mean_covariance, squared_deviations = _weighted_mean(deviations, total_covariances)
+    log_determinants = float(
+        (np.linalg.slogdet(total_covariances)[1] - np.linalg.slogdet(own_covariances)[1]).sum()
+    )
     return RandomEffects(
         mean=origin + unit * shift,
-        covariance=units * spread,
-        between_std=np.sqrt(between),
+        covariance=units * mean_covariance,
+        between_std=np.sqrt(between_variance),
         cochran_q=q,
-        deviance=min(widening + squares, _combined(away, own)[2]),
+        deviance=min(
+            log_determinants + squared_deviations, _weighted_mean(deviations, own_covariances)[2]
+        ),
     )
 
 
-def _combined(
+def _weighted_mean(
     values: NDArray[np.float64], covariances: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Weighted mean, its covariance, and the sum of squares of what values are off it."""
+    """Return the mean weighted by inverse covariances, its covariance, and sum of squares.
+
+    The sum is that of the squared deviations from the mean, weighted in the same way.
+    """
     precision = np.linalg.inv(covariances)
-    spread = np.linalg.inv(precision.sum(axis=0))
-    mean = spread @ np.einsum("kij,kj->i", precision, values)
-    off = values - mean
-    return mean, spread, float(np.einsum("ki,kij,kj->", off, precision, off))
+    mean_covariance = np.linalg.inv(precision.sum(axis=0))
+    mean = mean_covariance @ np.einsum("kij,kj->i", precision, values)
+    deviations = values - mean
+    return mean, mean_covariance, float(np.einsum("ki,kij,kj->", deviations, precision, deviations))
 
 
 # Modes
@@ -120,21 +134,23 @@ def _combined(
 
 @dataclass(frozen=True, slots=True)
 class PooledMode:
-    """One mode over all sessions.
+    """Frequency and damping ratio of one mode, pooled over all sessions.
 
     Attributes
     ----------
     number : int
+        Number of the mode, from 1.
     frequency_hz, frequency_std_hz : float
-        Mean over the sessions, and its standard deviation.
+        Mean frequency over the sessions, and the standard deviation of this mean.
     frequency_between_std_hz : float
-        Scatter between sessions beyond their own uncertainties.
+        Scatter of the frequency between sessions beyond their own uncertainties.
     damping_ratio, damping_ratio_std, damping_ratio_between_std : float
-        Likewise.
+        The same three values for the damping ratio.
     source : str
-        Model that it is of: "modal", or "beam".
+        Model from which the mode is estimated: "modal" model, or uniform "beam".
     participation_kg_m2, participation_std_kg_m2 : float or None
-        Inertia about the motor axis that takes part in it, of a mode of the modal model.
+        Inertia about the motor axis that takes part in the mode, and its standard deviation; None
+        for a mode of a uniform beam.
     """
 
     number: int
@@ -149,19 +165,22 @@ class PooledMode:
     participation_std_kg_m2: float | None = None
 
 
-def pooled_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
-    """Pool each mode that all sessions have, frequency and damping ratio each by itself."""
-    found = []
-    for modes in zip(*(each.modes for each in estimates), strict=False):
-        frequency = _pooled([(mode.frequency_hz, mode.frequency_std_hz) for mode in modes])
-        ratio = _pooled([(mode.damping_ratio, mode.damping_ratio_std) for mode in modes])
+def pool_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
+    """Pool frequency and damping ratio, separately, of each mode that all sessions have."""
+    pooled_list = []
+    for modes in zip(*(estimate.modes for estimate in estimates), strict=False):
+        frequency = _pool_quantity([(mode.frequency_hz, mode.frequency_std_hz) for mode in modes])
+        ratio = _pool_quantity([(mode.damping_ratio, mode.damping_ratio_std) for mode in modes])
         if frequency is not None and ratio is not None:
-            found.append(PooledMode(modes[0].number, *frequency, *ratio))
-    return tuple(found)
+            pooled_list.append(PooledMode(modes[0].number, *frequency, *ratio))
+    return tuple(pooled_list)
 
 
-def _pooled(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, float] | None:
-    """Mean, its standard deviation and the scatter between sessions; None if one has no std."""
+def _pool_quantity(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, float] | None:
+    """Return the mean of a quantity, its standard deviation, and its scatter between sessions.
+
+    Return None if a session has no standard deviation.
+    """
     values, std = np.array(estimates).T
     if not (np.isfinite(std).all() and (std > 0).all()):
         return None
@@ -172,36 +191,39 @@ def _pooled(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, flo
 
 # Structures
 
-_FEWEST: Final = 2
-_DAMPINGS: Final[tuple[tuple[Damping, str, Order], ...]] = (
+_FEWEST_SESSIONS: Final = 2
+"""Smallest number of sessions that can be pooled."""
+_DAMPING_PARAMETERS: Final[tuple[tuple[Damping, str, Order], ...]] = (
     ("internal", "zeta", "alpha"),
     ("external", "gamma", "lambda"),
 )
+"""Name, coefficient and order of each kind of damping."""
 
 
 @dataclass(frozen=True, slots=True)
 class PooledParameter:
-    """One parameter over all sessions.
+    """One parameter, pooled over all sessions.
 
     Attributes
     ----------
     name : str
+        Name of the parameter, such as "zeta".
     value : float
-        Mean; of a positive parameter that is estimated by its logarithm the geometric mean.
+        Mean over the sessions; the geometric mean if the parameter's logarithm is estimated.
     std : float
         Standard deviation of `value`.
     interval : (float, float)
         95 % confidence interval of the value, by Student's t with K − 1 degrees of freedom.
     within_std : float
-        What a typical session states as its own standard deviation (root mean square).
+        Root mean square of the standard deviations that the sessions state for their estimates.
     between_std : float
-        Scatter between sessions beyond that; 0 if that explains all.
+        Scatter between sessions beyond `within_std`; 0 if `within_std` explains all of it.
     chance : float
-        Probability that sessions without any such scatter differ as much as these (W. G. Cochran,
-        Biometrics 10 (1954) 101-129), each parameter by itself.
+        p-value of the scatter between sessions, for this parameter by itself (W. G. Cochran,
+        Biometrics 10 (1954) 101-129).
     next_interval : (float, float)
-        95 % prediction interval for one more session (J. P. T. Higgins et al.,
-        J. R. Stat. Soc. A 172 (2009) 137-159), whatever the noise of its own estimate.
+        95 % prediction interval for the true value in one more session (J. P. T. Higgins et al.,
+        J. R. Stat. Soc. A 172 (2009) 137-159), without the noise of that session's estimate.
     """
 
     name: str
@@ -216,27 +238,27 @@ class PooledParameter:
 
 @dataclass(frozen=True, slots=True)
 class PooledEstimate:
-    """One structure over all sessions.
+    """Parameters and modes of one damping structure, pooled over all sessions.
 
     Attributes
     ----------
     structure : str
-        Name.
+        Name of the structure, "I" to "VII".
     plant : Plant
-        Plant of the pooled parameters.
+        Plant with the pooled parameters.
     parameters : tuple of PooledParameter
-        Those that every session used determines.
+        The k parameters that every session used determines.
     covariance : ndarray, shape (k, k)
-        Covariance of these, positive ones as logarithms.
+        Covariance of these parameters; of the logarithm of a positive one.
     modes : tuple of PooledMode
+        Pooled modes, the lowest first.
     sessions : int
-        Used: those that determine the structure's damping.
+        Number of sessions used: those that determine the structure's damping.
     misfit : float
-        Median over the sessions of the whitened residual's mean square: 1 if the model leaves
-        nothing but noise. Where it is far beyond 1 the structure is wrong, and its standard
-        deviations mean little.
+        Median over the sessions of the whitened residual's mean square: 1 if the residual is only
+        noise. Far beyond 1 the structure is wrong, and its standard deviations mean little.
     bic : float
-        Criterion of all sessions together, see `pooled_bic`.
+        Bayesian information criterion of all sessions together, see `pooled_bic`.
     """
 
     structure: str
@@ -250,156 +272,191 @@ class PooledEstimate:
 
     @property
     def name(self) -> str:
-        """As tables call it."""
+        """Name of the damping structure as shown in tables."""
         return self.structure
 
     @property
     def sizes(self) -> tuple[ReportedLossFactor, ...]:
-        """Sizes of the dampings that all sessions together determine."""
-        names = tuple(each.name for each in self.parameters)
-        t, found = student_t_quantile(0.95, self.sessions - 1), []
+        """Loss factors of the kinds of damping that all sessions together determine."""
+        names = tuple(parameter.name for parameter in self.parameters)
+        t, loss_factors = student_t_quantile(0.95, self.sessions - 1), []
         values = self.plant.parameters
-        first = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
-        for damping, coefficient, order in _DAMPINGS:
-            size = damping_size(coefficient, order, values, names, self.covariance, first)
+        first_rad_s = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
+        for damping, coefficient, order in _DAMPING_PARAMETERS:
+            size = damping_size(coefficient, order, values, names, self.covariance, first_rad_s)
             if size is not None:
                 factor = math.exp(t * size.std / size.value)
-                ends = size.value / factor, size.value * factor
-                quantity = ReportedValue(size.value, size.std, ends)
-                found.append(ReportedLossFactor(damping, size.omega_rad_s, quantity))
-        return tuple(found)
+                interval = size.value / factor, size.value * factor
+                quantity = ReportedValue(size.value, size.std, interval)
+                loss_factors.append(ReportedLossFactor(damping, size.omega_rad_s, quantity))
+        return tuple(loss_factors)
 
     @property
     def by_name(self) -> dict[str, PooledParameter]:
-        """Parameters by name."""
-        return {each.name: each for each in self.parameters}
+        """Pooled parameters by their names."""
+        return {parameter.name: parameter for parameter in self.parameters}
 
 
 def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimate, ...]:
-    """Pool every structure that all sessions tried and two or more determine; lowest BIC first."""
-    by_name = by_structure(sessions)
-    tried = max(map(len, by_name.values()), default=0)
-    found = [pooled(estimates) for estimates in by_name.values() if len(estimates) == tried]
-    return tuple(sorted((each for each in found if each is not None), key=lambda each: each.bic))
+    """Pool the estimates of each damping structure fitted to all sessions.
+
+    A structure is left out if fewer than two sessions determine its damping.
+
+    The estimates are sorted by BIC, the lowest first.
+    """
+    by_name = estimates_by_structure(sessions)
+    fitted_sessions = max(map(len, by_name.values()), default=0)
+    pooled_list = [
+        pool_estimates(estimates)
+        for estimates in by_name.values()
+        if len(estimates) == fitted_sessions
+    ]
+    return tuple(
+        sorted(
+            (estimate for estimate in pooled_list if estimate is not None),
+            key=lambda estimate: estimate.bic,
+        )
+    )
 
 
-def by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, list[RecordEstimate]]:
-    """Whole-record estimates of all sessions by the name of the structure."""
-    found: dict[str, list[RecordEstimate]] = {}
+def estimates_by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, list[RecordEstimate]]:
+    """Return the whole-record estimates of all sessions by the name of the damping structure."""
+    estimates_by_name: dict[str, list[RecordEstimate]] = {}
     for session in sessions:
         for estimate in session.record_estimates:
-            found.setdefault(estimate.name, []).append(estimate)
-    return found
+            estimates_by_name.setdefault(estimate.name, []).append(estimate)
+    return estimates_by_name
 
 
 def determines_damping(estimate: RecordEstimate) -> bool:
-    """Whether a session determines its structure's damping, and the modes' offsets if free."""
+    """Return whether an estimate determines all free parameters of its damping structure."""
     return set(STRUCTURES[estimate.structure].free) <= set(estimate.determined)
 
 
-def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
-    """Pool one structure; None if fewer than two sessions determine its damping.
+def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
+    """Pool estimates of one damping structure; None if fewer than two determine its damping.
 
-    A setting of rig or specimen (mostly the tool inertia) that is at a bound in some session is not
-    in the common covariance; the plant gets its plain mean.
+    A parameter of rig or specimen (mostly the tool inertia) that is at a bound in some session is
+    not in the common covariance. The pooled plant has the unweighted mean of such a parameter.
     """
-    used = list(filter(determines_damping, estimates))
-    if len(used) < _FEWEST:
+    used_estimates = list(filter(determines_damping, estimates))
+    if len(used_estimates) < _FEWEST_SESSIONS:
         return None
-    names = [name for name in used[0].determined if all(name in e.determined for e in used)]
-    values, covariances = _stacked(used, names)
+    names = [
+        name
+        for name in used_estimates[0].determined
+        if all(name in e.determined for e in used_estimates)
+    ]
+    values, covariances = _stack_estimates(used_estimates, names)
     effects = random_effects(values, covariances)
     std = np.sqrt(np.diag(effects.covariance))
-    within = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
-    t = student_t_quantile(0.95, len(used) - 1)
-    chances = chi_square_p_value(effects.cochran_q, len(used) - 1)
-    columns = (effects.mean, std, within, effects.between_std, chances)
+    within_std = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
+    t = student_t_quantile(0.95, len(used_estimates) - 1)
+    chances = chi_square_p_value(effects.cochran_q, len(used_estimates) - 1)
+    statistics = (effects.mean, std, within_std, effects.between_std, chances)
     parameters = tuple(
-        _parameter(name, t, *row)
-        for name, row in zip(names, np.transpose(columns).tolist(), strict=True)
+        _pooled_parameter(name, t, *row)
+        for name, row in zip(names, np.transpose(statistics).tolist(), strict=True)
     )
-    means = {name: float(np.mean([e.parameters[name] for e in used])) for name in SETTINGS}
+    means = {
+        name: float(np.mean([e.parameters[name] for e in used_estimates])) for name in SETTINGS
+    }
     return PooledEstimate(
-        structure=used[0].structure,
-        plant=_plant(used[0], means | {each.name: each.value for each in parameters}),
+        structure=used_estimates[0].structure,
+        plant=_pooled_plant(
+            used_estimates[0], means | {parameter.name: parameter.value for parameter in parameters}
+        ),
         parameters=parameters,
         covariance=effects.covariance,
-        modes=pooled_modes(used),
-        sessions=len(used),
-        misfit=float(np.median([e.cost / e.degrees_of_freedom for e in used])),
+        modes=pool_modes(used_estimates),
+        sessions=len(used_estimates),
+        misfit=float(np.median([e.cost / e.degrees_of_freedom for e in used_estimates])),
         bic=pooled_bic(estimates),
     )
 
 
 def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
-    """Bayesian information criterion of one structure for all sessions together.
+    """Return the Bayesian information criterion of a damping structure for all sessions.
 
-    Damping and offsets of the modes belong to the specimen: one value for all sessions, and a
-    scatter between them if they differ by more than their uncertainties; each costs the logarithm
-    of the number of all data. The likelihood lost by a common value follows from the sessions'
-    estimates and covariances (the likelihood is taken to be normal about each). Settings of rig and
-    beam are each session's own, with every structure alike, and so cost nothing here. A parameter
-    that some session leaves undetermined cannot be common: it counts in every session. A single
-    session loses nothing.
+    Damping parameters belong to the specimen. Each has one common value, with a scatter between the
+    sessions if these differ by more than their uncertainties, and costs the logarithm of the number
+    of values in all sessions. The likelihood lost by a common value follows from the sessions'
+    estimates and covariances, because the likelihood is taken to be normal about each estimate.
+    Parameters of rig and beam are estimated in each session with every structure, so they are left
+    out here. A parameter that some session does not determine cannot be common, and counts once for
+    each session. A single session loses no likelihood.
     """
-    of_specimen = STRUCTURES[estimates[0].structure].free
-    shared = [name for name in of_specimen if all(name in e.determined for e in estimates)]
+    damping_parameters = STRUCTURES[estimates[0].structure].free
+    common = [name for name in damping_parameters if all(name in e.determined for e in estimates)]
     deviance = sum(e.deviance for e in estimates)
-    if shared and len(estimates) >= _FEWEST:
-        deviance += random_effects(*_stacked(estimates, shared)).deviance
-    each_its_own = (len(of_specimen) - len(shared)) * sum(math.log(e.values) for e in estimates)
-    return deviance + len(shared) * math.log(sum(e.values for e in estimates)) + each_its_own
+    if common and len(estimates) >= _FEWEST_SESSIONS:
+        deviance += random_effects(*_stack_estimates(estimates, common)).deviance
+    separate_cost = (len(damping_parameters) - len(common)) * sum(
+        math.log(e.values) for e in estimates
+    )
+    return deviance + len(common) * math.log(sum(e.values for e in estimates)) + separate_cost
 
 
-def _stacked(
+def _stack_estimates(
     estimates: Sequence[RecordEstimate], names: Sequence[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Estimates, shape (K, k), and their covariances, (K, k, k)."""
+    """Return the estimates, shape (K, k), and their covariances, shape (K, k, k)."""
     values = [[_coordinate(name, e.parameters[name]) for name in names] for e in estimates]
-    return np.array(values), np.array([_block(e, names) for e in estimates])
+    return np.array(values), np.array([_covariance_block(e, names) for e in estimates])
 
 
-def _parameter(
-    name: str, t: float, mean: float, std: float, within: float, between: float, chance: float
+def _pooled_parameter(
+    name: str,
+    t: float,
+    mean: float,
+    std: float,
+    within_std: float,
+    between_std: float,
+    chance: float,
 ) -> PooledParameter:
+    """Return a pooled parameter from the statistics of its value or of its logarithm."""
     value = math.exp(mean) if name in LOGARITHMIC else mean
     unit = value if name in LOGARITHMIC else 1.0
     return PooledParameter(
         name=name,
         value=value,
         std=unit * std,
-        interval=_interval(name, mean, t * std),
-        within_std=unit * within,
-        between_std=unit * between,
+        interval=_parameter_interval(name, mean, t * std),
+        within_std=unit * within_std,
+        between_std=unit * between_std,
         chance=chance,
-        next_interval=_interval(name, mean, t * math.hypot(std, between)),
+        next_interval=_parameter_interval(name, mean, t * math.hypot(std, between_std)),
     )
 
 
-def _interval(name: str, mean: float, half: float) -> tuple[float, float]:
+def _parameter_interval(name: str, mean: float, half_width: float) -> tuple[float, float]:
+    """Return an interval of a parameter from the centre and half width of its coordinate."""
     if name in LOGARITHMIC:
-        return math.exp(mean - half), math.exp(mean + half)
-    return mean - half, mean + half
+        return math.exp(mean - half_width), math.exp(mean + half_width)
+    return mean - half_width, mean + half_width
 
 
 def _coordinate(name: str, value: float) -> float:
+    """Return the value of a parameter, or its logarithm if the logarithm is estimated."""
     return math.log(value) if name in LOGARITHMIC else value
 
 
-def _block(estimate: RecordEstimate, names: Sequence[str]) -> NDArray[np.float64]:
+def _covariance_block(estimate: RecordEstimate, names: Sequence[str]) -> NDArray[np.float64]:
+    """Return the covariance of some parameters of an estimate."""
     indices = [estimate.determined.index(name) for name in names]
     return estimate.covariance[np.ix_(indices, indices)]
 
 
-def _plant(like: RecordEstimate, values: dict[str, float]) -> Plant:
+def _pooled_plant(estimate: RecordEstimate, values: dict[str, float]) -> Plant:
+    """Return a plant with given parameters and all other properties of a session's plant."""
     stiffness = values["bending_stiffness_n_m2"]
-    free = STRUCTURES[like.structure].free
+    free = STRUCTURES[estimate.structure].free
     return replace(
-        like.plant,
+        estimate.plant,
         beam=Beam(
-            like.plant.beam.length_m, values["density_over_stiffness"] * stiffness, stiffness
+            estimate.plant.beam.length_m, values["density_over_stiffness"] * stiffness, stiffness
         ),
-        damping=STRUCTURES[like.structure].damping({name: values[name] for name in free}),
+        damping=STRUCTURES[estimate.structure].damping({name: values[name] for name in free}),
         delay_s=values["delay_s"],
         tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
     )

@@ -1,4 +1,4 @@
-"""Sentences of a campaign's verdict: whether there is one specimen, and its damping."""
+"""Sentences of a campaign's verdict: whether the sessions are of one specimen, and its damping."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._experiment import fact_text, in_dispute
-from analysis.campaigns._statistics import BEST
+from analysis.campaigns._statistics import PAPER_BEST_MODELS
 from analysis.campaigns._welch_bias import LARGEST_MISFIT
 from analysis.identify.sentences import LOSSES
 from analysis.models import COEFFICIENT_OF, QUANTITIES, STRUCTURES
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from analysis.campaigns._experiment import StatedSpecimen
-    from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, Values
+    from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, SessionValues
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
@@ -30,35 +30,42 @@ if TYPE_CHECKING:
 
 # Names and numbers
 
-_NAMES: Final = {"delay_s": "delay of the torque", "tool_inertia_kg_m2": "tool inertia"}
-"""Names of quantities whose symbol alone is not clear."""
-_FINER: Final = {"bending_stiffness_n_m2": ("1e-3 N·m²", 1e3)}
-"""Units smaller than a single record's, because scatter between sessions needs more digits."""
+_CLEARER_NAMES: Final = {"delay_s": "delay of the torque", "tool_inertia_kg_m2": "tool inertia"}
+"""Names shown for parameters whose symbol alone is not clear."""
+_FINER_UNITS: Final = {"bending_stiffness_n_m2": ("1e-3 N·m²", 1e3)}
+"""Display unit and factor of parameters that need more digits here than for a single session."""
 _SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+"""Translation of the digits and the minus sign of an exponent to superscripts."""
 
-_LEAST: Final = 1e-99
-_OF_MODES: Final = {
+_SMALLEST_P_VALUE: Final = 1e-99
+"""Smallest p-value that is shown as a number."""
+_MODE_QUANTITIES: Final = {
     "frequency_hz": ("frequency", 1.0, "Hz"),
     "damping_ratio": ("damping ratio", 100.0, "%"),
 }
+"""Name, display factor and display unit of each quantity of a mode."""
 
 
 def label(quantity: str) -> tuple[str, float, str]:
-    """Symbol, factor and unit in which a parameter or a mode's quantity is shown."""
+    """Return the symbol or name, the display factor and the display unit of a quantity.
+
+    The quantity is a parameter, or ``frequency_hz_N`` or ``damping_ratio_N`` of mode N. A value
+    times the factor is in the display unit.
+    """
     if quantity in QUANTITIES:
         symbol, _, unit, factor = QUANTITIES[quantity]
-        unit, factor = _FINER.get(quantity, (unit, factor))
-        power, _, rest = unit.partition(" ")
+        unit, factor = _FINER_UNITS.get(quantity, (unit, factor))
+        power, _, unit_rest = unit.partition(" ")
         if power.startswith("1e"):
-            unit = f"10{power.removeprefix('1e').translate(_SUPERSCRIPTS)} {rest}"
-        return _NAMES.get(quantity, symbol), factor, "" if unit == "1" else unit
-    of_mode, mode = quantity.rsplit("_", 1)
-    what, factor, unit = _OF_MODES[of_mode]
-    return f"{what} of mode {mode}", factor, unit
+            unit = f"10{power.removeprefix('1e').translate(_SUPERSCRIPTS)} {unit_rest}"
+        return _CLEARER_NAMES.get(quantity, symbol), factor, "" if unit == "1" else unit
+    field_name, mode = quantity.rsplit("_", 1)
+    mode_quantity, factor, unit = _MODE_QUANTITIES[field_name]
+    return f"{mode_quantity} of mode {mode}", factor, unit
 
 
 def with_unit(parameter: str) -> str:
-    """Symbol with its unit, if it has one.
+    """Return the symbol or name of a quantity, followed by its display unit in parentheses.
 
     Examples
     --------
@@ -70,8 +77,8 @@ def with_unit(parameter: str) -> str:
     return f"{symbol} ({unit})" if unit else symbol
 
 
-def probability(chance: float) -> str:
-    """Format a probability that may be too small for a number, but is not 0.
+def probability(p_value: float) -> str:
+    """Format a p-value, with a lower bound for values that are too small to be shown.
 
     Examples
     --------
@@ -79,11 +86,11 @@ def probability(chance: float) -> str:
     >>> probability(0.0312), probability(0.0)
     ('0.031', '< 1e-99')
     """
-    return f"{chance:.2g}" if chance > _LEAST else f"< {_LEAST:g}"
+    return f"{p_value:.2g}" if p_value > _SMALLEST_P_VALUE else f"< {_SMALLEST_P_VALUE:g}"
 
 
 def percent(fraction: float) -> str:
-    """Format a fraction that may be close to 1, but is not 1.
+    """Format a fraction as a percentage; a fraction above 99.9 % is not rounded up to 100 %.
 
     Examples
     --------
@@ -97,297 +104,364 @@ def percent(fraction: float) -> str:
 # One specimen or several
 
 MIXTURE_MARK: Final = "‡"
-_OF_MIXTURE: Final = "of a mixture"
+"""Mark of values in tables and figures that are pooled over different specimens."""
+_MIXTURE_TITLE: Final = "of a mixture"
+"""Addition to the title of a table whose values are pooled over different specimens."""
 MIXTURE_NOTE: Final = (
     f"{MIXTURE_MARK} sessions differ by more than their uncertainties: the mean of a "
     "mixture, which may be valid for none of them."
 )
-_MANY: Final = 5
-_SLIGHT: Final = 2e-3
-"""Scatter of frequencies that one beam may have: ten kelvin change steel's stiffness by 0.3 %."""
+"""Footnote that explains `MIXTURE_MARK`."""
+_MOST_FILES_LISTED: Final = 5
+"""Largest number of file names that a sentence lists."""
+_SLIGHT_FREQUENCY_SCATTER: Final = 2e-3
+"""Relative scatter of a frequency that one beam may show: ten kelvin change the stiffness of steel
+by 0.3 %."""
 
 
-def specimens(found: Homogeneity) -> list[str]:
-    """Describe that sessions are not of one specimen; empty if they are."""
-    stated = _stated(found.specimens) if len(found.specimens) > 1 else []
-    leading = found.leading
-    return stated if leading is None else [*stated, *_differing(found, leading)]
+def specimens(homogeneity: Homogeneity) -> list[str]:
+    """Return sentences about different specimens; an empty list if the sessions agree."""
+    sentences = (
+        _describe_stated_specimens(homogeneity.specimens) if len(homogeneity.specimens) > 1 else []
+    )
+    leading = homogeneity.leading
+    return (
+        sentences
+        if leading is None
+        else [*sentences, *_describe_different_specimens(homogeneity, leading)]
+    )
 
 
-def title(text: str, found: Homogeneity) -> str:
-    """Add to a title that its values are pooled over a mixture.
+def title(text: str, homogeneity: Homogeneity) -> str:
+    """Return a title, with an addition if the values are pooled over several specimens.
 
     Parameters
     ----------
     text : str
-        The title.
-    found : Homogeneity
+        Title without the mark.
+    homogeneity : Homogeneity
         Whether the sessions are of one specimen.
     """
-    return f"{text}, {_OF_MIXTURE}" if found.mixed else text
+    return f"{text}, {_MIXTURE_TITLE}" if homogeneity.mixed else text
 
 
-def _stated(found: Sequence[StatedSpecimen]) -> list[str]:
-    keys = in_dispute(found)
-    each = "; ".join(
-        ", ".join(f"{key} {fact_text(key, one.facts[key])}" for key in keys if key in one.facts)
-        + f" in {_files(one.files)}"
-        for one in found
+def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]:
+    """Describe the different specimens that the session files state."""
+    differing_keys = in_dispute(specimens)
+    specimen_texts = "; ".join(
+        ", ".join(
+            f"{key} {fact_text(key, specimen.facts[key])}"
+            for key in differing_keys
+            if key in specimen.facts
+        )
+        + f" in {_list_files(specimen.files)}"
+        for specimen in specimens
     )
-    first = ", ".join(f"{key} {fact_text(key, found[0].facts[key])}" for key in keys)
+    first_specimen = ", ".join(
+        f"{key} {fact_text(key, specimens[0].facts[key])}" for key in differing_keys
+    )
     return [
-        f"The files state {len(found)} different specimens: {each}. Specimens are never "
-        f"pooled: all results below are for {first}. Analyse the files of the others separately, "
+        f"The files state {len(specimens)} different specimens: {specimen_texts}. Specimens are "
+        "never "
+        f"pooled: all results below are for {first_specimen}. Analyse the files of the others "
+        "separately, "
         "or correct the metadata where they are wrong."
     ]
 
 
-def _differing(found: Homogeneity, leading: Heterogeneity) -> list[str]:
+def _describe_different_specimens(homogeneity: Homogeneity, leading: Heterogeneity) -> list[str]:
+    """Describe how the estimates show that the sessions are of different specimens."""
     others = [
-        label(each.quantity)[0]
-        for each in found.quantities
-        if each.mixed and not each.of_rig and each is not leading
+        label(scatter.quantity)[0]
+        for scatter in homogeneity.quantities
+        if scatter.mixed and not scatter.of_rig and scatter is not leading
     ]
-    also = f" The same holds of {', '.join(others)}." if others else ""
+    others_sentence = f" The same holds of {', '.join(others)}." if others else ""
     return [
-        f"The sessions are not of one specimen in one state: {_scatter(leading)}.{also}",
-        f"{_where(leading)} Pooled values are then means of a mixture (marked {MIXTURE_MARK}) that "
+        "The sessions are not of one specimen in one state: "
+        f"{_describe_heterogeneity(leading)}.{others_sentence}",
+        f"{_describe_groups(leading)} Pooled values are then means of a mixture (marked "
+        f"{MIXTURE_MARK}) that "
         "may hold for none of the specimens: analyse the sessions of each specimen separately, or "
-        f"find what changed between sessions (clamp, temperature, wear).{_slight(found)}",
+        "find what changed between sessions (clamp, temperature, "
+        f"wear).{_small_scatter_remark(homogeneity)}",
     ]
 
 
-def _slight(found: Homogeneity) -> str:
-    """Describe a scatter of many standard deviations only because these are small."""
-    frequencies = [each for each in found.quantities if each.quantity.startswith("frequency_hz")]
-    mixed = [each for each in frequencies if each.mixed]
-    if not mixed or any(each.between_std > _SLIGHT * each.mean for each in mixed):
+def _small_scatter_remark(homogeneity: Homogeneity) -> str:
+    """Return a remark that the frequencies vary little in relative terms, or an empty text."""
+    frequencies = [
+        scatter for scatter in homogeneity.quantities if scatter.quantity.startswith("frequency_hz")
+    ]
+    mixed = [scatter for scatter in frequencies if scatter.mixed]
+    if not mixed or any(
+        scatter.between_std > _SLIGHT_FREQUENCY_SCATTER * scatter.mean for scatter in mixed
+    ):
         return ""
     return (
-        f" Frequencies vary by less than {100 * _SLIGHT:g} %, as those of one beam may when its "
+        f" Frequencies vary by less than {100 * _SLIGHT_FREQUENCY_SCATTER:g} %, as those of one "
+        "beam may when its "
         "temperature or clamp changes."
     )
 
 
-def _scatter(each: Heterogeneity) -> str:
-    """Describe the scatter of a quantity, relative to its uncertainty and to its size."""
-    percents = percent(each.i_squared)
-    equals = "" if percents.startswith(">") else "= "
-    size = _rounded([each.between_std], each)
-    scatter = f"{size}, {100 * each.between_std / abs(each.mean):.2g} %; " if each.mean else ""
+def _describe_heterogeneity(scatter: Heterogeneity) -> str:
+    """Describe the between-session scatter of a quantity, relative to its uncertainty and size."""
+    i_squared_text = percent(scatter.i_squared)
+    equals_sign = "" if i_squared_text.startswith(">") else "= "
+    between_text = _mean_text([scatter.between_std], scatter)
+    scatter_text = (
+        f"{between_text}, {100 * scatter.between_std / abs(scatter.mean):.2g} %; "
+        if scatter.mean
+        else ""
+    )
     return (
-        f"{label(each.quantity)[0]} varies between sessions by {each.own_stds:.3g} of its own "
-        f"standard deviations ({scatter}Cochran's Q = {each.cochran_q:.3g} where "
-        f"{each.degrees_of_freedom} is expected, I² {equals}{percents})"
+        f"{label(scatter.quantity)[0]} varies between sessions by {scatter.own_stds:.3g} of its "
+        "own "
+        f"standard deviations ({scatter_text}Cochran's Q = {scatter.cochran_q:.3g} where "
+        f"{scatter.degrees_of_freedom} is expected, I² {equals_sign}{i_squared_text})"
     )
 
 
-def _where(each: Heterogeneity) -> str:
-    """Describe the groups of sessions, or the outermost ones."""
-    name, _, _ = label(each.quantity)
-    values = {file: (value, std) for file, value, std in each.values}
-    if each.groups:
-        parts = "; ".join(
-            f"{_rounded([values[file][0] for file in part], each)} in {_files(part)}"
-            for part in each.groups
+def _describe_groups(scatter: Heterogeneity) -> str:
+    """Describe the groups of sessions, or the sessions of lowest and highest value."""
+    name, _, _ = label(scatter.quantity)
+    values = {file: (value, std) for file, value, std in scatter.values}
+    if scatter.groups:
+        groups = "; ".join(
+            f"{_mean_text([values[file][0] for file in group], scatter)} in {_list_files(group)}"
+            for group in scatter.groups
         )
-        return f"By the {name} they are {len(each.groups)} groups: {parts}."
-    low, high = _ends(each.values)
+        return f"By the {name} they are {len(scatter.groups)} groups: {groups}."
+    low, high = _extreme_sessions(scatter.values)
     return (
-        f"There are no clear groups: the {name} goes from {_rounded([low[1]], each)} in {low[0]} "
-        f"to {_rounded([high[1]], each)} in {high[0]}."
+        f"There are no clear groups: the {name} goes from {_mean_text([low[1]], scatter)} in "
+        f"{low[0]} "
+        f"to {_mean_text([high[1]], scatter)} in {high[0]}."
     )
 
 
-def _ends(values: Values) -> tuple[tuple[str, float, float], tuple[str, float, float]]:
-    ordered = sorted(values, key=lambda each: each[1])
+def _extreme_sessions(
+    values: SessionValues,
+) -> tuple[tuple[str, float, float], tuple[str, float, float]]:
+    """Return the entries of the sessions with the lowest and the highest value."""
+    ordered = sorted(values, key=lambda entry: entry[1])
     return ordered[0], ordered[-1]
 
 
-def _rounded(values: Sequence[float], each: Heterogeneity) -> str:
-    """Format means with enough digits to distinguish them."""
-    _, factor, unit = label(each.quantity)
-    digits = min(decimals(factor * max(each.between_std, 1e-300)), 9)
-    times = "·" if unit.startswith("10") else " "
-    return f"{factor * float(np.mean(values)):.{digits}f}{times}{unit}".rstrip()
+def _mean_text(values: Sequence[float], scatter: Heterogeneity) -> str:
+    """Format the mean of values with its unit, and enough digits to distinguish the groups."""
+    _, factor, unit = label(scatter.quantity)
+    digits = min(decimals(factor * max(scatter.between_std, 1e-300)), 9)
+    separator = "·" if unit.startswith("10") else " "
+    return f"{factor * float(np.mean(values)):.{digits}f}{separator}{unit}".rstrip()
 
 
-def _files(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:_MANY]) + (
-        f" and {len(names) - _MANY} more" if len(names) > _MANY else ""
+def _list_files(names: Sequence[str]) -> str:
+    """Return the number of files and the names of the first few."""
+    shown = ", ".join(names[:_MOST_FILES_LISTED]) + (
+        f" and {len(names) - _MOST_FILES_LISTED} more" if len(names) > _MOST_FILES_LISTED else ""
     )
     return f"{len(names)} file{'' if len(names) == 1 else 's'} ({shown})"
 
 
 # Verdict
 
-_OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
-_ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
-_CLASSICAL: Final = "III"
-"""Type of integer orders with both dampings."""
-_SIGNIFICANT: Final = 0.01
-_AS_GOOD: Final = 1.01
+_DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
+"""Name of the damping whose order each parameter is."""
+_ORDER_NAMES: Final[tuple[Order, ...]] = ("alpha", "lambda")
+"""Names of the orders of internal and of external damping."""
+_CLASSICAL_STRUCTURE: Final = "III"
+"""Structure with internal and external damping, both of order 1."""
+_SIGNIFICANCE_LEVEL: Final = 0.01
+"""Significance level, for all parameters together, of a test for between-session variance."""
+_EQUAL_ERROR_RATIO: Final = 1.01
+"""Largest ratio of prediction error to in-sample error that counts as equally good."""
 
 
-_NEARLY_INTEGER: Final = 0.05
+_NEARLY_INTEGER_DISTANCE: Final = 0.05
 """Distance from 1 within which an order is called nearly integer although 1 is excluded."""
 
 
-def answer(
+def describe_orders(
     freest: PooledEstimate,
     alpha: PooledOrder,
     lambda_: PooledOrder,
     validation: Sequence[LeftOutError],
 ) -> str:
-    """Describe the orders of the dampings, and the predictions of the classical and freest types.
+    """Describe the order of each damping, and the prediction errors of two structures.
+
+    The two structures are the classical one (both orders 1) and the freest one.
 
     Parameters
     ----------
     freest : PooledEstimate
+        Pooled estimate of the freest structure.
     alpha, lambda_ : PooledOrder
+        Orders of internal and external damping.
     validation : sequence of LeftOutError
+        Errors of sessions predicted from the others.
     """
-    joint = " and " if alpha.exact is None else "; "
-    dampings = f"{_answered(alpha)}{joint}{_answered(lambda_)}"
+    conjunction = " and " if alpha.exact is None else "; "
+    dampings = f"{_order_clause(alpha)}{conjunction}{_order_clause(lambda_)}"
     sentence = f"{dampings[0].upper()}{dampings[1:]}."
     errors: dict[str, list[str]] = {}
-    for name in dict.fromkeys((_CLASSICAL, freest.name)):
-        its = [e.error for e in validation if e.method == "record" and e.name == name]
-        if its:
-            errors.setdefault(f"{100 * float(np.mean(its)):.2g} %", []).append(name)
+    for name in dict.fromkeys((_CLASSICAL_STRUCTURE, freest.name)):
+        type_errors = [e.error for e in validation if e.method == "record" and e.name == name]
+        if type_errors:
+            errors.setdefault(f"{100 * float(np.mean(type_errors)):.2g} %", []).append(name)
     if not errors:
         return sentence
-    each = ", ".join(
+    error_texts = ", ".join(
         f"type{'s' if len(names) > 1 else ''} {listed(names)} with {error}"
         for error, names in errors.items()
     )
-    return f"{sentence} Error of the torque predicted for an unseen session: {each}."
+    return f"{sentence} Error of the torque predicted for an unseen session: {error_texts}."
 
 
-def _answered(found: PooledOrder) -> str:
-    """Describe the order of a damping in a few words."""
-    if found.exact is not None:
-        return _effective(found)
-    of = _OF[found.order]
-    if found.status == "absent":
-        return f"no {of}"
-    if found.status == "compatible" and found.interval is None:
-        return f"{of} of order 1 ({found.order} was not fitted)"
-    if found.value is None or found.interval is None or found.reason is not None:
-        return f"{of} of an order that is not established"
-    half = (found.interval[1] - found.interval[0]) / 2
-    number = " ± ".join(to_uncertainty((found.value, half), found.std or half))
-    value = f"{found.order} = {number}"
-    if found.status == "compatible":
-        return f"{of} of integer order ({value})"
-    if found.status == "open":
-        return f"{of} of an order near 1 ({value}; 1 is doubtful, but not excluded)"
-    if abs(found.value - 1) < _NEARLY_INTEGER:
-        return f"{of} of nearly integer order ({value}; 1 is excluded)"
-    return f"{of} of fractional order ({value})"
+def _order_clause(pooled_order: PooledOrder) -> str:
+    """Describe the order of one damping as the clause of a sentence."""
+    if pooled_order.exact is not None:
+        return _slope_clause(pooled_order)
+    damping = _DAMPING_OF_ORDER[pooled_order.order]
+    if pooled_order.status == "absent":
+        return f"no {damping}"
+    if pooled_order.status == "compatible" and pooled_order.interval is None:
+        return f"{damping} of order 1 ({pooled_order.order} was not fitted)"
+    if (
+        pooled_order.value is None
+        or pooled_order.interval is None
+        or pooled_order.reason is not None
+    ):
+        return f"{damping} of an order that is not established"
+    half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
+    value_text = " ± ".join(
+        to_uncertainty((pooled_order.value, half_width), pooled_order.std or half_width)
+    )
+    order_text = f"{pooled_order.order} = {value_text}"
+    if pooled_order.status == "compatible":
+        return f"{damping} of integer order ({order_text})"
+    if pooled_order.status == "open":
+        return f"{damping} of an order near 1 ({order_text}; 1 is doubtful, but not excluded)"
+    if abs(pooled_order.value - 1) < _NEARLY_INTEGER_DISTANCE:
+        return f"{damping} of nearly integer order ({order_text}; 1 is excluded)"
+    return f"{damping} of fractional order ({order_text})"
 
 
-def _effective(found: PooledOrder) -> str:
-    """Describe the growth of a loss over the visible modes in a few words."""
-    loss = LOSSES[found.order]
-    if found.value is None or found.interval is None or found.reason is not None:
+def _slope_clause(pooled_order: PooledOrder) -> str:
+    """Describe how one loss grows with frequency over the visible modes, as a clause."""
+    loss = LOSSES[pooled_order.order]
+    if (
+        pooled_order.value is None
+        or pooled_order.interval is None
+        or pooled_order.reason is not None
+    ):
         return f"{loss} with a slope that is not established"
-    half = (found.interval[1] - found.interval[0]) / 2
-    number = " ± ".join(to_uncertainty((found.value, half), found.std or half))
+    half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
+    slope_text = " ± ".join(
+        to_uncertainty((pooled_order.value, half_width), pooled_order.std or half_width)
+    )
     conclusion = {
         "compatible": "consistent with order 1",
         "fractional": "which excludes order 1",
         "open": "which alone does not exclude order 1",
     }
-    return f"{loss} growing as f^({number}), {conclusion[found.status]}"
+    return f"{loss} growing as f^({slope_text}), {conclusion[pooled_order.status]}"
 
 
-def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
-    """Describe the structure of the numbers, and a simpler sufficient one.
+def describe_structure(freest: PooledEstimate, best: PooledEstimate) -> str:
+    """Describe the damping structure of the reported parameters, and a simpler one.
 
     Parameters
     ----------
     freest : PooledEstimate
+        Estimate whose parameters are reported.
     best : PooledEstimate
         Estimate of the lowest BIC.
     """
-    given = [name for name in _ORDERS if STRUCTURES[freest.structure].fixed.get(name) == 1.0]
-    are = "is" if len(given) == 1 else "are"
-    so = (
-        f"; it assumes that {' and '.join(given)} {are} 1."
-        if given
+    fixed_orders = [
+        name for name in _ORDER_NAMES if STRUCTURES[freest.structure].fixed.get(name) == 1.0
+    ]
+    verb = "is" if len(fixed_orders) == 1 else "are"
+    consequence = (
+        f"; it assumes that {' and '.join(fixed_orders)} {verb} 1."
+        if fixed_orders
         else ", so its intervals hold for any simpler one, too."
     )
     sentence = (
-        f"The numbers are those of type {freest.name}: {_damping(freest.structure)}. "
-        f"It is the freest structure that the sessions determine{so}"
+        f"The numbers are those of type {freest.name}: {_describe_damping(freest.structure)}. "
+        f"It is the freest structure that the sessions determine{consequence}"
     )
     if best.name != freest.name:
         sentence += (
-            f" Type {best.name} has the lowest BIC ({_damping(best.structure)}); "
+            f" Type {best.name} has the lowest BIC ({_describe_damping(best.structure)}); "
             "its intervals are narrower, and valid only if it is true."
         )
     return sentence
 
 
-def sizes(found: Sequence[ReportedLossFactor]) -> list[str]:
-    """Describe each damping at its pivot frequency, where it depends least on its order."""
+def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[str]:
+    """Describe each loss factor at the frequency where it depends least on the order."""
     factors = []
-    for each in found:
-        if each.omega_rad_s is None or not (each.size.std and each.size.interval_95):
+    for loss_factor in loss_factors:
+        if loss_factor.omega_rad_s is None or not (
+            loss_factor.size.std and loss_factor.size.interval_95
+        ):
             continue
-        value, low, high = to_uncertainty((each.size.value, *each.size.interval_95), each.size.std)
-        flag = f", {each.size.flag}" if each.size.flag else ""
+        value, low, high = to_uncertainty(
+            (loss_factor.size.value, *loss_factor.size.interval_95), loss_factor.size.std
+        )
+        remark = f", {loss_factor.size.flag}" if loss_factor.size.flag else ""
         factors.append(
-            f"{each.damping} {value} (95 %: {low} to {high}) at "
-            f"{each.omega_rad_s / (2 * np.pi):.3g} Hz{flag}"
+            f"{loss_factor.damping} {value} (95 %: {low} to {high}) at "
+            f"{loss_factor.omega_rad_s / (2 * np.pi):.3g} Hz{remark}"
         )
     return [f"Loss factors at the pivot frequencies: {'; '.join(factors)}."] if factors else []
 
 
-def selected(
+def describe_selection(
     ranked: Sequence[PooledEstimate],
-    close: Sequence[PooledEstimate],
-    alone: Mapping[str, int],
+    rivals: Sequence[PooledEstimate],
+    single_selections: Mapping[str, int],
     sessions: int,
 ) -> str:
-    """Describe the structure that all sessions select together, its equals, and the agreement.
+    """Describe which damping structure all sessions together, and single sessions, select.
 
     Parameters
     ----------
     ranked : sequence of PooledEstimate
-        The lowest BIC first.
-    close : sequence of PooledEstimate
-        Those whose BIC does not distinguish them from the first.
-    alone : mapping of str to int
-        How many sessions select each structure by themselves.
+        Estimates of all structures, the lowest BIC first.
+    rivals : sequence of PooledEstimate
+        Estimates whose BIC is not distinguishable from the lowest.
+    single_selections : mapping of str to int
+        Number of sessions that select each structure by themselves.
     sessions : int
         Number of sessions.
     """
     best = ranked[0]
     sentence = f"Lowest BIC: type {best.name}."
-    if close:
-        names = " or ".join(f"type {each.name}" for each in close)
+    if rivals:
+        names = " or ".join(f"type {rival.name}" for rival in rivals)
         sentence += (
             f" All sessions together do not distinguish it from {names} (ΔBIC "
-            f"{close[0].bic - best.bic:.1f}; 10 = decisive)."
+            f"{rivals[0].bic - best.bic:.1f}; 10 = decisive)."
         )
     elif len(ranked) > 1:
         margin = ranked[1].bic - best.bic
         sentence += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
-    selections = {f"type {name}": count for name, count in alone.items()}
-    return f"{sentence} {in_single_sessions(selections, sessions)}"
+    selections = {f"type {name}": count for name, count in single_selections.items()}
+    return f"{sentence} {describe_single_sessions(selections, sessions)}"
 
 
-def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
-    """Describe whether the residual of a structure is noise.
+def describe_residual(best: PooledEstimate, adequate: int, sessions: int) -> str:
+    """Describe whether the residual of a damping structure's fit is noise.
 
     Parameters
     ----------
     best : PooledEstimate
-        Estimate of that structure.
+        Pooled estimate of the structure.
     adequate : int
-        Sessions whose residual is noise.
+        Number of sessions whose residual is noise.
     sessions : int
         Number of sessions.
     """
@@ -396,16 +470,16 @@ def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
             f"Its residual is {best.misfit:.3g} times the noise: no structure fitted describes the "
             "beam, and standard deviations are meaningless."
         )
-    return noise_alone(adequate, sessions)
+    return describe_noise_sessions(adequate, sessions)
 
 
-def noise_alone(adequate: int, sessions: int) -> str:
-    """State in how many sessions the residual is noise.
+def describe_noise_sessions(adequate: int, sessions: int) -> str:
+    """State in how many sessions the residual of the fit is noise.
 
     Parameters
     ----------
     adequate : int
-        Sessions whose residual is noise.
+        Number of sessions whose residual is noise.
     sessions : int
         Number of sessions.
     """
@@ -417,238 +491,287 @@ def noise_alone(adequate: int, sessions: int) -> str:
     )
 
 
-def modes(found: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[str]:
-    """Describe the damping of the modes.
+def describe_modes(pooled_modes: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[str]:
+    """Describe frequency and damping ratio of each mode.
 
     Parameters
     ----------
-    found : sequence of PooledMode
-        The modes.
+    pooled_modes : sequence of PooledMode
+        Modes pooled over the sessions.
     sessions : int
         Number of sessions.
     mixed : bool
         Whether the sessions are of several specimens.
     """
-    if not found:
+    if not pooled_modes:
         return []
     t = student_t_quantile(0.95, sessions - 1)
-    modes = "; ".join(_mode(each, t) for each in found)
+    modes = "; ".join(_mode_clause(mode, t) for mode in pooled_modes)
     of = "the sessions, a mixture" if mixed else "the sessions"
     return [f"Modes: {modes} (± 95 % of the mean over {of})."]
 
 
-def order(found: PooledOrder) -> str:
-    """Describe the estimate of one order."""
-    name, of = found.order, _OF[found.order]
-    counts = {f"“{status}”": count for status, count in found.alone.items()}
-    alone = f" {in_single_sessions(counts, sum(counts.values()))}"
-    if found.status == "absent":
-        return f"No {of} was found, so its order {name} has no meaning.{alone}"
-    if found.status == "compatible" and found.interval is None:
-        return f"The order {name} of the {of} is fixed at 1, with which it is compatible.{alone}"
-    if found.value is None or found.interval is None:
-        return f"The order {name} of the {of} is not identifiable: {found.reason}.{alone}"
-    half = (found.interval[1] - found.interval[0]) / 2
-    value, low, high = to_uncertainty((found.value, *found.interval), found.std or half)
-    is_ = (
-        f"The order {name} of the {of} is {value} "
+def describe_order(pooled_order: PooledOrder) -> str:
+    """Describe the pooled estimate of one order of the damping."""
+    name, damping = pooled_order.order, _DAMPING_OF_ORDER[pooled_order.order]
+    counts = {f"“{status}”": count for status, count in pooled_order.alone.items()}
+    sessions_sentence = f" {describe_single_sessions(counts, sum(counts.values()))}"
+    if pooled_order.status == "absent":
+        return f"No {damping} was found, so its order {name} has no meaning.{sessions_sentence}"
+    if pooled_order.status == "compatible" and pooled_order.interval is None:
+        return (
+            f"The order {name} of the {damping} is fixed at 1, with which it is "
+            f"compatible.{sessions_sentence}"
+        )
+    if pooled_order.value is None or pooled_order.interval is None:
+        return (
+            f"The order {name} of the {damping} is not identifiable: "
+            f"{pooled_order.reason}.{sessions_sentence}"
+        )
+    half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
+    value, low, high = to_uncertainty(
+        (pooled_order.value, *pooled_order.interval), pooled_order.std or half_width
+    )
+    statement = (
+        f"The order {name} of the {damping} is {value} "
         f"(95 %: {low} to {high}, between-session variance included)"
     )
-    if found.reason is not None:
-        would = is_.replace(" is ", " would be ", 1)
-        return f"{would}, but {found.reason}; do not interpret it.{alone}"
+    if pooled_order.reason is not None:
+        conditional = statement.replace(" is ", " would be ", 1)
+        return f"{conditional}, but {pooled_order.reason}; do not interpret it.{sessions_sentence}"
     conclusion = {
         "compatible": "consistent with 1",
         "fractional": "1 is excluded",
         "open": "1 is doubtful, but not excluded",
     }
-    return f"{is_}: {conclusion[found.status]}.{alone}"
+    return f"{statement}: {conclusion[pooled_order.status]}.{sessions_sentence}"
 
 
-def welch_bias(
+def describe_welch_bias(
     freest: PooledEstimate,
     biases: Sequence[WelchBias],
     withheld: Collection[str],
     *,
     comparable: bool,
 ) -> list[str]:
-    """Describe the bias of the Welch fits of the reported type.
+    """Describe the bias of the Welch fits of the reported damping structure.
 
     Parameters
     ----------
     freest : PooledEstimate
+        Estimate of the reported structure.
     biases : sequence of WelchBias
+        Biases of the Welch fits of all structures and weightings.
     withheld : collection of str
-        Orders that are not reported; their coefficients are not, either.
+        Orders that are not reported; their coefficients are not reported either.
     comparable : bool
-        Whether the sessions are of one specimen, and a uniform beam predicts its modes: else there
-        is nothing to compare with.
+        Whether the sessions are of one specimen and a uniform beam predicts its modes. If not,
+        there is no reference for the Welch fits.
     """
     if not comparable:
         return []
-    of_type = [each for each in biases if each.structure == freest.name]
-    best = [each for each in of_type if (each.structure, each.weighting) in BEST]
+    type_biases = [bias for bias in biases if bias.structure == freest.name]
+    best_model_biases = [
+        bias for bias in type_biases if (bias.structure, bias.weighting) in PAPER_BEST_MODELS
+    ]
     left_out = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
     sentences = []
-    for each in best or of_type[:1]:
-        found = [one for one in each.significant if one.parameter not in left_out]
-        if not found:
+    for bias in best_model_biases or type_biases[:1]:
+        significant = [one for one in bias.significant if one.parameter not in left_out]
+        if not significant:
             continue
         sentences.append(
-            f"Welch's {'; '.join(map(_biased, found))} (type {each.structure}, weights "
-            f"{each.weighting}, as in Table 3): bias, not scatter, which more sessions do not "
+            f"Welch's {'; '.join(map(_bias_clause, significant))} (type {bias.structure}, weights "
+            f"{bias.weighting}, as in Table 3): bias, not scatter, which more sessions do not "
             "reduce."
         )
-        if each.wmse < each.record_wmse:
+        if bias.wmse < bias.record_wmse:
             sentences.append(
-                f"The lower WMSE of the Welch fits ({each.wmse:.3g} against "
-                f"{each.record_wmse:.3g} (N·m/rad)²) is no evidence for them: it is the distance "
+                f"The lower WMSE of the Welch fits ({bias.wmse:.3g} against "
+                f"{bias.record_wmse:.3g} (N·m/rad)²) is no evidence for them: it is the distance "
                 "from Welch's response, which has the same bias."
             )
     return sentences
 
 
-def _biased(each: ParameterBias) -> str:
-    """Describe a parameter of a Welch fit and its bias."""
-    symbol, factor, unit = label(each.parameter)
-    value, scatter = to_uncertainty((each.welch, each.welch_std), each.welch_std, factor)
-    (record,) = to_uncertainty((each.record,), each.record_std, factor)
-    (size,) = to_uncertainty((abs(each.bias),), each.bias_std, factor)
-    name = each.parameter if each.parameter in _ORDERS else symbol
-    times = f"·{unit}" if unit else ""
-    edge = f", at the edge of the search range in {each.at_bounds}" if each.at_bounds else ""
+def _bias_clause(parameter_bias: ParameterBias) -> str:
+    """Describe the value of one parameter of a Welch fit and its bias."""
+    symbol, factor, unit = label(parameter_bias.parameter)
+    value, scatter = to_uncertainty(
+        (parameter_bias.welch, parameter_bias.welch_std), parameter_bias.welch_std, factor
+    )
+    (record,) = to_uncertainty((parameter_bias.record,), parameter_bias.record_std, factor)
+    (bias_text,) = to_uncertainty((abs(parameter_bias.bias),), parameter_bias.bias_std, factor)
+    name = parameter_bias.parameter if parameter_bias.parameter in _ORDER_NAMES else symbol
+    unit_text = f"·{unit}" if unit else ""
+    bounds_remark = (
+        f", at the edge of the search range in {parameter_bias.at_bounds}"
+        if parameter_bias.at_bounds
+        else ""
+    )
     return (
-        f"{name} ({value} ± {scatter}{times} between sessions{edge}) is {size}{times} "
-        f"{'above' if each.bias > 0 else 'below'} the whole records' {record}{times}"
+        f"{name} ({value} ± {scatter}{unit_text} between sessions{bounds_remark}) is "
+        f"{bias_text}{unit_text} "
+        f"{'above' if parameter_bias.bias > 0 else 'below'} the whole records' {record}{unit_text}"
     )
 
 
-def dissenting(who: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str]:
-    """Name the sessions that by themselves exclude the structure selected by all together.
+def describe_dissent(sessions: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str]:
+    """List the sessions that alone exclude the damping structure selected by all together.
 
     Parameters
     ----------
-    who : sequence of tuple
-        File of each session, and the structure that it selects.
+    sessions : sequence of tuple
+        File of each such session, and the structure that it selects.
     best : PooledEstimate
-        Estimate of the structure that all select.
+        Estimate of the structure that all sessions select together.
     """
-    if not who:
+    if not sessions:
         return []
-    names = ", ".join(f"{file} (type {structure})" for file, structure in who[:_MANY])
-    more = f" and {len(who) - _MANY} more" if len(who) > _MANY else ""
+    names = ", ".join(
+        f"{file} (type {structure})" for file, structure in sessions[:_MOST_FILES_LISTED]
+    )
+    more_text = (
+        f" and {len(sessions) - _MOST_FILES_LISTED} more"
+        if len(sessions) > _MOST_FILES_LISTED
+        else ""
+    )
     return [
-        f"Type {best.name} is excluded by {len(who)} single session{'s' if len(who) > 1 else ''}: "
-        f"{names}{more}. Check their reports (analyze --each) before relying on the mean."
+        f"Type {best.name} is excluded by {len(sessions)} single "
+        f"session{'s' if len(sessions) > 1 else ''}: "
+        f"{names}{more_text}. Check their reports (analyze --each) before relying on the mean."
     ]
 
 
-def scatter(best: PooledEstimate) -> str:
-    """Describe whether the sessions repeat, with one false alarm in a hundred campaigns."""
-    level = _SIGNIFICANT / max(len(best.parameters), 1)
-    moved = [label(each.name)[0] for each in best.parameters if each.chance < level]
-    if not moved:
-        lowest = min((each.chance for each in best.parameters), default=1.0)
-        tau = (
+def describe_scatter(best: PooledEstimate) -> str:
+    """Describe whether any parameter varies significantly between the sessions.
+
+    The level of the test gives one false alarm in a hundred campaigns.
+    """
+    level = _SIGNIFICANCE_LEVEL / max(len(best.parameters), 1)
+    varying = [
+        label(parameter.name)[0] for parameter in best.parameters if parameter.chance < level
+    ]
+    if not varying:
+        lowest = min((parameter.chance for parameter in best.parameters), default=1.0)
+        tau_remark = (
             "; the τ above zero are within chance"
-            if any(each.between_std > 0 for each in best.parameters)
+            if any(parameter.between_std > 0 for parameter in best.parameters)
             else ""
         )
         return (
             "No significant between-session variance (Cochran's Q, lowest p of "
-            f"{len(best.parameters)}: {probability(lowest)}{tau})."
+            f"{len(best.parameters)}: {probability(lowest)}{tau_remark})."
         )
     return (
-        f"Between-session variance in {', '.join(moved)} (Cochran's Q): something changes between "
+        f"Between-session variance in {', '.join(varying)} (Cochran's Q): something changes "
+        "between "
         "sessions, such as clamp, temperature or motor, and the interval of a single session is "
         "too narrow for the specimen."
     )
 
 
-def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions: int) -> list[str]:
-    """Describe how well the sessions predict an unseen one.
+def describe_prediction_errors(
+    best: PooledEstimate, validation: Sequence[LeftOutError], sessions: int
+) -> list[str]:
+    """Describe how well a damping structure predicts a session from the other sessions.
 
     Parameters
     ----------
     best : PooledEstimate
-        Estimate of the structure in question.
+        Estimate of the structure.
     validation : sequence of LeftOutError
         Errors of sessions predicted from the others.
     sessions : int
         Number of sessions.
     """
-    of_best = [each for each in validation if each.method == "record" and each.name == best.name]
-    own = [each.own_error for each in of_best if each.own_error is not None]
-    if not own:
+    structure_errors = [
+        left_out
+        for left_out in validation
+        if left_out.method == "record" and left_out.name == best.name
+    ]
+    own_errors = [
+        left_out.own_error for left_out in structure_errors if left_out.own_error is not None
+    ]
+    if not own_errors:
         return []
-    error, alone = float(np.mean([each.error for each in of_best])), float(np.mean(own))
+    error, own_error = (
+        float(np.mean([left_out.error for left_out in structure_errors])),
+        float(np.mean(own_errors)),
+    )
     verdict = (
         "the others predict a session as well as its own fit"
-        if error <= _AS_GOOD * alone
+        if error <= _EQUAL_ERROR_RATIO * own_error
         else "the others predict a session worse than its own fit, as the parameters vary"
     )
-    fewer = f"; mean of {len(own)} of {sessions} sessions" if len(own) < sessions else ""
+    sessions_remark = (
+        f"; mean of {len(own_errors)} of {sessions} sessions" if len(own_errors) < sessions else ""
+    )
     return [
         f"Leave-one-out error of the torque {100 * error:.2f} % rms (in-sample "
-        f"{100 * alone:.2f} %, noise included{fewer}): {verdict}."
+        f"{100 * own_error:.2f} %, noise included{sessions_remark}): {verdict}."
     ]
 
 
 def lost_trials(lost: Sequence[LostTrial], requested: int) -> list[str]:
-    """Describe the sessions that were to be predicted and were not.
+    """List the sessions that could not be predicted from the others, with the reasons.
 
     Parameters
     ----------
     lost : sequence of LostTrial
         Sessions that were not predicted.
     requested : int
-        Number of sessions to be predicted.
+        Number of sessions that were to be predicted.
     """
     if not lost:
         return []
-    each = "; ".join(f"{trial.path.name}: {trial.reason}" for trial in lost[:_MANY])
-    more = f"; and {len(lost) - _MANY} more" if len(lost) > _MANY else ""
+    reasons = "; ".join(f"{trial.path.name}: {trial.reason}" for trial in lost[:_MOST_FILES_LISTED])
+    more_text = (
+        f"; and {len(lost) - _MOST_FILES_LISTED} more" if len(lost) > _MOST_FILES_LISTED else ""
+    )
     return [
         f"Of {requested} sessions to be predicted from the others, {requested - len(lost)} "
         f"{'was' if requested - len(lost) == 1 else 'were'} and {len(lost)} "
-        f"{'was' if len(lost) == 1 else 'were'} not ({each}{more}). Prediction errors are averaged "
+        f"{'was' if len(lost) == 1 else 'were'} not ({reasons}{more_text}). Prediction errors are "
+        "averaged "
         "over those predicted."
     ]
 
 
-def in_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
-    """Describe the findings of single sessions with their numbers.
+def describe_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
+    """State how many sessions by themselves reach each conclusion.
 
     Parameters
     ----------
     counts : mapping of str to int
-        Number of sessions by what they find.
+        Number of sessions by their conclusion, the most common first.
     sessions : int
         Number of sessions.
     """
-    (first, count), *others = counts.items()
-    more = "".join(f", {what} in {n}" for what, n in others)
-    return f"Single sessions: {first} in {count} of {sessions}{more}."
+    (first_conclusion, count), *others = counts.items()
+    other_texts = "".join(f", {conclusion} in {n}" for conclusion, n in others)
+    return f"Single sessions: {first_conclusion} in {count} of {sessions}{other_texts}."
 
 
-def _damping(structure: str) -> str:
-    """Describe the kinds of damping of a structure, and their orders."""
-    shape = STRUCTURES[structure]
+def _describe_damping(structure: str) -> str:
+    """Describe the kinds of damping of a damping structure, and whether orders are free."""
+    damping_structure = STRUCTURES[structure]
     kinds = [
-        f"{what} damping ({order} {'free' if order in shape.free else '= 1'})"
-        for what, order, present in (
-            ("internal", "alpha", shape.internal),
-            ("external", "lambda", shape.external),
+        f"{name} damping ({order} {'free' if order in damping_structure.free else '= 1'})"
+        for name, order, present in (
+            ("internal", "alpha", damping_structure.internal),
+            ("external", "lambda", damping_structure.external),
         )
         if present
     ]
     return " and ".join(kinds)
 
 
-def _mode(mode: PooledMode, t: float) -> str:
-    half = t * 100 * mode.damping_ratio_std
-    digits = decimals(max(half, 1e-9))
+def _mode_clause(mode: PooledMode, t: float) -> str:
+    """Describe the frequency and the damping ratio of one mode."""
+    half_width = t * 100 * mode.damping_ratio_std
+    digits = decimals(max(half_width, 1e-9))
     return (
         f"{mode.frequency_hz:.5g} Hz with a damping ratio of "
-        f"{100 * mode.damping_ratio:.{digits}f} ± {half:.{digits}f} %"
+        f"{100 * mode.damping_ratio:.{digits}f} ± {half_width:.{digits}f} %"
     )

@@ -33,60 +33,64 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
 Result = TypeVar("Result")
+"""Type of a task's result."""
 
-_POLL_S: Final = 2.0
-"""Interval of checks for the presence of workers."""
+_PRESENCE_CHECK_INTERVAL_S: Final = 2.0
+"""Interval in seconds at which the presence of worker processes is checked."""
 
-_HOPELESS: Final = 2
-"""Tasks that end their processes, none being done, from which it is not the tasks' doing."""
+_FEWEST_LOST_TASKS: Final = 2
+"""Number of lost tasks, with none finished, from which the workers and not the tasks are at
+fault."""
 
 
 @dataclass(frozen=True, slots=True)
-class Lost:
-    """Result of a task whose worker ended each time it was tried.
+class LostTask:
+    """Result of a task whose worker process ended each time it ran the task.
 
     Attributes
     ----------
     reason : str
-        End of the worker.
+        Why the worker process ended.
     """
 
     reason: str
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux
         return os.cpu_count() or 1
 
 
-def _unheard(_number: int) -> None:
-    """Ignore progress."""
+def _ignore_progress(_number: int) -> None:
+    """Ignore the number of a finished task."""
 
 
 class Workers:
-    """Processes that run tasks side by side, behind an executor of `concurrent.futures`.
+    """Processes that run tasks in parallel, behind an executor of `concurrent.futures`.
 
-    A process that ends by itself (killed for lack of memory, mostly) takes other tasks with it:
-    all that are under way in a pool, or those that wait at the same worker of a cluster. They are
-    tried once more, each alone, so that only the one that ends its process is lost.
+    A worker process that ends by itself (mostly killed for lack of memory) takes other tasks with
+    it: all tasks in progress of a pool, or those that wait at the same worker of a cluster. Each of
+    these tasks runs once more, alone, so that only the task that ends its process is lost.
 
     Parameters
     ----------
     executor : Executor
-        Runs the tasks.
+        Executor that runs the tasks.
     """
 
-    _died: type[Exception] = BrokenExecutor
-    """Exceptions by which the executor reports that a task's process ended."""
-    _limit: int | None = None
-    """Tasks under way at once: the fewer, the fewer are tried again."""
-    _lost: str
-    """Reason for a task whose process ended twice."""
-    _hopeless: str | None = None
-    """Message if that is so for all tasks; None: that for each."""
+    _process_end_error: type[Exception] = BrokenExecutor
+    """Exception by which the executor reports that the process of a task ended."""
+    _most_in_progress: int | None = None
+    """Most tasks in progress at once; the fewer, the fewer have to run again after a process
+    ended."""
+    _lost_task_reason: str
+    """Reason reported for a task whose process ended twice."""
+    _no_workers_message: str | None = None
+    """Message of the error raised if no task survives; None: each lost task is reported by
+    itself."""
 
     def __init__(self, executor: Executor) -> None:
         self._executor = executor
@@ -95,116 +99,123 @@ class Workers:
         self,
         function: Callable[..., Result],
         arguments: Sequence[tuple[Any, ...]],
-        on_done: Callable[[int], None] = _unheard,
-    ) -> list[Result | Lost]:
-        """Call a function with every tuple of arguments.
+        on_done: Callable[[int], None] = _ignore_progress,
+    ) -> list[Result | LostTask]:
+        """Call a function with every tuple of arguments, in parallel.
 
         Parameters
         ----------
         function : callable
-            Importable, as are its arguments and what it returns.
+            Function that worker processes can import, as are its arguments and its result.
         arguments : sequence of tuple
+            Arguments of each call.
         on_done : callable, optional
             Called with the index of each finished task, in order of completion.
 
         Returns
         -------
         list
-            In the order of the arguments.
+            Results in the order of the arguments; `LostTask` if a task's process ended each time.
 
         Raises
         ------
         CampaignError
             There are no workers any more.
         """
-        results: dict[int, Result | Lost] = {}
+        results: dict[int, Result | LostTask] = {}
 
-        def submit(number: int) -> Future[Result]:
-            return self._executor.submit(function, *arguments[number])
+        def submit(index: int) -> Future[Result]:
+            """Start a task by its index."""
+            return self._executor.submit(function, *arguments[index])
 
-        def done(number: int, result: Result | Lost) -> None:
-            results[number] = result
-            on_done(number)
+        def store_result(index: int, result: Result | LostTask) -> None:
+            """Store the result of a task and report its completion."""
+            results[index] = result
+            on_done(index)
 
-        waiting = deque(range(len(arguments)))
-        while waiting:
-            with self._explaining():
-                suspects = self._try(waiting, submit, done)
-                for number in suspects:
-                    self._renew(alone=True)
-                    if self._try(deque([number]), submit, done):
-                        done(number, Lost(self._lost))
-            if suspects:
-                others = any(not isinstance(result, Lost) for result in results.values())
-                if self._hopeless and not others and (len(results) >= _HOPELESS or not waiting):
-                    raise CampaignError(self._hopeless)
-                self._renew()
-        return [results[number] for number in range(len(arguments))]
+        queue = deque(range(len(arguments)))
+        while queue:
+            with self._convert_errors():
+                interrupted = self._run_until_process_ends(queue, submit, store_result)
+                for index in interrupted:
+                    self._replace_executor(alone=True)
+                    if self._run_until_process_ends(deque([index]), submit, store_result):
+                        store_result(index, LostTask(self._lost_task_reason))
+            if interrupted:
+                any_finished = any(not isinstance(result, LostTask) for result in results.values())
+                if (
+                    self._no_workers_message
+                    and not any_finished
+                    and (len(results) >= _FEWEST_LOST_TASKS or not queue)
+                ):
+                    raise CampaignError(self._no_workers_message)
+                self._replace_executor()
+        return [results[index] for index in range(len(arguments))]
 
-    def _try(
+    def _run_until_process_ends(
         self,
-        waiting: deque[int],
+        queue: deque[int],
         submit: Callable[[int], Future[Result]],
-        done: Callable[[int, Result], None],
+        store_result: Callable[[int, Result], None],
     ) -> list[int]:
-        """Run waiting tasks until a worker process dies; return those in progress then."""
-        under_way: dict[Future[Result], int] = {}
-        suspects: list[int] = []
-        seen = time.monotonic()
-        while under_way or (waiting and not suspects):
-            while waiting and not suspects and len(under_way) != self._limit:
+        """Run queued tasks until a worker process ends; return the tasks interrupted by it."""
+        in_progress: dict[Future[Result], int] = {}
+        interrupted: list[int] = []
+        last_seen_s = time.monotonic()
+        while in_progress or (queue and not interrupted):
+            while queue and not interrupted and len(in_progress) != self._most_in_progress:
                 try:
-                    under_way[submit(waiting[0])] = waiting[0]
+                    in_progress[submit(queue[0])] = queue[0]
                 except BrokenExecutor:
-                    if not under_way:  # a process that had nothing to do has ended
-                        self._renew()
+                    if not in_progress:  # an idle process has ended
+                        self._replace_executor()
                     break
-                waiting.popleft()
-            for future in wait(under_way, _POLL_S, FIRST_COMPLETED).done:
-                number = under_way.pop(future)
+                queue.popleft()
+            for future in wait(in_progress, _PRESENCE_CHECK_INTERVAL_S, FIRST_COMPLETED).done:
+                index = in_progress.pop(future)
                 try:
                     result = future.result()
-                except self._died:
-                    suspects.append(number)
+                except self._process_end_error:
+                    interrupted.append(index)
                 else:
-                    done(number, result)
-            seen = self._still_there(seen)
-        return suspects
+                    store_result(index, result)
+            last_seen_s = self._check_presence(last_seen_s)
+        return interrupted
 
-    def _renew(self, *, alone: bool = False) -> None:
-        """Start processes instead of those that ended, or one for one task."""
+    def _replace_executor(self, *, alone: bool = False) -> None:
+        """Replace the executor after a worker process ended; `alone` requests one process."""
 
-    def _explaining(self) -> AbstractContextManager[None]:
-        """Convert other errors from a loss of all workers to `CampaignError`."""
+    def _convert_errors(self) -> AbstractContextManager[None]:
+        """Convert other errors that mean the loss of all workers to `CampaignError`."""
         return nullcontext()
 
-    def _still_there(self, seen: float) -> float:
-        """Return when workers were last seen; raise if they have been lost for too long."""
-        return seen
+    def _check_presence(self, last_seen_s: float) -> float:
+        """Return when workers were last present; raise if there have been none for too long."""
+        return last_seen_s
 
 
 @contextmanager
 def process_pool(jobs: int) -> Iterator[Workers]:
-    """Pool of fresh processes, whose linear algebra has one thread each.
+    """Provide a pool of fresh processes, each with single-threaded linear algebra.
 
-    Fresh, because a process with threads (a progress bar is one) cannot be forked safely. They
-    ignore Ctrl-C, which is the caller's to handle, and end with the caller however he ends. Work
-    that is under way is dropped when the context is left by an exception.
+    The processes are fresh because a process with threads (a progress bar is one) cannot be forked
+    safely. They ignore Ctrl-C, which the caller handles, and end together with the caller. Tasks in
+    progress are abandoned when an exception leaves the context.
     """
-    before = {name: os.environ.get(name) for name in SINGLE_THREADED}
+    environment = {name: os.environ.get(name) for name in SINGLE_THREADED}
     use_one_thread()
-    others = set(multiprocessing.active_children())
+    other_processes = set(multiprocessing.active_children())
     workers = _LocalWorkers(jobs)
     try:
         yield workers
     except BaseException:
         workers.close(wait=False)
-        for worker in set(multiprocessing.active_children()) - others:
+        for worker in set(multiprocessing.active_children()) - other_processes:
             worker.terminate()
         raise
     finally:
         workers.close()
-        for name, value in before.items():
+        for name, value in environment.items():
             if value is None:
                 os.environ.pop(name, None)
             else:
@@ -212,55 +223,63 @@ def process_pool(jobs: int) -> Iterator[Workers]:
 
 
 class _LocalWorkers(Workers):
-    _lost = "its worker process ended by itself twice, most often for lack of memory"
-    _hopeless = (
+    """Worker processes of a pool on this machine."""
+
+    _lost_task_reason = "its worker process ended by itself twice, most often for lack of memory"
+    _no_workers_message = (
         "The worker processes ended by themselves, most often for lack of memory: use fewer "
         "--jobs. A script that calls campaign() must do so under if __name__ == '__main__':"
     )
 
     def __init__(self, jobs: int) -> None:
-        super().__init__(_pool(jobs))
-        self._limit = jobs
+        super().__init__(_spawn_pool(jobs))
+        self._most_in_progress = jobs
 
-    def _renew(self, *, alone: bool = False) -> None:
+    def _replace_executor(self, *, alone: bool = False) -> None:
+        """Start a new pool after a worker process ended; `alone` requests one process."""
         self.close()
-        self._executor = _pool(1 if alone else self._limit)
+        self._executor = _spawn_pool(1 if alone else self._most_in_progress)
 
     def close(self, *, wait: bool = True) -> None:
-        """Start no more tasks, and end the processes after the present ones."""
+        """Start no more tasks, and end the processes after their present tasks."""
         self._executor.shutdown(wait, cancel_futures=True)
 
 
-def _pool(jobs: int | None) -> ProcessPoolExecutor:
+def _spawn_pool(jobs: int | None) -> ProcessPoolExecutor:
+    """Return a pool of processes that are started afresh, not forked."""
     return ProcessPoolExecutor(
-        jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_begin
+        jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_initialize_worker
     )
 
 
-def _begin() -> None:
-    """Make a worker ignore Ctrl-C, and end with its parent."""
+def _initialize_worker() -> None:
+    """Make a worker process ignore Ctrl-C and end together with its parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
 
-    def follow() -> None:
+    def end_with_parent() -> None:
+        """End this process when its parent process ends."""
         if parent is not None:
             parent.join()
             os._exit(1)
 
-    threading.Thread(target=follow, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-_CONNECT_S: Final = 5.0
-_WORKERS_S: Final = 10.0
-_GONE_S: Final = 30.0
-"""How long a cluster may be without any worker: its nannies restart them in seconds."""
+_CONNECTION_TIMEOUT_S: Final = 5.0
+"""Longest wait in seconds for a connection to the Dask scheduler."""
+_FIRST_WORKER_TIMEOUT_S: Final = 10.0
+"""Longest wait in seconds for the first worker of a Dask cluster."""
+_NO_WORKERS_TIMEOUT_S: Final = 30.0
+"""Longest time in seconds without any Dask worker; a cluster restarts its workers within
+seconds."""
 
 
 @contextmanager
 def dask_cluster(address: str) -> Iterator[Workers]:
-    """Workers of a Dask cluster.
+    """Provide the workers of a Dask cluster.
 
-    They need this package, of the same version, and the session files under the same paths.
+    The workers need the same version of this package, and the session files under the same paths.
 
     Parameters
     ----------
@@ -274,18 +293,21 @@ def dask_cluster(address: str) -> Iterator[Workers]:
         their versions differ.
     """
     try:
-        distributed = _distributed()
+        distributed = _import_distributed()
     except ImportError as error:
         raise CampaignError(
             "--dask needs the optional packages: pip install 'rigd[dask]'."
         ) from error
-    with _quiet():
+    with _suppress_dask_messages():
         try:
-            _knock(address)
-            client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
+            _check_scheduler(address)
+            client = distributed.Client(
+                address, timeout=_CONNECTION_TIMEOUT_S, set_as_default=False
+            )
         except (OSError, ValueError) as error:
             raise CampaignError(
-                f"No Dask scheduler answers at {address} within {_CONNECT_S:g} s; start one with "
+                f"No Dask scheduler answers at {address} within {_CONNECTION_TIMEOUT_S:g} s; start "
+                "one with "
                 "'dask scheduler' and its workers with 'dask worker ADDRESS', or leave --dask out."
             ) from error
         try:
@@ -296,8 +318,8 @@ def dask_cluster(address: str) -> Iterator[Workers]:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress messages of Dask that are reported here: failures, and different versions."""
+def _suppress_dask_messages() -> Iterator[None]:
+    """Suppress Dask's own messages on failures and different versions, which are reported here."""
     log = logging.getLogger("distributed.client")
     level = log.level
     log.setLevel(logging.CRITICAL)
@@ -309,66 +331,80 @@ def _quiet() -> Iterator[None]:
         log.setLevel(level)
 
 
-def _knock(address: str) -> None:
-    """Raise an OSError if no scheduler listens; Dask's client would retry even after failing."""
-    name = address.rsplit("://", maxsplit=1)[-1]
+def _check_scheduler(address: str) -> None:
+    """Raise an OSError if no scheduler listens at an address.
+
+    Dask's client would keep trying to connect even after it has reported its failure.
+    """
+    location = address.rsplit("://", maxsplit=1)[-1]
     if "://" in address and not address.startswith(("tcp://", "tls://")):
         return
-    host, _, port = name.rpartition(":")
+    host, _, port = location.rpartition(":")
     if not (host and port.isdecimal()):
         raise ValueError("no host and port")
-    socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
+    socket.create_connection((host.strip("[]"), int(port)), _CONNECTION_TIMEOUT_S).close()
 
 
 class _DaskWorkers(Workers):
-    """The scheduler tries a task whose worker ended at others, and gives it up after several."""
+    """Workers of a Dask cluster.
 
-    _lost = (
+    The scheduler repeats a task at another worker if its worker ended, and drops it after several.
+    """
+
+    _lost_task_reason = (
         "every Dask worker that ran it ended by itself, most often for lack of memory; see the "
         "workers' logs"
     )
 
     def __init__(self, client: Any, address: str) -> None:  # noqa: ANN401 - Dask has no types
-        # Each call counts, though arguments may be the same.
+        # With pure=False, Dask also repeats a call with the same arguments.
         super().__init__(client.get_executor(pure=False))
         self._client, self._address = client, address
-        self._died = _distributed().KilledWorker
+        self._process_end_error = _import_distributed().KilledWorker
 
     @contextmanager
-    def _explaining(self) -> Iterator[None]:
+    def _convert_errors(self) -> Iterator[None]:
+        """Convert errors that mean the loss of the scheduler to `CampaignError`."""
         try:
             yield
         except CampaignError:
             raise
-        except Exception as error:  # Dask has many for a scheduler that went away
-            expected = isinstance(error, CancelledError | _distributed().comm.CommClosedError)
+        except Exception as error:  # Dask raises many types if a scheduler is lost
+            expected = isinstance(
+                error, CancelledError | _import_distributed().comm.CommClosedError
+            )
             if self._client.status == "running" and not expected:
                 raise
-            raise CampaignError(self._gone("went away")) from error
+            raise CampaignError(self._cluster_lost_message("went away")) from error
 
-    def _still_there(self, seen: float) -> float:
+    def _check_presence(self, last_seen_s: float) -> float:
+        """Return when workers were last present; raise if scheduler or workers are lost."""
         now = time.monotonic()
         if self._client.status != "running":
-            raise CampaignError(self._gone("went away"))
+            raise CampaignError(self._cluster_lost_message("went away"))
         if self._client.scheduler_info(n_workers=-1)["workers"]:
             return now
-        if now - seen > _GONE_S:
-            raise CampaignError(self._gone(f"has had no workers for {_GONE_S:g} s"))
-        return seen
+        if now - last_seen_s > _NO_WORKERS_TIMEOUT_S:
+            raise CampaignError(
+                self._cluster_lost_message(f"has had no workers for {_NO_WORKERS_TIMEOUT_S:g} s")
+            )
+        return last_seen_s
 
-    def _gone(self, what: str) -> str:
+    def _cluster_lost_message(self, event: str) -> str:
+        """Return the message of an error that concerns the whole cluster."""
         return (
-            f"The Dask scheduler at {self._address} {what}; check its log and the workers', and "
+            f"The Dask scheduler at {self._address} {event}; check its log and the workers', and "
             "start the campaign again, or leave --dask out."
         )
 
 
-def _distributed() -> Any:  # noqa: ANN401 - Dask has no types
+def _import_distributed() -> Any:  # noqa: ANN401 - Dask has no types
+    """Return Dask's package `distributed`."""
     return import_module("distributed")
 
 
 def versions() -> dict[str, str]:
-    """Versions on which results depend, and whether objects can be passed on."""
+    """Return the versions of the packages on which results and the exchange of objects depend."""
     import numpy as np
 
     import rigd
@@ -376,33 +412,35 @@ def versions() -> dict[str, str]:
     python = ".".join(platform.python_version_tuple()[:2])
     return {
         "rigd": rigd.__version__, "Python": python, "numpy": np.__version__,
-        "distributed": _distributed().__version__,
+        "distributed": _import_distributed().__version__,
     }  # fmt: skip
 
 
 def _check_workers(client: Any, address: str) -> None:  # noqa: ANN401 - Dask has no types
-    """Raise if there are no workers, or one that lacks this package or has other versions."""
+    """Raise if a cluster has no workers, or a worker lacks this package or its versions."""
     try:
-        client.wait_for_workers(1, timeout=_WORKERS_S)
+        client.wait_for_workers(1, timeout=_FIRST_WORKER_TIMEOUT_S)
     except TimeoutError as error:
         raise CampaignError(
             f"The Dask scheduler at {address} has no workers; start some with "
             f"'dask worker {address} --nthreads 1'."
         ) from error
-    found: Mapping[str, dict[str, str] | Exception] = client.run(versions, on_error="return")
-    here = versions()
-    for worker, there in found.items():
-        if isinstance(there, ModuleNotFoundError):
+    answers: Mapping[str, dict[str, str] | Exception] = client.run(versions, on_error="return")
+    own_versions = versions()
+    for worker, worker_versions in answers.items():
+        if isinstance(worker_versions, ModuleNotFoundError):
             raise CampaignError(
-                f"The Dask worker at {worker} has no module {there.name}: install rigd "
-                f"{here['rigd']} with its extra 'dask' there, and start it again."
+                f"The Dask worker at {worker} has no module {worker_versions.name}: install rigd "
+                f"{own_versions['rigd']} with its extra 'dask' there, and start it again."
             )
-        if isinstance(there, Exception):
-            raise CampaignError(f"The Dask worker at {worker} cannot be used: {there}.")
-        other = [f"{name} {there[name]} and not {here[name]}" for name in here
-                 if there[name] != here[name]]  # fmt: skip
-        if other:
+        if isinstance(worker_versions, Exception):
+            raise CampaignError(f"The Dask worker at {worker} cannot be used: {worker_versions}.")
+        differences = [f"{name} {worker_versions[name]} and not {own_versions[name]}"
+                       for name in own_versions
+                       if worker_versions[name] != own_versions[name]]  # fmt: skip
+        if differences:
             raise CampaignError(
-                f"The Dask worker at {worker} has {', '.join(other)}: install the versions of this "
+                f"The Dask worker at {worker} has {', '.join(differences)}: install the versions "
+                "of this "
                 "machine there, and start it again."
             )

@@ -1,4 +1,4 @@
-"""Command `analyze`: parses options, runs the analysis file by file, prints and writes results."""
+"""Command `analyze`: parsing of its options, and start of the analyses that they select."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 import rigd
 from analysis.cli.exchange import IMPORT_EPILOG, export_app, import_command
 from analysis.cli.sessions import NoSessionsError, Outputs, session_command, session_files
-from analysis.cli.standard_streams import complain, standard_streams
+from analysis.cli.standard_streams import print_error, standard_streams
 from analysis.cli.touch import TOUCH_EPILOG, touch_command
 from analysis.cli.welch_options import (
     Band,
@@ -26,7 +26,7 @@ from analysis.cli.welch_options import (
     Overlap,
     Segment,
     band_hz,
-    choice,
+    parse_option_choice,
     welch_settings,
 )
 from analysis.results import FIGURE_FORMATS, Routes
@@ -40,19 +40,18 @@ if TYPE_CHECKING:
     from analysis.identify import Setting
     from analysis.results import FigureFormat
 
-DEFAULT: Final = "default"
-"""Name under which the command is registered that takes all other arguments."""
+DEFAULT_COMMAND: Final = "default"
+"""Name of the command that runs if the first argument is not the name of a command."""
 
 
 class DefaultCommandGroup(TyperGroup):
-    """A group in which a first argument that names no subcommand goes to the default command.
+    """Command group that runs a default command if the first argument is no command's name.
 
-    The default command replaces the group from the parsing on, so its usage, help and errors are
-    those of a command without subcommands.
+    Usage, help and errors of the default command are then those of a command without subcommands.
     """
 
-    # Typer's click is its own in some versions and the package of that name in others, so there is
-    # no one type of context to name.
+    # Some versions of Typer contain their own click, others use the package click, so the type of
+    # the context differs.
     def make_context(
         self,
         info_name: str | None,
@@ -60,29 +59,30 @@ class DefaultCommandGroup(TyperGroup):
         parent: Any = None,  # noqa: ANN401
         **extra: Any,  # noqa: ANN401
     ) -> Any:  # noqa: ANN401
-        """Parse the arguments for the subcommand named first, or for the default command."""
+        """Parse the arguments of the command named first, or of the default command."""
         with readable_errors():
-            if args and args[0] in self.commands and args[0] != DEFAULT:
+            if args and args[0] in self.commands and args[0] != DEFAULT_COMMAND:
                 return super().make_context(info_name, args, parent, **extra)
-            return self.commands[DEFAULT].make_context(info_name, args, parent, **extra)
+            return self.commands[DEFAULT_COMMAND].make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
-        """Run what `make_context` has parsed the arguments for."""
+        """Run the command whose arguments `make_context` has parsed."""
         with readable_errors():
             return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
 
 
 class CommandWithOthers(TyperCommand):
-    """The default command: its help names the others, which the group itself never shows."""
+    """Default command, whose help also lists the other commands."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
-        """Write the commands behind arguments and options."""
+        """Write arguments and options, followed by the list of the other commands."""
         super().format_options(ctx, formatter)
         with formatter.section("Commands"):
-            formatter.write_dl([*_COMMANDS.items()])
+            formatter.write_dl([*_OTHER_COMMANDS.items()])
 
 
 def _print_version(requested: bool) -> None:
+    """Print the version and exit, if requested."""
     if requested:
         typer.echo(f"analyze {rigd.__version__}")
         raise typer.Exit
@@ -94,22 +94,24 @@ Version = Annotated[
         "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
     ),
 ]
+"""Option --version."""
 
 
 _EXIT_INTERRUPTED: Final = 130
-_GARBAGE: Final = 20_000
+"""Exit code after Ctrl-C."""
+_COLLECTION_THRESHOLD: Final = 20_000
 """Number of new objects that triggers a garbage collection."""
 
-_COMMANDS: Final = {
+_OTHER_COMMANDS: Final = {
     "touch": "Estimate where, when and how hard the antenna met something.",
     "import": "Convert a record of another program to a session file (.csv, .mat, .tdms, .uff).",
     "export record": "Write the samples of a session for another program (.csv, .mat, .uff).",
     "export frf": "Write the frequency response of a session (.csv, .mat, .uff).",
     "export model": "Write a linear model of the antenna (.json, .npz, .mat).",
 }
-"""The other commands, each with a --help of its own."""
+"""Descriptions of the other commands in the help, by their names."""
 
-_EPILOG = """\
+_HELP_EPILOG = """\
 Example: analyze session.mcap --types III,VI --json fits.json
 
 Figures, tables and JSON go to session.report/ next to the file (session.report-2/ if that exists).
@@ -118,16 +120,17 @@ campaign.report/ next to the first. Sessions that do not suit Welch's method (st
 narrow sweeps, short or stopped ones) get only the whole-record analysis, and a line that says why.
 
 Exit code: 0 done; 1 a file could not be analysed; 2 usage error; 130 stopped by Ctrl-C."""
+"""Text at the end of the help of the command."""
 
 
-_METHODS: Final = ("welch", "record", "all")
-"""Ways from a record to models."""
+_METHOD_NAMES: Final = ("welch", "record", "all")
+"""Values of --method: analyses of a record."""
 
-_OF_WELCH: Final = ("types", "weights", "frf", "segment", "overlap", "nfft")
-"""Options of the Welch fits alone."""
+_WELCH_OPTIONS: Final = ("types", "weights", "frf", "segment", "overlap", "nfft")
+"""Names of the options that only concern Welch fits."""
 
-_TYPED: Final = "COMMANDLINE"
-"""What click calls the source of an option's value that is not a default."""
+_COMMAND_LINE_SOURCE: Final = "COMMANDLINE"
+"""Name that click gives to the source of a value stated on the command line."""
 
 # Plain messages of one or two sentences, not boxes: they end up in logs.
 app = typer.Typer(
@@ -136,19 +139,20 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+"""Application of the command `analyze` with its subcommands."""
 app.command("import", epilog=IMPORT_EPILOG)(import_command)
 app.command("touch", epilog=TOUCH_EPILOG)(touch_command)
 app.add_typer(export_app, name="export")
 
 
 def main() -> None:
-    """Entry point of the command."""
+    """Run the command `analyze` and end the process with its exit code."""
     raise_on(signal.SIGINT)
     use_one_thread()
-    # Figures consist of many objects that live until they are drawn: a garbage collection every 700
-    # takes a twentieth of all time.
-    gc.set_threshold(_GARBAGE)
-    _quieten_libraries()
+    # Figures consist of many objects that exist until they are drawn. A garbage collection after
+    # every 700 new objects would take 5 % of the computing time.
+    gc.set_threshold(_COLLECTION_THRESHOLD)
+    _suppress_library_warnings()
     with standard_streams():
         try:
             app()
@@ -156,19 +160,19 @@ def main() -> None:
             sys.exit(_EXIT_INTERRUPTED)
 
 
-def _quieten_libraries() -> None:
+def _suppress_library_warnings() -> None:
     """Suppress warnings of libraries, which are meant for programmers.
 
-    A record that suits no model drives searches where numbers overflow; the verdict reports the
-    result. Python's own switches (``-W``, PYTHONWARNINGS) bring them back.
+    With a record that no model describes, searches reach parameters at which numbers overflow; the
+    verdict reports the result. Python's switches (``-W``, PYTHONWARNINGS) enable the warnings.
     """
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
-        os.environ["PYTHONWARNINGS"] = "ignore"  # of worker processes
+        os.environ["PYTHONWARNINGS"] = "ignore"  # for worker processes
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
-@app.command(DEFAULT, epilog=_EPILOG, cls=CommandWithOthers)
+@app.command(DEFAULT_COMMAND, epilog=_HELP_EPILOG, cls=CommandWithOthers)
 def analyze(
     context: typer.Context,
     files: Annotated[
@@ -279,17 +283,23 @@ def analyze(
     try:
         files = session_files(files)
     except NoSessionsError as error:
-        complain(str(error))
+        print_error(str(error))
         raise typer.Exit(1) from None
     is_campaign = len(files) > 1 and not each
     if not is_campaign:
-        given = {"--paper": paper, "--jobs": jobs is not None, "--dask": dask is not None}
-        _refuse_of_campaigns([option for option, is_given in given.items() if is_given], files)
+        campaign_options = {
+            "--paper": paper,
+            "--jobs": jobs is not None,
+            "--dask": dask is not None,
+        }
+        _check_campaign_options(
+            [option for option, is_given in campaign_options.items() if is_given], files
+        )
     elif jobs is not None and dask is not None:
         raise typer.BadParameter(
             "the workers are those of --dask; leave one of the two out.", param_hint="--jobs"
         )
-    method = choice(method, _METHODS, "--method")
+    method = parse_option_choice(method, _METHOD_NAMES, "--method")
     if fix and method == "welch":
         raise typer.BadParameter(
             "the Welch fits take all of them from the file; leave it out, or take --method all.",
@@ -302,16 +312,16 @@ def analyze(
             param_hint="--uniformity",
         )
     if method == "record":
-        _check_without_paper(context, is_campaign=is_campaign)
+        _check_record_method(context, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
     routes = Routes(
         settings,
         paper=method != "record",
         whole_record=method != "welch",
-        fixed=_fixed(fix),
+        fixed=_fixed_parameters(fix),
         band_hz=band_hz(band),
         figures=_figure_formats(figures),
-        uniformity=None if uniformity is None else _relative(uniformity),
+        uniformity=None if uniformity is None else _relative_uniformity(uniformity),
     )
     outputs = Outputs(report, json, overwrite, verbose)
     try:
@@ -336,13 +346,13 @@ def analyze(
             except SingleSessionError as single:
                 code = _report_single_session(single, routes, outputs)
             except CampaignError as error:
-                complain(str(error))
+                print_error(str(error))
                 code = 1
     except OutputExistsError as error:
-        complain(str(error))
+        print_error(str(error))
         code = 2
     except OutputError as error:
-        complain(str(error))
+        print_error(str(error))
         code = 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
@@ -350,30 +360,35 @@ def analyze(
     raise typer.Exit(code)
 
 
-def _refuse_of_campaigns(options: Sequence[str], files: Sequence[Path]) -> None:
-    """Refuse options of a campaign where there is none."""
+def _check_campaign_options(options: Sequence[str], files: Sequence[Path]) -> None:
+    """Raise a usage error if there are options that only concern campaigns."""
     if not options:
         return
     if len(files) == 1:
-        why = "only for campaigns (two or more sessions); omit it."
+        reason = "only for campaigns (two or more sessions); omit it."
     else:
-        why = "only for campaigns, so not with --each; omit one of the two."
-    raise typer.BadParameter(why, param_hint=" and ".join(options))
+        reason = "only for campaigns, so not with --each; omit one of the two."
+    raise typer.BadParameter(reason, param_hint=" and ".join(options))
 
 
-def _check_without_paper(context: typer.Context, *, is_campaign: bool) -> None:
-    """Refuse outputs of the Welch fits where these are left out; name options without effect."""
+def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
+    """Raise a usage error for a campaign without Welch fits; warn of options without effect."""
     if is_campaign:
         raise typer.BadParameter(
             "a campaign has the paper's Tables 3 to 5, so record alone is for single files; take "
             "--method all, or add --each.",
             param_hint="--method",
         )
-    sources = {name: context.get_parameter_source(name) for name in _OF_WELCH}
-    given = [f"--{name}" for name, source in sources.items() if source and source.name == _TYPED]
-    if given:
+    sources = {name: context.get_parameter_source(name) for name in _WELCH_OPTIONS}
+    ineffective = [
+        f"--{name}"
+        for name, source in sources.items()
+        if source and source.name == _COMMAND_LINE_SOURCE
+    ]
+    if ineffective:
         typer.echo(
-            f"Warning: {', '.join(given)} {'concerns' if len(given) == 1 else 'concern'} the Welch "
+            f"Warning: {', '.join(ineffective)} "
+            f"{'concerns' if len(ineffective) == 1 else 'concern'} the Welch "
             "fits alone, which --method record leaves out: the whole record is fitted by every "
             "type.",
             err=True,
@@ -381,15 +396,16 @@ def _check_without_paper(context: typer.Context, *, is_campaign: bool) -> None:
 
 
 def _report_single_session(single: SingleSessionError, routes: Routes, outputs: Outputs) -> int:
-    """Print the errors of the other files of a campaign, and report the remaining one."""
+    """Print the errors of the unusable files of a campaign, and report the only usable one."""
     for failure in single.failures:
-        complain(failure.message)
+        print_error(failure.message)
     typer.echo(f"A campaign needs two sessions: {single.path} is reported alone.", err=True)
     others = {str(failure.path): failure.message for failure in single.failures}
     return max(1, session_command([single.path], routes, outputs, others=others))
 
 
-def _fixed(text: str) -> tuple[Setting, ...]:
+def _fixed_parameters(text: str) -> tuple[Setting, ...]:
+    """Return the parameters named in --fix; raise a usage error if one is unknown."""
     from analysis.identify import SETTINGS
 
     names = [name.strip() for name in text.split(",") if name.strip()]
@@ -402,7 +418,8 @@ def _fixed(text: str) -> tuple[Setting, ...]:
     return tuple(name for name in SETTINGS if name in names)
 
 
-def _relative(uniformity_percent: float) -> float:
+def _relative_uniformity(uniformity_percent: float) -> float:
+    """Return the uniformity as a fraction; raise a usage error outside its range."""
     from analysis.record_checks import MAX_UNIFORMITY_PERCENT
 
     if not 0.0 <= uniformity_percent <= MAX_UNIFORMITY_PERCENT:
@@ -414,6 +431,7 @@ def _relative(uniformity_percent: float) -> float:
 
 
 def _figure_formats(text: str) -> tuple[FigureFormat, ...]:
+    """Return the figure formats named in --figures; raise a usage error if one is unknown."""
     names = {name.strip().lower() for name in text.split(",") if name.strip()}
     unknown = sorted(names.difference(FIGURE_FORMATS))
     if unknown or not names:
@@ -422,10 +440,11 @@ def _figure_formats(text: str) -> tuple[FigureFormat, ...]:
             f"{', '.join(FIGURE_FORMATS)}.",
             param_hint="--figures",
         )
-    return tuple(each for each in FIGURE_FORMATS if each in names)
+    return tuple(figure_format for figure_format in FIGURE_FORMATS if figure_format in names)
 
 
 def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:
+    """Raise a usage error if --rerun has several sessions; raise if its file is taken."""
     from analysis.report import check_rerun_file
 
     if len(files) > 1:

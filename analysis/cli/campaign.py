@@ -1,4 +1,4 @@
-"""A campaign from the command line: progress with the time left, the folder, the tables."""
+"""Analysis of a campaign from the command line: progress bar, report folder, printed tables."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from analysis.models import WelchSettings
     from analysis.results import FigureFormat
 
-_NAME: Final = "campaign"
-_FIGURES: Final = 8
-"""At most; each takes about as long as half a session."""
+_DEFAULT_NAME: Final = "campaign"
+"""Default name of a campaign, for its report folder."""
+_MOST_FIGURES: Final = 8
+"""Largest number of figures, for the progress bar; each takes about half as long as a session."""
 
 
 def campaign_command(
@@ -42,28 +43,29 @@ def campaign_command(
     Parameters
     ----------
     files : sequence of Path
+        Session files.
     settings : WelchSettings
         Settings of the Welch fits.
     outputs : Outputs
-        Its folder is by default ``campaign.report`` next to the first file, or if that exists
-        ``campaign.report-2`` and so on.
+        Files to be written. The default report folder is ``campaign.report`` next to the first
+        file, or ``campaign.report-2`` and so on if that exists.
     structures : sequence of str
-        Types fitted to the whole records.
+        Structures fitted to the whole records.
     fixed : sequence of str
-        Settings that those fits take from the files.
+        Parameters that the whole-record fits take from the files.
     band_hz : tuple of float, optional
-        Band of all fits; by default what suits each record.
+        Frequency band of all fits; by default chosen for each record.
     jobs : int, optional
-        Worker processes, by default one per core.
+        Number of worker processes, by default one per core.
     dask : str, optional
-        Address of a Dask scheduler to use instead.
+        Address of a Dask scheduler whose workers are used instead.
     uniformity : float, optional
-        Relative standard deviation of each mode's frequency from that of a uniform beam, instead of
-        that stated in the files.
+        Relative standard deviation of mode frequencies from those of a uniform beam, instead of the
+        value stated in the files.
     with_paper : bool
-        Whether the paper's numbers are included.
+        Whether the tables also show the paper's values.
     formats : sequence of str
-        Formats of the figures.
+        File formats of the figures.
 
     Returns
     -------
@@ -73,40 +75,42 @@ def campaign_command(
     Raises
     ------
     CampaignError
-        None of the files could be used, or the workers could not be had.
+        None of the files could be used, or no workers are available.
     SingleSessionError
-        Only one of the files could be used, which makes no campaign: nothing was written.
+        Only one of the files could be used. Nothing was written.
     OutputExistsError, OutputError
-        Something cannot be written.
+        An output file cannot be written.
     """
     from analysis.campaigns import campaign
     from analysis.report import campaign_document, document_text
     from analysis.report.campaign_report import campaign_tables
     from analysis.report.folder import report_folders, write_new
 
-    first = files[0] if outputs.report is not None else files[0].with_name(_NAME)
-    (folder,) = report_folders([first], outputs.report, overwrite=outputs.overwrite)
+    folder_source = files[0] if outputs.report is not None else files[0].with_name(_DEFAULT_NAME)
+    (folder,) = report_folders([folder_source], outputs.report, overwrite=outputs.overwrite)
     run = partial(
         campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
         dask=dask, uniformity=uniformity,
     )  # fmt: skip
-    found = _analysed(run, len(files), folder, outputs, with_paper=with_paper, formats=formats)
+    result = _analyse_and_write(
+        run, len(files), folder, outputs, with_paper=with_paper, formats=formats
+    )
     lines = [f"Report of the campaign: {folder / 'report.html'}"]
     if outputs.json is not None and not outputs.json_to_stdout:
-        # Before any output: the streams may be closed.
-        text = document_text(campaign_document(found, with_paper=with_paper))
+        # The file is written before any output, because the streams may be closed.
+        text = document_text(campaign_document(result, with_paper=with_paper))
         write_new(outputs.json, text, overwrite=outputs.overwrite)
         lines.insert(0, f"All results as JSON: {outputs.json}")
     console = outputs.console()
-    console.print(campaign_tables(found, with_paper=with_paper, verbose=outputs.verbose))
+    console.print(campaign_tables(result, with_paper=with_paper, verbose=outputs.verbose))
     console.print("\n".join(lines), markup=False, soft_wrap=True)
     if outputs.json_to_stdout:
-        content = campaign_document(found, with_paper=with_paper)
+        content = campaign_document(result, with_paper=with_paper)
         print(document_text(content, ascii_only=True), end="")  # noqa: T201 - the requested output
-    return 1 if found.failures or found.lost_trials else 0
+    return 1 if result.failures or result.lost_trials else 0
 
 
-def _analysed(
+def _analyse_and_write(
     run: Callable[..., CampaignResult],
     files: int,
     folder: Path,
@@ -115,29 +119,29 @@ def _analysed(
     with_paper: bool,
     formats: Sequence[FigureFormat],
 ) -> CampaignResult:
-    """Analyse and write, with progress on a terminal; print the errors."""
+    """Analyse a campaign and write its report, with a progress bar; print the errors."""
     from analysis.campaigns import SingleSessionError
     from analysis.report.campaign_report import write_campaign
     from analysis.report.folder import new_folder
     from rigd.printable import progress_bar
 
     with progress_bar("{task.completed:.0f}/{task.total:.0f}") as progress:
-        bar = progress.add_task("starting", total=2 * files + _FIGURES)
+        bar = progress.add_task("starting", total=2 * files + _MOST_FIGURES)
 
         def on_progress(done: int, total: int, name: str) -> None:
-            progress.update(bar, completed=done, total=total + _FIGURES, description=name)
+            progress.update(bar, completed=done, total=total + _MOST_FIGURES, description=name)
 
-        with new_folder(folder, overwrite=outputs.overwrite) as part:
-            found = run(on_progress=on_progress)
-            if len(found.sessions) == 1:
-                raise SingleSessionError(found.sessions[0].path, found.failures)
+        with new_folder(folder, overwrite=outputs.overwrite) as partial_folder:
+            result = run(on_progress=on_progress)
+            if len(result.sessions) == 1:
+                raise SingleSessionError(result.sessions[0].path, result.failures)
             write_campaign(
-                found, part, with_paper=with_paper, formats=formats,
+                result, partial_folder, with_paper=with_paper, formats=formats,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),
             )  # fmt: skip
     report_error = partial(print_readable, progress.console)
-    for failure in found.failures:
+    for failure in result.failures:
         report_error(f"Error: {failure.message}")
-    for lost in found.lost_trials:
+    for lost in result.lost_trials:
         report_error(f"Error: {lost.path} is not predicted from the others: {lost.reason}")
-    return found
+    return result

@@ -1,4 +1,4 @@
-"""Commands `analyze import` and `analyze export`: records of other programs in, results out."""
+"""Commands `analyze import` and `analyze export` for files of other programs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from typer.models import OptionInfo
 
-from analysis.cli.standard_streams import complain
+from analysis.cli.standard_streams import print_error
 from analysis.cli.welch_options import (
     Band,
     Estimator,
@@ -17,7 +17,7 @@ from analysis.cli.welch_options import (
     Overlap,
     Segment,
     band_hz,
-    choice,
+    parse_option_choice,
     welch_settings,
 )
 
@@ -32,34 +32,42 @@ export_app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
 )
+"""Application of the commands `analyze export …`."""
 
 IMPORT_EPILOG = """\
 Example: analyze import log.tdms session.mcap --angle "Rig/Angle:deg" --torque "Rig/Tz:mN.m"
 --rate-hz 1000 --profile rig.toml --rest 0,1 --sweep 1,121
 
 Exit code: 0 done, 1 the file cannot be imported, 2 usage error, 130 stopped by Ctrl-C."""
+"""Text at the end of the help of the command that imports records."""
 
 _EXPORT_EPILOG = "Exit code: 0 done, 1 it cannot be exported, 2 usage error, 130 stopped by Ctrl-C."
+"""Text at the end of the help of the commands that export records and responses."""
 
 _MODEL_EPILOG = """\
 Example: analyze export model session.mcap beam.mat --rate 1000
 
 Exit code: 0 done, 1 it cannot be exported, 2 usage error, 130 stopped by Ctrl-C."""
+"""Text at the end of the help of the command that exports models."""
 
 _Session = Annotated[
     Path, typer.Argument(metavar="SESSION", readable=False, help="Session file (.mcap).")
 ]
+"""Argument SESSION of the export commands."""
 _Target = Annotated[
     Path,
     typer.Argument(metavar="OUT", readable=False, help="New file: .csv, .mat, .uff, .unv, .uf58."),
 ]
+"""Argument OUT of the commands that export records and responses."""
 _Binary = Annotated[
     bool, typer.Option("--binary", help="Write 8-byte floats instead of text (universal files).")
 ]
+"""Option --binary."""
 
 
-def _channel(what: str) -> OptionInfo:
-    option: OptionInfo = typer.Option(metavar="CHANNEL:UNIT", help=what)
+def _channel_option(help_text: str) -> OptionInfo:
+    """Return an option that takes a channel and its unit, with a help text."""
+    option: OptionInfo = typer.Option(metavar="CHANNEL:UNIT", help=help_text)
     return option
 
 
@@ -76,27 +84,30 @@ def import_command(
     session: Annotated[
         Path, typer.Argument(metavar="SESSION", readable=False, help="New session file (.mcap).")
     ],
-    angle: Annotated[str, _channel("Motor angle at the output shaft; rad, mrad, deg, …")],
-    torque: Annotated[str, _channel("Coupling torque; N.m, mN.m, N.mm, …")],
+    angle: Annotated[str, _channel_option("Motor angle at the output shaft; rad, mrad, deg, …")],
+    torque: Annotated[str, _channel_option("Coupling torque; N.m, mN.m, N.mm, …")],
     profile: Annotated[
         Path,
         typer.Option(metavar="FILE", readable=False, help="TOML with [beam] and the tool inertia."),
     ],
     time: Annotated[
-        str | None, _channel("Time of the samples; s, ms, us, ns. Times of day are read in s.")
+        str | None,
+        _channel_option("Time of the samples; s, ms, us, ns. Times of day are read in s."),
     ] = None,
     rate_hz: Annotated[
         float | None,
         typer.Option(metavar="HZ", help="Instead of --time: samples per second, without gaps."),
     ] = None,
-    reference: Annotated[str | None, _channel("Reference of the motor angle.")] = None,
-    torque_command: Annotated[str | None, _channel("Torque commanded to the motor.")] = None,
-    fx: Annotated[str | None, _channel("Force along x, sensor frame; N, mN, kN, lbf.")] = None,
-    fy: Annotated[str | None, _channel("Force along y, sensor frame.")] = None,
-    fz: Annotated[str | None, _channel("Force along z, sensor frame.")] = None,
-    tx: Annotated[str | None, _channel("Torque about x, sensor frame.")] = None,
-    ty: Annotated[str | None, _channel("Torque about y, sensor frame.")] = None,
-    tz: Annotated[str | None, _channel("Torque about z, sensor frame.")] = None,
+    reference: Annotated[str | None, _channel_option("Reference of the motor angle.")] = None,
+    torque_command: Annotated[str | None, _channel_option("Torque commanded to the motor.")] = None,
+    fx: Annotated[
+        str | None, _channel_option("Force along x, sensor frame; N, mN, kN, lbf.")
+    ] = None,
+    fy: Annotated[str | None, _channel_option("Force along y, sensor frame.")] = None,
+    fz: Annotated[str | None, _channel_option("Force along z, sensor frame.")] = None,
+    tx: Annotated[str | None, _channel_option("Torque about x, sensor frame.")] = None,
+    ty: Annotated[str | None, _channel_option("Torque about y, sensor frame.")] = None,
+    tz: Annotated[str | None, _channel_option("Torque about z, sensor frame.")] = None,
     rest: Annotated[
         str | None, typer.Option(metavar="T0,T1", help="Rest before the sweep, s from the start.")
     ] = None,
@@ -173,13 +184,13 @@ def import_command(
         "tz_nm": ("--tz", tz),
     }
     channels = {
-        field: _choice(option, text, QUANTITIES[field])
+        field: _parse_channel(option, text, QUANTITIES[field])
         for field, (option, text) in options.items()
         if text is not None
     }
-    times = None if time is None else _choice("--time", time, "time")
+    times = None if time is None else _parse_channel("--time", time, "time")
     segments = {
-        name: _interval(option, text)
+        name: _parse_interval(option, text)
         for name, option, text in (
             ("rest", "--rest", rest),
             ("sweep", "--sweep", sweep),
@@ -203,15 +214,15 @@ def import_command(
             operator,
             ignore_file_metadata,
         )
-        done = import_record(source, session, plan)
-        for warning in done.warnings:
+        imported = import_record(source, session, plan)
+        for warning in imported.warnings:
             typer.echo(f"Warning: {warning}", err=True)
         typer.echo(
-            f"{done.samples} samples at {done.rate_hz:g} Hz from {source}: {session}"
-            + ("" if "sweep" in done.segments else "; the whole record counts as the sweep")
+            f"{imported.samples} samples at {imported.rate_hz:g} Hz from {source}: {session}"
+            + ("" if "sweep" in imported.segments else "; the whole record counts as the sweep")
         )
 
-    raise typer.Exit(_explained(run))
+    raise typer.Exit(_exit_code(run))
 
 
 @export_app.command("record", epilog=_EXPORT_EPILOG)
@@ -226,7 +237,7 @@ def export_record_command(session: _Session, target: _Target, binary: _Binary = 
         table = export_record(session, target, binary=binary)
         typer.echo(f"{len(table.axis.values)} samples of {session}: {target}")
 
-    raise typer.Exit(_explained(run))
+    raise typer.Exit(_exit_code(run))
 
 
 @export_app.command("frf", epilog=_EXPORT_EPILOG)
@@ -253,7 +264,7 @@ def export_frf_command(
         table = export_frf(session, target, settings, requested_hz, binary=binary)
         typer.echo(f"{len(table.axis.values)} frequencies of {session}: {target}")
 
-    raise typer.Exit(_explained(run))
+    raise typer.Exit(_exit_code(run))
 
 
 @export_app.command("model", epilog=_MODEL_EPILOG)
@@ -274,7 +285,7 @@ def export_model_command(
         bool,
         typer.Option("--beam", help="The beam's model, even where its test was not passed."),
     ] = False,
-    given: Annotated[
+    input_kind: Annotated[
         str,
         typer.Option(
             "--input",
@@ -308,9 +319,9 @@ def export_model_command(
 
     options = ModelOptions(
         beam,
-        choice(given, INPUTS, "--input"),
-        _count(order),
-        _rate_hz(rate),
+        parse_option_choice(input_kind, INPUTS, "--input"),
+        _parse_order(order),
+        _parse_rate(rate),
         SAMPLES if samples is None else samples,
     )
 
@@ -326,26 +337,26 @@ def export_model_command(
         for line in _model_lines(model, source, target):
             typer.echo(line)
 
-    raise typer.Exit(_explained(run))
+    raise typer.Exit(_exit_code(run))
 
 
 def _model_lines(model: LinearModel, source: Path, target: Path) -> list[str]:
-    """Return the summary of an exported model, a line for each statement."""
+    """Return the printed summary of an exported model, one statement per line."""
     system, accuracy = model.system, model.accuracy
     status, p_value = model.identified.gate
-    gate = status if p_value is None else f"{status}, p = {p_value:.2g}"
+    uniformity_text = status if p_value is None else f"{status}, p = {p_value:.2g}"
     name = "exact beam" if model.kind == "beam" else "modal model"
     relaxations = sum(name.startswith("relaxation") for name in system.states.names)
-    when = "continuous time"
+    time_text = "continuous time"
     if system.period_s:
-        when = f"{1 / system.period_s:g} Hz, input held between samples"
+        time_text = f"{1 / system.period_s:g} Hz, input held between samples"
     low_hz, high_hz = accuracy.band_hz
     band = f"{low_hz:g} to {high_hz:g} Hz"
     inputs = ", ".join(map("{} ({})".format, system.inputs.names, system.inputs.units))
     lines = [
-        f"Model: {name} of {source} (uniform beam: {gate}): {target}",
+        f"Model: {name} of {source} (uniform beam: {uniformity_text}): {target}",
         f"Order: {system.order} states ({model.structure.pairs} pairs of poles, {relaxations} real "
-        f"poles); {when}",
+        f"poles); {time_text}",
         f"Input: {inputs}",
         f"Output: coupling_torque (N.m), delayed by {1e3 * system.delay_s:.4g} ms; the delay is "
         "not in the matrices",
@@ -363,7 +374,8 @@ def _model_lines(model: LinearModel, source: Path, target: Path) -> list[str]:
     return [*lines, *(f"Note: {note}" for note in model.notes)]
 
 
-def _count(text: str) -> int | None:
+def _parse_order(text: str) -> int | None:
+    """Return the number of states in --order, or None for auto; raise if invalid."""
     if text == "auto":
         return None
     if not (text.isascii() and text.isdecimal() and 1 <= int(text[:6]) <= _MOST_STATES):
@@ -374,28 +386,31 @@ def _count(text: str) -> int | None:
     return int(text)
 
 
-def _rate_hz(text: str) -> float | None:
+def _parse_rate(text: str) -> float | None:
+    """Return the rate in Hz in --rate, or None for continuous; raise if invalid."""
     if text == "continuous":
         return None
     try:
         rate_hz = float(text)
     except ValueError:
         rate_hz = math.nan
-    if not _RATES_HZ[0] <= rate_hz <= _RATES_HZ[1]:
+    if not _RATE_RANGE_HZ[0] <= rate_hz <= _RATE_RANGE_HZ[1]:
         raise typer.BadParameter(
-            f"'{text}' is neither continuous nor a rate from {_RATES_HZ[0]:g} to "
-            f"{_RATES_HZ[1]:g} Hz.",
+            f"'{text}' is neither continuous nor a rate from {_RATE_RANGE_HZ[0]:g} to "
+            f"{_RATE_RANGE_HZ[1]:g} Hz.",
             param_hint="--rate",
         )
     return rate_hz
 
 
 _MOST_STATES: Final = 200
-_RATES_HZ: Final = (1.0, 1e6)
+"""Largest number of states that --order accepts."""
+_RATE_RANGE_HZ: Final = (1.0, 1e6)
+"""Range of sampling rates in Hz that --rate accepts."""
 
 
-def _explained(run: Callable[[], None]) -> int:
-    """Run a command and return its exit code; print errors in a sentence or two."""
+def _exit_code(run: Callable[[], None]) -> int:
+    """Run a function and return the exit code; print an error in one or two sentences."""
     from numpy.linalg import LinAlgError
 
     from analysis.exchange import ExchangeError, TargetError
@@ -410,16 +425,16 @@ def _explained(run: Callable[[], None]) -> int:
     try:
         run()
     except (SettingsError, TargetError, OutputExistsError, SessionExistsError) as error:
-        complain(str(error))
+        print_error(str(error))
         return 2
     except (
         ExchangeError, SessionError, RecordError, FrequencyResponseError, MeasurementError,
         OutputError, IdentifiedBeamError, LinearModelError,
     ) as error:  # fmt: skip
-        complain(str(error))
+        print_error(str(error))
         return 1
     except LinAlgError as error:
-        complain(f"The estimate failed ({error}); is this a record of the rig?")
+        print_error(f"The estimate failed ({error}); is this a record of the rig?")
         return 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
@@ -427,7 +442,8 @@ def _explained(run: Callable[[], None]) -> int:
     return 0
 
 
-def _choice(option: str, text: str, quantity: str) -> ChannelChoice:
+def _parse_channel(option: str, text: str, quantity: str) -> ChannelChoice:
+    """Return the channel and unit of an option; raise a usage error for an invalid text."""
     from analysis.exchange import ExchangeError, parse_choice
 
     try:
@@ -436,16 +452,17 @@ def _choice(option: str, text: str, quantity: str) -> ChannelChoice:
         raise typer.BadParameter(str(error), param_hint=option) from error
 
 
-_LATEST_S: Final = 1e6
-"""More than any record that is read."""
+_LATEST_END_S: Final = 1e6
+"""Latest end of a segment in seconds, more than the duration of any record that is read."""
 
 
-def _interval(option: str, text: str) -> tuple[float, float]:
+def _parse_interval(option: str, text: str) -> tuple[float, float]:
+    """Return begin and end of a segment in seconds, from an option; raise if invalid."""
     try:
-        begin_s, end_s = (float(part) for part in text.split(","))
+        begin_s, end_s = (float(number_text) for number_text in text.split(","))
     except ValueError:
         begin_s = end_s = math.nan
-    if not 0.0 <= begin_s < end_s <= _LATEST_S:
+    if not 0.0 <= begin_s < end_s <= _LATEST_END_S:
         raise typer.BadParameter(
             f"'{text}' is not two times in s with 0 <= T0 < T1 <= 1e6, such as 1,121.",
             param_hint=option,
@@ -454,5 +471,6 @@ def _interval(option: str, text: str) -> tuple[float, float]:
 
 
 def _check_delay(option: str, delay_s: float) -> None:
+    """Raise a usage error if a channel's delay exceeds one second."""
     if not abs(delay_s) <= 1.0:
         raise typer.BadParameter(f"{delay_s} s cannot be the delay of a sample.", param_hint=option)

@@ -1,4 +1,4 @@
-"""Sessions analysed one by one from the command line: progress, reports, tables, JSON."""
+"""Analysis of sessions one by one from the command line: progress bar, reports, tables, JSON."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ if TYPE_CHECKING:
 
     from analysis.results import RecordResult, Routes
 
-_TEXT_WIDTH: Final = 120
-"""Columns of what is printed into a file or a pipe."""
-_FIGURE_STEPS: Final = 4
-"""How many times longer a figure takes than another step, roughly."""
+_TEXT_WIDTH_CHARACTERS: Final = 120
+"""Width in characters of texts that are printed to a file or a pipe."""
+_STEPS_PER_FIGURE: Final = 4
+"""Approximate duration of drawing a figure relative to another step, for the progress bar."""
 
 
 class NoSessionsError(ValueError):
-    """A folder without a session."""
+    """Error on a folder that contains no session."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """What is written and printed.
+    """Options of a command on the files to be written and the tables to be printed.
 
     Attributes
     ----------
     report : Path or None
-        Folder of the report, new or empty; by default next to the first file.
+        Folder of the report, new or empty; None selects a folder next to the first file.
     json : Path or None
-        New file for all results; ``-`` for standard output, which then holds nothing else.
+        New file for all results as JSON; ``-`` selects standard output, without other texts.
     overwrite : bool
-        Whether an earlier report, and earlier results in JSON, are replaced.
+        Whether an earlier report and an earlier JSON file are replaced.
     verbose : bool
-        Whether all tables are printed.
+        Whether all tables are printed, not only the main ones.
     """
 
     report: Path | None = None
@@ -51,21 +51,21 @@ class Outputs:
 
     @property
     def json_to_stdout(self) -> bool:
-        """Whether standard output is for the results alone."""
+        """Whether the JSON results go to standard output, so that texts go to standard error."""
         return self.json is not None and str(self.json) == "-"
 
     def console(self) -> Console:
-        """Return where people's text goes, in the report's width where that is not a terminal."""
+        """Return the console for texts, with a fixed width unless it is a terminal."""
         from rich.console import Console
 
         console = Console(stderr=self.json_to_stdout, highlight=False)
         if console.is_terminal:
             return console
-        return Console(stderr=self.json_to_stdout, highlight=False, width=_TEXT_WIDTH)
+        return Console(stderr=self.json_to_stdout, highlight=False, width=_TEXT_WIDTH_CHARACTERS)
 
 
 def session_files(paths: Sequence[Path]) -> list[Path]:
-    """Replace each folder by the sessions in it, by name; incomplete ones are left out.
+    """Return the session files, with each folder replaced by its complete sessions.
 
     Parameters
     ----------
@@ -75,23 +75,27 @@ def session_files(paths: Sequence[Path]) -> list[Path]:
     Raises
     ------
     NoSessionsError
-        A folder has no session in it.
+        A folder contains no session.
     """
-    found: list[Path] = []
+    session_paths: list[Path] = []
     for path in paths:
         if not path.is_dir():
-            found.append(path)
+            session_paths.append(path)
             continue
-        sessions = sorted(each for each in path.glob("*.mcap") if each.is_file())
+        sessions = sorted(file for file in path.glob("*.mcap") if file.is_file())
         if not sessions:
-            torn = any(path.glob("*.mcap.part"))
+            any_incomplete = any(path.glob("*.mcap.part"))
             raise NoSessionsError(
                 f"{path}: there is no session (*.mcap) in this folder; give session files, or the "
                 "folder that holds them."
-                + (" Recover an incomplete file (*.mcap.part) with `rigd recover`." if torn else "")
+                + (
+                    " Recover an incomplete file (*.mcap.part) with `rigd recover`."
+                    if any_incomplete
+                    else ""
+                )
             )
-        found += sessions
-    return found
+        session_paths += sessions
+    return session_paths
 
 
 def session_command(
@@ -106,61 +110,63 @@ def session_command(
     Parameters
     ----------
     files : sequence of Path
+        Session files.
     routes : Routes
+        Analyses to be run, and their settings.
     outputs : Outputs
-        Its folder is that of the report of one file, or of one folder per file.
+        Files to be written. The report folder contains the report of a single file, or one folder
+        for each of several files.
     rerun : Path, optional
-        New file with session and fits for Rerun's viewer, of one session.
+        New file with the session and its fits for Rerun's viewer; for a single session.
     others : mapping of str to str, optional
-        Files that were left out before, with the reported reasons, which become errors of the
-        results.
+        Messages by the names of files that could not be used, for the errors in the results.
 
     Returns
     -------
     int
-        Exit code: 1 if a file could not be analysed, 2 if the settings suit none, 0 otherwise.
+        Exit code: 0 done, 1 a file could not be analysed, 2 settings not applicable to a record.
 
     Raises
     ------
     OutputExistsError, OutputError
-        Something cannot be written.
+        An output file cannot be written.
     """
     from analysis.report import document, document_text
     from analysis.report.folder import report_folders, write_new
 
     folders = report_folders(files, outputs.report, overwrite=outputs.overwrite)
-    found, errors, code = _analyse_all(files, folders, routes, rerun, outputs)
-    if not found:
+    record_results, errors, code = _analyse_all(files, folders, routes, rerun, outputs)
+    if not record_results:
         return code
-    results = document(found, {**(others or {}), **errors})
+    results = document(record_results, {**(others or {}), **errors})
     if outputs.json is not None and not outputs.json_to_stdout:
-        # Before any output: the streams may be closed.
+        # The file is written before any output, because the streams may be closed.
         write_new(outputs.json, document_text(results), overwrite=outputs.overwrite)
     console = outputs.console()
-    _print_tables(console, found, single=len(files) == 1, verbose=outputs.verbose)
+    _print_tables(console, record_results, single=len(files) == 1, verbose=outputs.verbose)
     if outputs.json_to_stdout:
         typer.echo(document_text(results, ascii_only=True), nl=False)
     elif outputs.json is not None:
-        _say(console, f"All results as JSON: {outputs.json}")
+        _print_plain(console, f"All results as JSON: {outputs.json}")
     if rerun is not None:
-        _say(console, f"Session and fits for Rerun: {rerun} (rigd replay {rerun})")
+        _print_plain(console, f"Session and fits for Rerun: {rerun} (rigd replay {rerun})")
     for file, folder in zip(files, folders, strict=True):
         if str(file) not in errors:
             page = folder / "report.html"
-            _say(console, f"Report of {file}: {page if page.exists() else folder}")
+            _print_plain(console, f"Report of {file}: {page if page.exists() else folder}")
     return code
 
 
 def _print_tables(
     console: Console, results: Sequence[RecordResult], *, single: bool, verbose: bool
 ) -> None:
-    """Print the main tables of a single file, or all of them; for several files a summary."""
+    """Print the tables of a single file, or a summary of several files."""
     from analysis.report import result_text, summary_table
 
-    by_welch = [each for each in results if each.welch is not None]
+    by_welch = [result for result in results if result.welch is not None]
     if single or not by_welch:
-        for each in results:
-            console.print(result_text(each, verbose=verbose))
+        for result in results:
+            console.print(result_text(result, verbose=verbose))
     else:
         console.print(summary_table(by_welch))
         console.print("")
@@ -173,7 +179,7 @@ def _analyse_all(
     rerun: Path | None,
     outputs: Outputs,
 ) -> tuple[list[RecordResult], dict[str, str], int]:
-    """Analyse and report every file; return results, message by failed file, and exit code."""
+    """Analyse and report each file; return results, error messages by file, and exit code."""
     from numpy.linalg import LinAlgError
 
     from analysis.identify import MeasurementError
@@ -183,21 +189,21 @@ def _analyse_all(
     from rigd.printable import progress_bar
     from rigd.session import SessionError
 
-    found: list[RecordResult] = []
+    results: list[RecordResult] = []
     errors: dict[str, str] = {}
     code = 0
     with progress_bar() as progress:
         print_message = partial(print_readable, progress.console)
-        steps = _steps(routes, rerun)
+        steps = _count_steps(routes, rerun)
         task = progress.add_task("", total=len(files) * steps)
         for number, (file, folder) in enumerate(zip(files, folders, strict=True), start=1):
 
             def on_step(done: str, name: str = file.name) -> None:
-                weight = _FIGURE_STEPS if done.startswith("figure") else 1
+                weight = _STEPS_PER_FIGURE if done.startswith("figure") else 1
                 progress.update(task, advance=weight, description=f"{name}: {done}")
 
             try:
-                found.append(
+                results.append(
                     _analyse_file(
                         file,
                         folder,
@@ -216,10 +222,11 @@ def _analyse_all(
                 errors[str(file)] = message = _error_message(file, error)
                 progress.update(task, completed=number * steps)
                 print_message(f"Error: {message}")
-    return found, errors, code
+    return results, errors, code
 
 
 def _error_message(file: Path, error: Exception) -> str:
+    """Return the message that is printed for an error in the analysis of a file."""
     from numpy.linalg import LinAlgError
 
     if isinstance(error, MemoryError):
@@ -229,14 +236,15 @@ def _error_message(file: Path, error: Exception) -> str:
     return str(error)
 
 
-def _steps(routes: Routes, rerun: Path | None) -> int:
-    from analysis.report import FIGURES as OF_RECORD
+def _count_steps(routes: Routes, rerun: Path | None) -> int:
+    """Return the number of progress steps of the analysis of one file."""
+    from analysis.report import FIGURES as RECORD_FIGURES
     from analysis.report.record_report import figures_of_paper
 
     figures = figures_of_paper(paper=routes.paper, whole_record=routes.whole_record)
-    pictures = len(figures) + routes.whole_record * len(OF_RECORD) + (rerun is not None)
+    figure_count = len(figures) + routes.whole_record * len(RECORD_FIGURES) + (rerun is not None)
     steps = 1 + routes.whole_record + routes.paper * (1 + len(routes.settings.types))
-    return steps + _FIGURE_STEPS * pictures
+    return steps + _STEPS_PER_FIGURE * figure_count
 
 
 def _analyse_file(
@@ -249,6 +257,7 @@ def _analyse_file(
     *,
     overwrite: bool,
 ) -> RecordResult:
+    """Analyse one file, and write its report and its file for Rerun."""
     from analysis.report.folder import new_folder
     from analysis.report.record_report import write_report
     from analysis.results import record_result
@@ -257,8 +266,8 @@ def _analyse_file(
         file, routes, on_step=on_step,
         warn=lambda text: print_message(f"Warning: {text}"),
     )  # fmt: skip
-    with new_folder(folder, overwrite=overwrite) as part:
-        write_report(result, part, on_step, formats=routes.figures)
+    with new_folder(folder, overwrite=overwrite) as partial_folder:
+        write_report(result, partial_folder, on_step, formats=routes.figures)
     if rerun is not None:
         from analysis.report import write_rerun_file
 
@@ -267,5 +276,6 @@ def _analyse_file(
     return result
 
 
-def _say(console: Console, text: str) -> None:
+def _print_plain(console: Console, text: str) -> None:
+    """Print a text without markup and line wrapping."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)

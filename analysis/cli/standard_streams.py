@@ -1,4 +1,4 @@
-"""Standard output and error as a command needs them: of any encoding, unread, on a full disk."""
+"""Standard output and error that tolerate any text, a closed pipe and a full disk."""
 
 from __future__ import annotations
 
@@ -17,32 +17,35 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-_NAMES: Final = ("stdout", "stderr")
+_STREAM_NAMES: Final = ("stdout", "stderr")
+"""Attributes of `sys` with the standard streams."""
 _EXIT_FAILED: Final = 1
+"""Exit code if a standard stream cannot be written."""
 
 
-def complain(message: str) -> None:
-    """Write an error to standard error."""
+def print_error(message: str) -> None:
+    """Print an error message to standard error."""
     typer.echo(f"Error: {readable_message(message)}", err=True)
 
 
 def print_readable(console: Console, message: str) -> None:
-    """Write a message about a file above a line of progress."""
+    """Print a message about a file above the progress bar."""
     console.print(readable_message(message), markup=False, soft_wrap=True)
 
 
 class StandardStreamError(OSError):
-    """A standard stream that takes no more, as on a full disk."""
+    """Error in writing to a standard stream, such as a full disk."""
 
 
-class _Descriptor(io.FileIO):
-    """A standard stream that goes nowhere once its reader has gone.
+class _PipeTolerantDescriptor(io.FileIO):
+    """File descriptor of a standard stream that discards data after the pipe was closed.
 
-    Who reads no further, as ``head`` does, has what he wanted: the work goes on, and the exit code
-    is that of the work.
+    A reader such as ``head`` closes the pipe when it has enough. The command continues, and its
+    exit code does not depend on the pipe.
     """
 
     def write(self, data: bytes) -> int | None:  # type: ignore[override]
+        """Write data, or discard them if the pipe was closed."""
         try:
             return super().write(data)
         except BrokenPipeError:
@@ -53,47 +56,50 @@ class _Descriptor(io.FileIO):
 
 @contextmanager
 def standard_streams() -> Iterator[None]:
-    """Have both streams take any text and outlive their reader; end with 1 where one is full.
+    """Let standard output and error accept any text, and continue after a pipe was closed.
 
-    A character that the stream's encoding lacks becomes a question mark.
+    A character that the stream's encoding lacks becomes a question mark. If a stream cannot be
+    written, as on a full disk, the process ends with exit code 1.
     """
-    for name in _NAMES:
+    for name in _STREAM_NAMES:
         stream = getattr(sys, name)
-        if not isinstance(stream, io.TextIOWrapper):  # closed, or a test's
+        if not isinstance(stream, io.TextIOWrapper):  # closed, or replaced by a test
             continue
         stream.reconfigure(errors="replace")
-        # A terminal has its reader for as long as it is one, and is not just a file on Windows.
+        # A terminal cannot lose its reader, and it is not just a file on Windows.
         if not stream.isatty():
-            setattr(sys, name, _like(stream))
+            setattr(sys, name, _pipe_tolerant_stream(stream))
     try:
         try:
             yield
         finally:
-            _flush()
+            _flush_streams()
     except StandardStreamError as error:
         with suppress(OSError):
             sys.stderr.write(f"Error: the output cannot be written ({error.strerror}).\n")
             sys.stderr.flush()
-        # What is left unwritten would be tried again, and complained of, by Python.
+        # Python would try to write the buffered text again, and print an error.
         for number in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
         sys.exit(_EXIT_FAILED)
 
 
-def _like(stream: io.TextIOWrapper) -> io.TextIOWrapper:
+def _pipe_tolerant_stream(stream: io.TextIOWrapper) -> io.TextIOWrapper:
+    """Return a text stream on the same descriptor that ignores a closed pipe."""
     stream.flush()
-    raw: io.RawIOBase = _Descriptor(stream.fileno(), "wb", closefd=False)
+    raw: io.RawIOBase = _PipeTolerantDescriptor(stream.fileno(), "wb", closefd=False)
     return io.TextIOWrapper(
         io.BufferedWriter(raw),
         encoding=stream.encoding,
         errors=stream.errors,
-        # Standard error, with no buffer of its own, is written through.
+        # Standard error has no buffer of its own and is written at once.
         line_buffering=stream.line_buffering or stream.write_through,
     )
 
 
-def _flush() -> None:
-    for name in _NAMES:
+def _flush_streams() -> None:
+    """Write the buffered text of both standard streams."""
+    for name in _STREAM_NAMES:
         stream = getattr(sys, name)
         if stream is not None:
             stream.flush()

@@ -1,4 +1,4 @@
-"""Command `analyze touch`: where, when and how hard recorded antennas met something."""
+"""Command `analyze touch`: position, time and force of touches of the antenna in records."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from analysis.cli.sessions import NoSessionsError, Outputs, session_files
-from analysis.cli.standard_streams import complain, print_readable
+from analysis.cli.standard_streams import print_error, print_readable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,6 +20,7 @@ TOUCH_EPILOG = """\
 Example: analyze touch sessions/*.mcap --model beam.json --report touches
 
 Exit code: 0 done, 1 a file could not be analysed, 2 usage error, 130 stopped by Ctrl-C."""
+"""Text at the end of the help of the command."""
 
 
 def touch_command(
@@ -66,12 +67,12 @@ def touch_command(
             check_new_file(json, "--json")
         if report is not None:
             report_folders(files[:1], report)
-        code = _analyse(files, model, outputs)
+        code = _run_analysis(files, model, outputs)
     except (OutputExistsError, IdentifiedBeamError) as error:
-        complain(str(error))
+        print_error(str(error))
         code = 2
     except (NoSessionsError, OutputError) as error:
-        complain(str(error))
+        print_error(str(error))
         code = 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
@@ -79,7 +80,8 @@ def touch_command(
     raise typer.Exit(code)
 
 
-def _analyse(files: Sequence[Path], model: Path | None, outputs: Outputs) -> int:
+def _run_analysis(files: Sequence[Path], model: Path | None, outputs: Outputs) -> int:
+    """Analyse the files, print and write the results, and return the exit code."""
     from analysis.report import document_text
     from analysis.report.folder import new_folder, write_new
     from analysis.report.table import terminal_table
@@ -90,52 +92,52 @@ def _analyse(files: Sequence[Path], model: Path | None, outputs: Outputs) -> int
         write_touch_report,
     )
 
-    sessions, errors = _sessions(files, model)
+    sessions, errors = _analyse_sessions(files, model)
     document = touches_document(sessions, errors)
     if outputs.json is not None and not outputs.json_to_stdout:
         write_new(outputs.json, document_text(document))
     if outputs.report is not None and sessions:
-        with new_folder(outputs.report) as part:
-            write_touch_report(sessions, errors, part)
+        with new_folder(outputs.report) as partial_folder:
+            write_touch_report(sessions, errors, partial_folder)
     console = outputs.console()
-    say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
+    print_plain = partial(console.print, markup=False, highlight=False, soft_wrap=True)
     for session in sessions:
         for line in session_lines(session):
-            say(line)
+            print_plain(line)
     if any(session.touches for session in sessions):
-        say("")
+        print_plain("")
         console.print(terminal_table(touches_table(sessions)))
     if outputs.json_to_stdout:
         typer.echo(document_text(document, ascii_only=True), nl=False)
     if outputs.report is not None and sessions:
-        say(f"Report: {outputs.report / 'report.html'}")
+        print_plain(f"Report: {outputs.report / 'report.html'}")
     return 1 if errors else 0
 
 
-def _sessions(
+def _analyse_sessions(
     files: Sequence[Path], model: Path | None
 ) -> tuple[list[TouchedSession], dict[str, str]]:
-    """Analyse every file; return what was found, and the message by failed file."""
+    """Analyse the touches in each file; return the results, and error messages by file."""
     from analysis.record import RecordError
     from analysis.touch import TouchAnalysis
     from rigd.printable import progress_bar
     from rigd.session import SessionError
 
-    found: list[TouchedSession] = []
+    sessions: list[TouchedSession] = []
     errors: dict[str, str] = {}
     analysis = TouchAnalysis(model)
     with progress_bar() as progress:
         task = progress.add_task("", total=len(files))
         for number, file in enumerate(files):
 
-            def on_step(what: str, name: str = file.name) -> None:
-                progress.update(task, description=f"{name}: {what}")
+            def on_step(step: str, name: str = file.name) -> None:
+                progress.update(task, description=f"{name}: {step}")
 
             try:
-                found.append(analysis.session(file, on_step))
+                sessions.append(analysis.session(file, on_step))
             except (SessionError, RecordError, MemoryError) as error:
                 message = str(error) or f"{file}: not enough memory; close other programs."
                 errors[str(file)] = message
                 print_readable(progress.console, f"Error: {message}")
             progress.update(task, completed=number + 1)
-    return found, errors
+    return sessions, errors

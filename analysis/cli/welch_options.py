@@ -1,4 +1,4 @@
-"""Options on how the frequency response is estimated and what is fitted to it."""
+"""Command line options of the frequency response estimate and of the Welch fits."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ if TYPE_CHECKING:
 
     from analysis.models import WelchSettings
 
-_MAX_NFFT: Final = 2**22
-"""Longest transform: 26 times the paper's, still a matter of seconds and of a few 100 MB."""
+_MAX_NFFT_SAMPLES: Final = 2**22
+"""Longest FFT in samples: 26 times the paper's, which takes seconds and a few 100 MB."""
 
 
-_Choice = TypeVar("_Choice", bound=str)
+_ChoiceName = TypeVar("_ChoiceName", bound=str)
+"""Type of the names among which an option chooses."""
 
 Band = Annotated[
     str | None,
@@ -26,6 +27,7 @@ Band = Annotated[
         "record's rate]",
     ),
 ]
+"""Option --band: frequency band of the fits."""
 Estimator = Annotated[
     str,
     typer.Option(
@@ -34,22 +36,28 @@ Estimator = Annotated[
         "reference as instrument (no bias from fed-back noise); fft: one FFT of the whole record.",
     ),
 ]
+"""Option --frf: estimator of the frequency response."""
 Segment = Annotated[
     int | None,
     typer.Option(
         metavar="SAMPLES", min=2, help="Welch segment.  [default: 17.266 s, as in the paper]"
     ),
 ]
+"""Option --segment: length of a Welch segment."""
 Overlap = Annotated[
     int | None,
     typer.Option(
         metavar="SAMPLES", min=0, help="Overlap of segments.  [default: 15 % of the segment]"
     ),
 ]
+"""Option --overlap: overlap of Welch segments."""
 Nfft = Annotated[
     int | None,
-    typer.Option(metavar="SAMPLES", min=2, max=_MAX_NFFT, help="FFT length.  [default: 160 s]"),
+    typer.Option(
+        metavar="SAMPLES", min=2, max=_MAX_NFFT_SAMPLES, help="FFT length.  [default: 160 s]"
+    ),
 ]
+"""Option --nfft: length of the FFT."""
 
 
 def welch_settings(
@@ -60,9 +68,9 @@ def welch_settings(
     overlap: int | None,
     nfft: int | None,
 ) -> WelchSettings:
-    """Check the options' texts; wrong ones end in typer.BadParameter (exit code 2).
+    """Return the Welch settings from the options' texts; raise a usage error for invalid ones.
 
-    The band is the default: what suits a record, `analysis.suited` knows.
+    The band is the default one, because `analysis.suited` chooses a band for each record.
     """
     from analysis.models import WelchSettings
     from rigd.spectral import Estimator as FrfEstimator
@@ -78,31 +86,31 @@ def welch_settings(
             param_hint="--nfft",
         )
     return WelchSettings(
-        estimator=choice(frf, get_args(FrfEstimator), "--frf"),
+        estimator=parse_option_choice(frf, get_args(FrfEstimator), "--frf"),
         segment_length=segment,
         overlap=overlap,
         nfft=nfft,
-        types=_types(types),
-        weightings=_weightings(weights),
+        types=_parse_types(types),
+        weightings=_parse_weightings(weights),
     )
 
 
-def choice(text: str, choices: Sequence[_Choice], option: str) -> _Choice:
-    """Return the choice that was named; a wrong one ends in typer.BadParameter (exit code 2)."""
-    for each in choices:
-        if each == text.lower():
-            return each
+def parse_option_choice(text: str, choices: Sequence[_ChoiceName], option: str) -> _ChoiceName:
+    """Return the choice that a text names, ignoring case; raise a usage error for others."""
+    for candidate in choices:
+        if candidate == text.lower():
+            return candidate
     raise typer.BadParameter(
         f"there is no '{text}'; choose from {', '.join(choices)}.", param_hint=option
     )
 
 
 def band_hz(text: str | None) -> tuple[float, float] | None:
-    """Check the text of --band, None if it was not given."""
+    """Return the band in Hz stated by --band, or None without it; raise if invalid."""
     if text is None:
         return None
     try:
-        first_hz, last_hz = (float(part) for part in text.split(","))
+        first_hz, last_hz = (float(frequency_text) for frequency_text in text.split(","))
     except ValueError:
         first_hz = last_hz = math.nan
     if not 0.0 <= first_hz < last_hz < math.inf:
@@ -113,10 +121,11 @@ def band_hz(text: str | None) -> tuple[float, float] | None:
     return first_hz, last_hz
 
 
-def _types(text: str) -> tuple[str, ...]:
+def _parse_types(text: str) -> tuple[str, ...]:
+    """Return the model types named in --types; raise a usage error if one is unknown."""
     from analysis.models import STRUCTURES
 
-    names = _listed(text.upper())
+    names = _split_list(text.upper())
     unknown = [name for name in names if name not in STRUCTURES]
     if unknown or not names:
         raise typer.BadParameter(
@@ -127,11 +136,12 @@ def _types(text: str) -> tuple[str, ...]:
     return names
 
 
-def _weightings(text: str) -> tuple[str, ...]:
+def _parse_weightings(text: str) -> tuple[str, ...]:
+    """Return the weightings named in --weights; raise a usage error if one is unknown."""
     from analysis.models import WeightingError, weighting_name
 
     try:
-        names = tuple(weighting_name(name) for name in _listed(text))
+        names = tuple(weighting_name(name) for name in _split_list(text))
     except WeightingError as error:
         raise typer.BadParameter(str(error), param_hint="--weights") from error
     if not names:
@@ -141,6 +151,6 @@ def _weightings(text: str) -> tuple[str, ...]:
     return names
 
 
-def _listed(text: str) -> tuple[str, ...]:
-    """Names of a comma-separated list, each once, in the order given."""
-    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+def _split_list(text: str) -> tuple[str, ...]:
+    """Return the names in a comma-separated list, each once, in their order."""
+    return tuple(dict.fromkeys(entry.strip() for entry in text.split(",") if entry.strip()))

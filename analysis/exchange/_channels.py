@@ -22,9 +22,11 @@ if TYPE_CHECKING:
 # Units
 
 _INCH_M: Final = 0.0254
+"""Length of an inch in metres."""
 _POUND_N: Final = 4.4482216152605
+"""Pound-force in newtons."""
 
-UNITS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
+UNIT_SIZES: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
     {
         "angle": {
             "rad": 1.0,
@@ -49,7 +51,7 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     }
 )
-"""Quantity → unit → how many rad, N·m, N or s it is."""
+"""Size of each unit in rad, N·m, N or s, by the quantity it measures."""
 
 _NAME_SUFFIXES: Final = {
     "rad": "rad",
@@ -62,83 +64,97 @@ _NAME_SUFFIXES: Final = {
     "ms": "ms",
     "us": "us",
 }
-"""Last word of a channel's name → the unit it means."""
+"""Unit that the last word of a channel's name suggests."""
 
-_NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?=\s*[^\s\d.])")
-_IN_BRACKETS: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
+_NUMBER_PATTERN: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?=\s*[^\s\d.])")
+"""Pattern of a number that is followed by a unit."""
+_BRACKETS_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
+"""Pattern of a text in brackets at the end of a name."""
 
 
 def canonical_unit(text: str) -> str | None:
-    """Return the table's spelling of a unit (``Nm``, ``N·m`` and ``N*m`` are ``N.m``), or None.
+    """Return a unit as spelled in `UNIT_SIZES`, or None if it is unknown.
 
-    Words such as ``degrees`` and ``msec``, as programs write them, are known too.
-    Capitals matter: ``mN.m`` is a thousandth of a newton metre and ``nm`` no torque at all.
+    ``Nm``, ``N·m`` and ``N*m`` become ``N.m``, words such as ``degrees`` and ``msec`` their units.
+    The case of letters matters: ``mN.m`` is a thousandth of a newton metre, and ``nm`` is no
+    torque.
     """
-    bare = _bare(text)
-    return _SPELLINGS.get(bare) or _WORDS.get(bare.lower())
+    spelling = _plain_spelling(text)
+    return _UNITS_BY_SPELLING.get(spelling) or _UNITS_BY_WORD.get(spelling.lower())
 
 
-def factor(quantity: str, unit: str) -> float:
-    """Size of a unit in rad, N·m, N or s.
+def unit_factor(quantity: str, unit: str) -> float:
+    """Return the size of a unit in rad, N·m, N or s.
 
     Parameters
     ----------
     quantity : {"angle", "torque", "force", "time"}
+        Quantity that the unit measures.
     unit : str
-        In any spelling that `canonical_unit` knows, with a number before it or not: ``0.02 N.m`` is
-        the value of one volt of a sensor's signal.
+        Unit in any spelling of `canonical_unit`, with or without a number before it: ``0.02 N.m``
+        may be the value of one volt of a sensor's signal.
 
     Raises
     ------
     ExchangeError
-        If it is not a unit of that quantity, or the number is not finite or 0.
+        If it is no unit of that quantity, or if the number is not finite or is 0.
     """
-    size, name = _scaled(unit)
-    known = canonical_unit(name)
-    if known is None or known not in UNITS[quantity] or not math.isfinite(size) or size == 0.0:
-        base = next(iter(UNITS[quantity]))
+    size, name = _split_number(unit)
+    known_unit = canonical_unit(name)
+    if (
+        known_unit is None
+        or known_unit not in UNIT_SIZES[quantity]
+        or not math.isfinite(size)
+        or size == 0.0
+    ):
+        base = next(iter(UNIT_SIZES[quantity]))
         raise ExchangeError(
             f"'{unit}' is not a unit of {quantity} that is known here; choose from "
-            f"{', '.join(UNITS[quantity])}. Of a signal in volts, counts or the like, state what "
+            f"{', '.join(UNIT_SIZES[quantity])}. Of a signal in volts, counts or the like, state "
+            "what "
             f"one of them stands for, as a number and a unit: CHANNEL:0.02 {base}."
         )
-    return size * UNITS[quantity][known]
+    return size * UNIT_SIZES[quantity][known_unit]
 
 
 def stated_unit(unit: str) -> str:
-    """Spell a unit as the table does, with its number if it has one other than 1."""
-    size, name = _scaled(unit)
-    known = canonical_unit(name) or name
-    return known if size == 1.0 else f"{size!r} {known}"
+    """Return a unit as spelled in `UNIT_SIZES`, with its number unless this is 1."""
+    size, name = _split_number(unit)
+    known_unit = canonical_unit(name) or name
+    return known_unit if size == 1.0 else f"{size!r} {known_unit}"
 
 
 def unit_in_brackets(name: str) -> str | None:
-    """Return the unit in brackets behind a name, as in ``Angle [deg]`` or ``Tz (mN.m)``."""
-    found = _IN_BRACKETS.search(name)
-    return canonical_unit(found[1]) if found else None
+    """Return the unit in brackets after a name, as in ``Angle [deg]``; None without one."""
+    match = _BRACKETS_PATTERN.search(name)
+    return canonical_unit(match[1]) if match else None
 
 
 def unit_in_suffix(name: str) -> str | None:
     """Return the unit that the last word of a name suggests, as in ``angle_rad``, or None."""
-    _, underscore, last = name.strip().rpartition("_")
-    return _NAME_SUFFIXES.get(last) if underscore else None
+    _, underscore, last_word = name.strip().rpartition("_")
+    return _NAME_SUFFIXES.get(last_word) if underscore else None
 
 
-def _scaled(unit: str) -> tuple[float, str]:
-    """Take a number and a unit apart, ``0.02 N.m``; 1 where there is no number."""
-    found = _NUMBER.match(unit.strip())
-    return (float(found[0]), unit.strip()[found.end() :]) if found else (1.0, unit)
+def _split_number(unit: str) -> tuple[float, str]:
+    """Split a text such as ``0.02 N.m`` into number and unit; the number is 1 by default."""
+    match = _NUMBER_PATTERN.match(unit.strip())
+    return (float(match[0]), unit.strip()[match.end() :]) if match else (1.0, unit)
 
 
-def _bare(text: str) -> str:
+def _plain_spelling(text: str) -> str:
+    """Return a unit without spaces, dots and hyphens, and with special characters replaced."""
     return re.sub(
         r"[\s.·⋅*-]", "", text.strip().replace("µ", "u").replace("μ", "u").replace("°", "deg")
     )
 
 
-_SPELLINGS: Final = {_bare(name): name for names in UNITS.values() for name in names}
+_UNITS_BY_SPELLING: Final = {
+    _plain_spelling(name): name for names in UNIT_SIZES.values() for name in names
+}
+"""Units as spelled in `UNIT_SIZES` by their spelling without dots."""
 
-_WORDS: Final = {
+_UNITS_BY_WORD: Final = {
     "degree": "deg",
     "degrees": "deg",
     "grad": "deg",
@@ -159,7 +175,7 @@ _WORDS: Final = {
     "newtonmetre": "N.m",
     "newton": "N",
 }
-"""Words for units, in any case of letters."""
+"""Words for units, in lower case, with the units that they mean."""
 
 
 # Fields
@@ -178,19 +194,19 @@ QUANTITIES: Final[Mapping[str, str]] = MappingProxyType(
         "tz_nm": "torque",
     }
 )
-"""Field of a sample → what is measured there."""
+"""Quantity that each field of a sample measures."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelChoice:
-    """A channel of the file and the unit of its numbers.
+    """User's choice of a channel in a file, with the unit of its values.
 
     Attributes
     ----------
     channel : str
-        Its name in the file.
+        Name of the channel in the file.
     unit : str
-        As `analysis.exchange._channels.UNITS` spells it, after a number if one was stated.
+        Unit as spelled by `canonical_unit`, after a number if the user stated one.
     factor : float
         Size of that unit in rad, N·m, N or s.
     """
@@ -200,22 +216,24 @@ class ChannelChoice:
     factor: float
 
     def __str__(self) -> str:
+        """Return the choice in the form ``CHANNEL:UNIT``."""
         return f"{self.channel}:{self.unit}"
 
 
 def parse_choice(text: str, quantity: str) -> ChannelChoice:
-    """Take ``CHANNEL:UNIT`` apart; the last colon counts.
+    """Parse the text ``CHANNEL:UNIT`` of an option; the last colon separates the two.
 
     Parameters
     ----------
     text : str
-        Such as ``Motor/Angle:deg``.
+        Text such as ``Motor/Angle:deg``.
     quantity : {"angle", "torque", "force", "time"}
+        Quantity that the unit must measure.
 
     Raises
     ------
     ExchangeError
-        If the unit is missing or unknown, or there is no name before it.
+        If the unit is missing or unknown, or no name precedes it.
 
     Examples
     --------
@@ -227,29 +245,29 @@ def parse_choice(text: str, quantity: str) -> ChannelChoice:
     if not colon or not channel.strip():
         raise ExchangeError(
             f"'{text}' does not say channel and unit; write CHANNEL:UNIT with one of the units "
-            f"{', '.join(UNITS[quantity])}. A unit is never guessed."
+            f"{', '.join(UNIT_SIZES[quantity])}. A unit is never guessed."
         )
-    size = factor(quantity, unit)
+    size = unit_factor(quantity, unit)
     return ChannelChoice(channel.strip(), stated_unit(unit), size)
 
 
 # Time base
 
 MAX_JITTER: Final = 0.1
-"""Largest distance of a time stamp from its tick, in periods.
+"""Largest distance of a time stamp from its tick, in sample periods. A larger distance makes the
+sample's position doubtful."""
 
-A stamp farther from the nearest tick makes the sample's position doubtful.
-"""
+MAX_TICKS_PER_SAMPLE: Final = 10
+"""Largest number of ticks per sample, as for the analysis: beyond it, most of the record is
+missing."""
 
-MAX_SPAN: Final = 10
-"""Most ticks for each sample, as for the analysis: beyond that there is more gap than record."""
+MAX_GAP_FRACTION: Final = 0.05
+"""Largest fraction of the steps between samples that are longer than one tick. With more such
+steps, the times are too coarse to determine the rate, as milliseconds are for a record at 700
+Hz."""
 
-MAX_GAPS: Final = 0.05
-"""Largest fraction of steps from sample to sample that are longer than a tick. If there are more,
-the times are too coarse to determine the rate: milliseconds of a record at 700 Hz, say."""
-
-RATES_HZ: Final = (0.1, 1e6)
-"""Rates that a session may have."""
+RATE_RANGE_HZ: Final = (0.1, 1e6)
+"""Lowest and highest sampling rate of a session."""
 
 _RATE_DIGITS: Final = 9
 """Digits to which time stamps determine a rate: 1000.0000000002 is read as 1000."""
@@ -257,16 +275,16 @@ _RATE_DIGITS: Final = 9
 
 @dataclass(frozen=True, slots=True)
 class Timebase:
-    """Ticks of the samples.
+    """Sampling rate of a record, and the tick of each of its samples.
 
     Attributes
     ----------
     ticks : ndarray of int, shape (n,)
-        From 0 on, increasing.
+        Tick of each sample, increasing from 0.
     rate_hz : float
         Ticks per second.
     jitter : float
-        Largest distance of a time stamp from its tick, in periods.
+        Largest distance of a time stamp from its tick, in sample periods.
     """
 
     ticks: NDArray[np.int64]
@@ -275,90 +293,94 @@ class Timebase:
 
     @property
     def missing(self) -> int:
-        """Ticks between the first and the last that have no sample."""
+        """Number of ticks between the first and the last that have no sample."""
         return int(self.ticks[-1]) + 1 - len(self.ticks)
 
 
-def uniform(path: Path, samples: int, rate_hz: float) -> Timebase:
+def uniform_timebase(path: Path, samples: int, rate_hz: float) -> Timebase:
     """Return the time base of samples without gaps, at the rate that the user states."""
     _check_rate(path, rate_hz)
     return Timebase(np.arange(samples), rate_hz, 0.0)
 
 
-def from_time_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) -> Timebase:
-    """Find the rate and the tick of each sample from its time.
+def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) -> Timebase:
+    """Return the sampling rate and the tick of each sample, determined from time stamps.
 
     Parameters
     ----------
     path : Path
-        For messages.
+        File, for messages.
     channel : str
         Name of the channel of times, for messages.
     time_s : ndarray of float, shape (n,)
-        n at least 2.
+        Time stamps of at least two samples.
 
     Raises
     ------
     ExchangeError
         If times are not finite, do not increase, or are not equidistant apart from gaps.
     """
-    stray = np.flatnonzero(~np.isfinite(time_s))
-    if stray.size:
+    not_finite = np.flatnonzero(~np.isfinite(time_s))
+    if not_finite.size:
         raise ExchangeError(
-            f"{path}: the time '{channel}' of sample {stray[0] + 1} is {time_s[stray[0]]}, so its "
+            f"{path}: the time '{channel}' of sample {not_finite[0] + 1} is "
+            f"{time_s[not_finite[0]]}, so its "
             "position is unknown; repair the times, or give --rate-hz instead of --time if no "
             "sample is missing."
         )
     steps_s = np.diff(time_s)
-    backward = np.flatnonzero(steps_s <= 0.0)
-    if backward.size:
-        first = int(backward[0])
+    not_increasing = np.flatnonzero(steps_s <= 0.0)
+    if not_increasing.size:
+        index = int(not_increasing[0])
         raise ExchangeError(
-            f"{path}: the time '{channel}' does not increase from sample {first + 1} "
-            f"({time_s[first]:.9g} s) to sample {first + 2} ({time_s[first + 1]:.9g} s); repair "
+            f"{path}: the time '{channel}' does not increase from sample {index + 1} "
+            f"({time_s[index]:.9g} s) to sample {index + 2} ({time_s[index + 1]:.9g} s); repair "
             "the times, or give --rate-hz instead of --time if the samples are equidistant."
         )
-    # The median distinguishes a step of one tick from a gap; the mean over all such steps is not at
-    # the mercy of how finely the file writes its times, as the median itself is.
-    single = steps_s < 1.5 * np.median(steps_s)
-    steps = np.round(steps_s / steps_s[single].mean())
-    gaps = np.count_nonzero(steps > 1) / len(steps)
-    if gaps > MAX_GAPS:
+    # The median distinguishes a step of one tick from a gap. The mean over all steps of one tick,
+    # unlike the median, does not depend on the number of digits of the times.
+    is_one_tick = steps_s < 1.5 * np.median(steps_s)
+    steps = np.round(steps_s / steps_s[is_one_tick].mean())
+    gap_fraction = np.count_nonzero(steps > 1) / len(steps)
+    if gap_fraction > MAX_GAP_FRACTION:
         raise ExchangeError(
             f"{path}: the times '{channel}' advance unevenly, by {steps_s.min():.6g} to "
-            f"{steps_s.max():.6g} s: {100 * gaps:.2g} % of the steps would be gaps. Write the "
+            f"{steps_s.max():.6g} s: {100 * gap_fraction:.2g} % of the steps would be gaps. Write "
+            "the "
             "times with more digits, resample the record to one rate, or give --rate-hz instead of "
             "--time if the samples are equidistant."
         )
     ticks = np.concatenate(([0.0], np.cumsum(steps)))
-    if ticks[-1] + 1 > MAX_SPAN * len(ticks):
+    if ticks[-1] + 1 > MAX_TICKS_PER_SAMPLE * len(ticks):
         raise ExchangeError(
             f"{path}: the times '{channel}' of the {len(ticks)} samples span {ticks[-1] + 1:.0f} "
             "periods, so most of the record is missing; cut the session out of the file."
         )
-    period_s = _slope(ticks, time_s)
+    period_s = _regression_slope(ticks, time_s)
     rate_hz = float(f"{1 / period_s:.{_RATE_DIGITS}g}")
     _check_rate(path, rate_hz)
     deviation = (time_s - time_s[0]) * rate_hz - ticks
     deviation = np.abs(deviation - np.median(deviation))
-    worst = int(np.argmax(deviation))
-    if deviation[worst] > MAX_JITTER:
+    worst_index = int(np.argmax(deviation))
+    if deviation[worst_index] > MAX_JITTER:
         raise ExchangeError(
-            f"{path}: the times '{channel}' are not equidistant: sample {worst + 1} lies "
-            f"{deviation[worst]:.2g} periods from where {rate_hz:g} Hz would have it. Resample the "
+            f"{path}: the times '{channel}' are not equidistant: sample {worst_index + 1} lies "
+            f"{deviation[worst_index]:.2g} periods from where {rate_hz:g} Hz would have it. "
+            "Resample the "
             "record to one rate, or give --rate-hz instead of --time if only the stamps are off."
         )
-    return Timebase(ticks.astype(np.int64), rate_hz, float(deviation[worst]))
+    return Timebase(ticks.astype(np.int64), rate_hz, float(deviation[worst_index]))
 
 
-def _slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """Slope of the straight line through points, by least squares."""
+def _regression_slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    """Return the slope of the least-squares straight line through points."""
     x, y = x - x.mean(), y - y.mean()
     return float(x @ y / (x @ x))
 
 
 def _check_rate(path: Path, rate_hz: float) -> None:
-    lowest_hz, highest_hz = RATES_HZ
+    """Raise if a sampling rate is outside the range of sessions."""
+    lowest_hz, highest_hz = RATE_RANGE_HZ
     if not lowest_hz <= rate_hz <= highest_hz:
         raise ExchangeError(
             f"{path}: a rate of {rate_hz:g} Hz is outside the range of sessions, {lowest_hz:g} to "

@@ -1,4 +1,4 @@
-"""CSV: channels of a text file, and a table as text."""
+"""Reading of channels from text files, and writing of tables as CSV."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 
 def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
-    """Read columns of a text file, as `analysis.exchange._source.read_source` asks for.
+    """Read columns from a text file (see `analysis.exchange.read_source`).
 
-    A column is named by its title, or ``#3`` for the third. An empty cell reads as NaN.
+    A column is named by its title, or by its number: ``#3`` is the third. An empty cell is NaN.
     """
     try:
         with path.open("rb") as stream:
@@ -57,23 +57,31 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 
 # Writing
 
-_BLOCK: Final = 20_000
+_BLOCK_ROWS: Final = 20_000
+"""Number of rows that are formatted at a time."""
 
 
 def write_csv(table: ExportTable, stream: BinaryIO) -> None:
-    """Write commas, decimal points and UTF-8; a complex column becomes two, real and imaginary."""
-    columns = [part for column in (table.axis, *table.columns) for part in _real_parts(column)]
+    """Write a table as CSV in UTF-8; a complex column becomes a real and an imaginary column."""
+    columns = [
+        real_column
+        for column in (table.axis, *table.columns)
+        for real_column in _real_parts(column)
+    ]
     stream.write((",".join(column.name for column in columns) + "\n").encode("utf-8"))
-    for begin in range(0, len(table.axis.values), _BLOCK):
-        texts = [map(repr, column.values[begin : begin + _BLOCK].tolist()) for column in columns]
+    for begin in range(0, len(table.axis.values), _BLOCK_ROWS):
+        texts = [
+            map(repr, column.values[begin : begin + _BLOCK_ROWS].tolist()) for column in columns
+        ]
         lines = "\n".join(map(",".join, zip(*texts, strict=True)))
         stream.write((lines + "\n").encode("ascii"))
 
 
 def _real_parts(column: ExportColumn) -> Iterator[ExportColumn]:
+    """Yield a column, or the real and the imaginary part of a complex column."""
     if not np.iscomplexobj(column.values):
         yield column
         return
     quantity, _, unit = column.name.partition("_")
-    for part, values in (("real", column.values.real), ("imaginary", column.values.imag)):
-        yield replace(column, name=f"{quantity}_{part}_{unit}", values=values)
+    for part_name, values in (("real", column.values.real), ("imaginary", column.values.imag)):
+        yield replace(column, name=f"{quantity}_{part_name}_{unit}", values=values)

@@ -1,4 +1,4 @@
-"""A session's record, its frequency response or its model into a new file for another program."""
+"""Export of a session's record, frequency response or model to a file for another program."""
 
 from __future__ import annotations
 
@@ -21,31 +21,33 @@ if TYPE_CHECKING:
     from analysis.linear_model import LinearModel, ModelOptions
     from analysis.models import WelchSettings
 
-_UNIVERSAL: Final = (".uff", ".unv", ".uf58")
-SUFFIXES: Final = (".csv", ".mat", *_UNIVERSAL)
-"""Endings of the files that can be written."""
+_UNIVERSAL_SUFFIXES: Final = (".uff", ".unv", ".uf58")
+"""Suffixes of universal files."""
+SUFFIXES: Final = (".csv", ".mat", *_UNIVERSAL_SUFFIXES)
+"""Suffixes of the files to which records and frequency responses can be written."""
 
 
 def export_record(session: Path, target: Path, *, binary: bool = False) -> ExportTable:
-    """Write the samples of a session as they were recorded.
+    """Write the samples of a session, as recorded, to a file for another program.
 
     Parameters
     ----------
     session : Path
+        Session file.
     target : Path
-        A new file; its ending, one of `SUFFIXES`, is its format.
+        New file, whose suffix (one of `SUFFIXES`) selects the format.
     binary : bool
-        Write a universal file's numbers as 8-byte floats instead of text.
+        Whether a universal file has 8-byte floats instead of text.
 
     Returns
     -------
     ExportTable
-        What was written.
+        Table that was written.
 
     Raises
     ------
     TargetError
-        If the ending is unknown, or `binary` is not for it.
+        If the suffix is unknown, or its format does not support `binary`.
     ExchangeError
         If the record does not fit the format, or a library is missing.
     analysis.report.folder.OutputExistsError, analysis.report.folder.OutputError
@@ -63,7 +65,7 @@ def export_record(session: Path, target: Path, *, binary: bool = False) -> Expor
     """
     check_target(target, binary=binary)
     table = record_table(session)
-    _write(table, target, binary=binary)
+    _write_table(table, target, binary=binary)
     return table
 
 
@@ -75,22 +77,23 @@ def export_frf(
     *,
     binary: bool = False,
 ) -> ExportTable:
-    """Write the frequency response that an analysis with these settings and band would fit.
+    """Write the estimated frequency response of a session to a file for another program.
 
-    Otherwise as `export_record`; the analysis' own errors come on top.
+    It is the response that an analysis with the same settings and band fits. The function raises
+    the errors of `export_record` and those of the estimate.
 
     Parameters
     ----------
     session, target, binary
-        As for `export_record`.
+        Session, new file and number format, as for `export_record`.
     settings : WelchSettings
         Estimator and segments.
     band_hz : tuple of float, optional
-        First and last frequency; by default what suits the record.
+        First and last frequency; by default chosen for the record.
     """
     check_target(target, binary=binary)
     table = frf_table(session, settings, band_hz)
-    _write(table, target, binary=binary)
+    _write_table(table, target, binary=binary)
     return table
 
 
@@ -100,43 +103,43 @@ def export_model(
     options: ModelOptions,
     on_step: Callable[[str], None] = lambda _step: None,
 ) -> LinearModel:
-    """Write a linear model of the antenna: the modal model, and a state space.
+    """Write a linear model of the antenna to a file: modal model and state-space matrices.
 
     Parameters
     ----------
     source : Path
-        A session, which is analysed, or the document of ``analyze --json``.
+        Session file, which is analysed, or the document of ``analyze --json``.
     target : Path
-        A new file; its ending, one of `MODEL_FORMATS`, is its format.
+        New file, whose suffix (a key of `MODEL_FORMATS`) selects the format.
     options : ModelOptions
-        Which model, which input, how many states.
+        Kind of model, input, and number of states.
     on_step : callable, optional
-        Called with a few words before each step.
+        Called before each step with the name of the step.
 
     Returns
     -------
     LinearModel
-        What was written.
+        Model that was written.
 
     Raises
     ------
     TargetError
-        If the ending is unknown.
+        If the suffix is unknown.
     analysis.report.folder.OutputExistsError, analysis.report.folder.OutputError
         If the file exists or cannot be written.
     analysis.linear_model.LinearModelError, rigd.identified_beam.IdentifiedBeamError
-        If there is no such model, or it cannot be realised.
+        If the source has no such model, or the model cannot be realised.
     rigd.session.SessionError, analysis.record.RecordError, analysis.identify.MeasurementError
         If the session cannot be read or analysed.
     """
     from analysis.linear_model import identified_in_document, identified_in_session, linear_model
 
-    _check_ending(target, MODEL_FORMATS)
+    _check_suffix(target, MODEL_FORMATS)
     check_new_file(target, "The file")
     is_session = source.suffix.lower() == ".mcap"
     on_step("analysis" if is_session else "document")
-    found = identified_in_session(source) if is_session else identified_in_document(source)
-    model = linear_model(found, options, on_step)
+    identified = identified_in_session(source) if is_session else identified_in_document(source)
+    model = linear_model(identified, options, on_step)
     on_step("file")
     variables = {**model.variables(), "exported_by": f"rigd {rigd.__version__}"}
     with _new_file(target) as stream:
@@ -145,24 +148,27 @@ def export_model(
 
 
 def check_target(target: Path, *, binary: bool) -> None:
-    """Refuse what cannot be written, before anything is computed."""
-    _check_ending(target, SUFFIXES)
+    """Raise if a record or response cannot be written to a file, before computing it."""
+    _check_suffix(target, SUFFIXES)
     suffix = target.suffix.lower()
-    if binary and suffix not in _UNIVERSAL:
+    if binary and suffix not in _UNIVERSAL_SUFFIXES:
         raise TargetError(
-            f"{target}: --binary is for universal files ({', '.join(_UNIVERSAL)}); leave it out."
+            f"{target}: --binary is for universal files ({', '.join(_UNIVERSAL_SUFFIXES)}); leave "
+            "it out."
         )
     check_new_file(target, "The file")
 
 
-def _check_ending(target: Path, endings: Collection[str]) -> None:
-    if target.suffix.lower() not in endings:
+def _check_suffix(target: Path, suffixes: Collection[str]) -> None:
+    """Raise if the suffix of a file is not one of the given suffixes."""
+    if target.suffix.lower() not in suffixes:
         raise TargetError(
-            f"{target}: the ending selects the format; choose one of {', '.join(endings)}."
+            f"{target}: the ending selects the format; choose one of {', '.join(suffixes)}."
         )
 
 
-def _write(table: ExportTable, target: Path, *, binary: bool) -> None:
+def _write_table(table: ExportTable, target: Path, *, binary: bool) -> None:
+    """Write a table to a new file in the format of its suffix."""
     with _new_file(target) as stream:
         match target.suffix.lower():
             case ".csv":
@@ -181,7 +187,7 @@ def _write(table: ExportTable, target: Path, *, binary: bool) -> None:
 
 @contextmanager
 def _new_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a new file that vanishes again if it cannot be completed."""
+    """Open a new file for writing; the file is removed if writing fails."""
     try:
         stream = path.open("xb")
     except OSError as error:

@@ -1,9 +1,9 @@
-"""Import: a measurement of another program becomes a session file, and is checked on the way.
+"""Conversion of a measurement of another program to a session file, with checks.
 
-Nothing is guessed: channels, units and circumstances are the user's to state (`ImportPlan`). Stated
-units are compared with those of the file, the time stamps with a uniform rate, and the torque with
-that of the undamped beam. Values that are not finite are held and flagged, as in the session
-format.
+The user states channels, units and circumstances in an `ImportPlan`; none of them is guessed. The
+stated units are compared with the units in the file, the time stamps with a uniform rate, and the
+torque with the torque of the undamped beam. Values that are not finite are replaced by the last
+finite value and flagged, as in the session format.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 import rigd
-from analysis.exchange._file_statements import FileStatements, time_samples
+from analysis.exchange._file_statements import FileStatements, plan_timebase
 from analysis.exchange._source import ExchangeError, read_source
 from analysis.record_checks import first_mode_hz, too_much_unknown
 from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
@@ -36,34 +36,37 @@ if TYPE_CHECKING:
 
 # Import
 
-REQUIRED: Final = ("angle_rad", "coupling_torque_nm")
-"""Fields of a sample without which nothing can be analysed."""
+REQUIRED_FIELDS: Final = ("angle_rad", "coupling_torque_nm")
+"""Fields of a sample that every analysis needs."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImportPlan:
-    """Channels, units and circumstances; nothing of it is guessed.
+    """User's statements on channels, units and circumstances of a record to be imported.
 
     Attributes
     ----------
     channels : mapping of str to ChannelChoice
-        Field of a sample (`analysis.exchange._channels.QUANTITIES`) → channel and unit; those of
-        `REQUIRED` must be among them.
+        Channel and unit by the field of a sample (`analysis.exchange.QUANTITIES`). The fields in
+        `REQUIRED_FIELDS` must be present.
     specimen : SpecimenFile
+        Beam and clamp.
     time : ChannelChoice, optional
         Channel with the time of each sample.
     rate_hz : float, optional
-        Samples per second of a record without gaps; this or `time`.
+        Sampling rate of a record without gaps; required if `time` is not given.
     segments_s : mapping of str to (float, float)
-        Name (rest, sweep, ring_down) → begin and end in s after the first sample.
+        Begin and end, in seconds after the first sample, by the segment's name: rest, sweep or
+        ring_down.
     angle_delay_s, torque_delay_s : float
-        Age of either value at its time stamp.
+        Age of the angle and of the torque at their time stamps.
     reverse_torque : bool
-        Whether the coupling torque counts against the angle's sense, as a reaction does.
+        Whether the sign of the coupling torque is reversed, because the sensor measures the
+        reaction.
     note, label, operator : str
-        From the operator; the label is what they call the specimen.
+        Note, label of the specimen, and name of the operator.
     ignore_file_metadata : bool
-        Whether the plan counts where the file states another rate, time, start, unit or scale.
+        Whether the plan overrides the file's rate, times, start, units and scale.
     """
 
     channels: Mapping[str, ChannelChoice]
@@ -80,31 +83,33 @@ class ImportPlan:
     ignore_file_metadata: bool = False
 
     def __post_init__(self) -> None:
-        if any(name not in self.channels for name in REQUIRED):
-            raise ValueError(f"a plan needs channels for {' and '.join(REQUIRED)}")
+        if any(name not in self.channels for name in REQUIRED_FIELDS):
+            raise ValueError(f"a plan needs channels for {' and '.join(REQUIRED_FIELDS)}")
         if (self.time is None) == (self.rate_hz is None):
             raise ValueError("a plan needs either a channel of times or a rate")
 
     @property
     def choices(self) -> tuple[ChannelChoice, ...]:
-        """Every channel that is to be read."""
+        """Choices of all channels that are to be read."""
         return (*self.channels.values(), *(() if self.time is None else (self.time,)))
 
 
 @dataclass(frozen=True, slots=True)
 class ImportedRecord:
-    """Result of an import.
+    """Session file that results from an import.
 
     Attributes
     ----------
     path : Path
-        The session file.
+        Path of the session file.
     samples : int
+        Number of samples.
     rate_hz : float
+        Sampling rate.
     segments : mapping of str to (int, int)
-        Name → first tick and end, as stated.
+        First and end tick by the segment's name, as stated in the plan.
     warnings : tuple of str
-        Sentences to be read before any result; the session has them as events.
+        Warnings for the user, which are also stored as events of the session.
     """
 
     path: Path
@@ -114,28 +119,29 @@ class ImportedRecord:
     warnings: tuple[str, ...]
 
 
-_JITTER_REPORTED: Final = 0.01
-"""Distance of a time stamp from its tick, in periods, from which it is reported."""
+_REPORTED_JITTER: Final = 0.01
+"""Distance of a time stamp from its tick, in sample periods, above which it is reported."""
 
 
 def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecord:
     """Read channels of a file and write them as a new session.
 
-    Gaps in the time become missing ticks. Values that are not finite are held from the sample
-    before and flagged as stale, which every analysis masks. Nothing is resampled.
+    Gaps in the times become missing ticks. Values that are not finite are replaced by the value
+    before and flagged as stale, so that every analysis masks them. Nothing is resampled.
 
     Parameters
     ----------
     source : Path
-        A file that `analysis.exchange._source.read_source` reads.
+        File in a format of `analysis.exchange.read_source`.
     target : Path
-        The session, ``NAME.mcap``, which must not exist.
+        New session file ``NAME.mcap``, which must not exist.
     plan : ImportPlan
+        The user's statements on the record.
 
     Raises
     ------
     ExchangeError
-        If the file cannot be read, is not a record, or contradicts the plan.
+        If the file cannot be read, contains no record, or contradicts the plan.
     rigd.session.SessionError
         If the session exists or cannot be written.
     """
@@ -145,59 +151,64 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     statements = FileStatements(source, plan, [*remarks])
     statements.check_scales(channels)
     statements.check_units(channels)
-    base = statements.timebase(channels)
-    channels, delays_s = statements.align(channels, base)
-    base = time_samples(source, plan, channels)
+    timebase = statements.timebase(channels)
+    channels, delays_s = statements.align(channels, timebase)
+    timebase = plan_timebase(source, plan, channels)
     warnings = statements.warnings
-    warnings += _check_rate(source, plan, base)
-    segments = _segments(source, plan.segments_s, base.rate_hz, int(base.ticks[-1]) + 1)
-    columns = _columns(plan, channels)
-    del channels  # of the largest files, a quarter of a gigabyte
+    warnings += _check_duration(source, plan, timebase)
+    segments = _segment_ticks(
+        source, plan.segments_s, timebase.rate_hz, int(timebase.ticks[-1]) + 1
+    )
+    columns = _si_columns(plan, channels)
+    del channels  # frees up to a quarter of a gigabyte
     titles = {name: choice.channel for name, choice in plan.channels.items()}
-    columns, status, first = hold(source, titles, columns)
-    ticks = base.ticks[first:]
-    after_gap = np.diff(ticks, prepend=-1) > 1
-    if base.jitter > _JITTER_REPORTED:
+    columns, status, first_sample = hold_last_values(source, titles, columns)
+    ticks = timebase.ticks[first_sample:]
+    is_after_gap = np.diff(ticks, prepend=-1) > 1
+    if timebase.jitter > _REPORTED_JITTER:
         warnings.append(
-            f"The time stamps lie up to {base.jitter:.2g} periods from equidistant ones."
+            f"The time stamps lie up to {timebase.jitter:.2g} periods from equidistant ones."
         )
-    warnings += _missing_sentences(titles, status, first, ticks)
-    odd = unlikely_torque(
-        _on_grid(ticks, columns["angle_rad"]),
-        _on_grid(ticks, columns["coupling_torque_nm"]),
-        base.rate_hz,
+    warnings += _describe_missing_samples(titles, status, first_sample, ticks)
+    anomaly = torque_anomaly(
+        _interpolate_gaps(ticks, columns["angle_rad"]),
+        _interpolate_gaps(ticks, columns["coupling_torque_nm"]),
+        timebase.rate_hz,
         plan.specimen,
     )
-    warnings += [odd] if odd else []
-    status[after_gap] |= np.uint32(Status.AFTER_LOST)
-    start_utc_ns, doubt = _start_utc_ns(source, int(ticks[-1]) / base.rate_hz)
-    warnings += [doubt] if doubt else []
-    metadata = _metadata(source, target, file_format, plan, base.rate_hz)
-    for key, field_name in (("angle_delay_s", REQUIRED[0]), ("torque_delay_s", REQUIRED[1])):
-        found_s = delays_s.get(plan.channels[field_name].channel, 0.0)
-        metadata[key] = repr(float(metadata[key]) + found_s)
+    warnings += [anomaly] if anomaly else []
+    status[is_after_gap] |= np.uint32(Status.AFTER_LOST)
+    start_utc_ns, start_warning = _session_start(source, int(ticks[-1]) / timebase.rate_hz)
+    warnings += [start_warning] if start_warning else []
+    metadata = _session_metadata(source, target, file_format, plan, timebase.rate_hz)
+    for key, field_name in (
+        ("angle_delay_s", REQUIRED_FIELDS[0]),
+        ("torque_delay_s", REQUIRED_FIELDS[1]),
+    ):
+        delay_s = delays_s.get(plan.channels[field_name].channel, 0.0)
+        metadata[key] = repr(float(metadata[key]) + delay_s)
     if statements.ignored:
         metadata["import_ignored"] = "; ".join(statements.ignored)
     write_session(
         target,
         {**columns, "tick": ticks, "status": status},
-        base.rate_hz,
+        timebase.rate_hz,
         start_utc_ns,
         metadata,
         segments,
         warnings,
     )
-    return ImportedRecord(target, len(ticks), base.rate_hz, segments, tuple(warnings))
+    return ImportedRecord(target, len(ticks), timebase.rate_hz, segments, tuple(warnings))
 
 
-_LATEST_NS: Final = 2**63 - 1
-"""Latest time that a session file can have, in the year 2262."""
+_LATEST_START_NS: Final = 2**63 - 1
+"""Latest time that a session file can state, in nanoseconds since 1970 (the year 2262)."""
 
 
-def _start_utc_ns(source: Path, duration_s: float) -> tuple[int, str]:
-    """Return when the file was changed last, or now with a warning if no session can have that."""
+def _session_start(source: Path, duration_s: float) -> tuple[int, str]:
+    """Return the file's modification time in ns, or the present time with a warning."""
     changed_ns = source.stat().st_mtime_ns
-    if changed_ns >= 0 and changed_ns + duration_s * 1e9 < _LATEST_NS:
+    if changed_ns >= 0 and changed_ns + duration_s * 1e9 < _LATEST_START_NS:
         return changed_ns, ""
     year = 1970 + changed_ns / (365.2425 * 86_400e9)
     return time.time_ns(), (
@@ -206,68 +217,70 @@ def _start_utc_ns(source: Path, duration_s: float) -> tuple[int, str]:
     )
 
 
-def _check_rate(path: Path, plan: ImportPlan, base: Timebase) -> list[str]:
-    """Raise if no record at this rate shows the beam; warn of a very short time."""
+def _check_duration(path: Path, plan: ImportPlan, timebase: Timebase) -> list[str]:
+    """Raise if the rate is too low for the beam's first mode; warn if the record is very short."""
     beam, times = plan.specimen.beam, plan.time
-    first_hz, duration_s = first_mode_hz(beam), (int(base.ticks[-1]) + 1) / base.rate_hz
+    first_hz, duration_s = first_mode_hz(beam), (int(timebase.ticks[-1]) + 1) / timebase.rate_hz
     remedy = (
         f"state the unit of '{times.channel}', which was taken to be {times.unit}, with --time "
         f"{times.channel}:UNIT (s, ms, us, ns)"
         if times
         else "state the true rate with --rate-hz"
     )
-    if first_hz >= base.rate_hz / 2:
+    if first_hz >= timebase.rate_hz / 2:
         raise ExchangeError(
-            f"{path}: the record lasts {duration_s:.6g} s at {base.rate_hz:g} Hz, but the first "
+            f"{path}: the record lasts {duration_s:.6g} s at {timebase.rate_hz:g} Hz, but the "
+            "first "
             f"mode of this beam is at {first_hz:.3g} Hz, beyond the Nyquist frequency of "
-            f"{base.rate_hz / 2:g} Hz; {remedy}, or correct the beam in --profile."
+            f"{timebase.rate_hz / 2:g} Hz; {remedy}, or correct the beam in --profile."
         )
     if duration_s * first_hz < 1:
         return [
-            f"The record lasts {duration_s:.3g} s at {base.rate_hz:g} Hz, less than one period of "
+            f"The record lasts {duration_s:.3g} s at {timebase.rate_hz:g} Hz, less than one period "
+            "of "
             f"the first mode of this beam, {first_hz:.3g} Hz; if that is wrong, {remedy}."
         ]
     return []
 
 
-def _columns(
+def _si_columns(
     plan: ImportPlan, channels: Mapping[str, SourceChannel]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the fields of the samples in SI units; infinite values are handled later."""
+    """Return the fields of the samples in SI units, including values that are not finite."""
     columns = {}
     with np.errstate(over="ignore"):
         for name, choice in plan.channels.items():
-            reverse = plan.reverse_torque and name == "coupling_torque_nm"
-            size = -choice.factor if reverse else choice.factor
+            is_reversed = plan.reverse_torque and name == "coupling_torque_nm"
+            factor = -choice.factor if is_reversed else choice.factor
             values = channels[choice.channel].values
-            columns[name] = values if size == 1.0 else values * size
+            columns[name] = values if factor == 1.0 else values * factor
     return columns
 
 
-def _segments(
+def _segment_ticks(
     path: Path, segments_s: Mapping[str, tuple[float, float]], rate_hz: float, ticks: int
 ) -> dict[str, tuple[int, int]]:
-    """Segments in ticks, all of them inside the record."""
-    found = {}
+    """Return first and end tick of each segment; raise if one is not inside the record."""
+    ticks_by_name = {}
     for name, (begin_s, end_s) in segments_s.items():
-        first, end = round(begin_s * rate_hz), round(end_s * rate_hz)
-        if not 0 <= first < end <= ticks:
+        first_tick, end = round(begin_s * rate_hz), round(end_s * rate_hz)
+        if not 0 <= first_tick < end <= ticks:
             raise ExchangeError(
                 f"{path}: the segment {name} from {begin_s:g} to {end_s:g} s is not inside the "
                 f"record, which lasts {ticks / rate_hz:g} s; count from the first sample."
             )
-        found[name] = (first, end)
-    return found
+        ticks_by_name[name] = (first_tick, end)
+    return ticks_by_name
 
 
-def _missing_sentences(
-    titles: Mapping[str, str], status: NDArray[np.uint32], first: int, ticks: NDArray[np.int64]
+def _describe_missing_samples(
+    titles: Mapping[str, str], status: NDArray[np.uint32], omitted: int, ticks: NDArray[np.int64]
 ) -> list[str]:
-    """Return sentences on missing parts of the record."""
-    found = []
-    if first:
-        found.append(
-            f"The first {first} samples were left out: angle or torque is not finite there."
+    """Return sentences on missing samples and on values that are not finite."""
+    sentences = []
+    if omitted:
+        sentences.append(
+            f"The first {omitted} samples were left out: angle or torque is not finite there."
         )
     for flag, name in (
         (Status.ANGLE_STALE, titles["angle_rad"]),
@@ -275,27 +288,30 @@ def _missing_sentences(
     ):
         count = int(np.count_nonzero(status & flag))
         if count:
-            found.append(f"{count} samples of '{name}' are not finite; they were flagged as stale.")
+            sentences.append(
+                f"{count} samples of '{name}' are not finite; they were flagged as stale."
+            )
     steps = np.diff(ticks)
     missing = int(steps.sum()) - len(steps)
     if missing:
-        found.append(
+        sentences.append(
             f"{missing} samples are missing in {np.count_nonzero(steps > 1)} gaps of the time, the "
             f"longest of {int(steps.max()) - 1}."
         )
-    return found
+    return sentences
 
 
-def _on_grid(ticks: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _interpolate_gaps(ticks: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the values at all ticks, interpolated in gaps."""
     if ticks[-1] - ticks[0] + 1 == len(ticks):
         return values
     return np.interp(np.arange(ticks[0], ticks[-1] + 1), ticks, values)
 
 
-def _metadata(
+def _session_metadata(
     source: Path, target: Path, file_format: str, plan: ImportPlan, rate_hz: float
 ) -> dict[str, str]:
-    """Return the metadata of the session and of its source."""
+    """Return the metadata of the new session, including those of its source file."""
     beam = plan.specimen.beam
     numbers = {
         "rate_hz": rate_hz,
@@ -339,64 +355,48 @@ def _metadata(
 
 # Values that are not finite
 
-_FLAGS: Final = {
+_STALE_FLAGS: Final = {
     "angle_rad": Status.ANGLE_STALE,
     "coupling_torque_nm": Status.WRENCH_STALE,
 }
-"""Field of a sample → the flag that says its value is that of the sample before."""
+"""Flag that marks a held value, by the field of a sample."""
 
 
-def hold(
+def hold_last_values(
     path: Path, names: Mapping[str, str], columns: Mapping[str, NDArray[np.float64]]
 ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.uint32], int]:
-    """Replace values that are not finite as the session format does: by the last good one.
+    """Replace values that are not finite by the last finite value, and flag them as stale.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    names : mapping of str to str
-        Field → name of its channel in the file, for messages.
-    columns : mapping of str to ndarray of float, shape (n,)
-        Field → values.
-
-    Returns
-    -------
-    columns : dict of str to ndarray of float, shape (n - first,)
-    status : ndarray of uint32, shape (n - first,)
-        Bits of `rigd.session.layout.Status`.
-    first : int
-        Samples at the beginning that had to be left out, having nothing to hold.
-
-    Raises
-    ------
-    ExchangeError
-        If it is too many values, or those of a channel that cannot be flagged.
+    `names` are the names of the fields' channels in the file. Return the fields, shape
+    (n - first_sample,), the bits of `rigd.session.layout.Status`, and the number
+    `first_sample` of initial samples that are left out because no finite value precedes them. Raise
+    ExchangeError if too many values are not finite, or if the field of such a value has no flag.
     """
     bad = {name: ~np.isfinite(values) for name, values in columns.items()}
     for name, mask in bad.items():
         count = int(mask.sum())
-        if count and name not in _FLAGS:
+        if count and name not in _STALE_FLAGS:
             raise ExchangeError(
                 f"{path}: '{names[name]}' is not finite in {count} of {len(mask)} samples, first "
                 f"in sample {int(np.argmax(mask)) + 1}; repair it, or leave this channel out: no "
                 "analysis needs it."
             )
-        much = too_much_unknown(f"'{names[name]}'", count, len(mask))
-        if much:
+        problem = too_much_unknown(f"'{names[name]}'", count, len(mask))
+        if problem:
             raise ExchangeError(
-                f"{path}: {much} Or choose another channel, or cut the session out of the file."
+                f"{path}: {problem} Or choose another channel, or cut the session out of the file."
             )
-    first = max(int(np.argmin(mask)) for mask in bad.values())
-    held = {name: _held(values, bad[name])[first:] for name, values in columns.items()}
+    first_sample = max(int(np.argmin(mask)) for mask in bad.values())
+    held = {name: _hold_last(values, bad[name])[first_sample:] for name, values in columns.items()}
     status = np.zeros(len(next(iter(held.values()))), dtype=np.uint32)
-    for name, flag in _FLAGS.items():
+    for name, flag in _STALE_FLAGS.items():
         if name in bad:
-            status[bad[name][first:]] |= np.uint32(flag)
-    return held, status, first
+            status[bad[name][first_sample:]] |= np.uint32(flag)
+    return held, status, first_sample
 
 
-def _held(values: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _hold_last(values: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the values with each bad value replaced by the last good value before it."""
     if not bad.any():
         return values
     last_good = np.maximum.accumulate(np.where(bad, 0, np.arange(len(values))))
@@ -405,70 +405,64 @@ def _held(values: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.flo
 
 # Plausibility of the torque
 
-_BANDS: Final = ((0.25, 0.6), (1.5, 3.5))
-"""In first natural frequencies: on either side of the first resonance, far enough from it and from
-the first antiresonance (at 4.4) for damping not to matter, and above the frequencies at which the
-paper's external damping outweighs the inertia."""
+_CHECK_BANDS: Final = ((0.25, 0.6), (1.5, 3.5))
+"""Frequency bands of the torque check, as multiples of the first natural frequency. They lie on
+either side of the first resonance, far enough from it and from the first antiresonance (at 4.4) for
+damping not to matter, and above the frequencies at which the paper's external damping exceeds the
+inertia."""
 
-_CERTAIN: Final = 6.0
-"""Distance from zero, in standard deviations, that the factor between torque and model must have
-for a decision: a motion that does not reach these frequencies gives none."""
+_SIGNIFICANT_STDS: Final = 6.0
+"""Smallest significant ratio of torque to model, in standard deviations. A motion that does not
+excite the bands gives no significant ratio."""
 
-_TAPER: Final = 0.05
-"""Fraction of the record at either end over which it is faded: a record may begin and end in
-motion, and the paper's chirp passes these frequencies early."""
+_TAPER_FRACTION: Final = 0.05
+"""Fraction of the record that is tapered at either end: a record may begin and end in motion, and
+the paper's chirp passes the bands early."""
 
-_FACTOR: Final = 3.0
-"""Largest factor between torque and model that damping and a wrong mass may account for. The units
-that are easily mixed up differ by more than ten."""
+_LARGEST_RATIO: Final = 3.0
+"""Largest ratio of torque to model that damping and a wrong mass may explain. Units that are easily
+confused differ by more than ten."""
 
 
-def unlikely_torque(
+def torque_anomaly(
     angle_rad: NDArray[np.float64],
     torque_nm: NDArray[np.float64],
     rate_hz: float,
     specimen: SpecimenFile,
 ) -> str | None:
-    """Compare the torque with that of the undamped beam on either side of its first resonance.
+    """Check sign and size of the torque against the undamped beam near its first resonance.
 
-    Parameters
-    ----------
-    angle_rad, torque_nm : ndarray of float, shape (n,)
-        The whole record, finite.
-    rate_hz : float
-    specimen : SpecimenFile
-
-    Returns
-    -------
-    str or None
-        Anomaly and remedy; None if there is none, or the motion does not decide it.
+    `angle_rad` and `torque_nm` are the whole record with finite values. Return a sentence with
+    anomaly and remedy, or None if the torque is plausible or the motion too small for the check.
     """
     frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
     first_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)
     band = np.zeros(frequency_hz.shape, dtype=np.bool_)
-    for low, high in _BANDS:
+    for low, high in _CHECK_BANDS:
         band |= (frequency_hz >= low * first_hz) & (frequency_hz <= high * first_hz)
     s = 2j * np.pi * frequency_hz[band]
-    from_middle = np.abs(np.linspace(-1.0, 1.0, len(angle_rad)))  # 0 in the middle, 1 at either end
-    window = np.sin(np.pi / 2 * np.minimum((1 - from_middle) / (2 * _TAPER), 1)) ** 2
+    distance = np.abs(np.linspace(-1.0, 1.0, len(angle_rad)))  # 0 in the middle, 1 at either end
+    window = np.sin(np.pi / 2 * np.minimum((1 - distance) / (2 * _TAPER_FRACTION), 1)) ** 2
     with np.errstate(over="ignore", invalid="ignore"):
         angle, torque = (
             np.fft.rfft(window * (values - values.mean()))[band]
             for values in (angle_rad, torque_nm)
         )
         model = (transfer(s, specimen.beam, Damping()) + specimen.tool_inertia_kg_m2 * s**2) * angle
-        power, total = (float(np.vdot(each, each).real) for each in (model, torque))
-        if not (0.0 < power < np.inf and 0.0 < total < np.inf):
+        model_power, torque_power = (
+            float(np.vdot(spectrum, spectrum).real) for spectrum in (model, torque)
+        )
+        if not (0.0 < model_power < np.inf and 0.0 < torque_power < np.inf):
             return None
-        ratio = complex(np.vdot(model, torque) / power)
-    size = abs(ratio)
-    explained = size**2 * power
-    unexplained_per_bin = max(total - explained, 0.0) / np.count_nonzero(band)
-    if explained < _CERTAIN**2 * unexplained_per_bin:
+        ratio = complex(np.vdot(model, torque) / model_power)
+    magnitude = abs(ratio)
+    explained = magnitude**2 * model_power
+    unexplained_per_bin = max(torque_power - explained, 0.0) / np.count_nonzero(band)
+    if explained < _SIGNIFICANT_STDS**2 * unexplained_per_bin:
         return None
-    if not 1 / _FACTOR < size < _FACTOR:
+    if not 1 / _LARGEST_RATIO < magnitude < _LARGEST_RATIO:
         return (
-            f"The torque is {size:.3g} times that of this beam: check the units of "
+            f"The torque is {magnitude:.3g} times that of this beam: check the units of "
             "angle and torque, and the beam's length and density."
         )
     if ratio.real < 0.0:
@@ -481,8 +475,8 @@ def unlikely_torque(
 
 # Session file
 
-_BLOCK: Final = 25_000
-"""Samples that are packed at a time."""
+_BLOCK_SAMPLES: Final = 25_000
+"""Number of samples that are encoded at a time."""
 
 
 def write_session(
@@ -494,21 +488,21 @@ def write_session(
     segments: Mapping[str, tuple[int, int]],
     warnings: Sequence[str],
 ) -> None:
-    """Write a session that was recorded elsewhere.
+    """Write a record of another program as a session file.
 
-    How it ended is not known, so the outcome has the counts and nothing else. If it cannot be
-    written, nothing is left behind.
+    The reason for the end of the record is not known, so the outcome only has the numbers of
+    samples. If writing fails, no file remains.
 
     Parameters
     ----------
     path : Path
-        Its final name, which must not exist.
+        Path of the new file, which must not exist.
     samples : mapping of str to ndarray, shape (n,)
-        Fields of a sample, ``tick`` among them; those that are absent are 0.
+        Fields of the samples, including ``tick``; absent fields are 0.
     rate_hz, start_utc_ns, metadata, segments
-        As the format has them (docs/session_format.md).
+        Sampling rate, start, metadata and segments as in docs/session_format.md.
     warnings : sequence of str
-        Written as events.
+        Warnings, which become events of the session.
 
     Raises
     ------
@@ -521,9 +515,9 @@ def write_session(
         writer.begin(start_utc_ns, metadata, segments, {})
         for warning in warnings:
             writer.log(0, "warning", warning, "import")
-        for begin in range(0, len(ticks), _BLOCK):
-            part = slice(begin, begin + _BLOCK)
-            block = {name: values[part] for name, values in samples.items()}
+        for begin in range(0, len(ticks), _BLOCK_SAMPLES):
+            rows = slice(begin, begin + _BLOCK_SAMPLES)
+            block = {name: values[rows] for name, values in samples.items()}
             block["t_ns"] = np.rint(np.multiply(block["tick"], 1e9 / rate_hz))
             writer.write_samples(encode_samples(block))
         scheduled = int(ticks[-1]) + 1
@@ -531,7 +525,7 @@ def write_session(
         counts["lost"] = scheduled - len(ticks)
         writer.close({name: str(count) for name, count in counts.items()})
     except BaseException:
-        # Unlike a recording, the source is still there: an incomplete copy of it is useless.
+        # The source still exists, so an incomplete copy of it is useless.
         try:
             writer.abandon()
         finally:

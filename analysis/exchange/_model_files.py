@@ -1,4 +1,4 @@
-"""Files of linear models: JSON, NumPy and MATLAB, all with the same variables."""
+"""Writing of linear models to JSON, NumPy and MATLAB files with the same variables."""
 
 from __future__ import annotations
 
@@ -9,22 +9,24 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 
 Variables = Mapping[str, Any]
-"""Strings, numbers, lists of strings and arrays by name."""
+"""Variables of a linear model by name: strings, numbers, lists of strings and arrays."""
 
 
 def write_json(variables: Variables, stream: BinaryIO) -> None:
-    """Write an object with a line for each variable.
+    """Write the variables of a linear model as a JSON object, with a line for each variable.
 
-    Complex numbers are pairs of real and imaginary part; what is not known is null.
+    Complex numbers are pairs of real and imaginary part; unknown values are null.
 
     Parameters
     ----------
     variables : mapping
+        Variables by name.
     stream : binary file
+        Destination.
     """
     from analysis.results import finite
 
-    content = finite({name: _plain(value) for name, value in variables.items()})
+    content = finite({name: _json_value(value) for name, value in variables.items()})
     lines = (
         f"{json.dumps(name)}: {json.dumps(value, ensure_ascii=False, allow_nan=False)}"
         for name, value in content.items()
@@ -33,32 +35,38 @@ def write_json(variables: Variables, stream: BinaryIO) -> None:
 
 
 def write_npz(variables: Variables, stream: BinaryIO) -> None:
-    """Write an array for each variable, none of which needs pickle.
+    """Write the variables of a linear model as NumPy arrays that can be loaded without pickle.
 
     Parameters
     ----------
     variables : mapping
+        Variables by name.
     stream : binary file
+        Destination.
     """
     np.savez_compressed(
         stream,
-        **{name: _strings(value, np.str_) for name, value in variables.items()},
+        **{name: _string_array(value, np.str_) for name, value in variables.items()},
     )
 
 
 def write_mat(variables: Variables, stream: BinaryIO) -> None:
-    """Write a variable for each, lists of strings as cell arrays; MATLAB's version 7.
+    """Write the variables of a linear model to a MATLAB file of version 7.
+
+    Lists of strings become cell arrays.
 
     Parameters
     ----------
     variables : mapping
+        Variables by name.
     stream : binary file
+        Destination.
     """
     from scipy.io import savemat
 
     savemat(
         stream,
-        {name: _strings(value, np.object_) for name, value in variables.items()},
+        {name: _string_array(value, np.object_) for name, value in variables.items()},
         do_compression=True,
         oned_as="column",
     )
@@ -69,10 +77,11 @@ MODEL_FORMATS: Final[Mapping[str, Callable[[Variables, BinaryIO], None]]] = {
     ".npz": write_npz,
     ".mat": write_mat,
 }
-"""Writer by the ending of the file."""
+"""Function that writes a linear model, by the suffix of the file."""
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401
+def _json_value(value: Any) -> Any:  # noqa: ANN401
+    """Return an array as nested lists, complex numbers as pairs; other values unchanged."""
     if not isinstance(value, np.ndarray):
         return value
     if np.iscomplexobj(value):
@@ -80,5 +89,6 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
     return value.tolist()
 
 
-def _strings(value: Any, kind: type) -> Any:  # noqa: ANN401
-    return np.array(value, dtype=kind) if isinstance(value, list) else value
+def _string_array(value: Any, element_type: type) -> Any:  # noqa: ANN401
+    """Return a list of strings as an array of a type; other values unchanged."""
+    return np.array(value, dtype=element_type) if isinstance(value, list) else value

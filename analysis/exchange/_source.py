@@ -1,4 +1,4 @@
-"""A measurement file of another program as named channels, read within bounds."""
+"""Reading of named channels from measurement files of other programs, within memory bounds."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 
 class ExchangeError(Exception):
-    """A file that cannot be imported or exported; the message names file, cause and remedy."""
+    """Error on a file that cannot be imported or exported; the message states the remedy."""
 
 
 class TargetError(ExchangeError):
-    """A name under which nothing can be written."""
+    """Error on the name of an output file, such as an unknown suffix."""
 
 
 # Reading
@@ -33,16 +33,16 @@ class TargetError(ExchangeError):
 
 @dataclass(frozen=True, slots=True)
 class FileTimes:
-    """Times that a file has of its samples.
+    """Times of the samples that a file contains.
 
     Attributes
     ----------
     name : str
-        Name of the channel that has them.
+        Name of the channel of times.
     values : ndarray of float, shape (n,)
-        Unchanged from the file.
+        Times as in the file.
     unit_s : float or None
-        Size of their unit in seconds, None if the file does not state it.
+        Unit of the times in seconds; None if the file does not state it.
     """
 
     name: str
@@ -52,25 +52,25 @@ class FileTimes:
 
 @dataclass(frozen=True, slots=True)
 class SourceChannel:
-    """One channel of the file, unchanged.
+    """Values of one channel of a file, with the file's statements on them.
 
     Attributes
     ----------
     values : ndarray of float, shape (n,)
-        In the unit that the user states; NaN and infinities as they are.
+        Values as in the file, NaN and infinities included.
     unit_label : str
-        Unit stated in the file, "" if none.
+        Unit stated in the file; empty if not stated.
     rate_hz : float or None
-        Samples per second by the file, None if it states none.
+        Sampling rate stated in the file; None if not stated.
     remark : str
-        What the user should know of the file, "" if nothing.
+        Warning for the user about the file; empty if there is none.
     start_ns : int or None
-        Time of the first sample by the file, ns from any instant that all channels of the file have
-        in common, None if it says nothing.
+        Time of the first sample stated in the file, in ns from an origin common to all channels of
+        the file; None if not stated.
     times : FileTimes or None
-        Times that the file has of these samples besides.
+        Times of these samples in another channel of the file; None if there are none.
     unapplied_scale : str
-        Scale that the file asks for and that the values do not have, "" if none.
+        Scale stated in the file but not applied to the values; empty if there is none.
     """
 
     values: NDArray[np.float64]
@@ -84,69 +84,73 @@ class SourceChannel:
 
 @dataclass(frozen=True, slots=True)
 class _Format:
-    """How files of one kind are read: by ``read(path, names)`` of a module of this package."""
+    """File format, read by the function ``read(path, names)`` of a module of this package."""
 
     name: str
     module: str
     max_bytes: int
-    """Larger files are refused: what reads them needs up to ten times as much memory."""
+    """Largest file that is read; its reader needs up to ten times as much memory."""
 
 
-_MB: Final = 1_000_000
+_MEGABYTE: Final = 1_000_000
+"""Number of bytes in a megabyte."""
 
 _FORMATS: Final = {
-    ".csv": _Format("CSV", "_csv_format", 512 * _MB),
-    ".txt": _Format("CSV", "_csv_format", 512 * _MB),
-    ".dat": _Format("CSV", "_csv_format", 512 * _MB),
-    ".tsv": _Format("CSV", "_csv_format", 512 * _MB),
-    ".asc": _Format("CSV", "_csv_format", 512 * _MB),
-    ".lvm": _Format("CSV", "_csv_format", 512 * _MB),
-    ".mat": _Format("MATLAB", "_matlab_format", 512 * _MB),
-    ".tdms": _Format("TDMS", "_tdms_format", 512 * _MB),
-    ".uff": _Format("UFF58", "_uff_format", 128 * _MB),
-    ".unv": _Format("UFF58", "_uff_format", 128 * _MB),
-    ".uf58": _Format("UFF58", "_uff_format", 128 * _MB),
+    ".csv": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".txt": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".dat": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".tsv": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".asc": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".lvm": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".mat": _Format("MATLAB", "_matlab_format", 512 * _MEGABYTE),
+    ".tdms": _Format("TDMS", "_tdms_format", 512 * _MEGABYTE),
+    ".uff": _Format("UFF58", "_uff_format", 128 * _MEGABYTE),
+    ".unv": _Format("UFF58", "_uff_format", 128 * _MEGABYTE),
+    ".uf58": _Format("UFF58", "_uff_format", 128 * _MEGABYTE),
 }
+"""File format by the suffix of the file's name."""
 
 
 def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, SourceChannel]]:
-    """Read some channels of a file.
+    """Read some channels of a measurement file of another program.
 
     Parameters
     ----------
     path : Path
-        Its ending says what it is: .csv, .txt, .dat, .tsv, .asc, .lvm, .mat, .tdms, .uff, .unv or
-        .uf58.
+        File whose suffix selects the format: .csv, .txt, .dat, .tsv, .asc, .lvm, .mat, .tdms, .uff,
+        .unv or .uf58.
     names : sequence of str
-        The channels, as the format has them (docs/exchange.md).
+        Names of the channels, as in docs/exchange.md.
 
     Returns
     -------
     format_name : str
+        Name of the file format.
     channels : mapping
-        Each name with its channel; all have at least two samples.
+        Channels by their names; all have at least two samples.
 
     Raises
     ------
     ExchangeError
-        If the file cannot be read, or has no such channel of numbers.
+        If the file cannot be read, or lacks a requested channel of numbers.
     """
-    kind = _FORMATS.get(path.suffix.lower())
-    if kind is None:
+    file_format = _FORMATS.get(path.suffix.lower())
+    if file_format is None:
         raise ExchangeError(
             f"{path}: the ending of the name selects the format; give a file that ends in one of "
             f"{', '.join(_FORMATS)}."
         )
-    _check_file(path, kind)
+    _check_file(path, file_format)
     read: Callable[[Path, Sequence[str]], Mapping[str, SourceChannel]]
-    read = import_module(f"analysis.exchange.{kind.module}").read
+    read = import_module(f"analysis.exchange.{file_format.module}").read
     try:
         channels = read(path, names)
     except OSError as error:
         raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except MemoryError as error:
         raise ExchangeError(
-            f"{path}: would take more than {MAX_MEMORY / _MB:.0f} MB of memory to read, so it is "
+            f"{path}: would take more than {MAX_MEMORY_BYTES / _MEGABYTE:.0f} MB of memory to "
+            "read, so it is "
             "damaged or holds far more than a session; export the session's channels alone."
         ) from error
     for name, channel in channels.items():
@@ -154,25 +158,27 @@ def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, Sou
         if length < 2:
             raise ExchangeError(f"{path}: '{name}' has {length} samples, too few for a record.")
         check_samples(path, f"The channel '{name}'", length)
-    return kind.name, channels
+    return file_format.name, channels
 
 
-def _check_file(path: Path, kind: _Format) -> None:
+def _check_file(path: Path, file_format: _Format) -> None:
+    """Raise if a path is no regular file, or if the file is too large for its format."""
     try:
         status = path.stat()
     except OSError as error:
         raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
     if not stat.S_ISREG(status.st_mode):
         raise ExchangeError(f"{path}: is not a file; give a file of measurements.")
-    if status.st_size > kind.max_bytes:
+    if status.st_size > file_format.max_bytes:
         raise ExchangeError(
-            f"{path}: has {status.st_size / _MB:.0f} MB, more than the {kind.max_bytes / _MB:.0f} "
-            f"MB of {kind.name} that are read; export the session's channels alone."
+            f"{path}: has {status.st_size / _MEGABYTE:.0f} MB, more than the "
+            f"{file_format.max_bytes / _MEGABYTE:.0f} "
+            f"MB of {file_format.name} that are read; export the session's channels alone."
         )
 
 
 def check_lengths(path: Path, channels: Mapping[str, SourceChannel]) -> None:
-    """Refuse channels of different lengths."""
+    """Raise if channels have different numbers of samples."""
     lengths = {name: len(channel.values) for name, channel in channels.items()}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
@@ -184,18 +190,19 @@ def check_lengths(path: Path, channels: Mapping[str, SourceChannel]) -> None:
 
 # Bounds on memory and length
 
-MAX_MEMORY: Final = 800_000_000
-"""Most memory that reading a file may take, bytes."""
+MAX_MEMORY_BYTES: Final = 800_000_000
+"""Largest amount of memory in bytes that reading a file may take."""
 
 
 @contextmanager
-def bounded_memory(extra_bytes: int = MAX_MEMORY) -> Iterator[None]:
-    """Limit the growth of the process: larger requests raise a MemoryError.
+def bounded_memory(extra_bytes: int = MAX_MEMORY_BYTES) -> Iterator[None]:
+    """Limit the memory that the process may allocate in addition to the present amount.
 
-    Formats such as MATLAB's are compressed and nested, and their readers believe what a file says
-    of its sizes; a kilobyte can ask for all the memory there is. The kernel's own limit holds for
-    every library alike. Where there is none (Windows, macOS) nothing is limited. Libraries are to
-    be imported before, as the address space that they reserve would count too.
+    Larger requests raise a MemoryError. Formats such as MATLAB's are compressed and nested, and
+    their readers trust the sizes stated in the file, so that a kilobyte can request all memory of
+    the machine. The kernel's limit applies to every library. On systems without it (Windows,
+    macOS), nothing is limited. Libraries must be imported before, because the address space that
+    they reserve counts, too.
     """
     try:
         import resource
@@ -207,38 +214,43 @@ def bounded_memory(extra_bytes: int = MAX_MEMORY) -> Iterator[None]:
     except OSError:
         yield
         return
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    ceiling = pages * resource.getpagesize() + extra_bytes
-    bounds = [limit for limit in (soft, hard, ceiling) if limit != resource.RLIM_INFINITY]
-    resource.setrlimit(resource.RLIMIT_AS, (min(bounds), hard))
+    soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_AS)
+    new_limit = pages * resource.getpagesize() + extra_bytes
+    limits = [
+        limit for limit in (soft_limit, hard_limit, new_limit) if limit != resource.RLIM_INFINITY
+    ]
+    resource.setrlimit(resource.RLIMIT_AS, (min(limits), hard_limit))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+        resource.setrlimit(resource.RLIMIT_AS, (soft_limit, hard_limit))
 
 
-def check_samples(path: Path, what: str, samples: int) -> None:
-    """Refuse a channel that is, or claims to be, longer than `MAX_SAMPLES`."""
+def check_samples(path: Path, channel_text: str, samples: int) -> None:
+    """Raise if a channel has, or claims to have, more than `MAX_SAMPLES` samples."""
     if samples > MAX_SAMPLES:
         raise ExchangeError(
-            f"{path}: {what} has {samples} samples, more than the {MAX_SAMPLES} that are read; cut "
+            f"{path}: {channel_text} has {samples} samples, more than the {MAX_SAMPLES} that are "
+            "read; cut "
             "the session out of the file first."
         )
 
 
 # Common functions of the readers
 
-_NAMES_SHOWN: Final = 12
-"""Channel names that a message lists."""
-_NAME_SHOWN: Final = 60
-"""Characters of each."""
+_MOST_NAMES_LISTED: Final = 12
+"""Largest number of channel names that a message lists."""
+_MOST_NAME_CHARACTERS: Final = 60
+"""Largest number of characters of each channel name in a message."""
 
 
-def no_such_channel(path: Path, name: str, available: Iterable[str]) -> ExchangeError:
-    """Make the error for a channel that is not there, with the names of those that are."""
+def no_such_channel_error(path: Path, name: str, available: Iterable[str]) -> ExchangeError:
+    """Return the error for a channel that is missing, with the names of the available channels."""
     names = list(available)
-    listed = ", ".join(repr(printable(each, _NAME_SHOWN)) for each in names[:_NAMES_SHOWN])
-    more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+    listed = ", ".join(
+        repr(printable(channel, _MOST_NAME_CHARACTERS)) for channel in names[:_MOST_NAMES_LISTED]
+    )
+    more = f" and {len(names) - _MOST_NAMES_LISTED} more" if len(names) > _MOST_NAMES_LISTED else ""
     return ExchangeError(
         f"{path}: has no channel '{name}'; it has {listed}{more}."
         if names
@@ -247,47 +259,36 @@ def no_such_channel(path: Path, name: str, available: Iterable[str]) -> Exchange
 
 
 def channel_index(
-    path: Path, name: str, titles: Sequence[str], several: str, *, numbered: bool = False
+    path: Path, name: str, titles: Sequence[str], duplicates_text: str, *, numbered: bool = False
 ) -> int:
-    """Return the index of a channel, found by its title, or by its number as in ``#3``.
+    """Return the index of a channel that is given by its title or by its number, as ``#3``.
 
-    Parameters
-    ----------
-    path
-        File, for messages.
-    name
-        What the user calls the channel.
-    titles
-        Titles of all channels in the file.
-    several
-        What several channels of one title are, such as "columns are named".
-    numbered
-        Whether a message lists the titles with their numbers.
-
-    Raises
-    ------
-    ExchangeError
-        If there is no such channel, or more than one.
+    `titles` are the titles of all channels in the file. `duplicates_text` is the start of the
+    message on several channels of one title, such as "columns are named". `numbered` states whether
+    a message lists the titles with their numbers. Raise ExchangeError without exactly one such
+    channel.
     """
     count = titles.count(name)
     if count == 1:
         return titles.index(name)
     if count > 1:
         raise ExchangeError(
-            f"{path}: {count} {several} '{name}'; give the number, such as "
+            f"{path}: {count} {duplicates_text} '{name}'; give the number, such as "
             f"#{titles.index(name) + 1} for the first of them."
         )
     number = name.removeprefix("#")
     if name != number and number.isdecimal() and 0 < int(number) <= len(titles):
         return int(number) - 1
-    listed = [f"#{number} {each}" for number, each in enumerate(titles, 1)] if numbered else titles
-    raise no_such_channel(path, name, listed)
+    listed = (
+        [f"#{number} {title}" for number, title in enumerate(titles, 1)] if numbered else titles
+    )
+    raise no_such_channel_error(path, name, listed)
 
 
-def as_column(path: Path, name: str, values: NDArray[np.generic]) -> NDArray[np.float64]:
-    """Return real numbers (n,) as floats; anything else is refused."""
+def real_vector(path: Path, name: str, values: NDArray[np.generic]) -> NDArray[np.float64]:
+    """Return real numbers as a vector of floats; raise if the values are not real numbers."""
     if values.dtype.kind == "c":
-        raise not_in_time(path, name)
+        raise not_in_time_error(path, name)
     if values.dtype.kind not in "iuf":
         raise ExchangeError(
             f"{path}: the channel '{name}' does not hold real numbers but {values.dtype.name}; "
@@ -296,8 +297,8 @@ def as_column(path: Path, name: str, values: NDArray[np.generic]) -> NDArray[np.
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def not_in_time(path: Path, name: str) -> ExchangeError:
-    """Make the error for a complex channel."""
+def not_in_time_error(path: Path, name: str) -> ExchangeError:
+    """Return the error for a complex channel, which is no function of time."""
     return ExchangeError(
         f"{path}: '{name}' is complex, so it is a frequency response or a spectrum. A session is "
         "made of measured samples: give angle and torque over time; a record cannot be "
@@ -305,8 +306,8 @@ def not_in_time(path: Path, name: str) -> ExchangeError:
     )
 
 
-def missing_library(path: Path, library: str) -> ExchangeError:
-    """Make the error for a library that is not installed."""
+def missing_library_error(path: Path, library: str) -> ExchangeError:
+    """Return the error for a library that is not installed."""
     return ExchangeError(
         f"{path}: needs the package {library}, which is not installed; install all packages for "
         "import and export with `pip install 'rigd[exchange]'`."

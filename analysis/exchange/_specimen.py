@@ -1,4 +1,4 @@
-"""Beam and clamp from a TOML file: a rig's profile, or one with nothing else in it."""
+"""Reading of beam and clamp from a TOML file, such as the profile of a rig."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from analysis.record_checks import (
     MAX_TIP_MASS_KG,
     MAX_UNCERTAINTY_PERCENT,
     MAX_UNIFORMITY_PERCENT,
-    UNCERTAIN,
+    UNCERTAIN_QUANTITIES,
 )
 from rigd.beam import Beam
 from rigd.documents import DocumentError, parse_toml, read_text
@@ -25,22 +25,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SpecimenFile:
-    """Specimen and clamp of an imported record.
+    """Beam, clamp and uncertainties of an imported record's specimen, as a file states them.
 
     Attributes
     ----------
     beam : Beam
+        Beam of the specimen.
     tool_inertia_kg_m2 : float
-        Inertia about the motor's axis of what sits between torque sensor and beam.
+        Inertia about the motor's axis of the parts between torque sensor and beam.
     uncertainty_percent : mapping of str to float
-        Relative standard uncertainties of `analysis.record_checks.UNCERTAIN`, those stated.
+        Stated relative standard uncertainties of the `UNCERTAIN_QUANTITIES`.
     uniformity_percent : float or None
-        Relative standard deviation of each mode's frequency from that of a uniform beam, if stated.
+        Relative standard deviation of mode frequencies from those of a uniform beam; None if not
+        stated.
     tip_mass_kg : float or None
-        Point mass at the beam's tip, if stated.
+        Point mass at the beam's tip; None if not stated.
     axis_tilt_deg : float or None
-        Inclination of the plane of motion along the beam at rest, positive where the tip is lower
-        than the motor's axis, if stated.
+        Inclination of the plane of motion along the beam at rest, positive if the tip is lower than
+        the motor's axis; None if not stated.
     """
 
     beam: Beam
@@ -52,10 +54,11 @@ class SpecimenFile:
 
 
 def read_specimen(path: Path) -> SpecimenFile:
-    """Read ``[beam]`` and, as far as they are stated, tool inertia, tilt and ``[uncertainty]``.
+    """Read beam, tool inertia, tilt and uncertainties of a specimen from a TOML file.
 
-    A number is plain or, as in a profile, ``{ value = 0.98, source = "measured" }``. Nothing else
-    of a profile is used: delays, rate and limits are those of the rig's own recorder.
+    Only ``[beam]`` is required. A number is plain or, as in a profile, ``{ value = 0.98, source =
+    "measured" }``. Other entries of a profile are not used, because delays, rate and limits are
+    those of the rig's own recorder.
 
     Raises
     ------
@@ -74,12 +77,12 @@ def read_specimen(path: Path) -> SpecimenFile:
     except DocumentError as error:
         raise ExchangeError(f"{path}: {error}.") from error
     rig, beam, sensor, uncertainty = (
-        _section(path, content, name) for name in ("rig", "beam", "sensor", "uncertainty")
+        _read_section(path, content, name) for name in ("rig", "beam", "sensor", "uncertainty")
     )
-    percent = partial(_between, path, "uncertainty", uncertainty, low=0.0)
+    percent = partial(_number_in_range, path, "uncertainty", uncertainty, low=0.0)
     tool_inertia_kg_m2 = 0.0
     if "tool_inertia_kg_m2" in sensor:
-        tool_inertia_kg_m2 = _number(path, "sensor", sensor, "tool_inertia_kg_m2")
+        tool_inertia_kg_m2 = _required_number(path, "sensor", sensor, "tool_inertia_kg_m2")
         if tool_inertia_kg_m2 < 0.0:
             raise ExchangeError(
                 f"{path}: sensor.tool_inertia_kg_m2 is {tool_inertia_kg_m2:g} kg·m², but an "
@@ -87,31 +90,35 @@ def read_specimen(path: Path) -> SpecimenFile:
             )
     return SpecimenFile(
         Beam(
-            length_m=_positive(path, beam, "length_m"),
-            density_kg_per_m=_positive(path, beam, "density_kg_per_m"),
-            bending_stiffness_n_m2=_positive(path, beam, "bending_stiffness_n_m2"),
+            length_m=_positive_number(path, beam, "length_m"),
+            density_kg_per_m=_positive_number(path, beam, "density_kg_per_m"),
+            bending_stiffness_n_m2=_positive_number(path, beam, "bending_stiffness_n_m2"),
         ),
         tool_inertia_kg_m2,
         {
             name: value
-            for name in UNCERTAIN
+            for name in UNCERTAIN_QUANTITIES
             if (value := percent(f"{name}_percent", high=MAX_UNCERTAINTY_PERCENT)) is not None
         },
         percent("uniformity_percent", high=MAX_UNIFORMITY_PERCENT),
-        _between(path, "beam", beam, "tip_mass_kg", low=0.0, high=MAX_TIP_MASS_KG),
-        _between(path, "rig", rig, "axis_tilt_deg", low=-MAX_AXIS_TILT_DEG, high=MAX_AXIS_TILT_DEG),
+        _number_in_range(path, "beam", beam, "tip_mass_kg", low=0.0, high=MAX_TIP_MASS_KG),
+        _number_in_range(
+            path, "rig", rig, "axis_tilt_deg", low=-MAX_AXIS_TILT_DEG, high=MAX_AXIS_TILT_DEG
+        ),
     )
 
 
-def _section(path: Path, content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+def _read_section(path: Path, content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Return a section of the file, empty if absent; raise if the entry is no section."""
     section = content.get(name, {})
     if not isinstance(section, dict):
         raise ExchangeError(f"{path}: {name} is not a section; write [{name}] with its keys below.")
     return section
 
 
-def _positive(path: Path, section: Mapping[str, Any], key: str) -> float:
-    value = _number(path, "beam", section, key)
+def _positive_number(path: Path, section: Mapping[str, Any], key: str) -> float:
+    """Return a positive number of the beam; raise if it is missing or not positive."""
+    value = _required_number(path, "beam", section, key)
     if not value > 0.0:
         raise ExchangeError(
             f"{path}: beam.{key} is {value:g} {unit_of(key)}, but must be positive."
@@ -119,13 +126,13 @@ def _positive(path: Path, section: Mapping[str, Any], key: str) -> float:
     return value
 
 
-def _between(
+def _number_in_range(
     path: Path, name: str, section: Mapping[str, Any], key: str, *, low: float, high: float
 ) -> float | None:
-    """Return an optional number of a section, None if it is not stated."""
+    """Return an optional number of a section within a range, or None if it is not stated."""
     if key not in section:
         return None
-    value = _number(path, name, section, key)
+    value = _required_number(path, name, section, key)
     if not low <= value <= high:
         raise ExchangeError(
             f"{path}: {name}.{key} is {value:g} {unit_of(key)}, but must lie between {low:g} and "
@@ -134,7 +141,8 @@ def _between(
     return value
 
 
-def _number(path: Path, name: str, section: Mapping[str, Any], key: str) -> float:
+def _required_number(path: Path, name: str, section: Mapping[str, Any], key: str) -> float:
+    """Return a required number of a section, plain or with its source."""
     value, unit = section.get(key), unit_of(key)
     if isinstance(value, dict):
         value = value.get("value")

@@ -1,4 +1,4 @@
-"""Table for export: named columns with units over one axis, the same for every format."""
+"""Tables for export, the same for every file format: named columns with units over one axis."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ExportColumn:
-    """One quantity.
+    """Column of a table for export: values of one quantity.
 
     Attributes
     ----------
     name : str
-        With the unit as its suffix.
+        Name with the unit as its suffix.
     title : str
-        Title in ASCII; of a ratio, both sides of " / " in at most 20 characters each.
+        Title in ASCII; the title of a ratio has " / " between two texts of at most 20 characters.
     unit : str
-        "" without a unit.
+        Unit in ASCII; empty for a number without a unit.
     values : ndarray, shape (n,)
         Integers, floats or complex numbers.
     """
@@ -49,7 +49,7 @@ class ExportColumn:
 
 @dataclass(frozen=True, slots=True)
 class ExportTable:
-    """Columns over a common axis.
+    """Table for export: columns over a common axis.
 
     Attributes
     ----------
@@ -57,8 +57,10 @@ class ExportTable:
         Name of the session file.
     axis : ExportColumn
         Time or frequency, increasing.
-    columns : tuple of ExportColumn information : mapping of str to str
-        Its origin, for formats that can store it.
+    columns : tuple of ExportColumn
+        Columns of the table.
+    information : mapping of str to str
+        Metadata of the session or the estimate, for formats that can store them.
     """
 
     source: str
@@ -67,7 +69,7 @@ class ExportTable:
     information: Mapping[str, str]
 
 
-_TITLES: Final = {
+_COLUMN_TITLES: Final = {
     "tick": "Tick",
     "angle_reference_rad": "Angle reference",
     "angle_rad": "Angle",
@@ -77,17 +79,18 @@ _TITLES: Final = {
     **{f"t{axis}_nm": f"Torque {axis}" for axis in "xyz"},
     "status": "Status bits",
 }
+"""Title of each exported field of a sample."""
 
 
 def record_table(path: Path) -> ExportTable:
-    """Return the samples of a session as recorded: gaps remain, and flags are a column.
+    """Return the samples of a session as recorded, with gaps, and the status bits as a column.
 
     Raises
     ------
     rigd.session.SessionError
         If the file cannot be read.
     ExchangeError
-        If it has no sample or no rate.
+        If the session has no samples or no sampling rate.
     """
     session = read_session(path)
     rate_hz = session.number("rate_hz")
@@ -101,27 +104,29 @@ def record_table(path: Path) -> ExportTable:
         path.name,
         ExportColumn("time_s", "Time", "s", samples["tick"] / rate_hz),
         tuple(
-            ExportColumn(name, _TITLES[name], _unit(name), np.ascontiguousarray(samples[name]))
+            ExportColumn(
+                name, _COLUMN_TITLES[name], _ascii_unit(name), np.ascontiguousarray(samples[name])
+            )
             for name in SAMPLE_FIELDS
-            if name in _TITLES
+            if name in _COLUMN_TITLES
         ),
-        {**session.metadata, **_segment_texts(session.segments), **_origin(path)},
+        {**session.metadata, **_segment_texts(session.segments), **_origin_information(path)},
     )
 
 
 def frf_table(
     path: Path, settings: WelchSettings, band_hz: tuple[float, float] | None = None
 ) -> ExportTable:
-    """Estimate the response from angle to coupling torque, as the analysis does that fits it.
+    """Estimate the response from angle to coupling torque, as in the analysis of a session.
 
-    The channels' delays are taken out of it; the tool inertia is not. Without a band it is what
-    the record's rate holds of that of the settings.
+    The response is corrected for the channels' delays, but not for the tool inertia. The default
+    band is that of the settings, limited by the record's sampling rate.
 
     Raises
     ------
     rigd.session.SessionError, analysis.record.RecordError,
-    analysis.paper._estimate.FrequencyResponseError
-        As the analysis raises them.
+    analysis.paper.FrequencyResponseError
+        If the session cannot be read or analysed.
     """
     record = load_record(path)
     settings = welch_settings(record, settings, band_hz)
@@ -132,7 +137,7 @@ def frf_table(
     if response.coherence is not None:
         columns.append(ExportColumn("coherence", "Coherence", "", response.coherence))
     segmentation = settings.segmentation(record.rate_hz)
-    used = {} if settings.estimator == "fft" else asdict(segmentation)
+    welch_lengths = {} if settings.estimator == "fft" else asdict(segmentation)
     return ExportTable(
         path.name,
         ExportColumn("frequency_hz", "Frequency", "Hz", response.frequency_hz),
@@ -140,7 +145,7 @@ def frf_table(
         {
             "estimator": response.estimator,
             "segments": str(response.segments),
-            **{f"{name}_samples": str(value) for name, value in used.items()},
+            **{f"{name}_samples": str(value) for name, value in welch_lengths.items()},
             "rate_hz": repr(record.rate_hz),
             "angle_delay_removed_s": repr(record.angle_delay_s),
             "torque_delay_removed_s": repr(record.torque_delay_s),
@@ -148,19 +153,24 @@ def frf_table(
             "beam_length_m": repr(record.beam.length_m),
             "beam_density_kg_per_m": repr(record.beam.density_kg_per_m),
             "beam_bending_stiffness_n_m2": repr(record.beam.bending_stiffness_n_m2),
-            **_origin(path),
+            **_origin_information(path),
         },
     )
 
 
-def _unit(name: str) -> str:
-    """Return a field's unit as it is written into files, in ASCII."""
+def _ascii_unit(name: str) -> str:
+    """Return the unit of a field in ASCII, as written to files."""
     return unit_of(name).replace("·", ".")
 
 
 def _segment_texts(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
-    return {f"segment_{name}_ticks": f"{first},{end}" for name, (first, end) in segments.items()}
+    """Return first and end tick of each segment as text."""
+    return {
+        f"segment_{name}_ticks": f"{first_tick},{end}"
+        for name, (first_tick, end) in segments.items()
+    }
 
 
-def _origin(path: Path) -> dict[str, str]:
+def _origin_information(path: Path) -> dict[str, str]:
+    """Return the names of the session file and of the exporting program."""
     return {"session_file": path.name, "exported_by": f"rigd {rigd.__version__}"}

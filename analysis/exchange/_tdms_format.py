@@ -1,4 +1,4 @@
-"""Channels of a LabVIEW TDMS file, by npTDMS."""
+"""Reading of channels from LabVIEW TDMS files by the package npTDMS."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from analysis.exchange._source import (
     ExchangeError,
     FileTimes,
     SourceChannel,
-    as_column,
     bounded_memory,
     check_samples,
-    missing_library,
-    no_such_channel,
+    missing_library_error,
+    no_such_channel_error,
+    real_vector,
 )
 from rigd.text_table.titles import is_title_of_times, time_unit_s
 
@@ -27,29 +27,33 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import BinaryIO
 
-_MOST_ENTRIES: Final = 5_000_000
-"""Most channels, counted again in each segment: npTDMS takes that many steps before it reads."""
+_MOST_LISTED_CHANNELS: Final = 5_000_000
+"""Largest number of channels, counted in each segment, because npTDMS processes all of them before
+it reads a value."""
 
-_EARLIEST: Final = np.datetime64("1980-01-01")
-"""LabVIEW's own zero, in 1904, means that no start was given."""
-_EARLIEST_NS: Final = int(_EARLIEST.astype("datetime64[ns]").astype(np.int64))
+_EARLIEST_START: Final = np.datetime64("1980-01-01")
+"""Earliest start that counts as stated; LabVIEW's origin, in 1904, means that none was given."""
+_EARLIEST_START_NS: Final = int(_EARLIEST_START.astype("datetime64[ns]").astype(np.int64))
+"""Earliest start that counts as stated, in nanoseconds since 1970."""
 
-_LEAD_IN: Final = 28
+_LEAD_IN_BYTES: Final = 28
+"""Number of bytes of a segment's lead-in."""
 _HAS_METADATA, _NEW_LIST, _BIG_ENDIAN = 1 << 1, 1 << 2, 1 << 6
+"""Bits in the lead-in: the segment has metadata, a new list of channels, big-endian numbers."""
 
 
 def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
-    """Read channels ``Group/Channel``, as `analysis.exchange._source.read_source` asks for.
+    """Read channels ``Group/Channel`` from a TDMS file (see `analysis.exchange.read_source`).
 
-    Scalings of the file are applied; one that npTDMS does not know is reported with the channel,
-    whose values are then raw. The file is opened by itself, without an index file in the same
-    folder, which may belong to another.
+    Scales in the file are applied. If npTDMS does not know a scale, the values are raw and the
+    channel states it. An index file in the same folder is not used, because it may belong to
+    another file.
     """
     try:
         from nptdms import TdmsFile
         from nptdms.log import log_manager
     except ImportError as error:
-        raise missing_library(path, "npTDMS") from error
+        raise missing_library_error(path, "npTDMS") from error
     log_manager.set_level(logging.ERROR)  # its warnings are reported below
     try:
         with path.open("rb") as stream:
@@ -60,17 +64,21 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
                     for group in file.groups()
                     for channel in group.channels()
                 }
-                torn = file.file_status.incomplete_final_segment
-                found = {name: _channel(path, name, channels, torn) for name in names}
+                is_cut_off = file.file_status.incomplete_final_segment
+                source_channels = {
+                    name: _read_channel(path, name, channels, is_cut_off) for name in names
+                }
                 for name in names:
                     levels = (channels[name], file[channels[name].group_name], file)
                     scale = _unapplied_scale([level.properties for level in levels])
-                    times = _times(path, name, names, channels)
-                    found[name] = replace(found[name], unapplied_scale=scale, times=times)
-                return _with_common_starts(found)
+                    times = _group_times(path, name, names, channels)
+                    source_channels[name] = replace(
+                        source_channels[name], unapplied_scale=scale, times=times
+                    )
+                return _drop_relative_starts(source_channels)
     except (ExchangeError, OSError, MemoryError):
         raise
-    except Exception as error:  # npTDMS lets through whatever a damaged file provokes
+    except Exception as error:  # npTDMS raises many types on a damaged file
         raise ExchangeError(
             f"{path}: is not a TDMS file, or is damaged ({error}); copy it again from where it was "
             "recorded."
@@ -78,95 +86,102 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 
 
 def _check_entries(path: Path, stream: BinaryIO) -> None:
-    """Refuse a file whose table of contents alone would take minutes or gigabytes to read."""
+    """Raise if the table of contents would take minutes or gigabytes to read."""
     size = path.stat().st_size
     offset = channels = entries = 0
-    while offset + _LEAD_IN <= size and entries <= _MOST_ENTRIES:
+    while offset + _LEAD_IN_BYTES <= size and entries <= _MOST_LISTED_CHANNELS:
         stream.seek(offset)
-        head = stream.read(_LEAD_IN + 4)
-        contents = int.from_bytes(head[4:8], "little")
-        order = ">" if contents & _BIG_ENDIAN else "<"
-        (length,) = struct.unpack(f"{order}Q", head[12:20])
-        if contents & _HAS_METADATA and len(head) == _LEAD_IN + 4:
-            (listed,) = struct.unpack(f"{order}L", head[_LEAD_IN:])
-            channels = listed if contents & _NEW_LIST else channels + listed
+        lead_in = stream.read(_LEAD_IN_BYTES + 4)
+        contents = int.from_bytes(lead_in[4:8], "little")
+        byte_order = ">" if contents & _BIG_ENDIAN else "<"
+        (length,) = struct.unpack(f"{byte_order}Q", lead_in[12:20])
+        if contents & _HAS_METADATA and len(lead_in) == _LEAD_IN_BYTES + 4:
+            (channel_count,) = struct.unpack(f"{byte_order}L", lead_in[_LEAD_IN_BYTES:])
+            channels = channel_count if contents & _NEW_LIST else channels + channel_count
             entries += channels
         entries += 1
-        offset += _LEAD_IN + length
+        offset += _LEAD_IN_BYTES + length
     stream.seek(0)
-    if entries > _MOST_ENTRIES:
+    if entries > _MOST_LISTED_CHANNELS:
         raise ExchangeError(
-            f"{path}: its segments list more than {_MOST_ENTRIES} channels in all, so it is "
+            f"{path}: its segments list more than {_MOST_LISTED_CHANNELS} channels in all, so it "
+            "is "
             "damaged or no record of a few channels; export the session's channels alone."
         )
 
 
-def _channel(path: Path, name: str, channels: Mapping[str, Any], torn: bool) -> SourceChannel:
+def _read_channel(
+    path: Path, name: str, channels: Mapping[str, Any], is_cut_off: bool
+) -> SourceChannel:
+    """Return one channel; `is_cut_off` states that the end of the file is missing."""
     channel = channels.get(name)
     if channel is None:
-        raise no_such_channel(path, name, channels)
+        raise no_such_channel_error(path, name, channels)
     check_samples(path, f"The channel '{name}'", len(channel))
     properties = channel.properties
     values, label = channel[:], str(properties.get("unit_string", ""))
     if values.dtype.kind == "M":  # LabVIEW's time stamps
         values, label = (values - values[:1]) / np.timedelta64(1, "s"), "s"
     axis = str(properties.get("wf_xunit_string", "")).strip()
-    if _bare_lower(axis) in _FREQUENCIES:
+    if _plain_lower_case(axis) in _FREQUENCY_UNITS:
         raise ExchangeError(
             f"{path}: '{name}' is a function of frequency (its wf_xunit_string is '{axis}'), not "
             "of time; give measured samples."
         )
     unit_s = time_unit_s(axis) or 1.0
     return SourceChannel(
-        as_column(path, name, values),
+        real_vector(path, name, values),
         unit_label=label or str(properties.get("NI_UnitDescription", "")),
         rate_hz=_rate_hz(properties.get("wf_increment"), unit_s),
-        remark="The file's end is missing: its recording was cut off." if torn else "",
+        remark="The file's end is missing: its recording was cut off." if is_cut_off else "",
         start_ns=_start_ns(properties, unit_s),
     )
 
 
-_FREQUENCIES: Final = ("hz", "hertz", "khz", "1/s")
+_FREQUENCY_UNITS: Final = ("hz", "hertz", "khz", "1/s")
+"""Units of an axis of frequencies, in lower case."""
 
 
-def _bare_lower(text: str) -> str:
+def _plain_lower_case(text: str) -> str:
+    """Return a text in lower case, without surrounding spaces and brackets."""
     return text.strip(" []()").lower()
 
 
 def _rate_hz(increment: object, unit_s: float) -> float | None:
+    """Return the sampling rate in Hz for a time increment; None if it is not valid."""
     if not isinstance(increment, int | float) or not 0 < increment < math.inf:
         return None
     return 1 / (increment * unit_s)
 
 
 def _start_ns(properties: Mapping[str, Any], unit_s: float) -> int | None:
-    """Return the time of the first sample: start time, if there is one, and offset."""
-    begun, offset = properties.get("wf_start_time"), properties.get("wf_start_offset")
-    begun_ns = 0
-    if isinstance(begun, np.datetime64) and begun >= _EARLIEST:
-        begun_ns = int(begun.astype("datetime64[ns]").astype(np.int64))
+    """Return the time of the first sample in ns, from start time and offset; None without them."""
+    start, offset = properties.get("wf_start_time"), properties.get("wf_start_offset")
+    start_time_ns = 0
+    if isinstance(start, np.datetime64) and start >= _EARLIEST_START:
+        start_time_ns = int(start.astype("datetime64[ns]").astype(np.int64))
     elif offset is None and "wf_increment" not in properties:
         return None
     if not isinstance(offset, int | float) or not math.isfinite(offset):
         offset = 0.0
-    return begun_ns + round(offset * unit_s * 1e9)
+    return start_time_ns + round(offset * unit_s * 1e9)
 
 
-def _with_common_starts(channels: dict[str, SourceChannel]) -> dict[str, SourceChannel]:
-    """Drop the time offsets of channels without a start time if other channels have one."""
+def _drop_relative_starts(channels: dict[str, SourceChannel]) -> dict[str, SourceChannel]:
+    """Remove start times that are only offsets, if other channels have absolute start times."""
     starts = [channel.start_ns or 0 for channel in channels.values()]
-    if max(starts) < _EARLIEST_NS:
+    if max(starts) < _EARLIEST_START_NS:
         return channels
     return {
         name: channel
-        if channel.start_ns is None or channel.start_ns >= _EARLIEST_NS
+        if channel.start_ns is None or channel.start_ns >= _EARLIEST_START_NS
         else replace(channel, start_ns=None)
         for name, channel in channels.items()
     }
 
 
 def _unapplied_scale(levels: Sequence[Mapping[str, Any]]) -> str:
-    """Name the scales that a channel, its group or the file asks for and npTDMS does not apply."""
+    """Return the types of scales stated in the properties that npTDMS does not apply."""
     from nptdms.scaling import get_scaling
 
     for properties in levels:
@@ -183,10 +198,10 @@ def _unapplied_scale(levels: Sequence[Mapping[str, Any]]) -> str:
     return ""
 
 
-def _times(
+def _group_times(
     path: Path, name: str, names: Sequence[str], channels: Mapping[str, Any]
 ) -> FileTimes | None:
-    """Return the times in a channel of the same group that was not requested, if there is one."""
+    """Return the times in another channel of the same group, unless it was requested, or None."""
     channel = channels[name]
     for other, candidate in channels.items():
         if (
@@ -197,8 +212,8 @@ def _times(
         ):
             continue
         try:
-            found = _channel(path, other, channels, False)
-        except ExchangeError:  # texts, say
+            time_channel = _read_channel(path, other, channels, False)
+        except ExchangeError:  # the channel has texts, for example
             continue
-        return FileTimes(other, found.values, time_unit_s(found.unit_label))
+        return FileTimes(other, time_channel.values, time_unit_s(time_channel.unit_label))
     return None

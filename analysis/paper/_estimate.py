@@ -1,4 +1,4 @@
-"""Frequency response of a record, by Welch's method (as in the reference paper) or another one."""
+"""Estimate of a record's frequency response by Welch's method or another estimator."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 
 
 class FrequencyResponseError(ValueError):
-    """The requested frequency response cannot be estimated from this record."""
+    """Error if the requested frequency response cannot be estimated from a record."""
 
 
 class SettingsError(FrequencyResponseError):
-    """The settings are inconsistent, or do not suit the record's rate."""
+    """Error if settings are inconsistent, or not applicable at a record's sampling rate."""
 
 
 def estimate(
     record: Record, settings: WelchSettings
 ) -> tuple[FrequencyResponse, FrequencyResponse]:
-    """Estimate the response for the fits, and that of the whole record for comparison.
+    """Estimate the frequency response for the fits, and a whole-record one for comparison.
 
     Parameters
     ----------
@@ -53,13 +53,13 @@ def estimate(
     Returns
     -------
     response, whole_record : FrequencyResponse
-        Both in the band of the settings and without the channels' delays; one and the same with
-        the estimator "fft".
+        Responses in the band of the settings, without the channels' delays. With the estimator
+        "fft", both are the same.
 
     Raises
     ------
     SettingsError
-        The segments or the band make no sense at the record's rate.
+        The segments or the band are not valid at the record's sampling rate.
     FrequencyResponseError
         The record is too short for the segments, or its angle does not move.
     """
@@ -67,7 +67,7 @@ def estimate(
     _check_band(record, settings.band_hz)
     if settings.estimator != "fft":
         _check_segmentation(record, segmentation)
-    # A constant angle asks no torque of the beam, but would leak into the lowest bins of both.
+    # A constant angle causes no torque, but would leak into the lowest bins of both responses.
     angle = record.angle_rad - (record.rest_angle_rad or 0.0)
     try:
         whole_record = fft_response(
@@ -77,7 +77,7 @@ def estimate(
             response = whole_record
         elif settings.estimator == "iv":
             response = instrumental_response(
-                _moving_reference_rad(record)[record.first_sweep],
+                _relative_reference_rad(record)[record.first_sweep],
                 angle[record.first_sweep],
                 record.torque_nm[record.first_sweep],
                 record.rate_hz,
@@ -95,26 +95,27 @@ def estimate(
         raise FrequencyResponseError(f"{record.path}: {error}") from error
     try:
         response, whole_record = (
-            each.band(*settings.band_hz).without_delays(
+            estimated.band(*settings.band_hz).without_delays(
                 input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
             )
-            for each in (response, whole_record)
+            for estimated in (response, whole_record)
         )
     except SpectralError as error:
         raise SettingsError(f"{record.path}: {error}") from error
-    unknown = np.flatnonzero(~np.isfinite(response.response))
-    if unknown.size:
+    not_finite = np.flatnonzero(~np.isfinite(response.response))
+    if not_finite.size:
         raise FrequencyResponseError(
-            f"{record.path}: the angle has no power at {response.frequency_hz[unknown[0]]:g} Hz, "
+            f"{record.path}: the angle has no power at {response.frequency_hz[not_finite[0]]:g} "
+            "Hz, "
             "so there is no frequency response there; choose a --band that was excited."
         )
     return response, whole_record
 
 
-def _moving_reference_rad(record: Record) -> NDArray[np.float64]:
-    """Return the requested motion from its start, shape (n,).
+def _relative_reference_rad(record: Record) -> NDArray[np.float64]:
+    """Return the reference angle relative to its start in rad, shape (n,).
 
-    Raise `FrequencyResponseError` if there is none: an imported record may lack it.
+    Raise `FrequencyResponseError` if the reference does not move, as in some imported records.
     """
     reference: NDArray[np.float64] = record.reference_rad - record.reference_rad[0]
     if not reference[record.first_sweep].any():
@@ -126,6 +127,7 @@ def _moving_reference_rad(record: Record) -> NDArray[np.float64]:
 
 
 def _check_band(record: Record, band_hz: tuple[float, float]) -> None:
+    """Raise if the band exceeds the Nyquist frequency."""
     nyquist_hz = record.rate_hz / 2
     if band_hz[1] > nyquist_hz:
         raise SettingsError(
@@ -135,7 +137,7 @@ def _check_band(record: Record, band_hz: tuple[float, float]) -> None:
 
 
 def _check_segmentation(record: Record, segmentation: Segmentation) -> None:
-    """Raise if `welch_response` would refuse the segments, in terms of the options."""
+    """Raise if `welch_response` would not accept the segments; the message names the options."""
     length, overlap, nfft = segmentation.segment_length, segmentation.overlap, segmentation.nfft
     if overlap >= length:
         raise SettingsError(
@@ -151,12 +153,12 @@ def _check_segmentation(record: Record, segmentation: Segmentation) -> None:
     if segment_count(samples, length, overlap) == 0:
         raise FrequencyResponseError(
             f"{record.path}: the sweep has {samples} samples ({samples / record.rate_hz:g} s), "
-            f"fewer than one Welch segment of {length}{_remedy(samples)}"
+            f"fewer than one Welch segment of {length}{_segment_remedy(samples)}"
         )
 
 
-def _remedy(samples: int) -> str:
-    """Return segments that fit a sweep of so many samples, as the end of a sentence."""
+def _segment_remedy(samples: int) -> str:
+    """Return the end of a sentence with options that suit a sweep of a number of samples."""
     try:
         length, overlap = segment_lengths(samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION)
     except SpectralError:
@@ -170,21 +172,22 @@ def _remedy(samples: int) -> str:
 def estimate_warnings(
     record: Record, settings: WelchSettings, response: FrequencyResponse
 ) -> tuple[str, ...]:
-    """Return sentences on the reasons against an estimate."""
-    found = []
+    """Return sentences on weaknesses of an estimate, such as few segments or a low resolution."""
+    sentences = []
     is_welch = settings.estimator != "fft"
     length = (
         settings.segmentation(record.rate_hz).segment_length if is_welch else len(record.time_s)
     )
     if is_welch and response.segments < PAPER_SEGMENTS:
-        found.append(
+        sentences.append(
             f"Only {response.segments} Welch segment(s) of {length} samples fit "
-            f"the sweep of {record.first_sweep_samples}{_remedy(record.first_sweep_samples)}"
+            "the sweep of "
+            f"{record.first_sweep_samples}{_segment_remedy(record.first_sweep_samples)}"
         )
     resolution_hz = record.rate_hz / length
     first_mode_hz = undamped_frequencies_rad_s(record.beam, 1)[0] / (2 * np.pi)
     if resolution_hz > first_mode_hz:
-        found.append(
+        sentences.append(
             f"A transform of {1 / resolution_hz:.3g} s resolves {resolution_hz:.3g} Hz and cannot "
             f"show the first mode, at {first_mode_hz:.3g} Hz; take longer segments, or record "
             "longer."
@@ -192,16 +195,16 @@ def estimate_warnings(
     excited_hz = _excited_band_hz(record.metadata)
     first_hz, last_hz = settings.band_hz
     if excited_hz is not None and (excited_hz[0] > first_hz or excited_hz[1] < last_hz):
-        found.append(
+        sentences.append(
             f"The band {first_hz:g} to {last_hz:g} Hz reaches beyond the excitation "
             f"({excited_hz[0]:g} to {excited_hz[1]:g} Hz): what was not excited is noise; "
             "narrow --band."
         )
-    return tuple(found)
+    return tuple(sentences)
 
 
 def _excited_band_hz(metadata: Mapping[str, str]) -> tuple[float, float] | None:
-    """Return the band of the excitation, in rising order; None if the file lacks it."""
+    """Return the lowest and highest frequency of the excitation; None if not stated."""
     try:
         start_hz, stop_hz = float(metadata["start_hz"]), float(metadata["stop_hz"])
     except (KeyError, ValueError):

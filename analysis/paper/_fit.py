@@ -1,26 +1,29 @@
 """Fit of the damping structures to a frequency response: Eq. (26) of the reference paper.
 
-``J = sum_p W_p |G_exp(j omega_p) - Ĝ(j omega_p)|²`` with complex deviations and the weights of
-`analysis.models`. Its minimum is searched over the whole range of physical damping, without a guess
-from the user: a coarse sweep of all unknowns, descents from each of its local minima on a few
-hundred representative points, and refinement of the best few on every point.
+The cost is ``J = sum_p W_p |G_exp(j omega_p) - Ĝ(j omega_p)|²`` with complex deviations and the
+weights of `analysis.models`. Its minimum is searched over the whole range of physical damping,
+without an initial guess. The cost is evaluated on a coarse grid of all unknowns. Descents begin at
+the local minima of the grid, with a few hundred representative points of the response. The best few
+are refined with all points.
 
-The sweep is needed: the cost of types III, V and VI has several minima, and from a random start
-type VI falls into the best one in fewer than half of the cases. The reference paper sweeps the
-whole range of physical interest finely; here the sweep is coarse (`starts`).
+The grid is necessary because the cost of types III, V and VI has several minima: from a random
+start, type VI reaches the best minimum in fewer than half of the cases. The reference paper uses a
+fine grid over the whole range of physical interest; the grid used here is coarse (`starts`).
 
-Standard deviations are from the covariance of a weighted least-squares fit, which treats every
-deviation of the model from the measurement as random. Their accuracy on simulated sessions with
-type VI:
+The standard deviations follow from the covariance of a weighted least-squares fit, which treats
+each deviation of the model from the measurement as random. Their accuracy on simulated sessions
+with type VI is as follows:
 
-* errors that are independent from bin to bin: within 20 % of the scatter of repeated fits;
-* errors shared by the nine neighbours that zero padding makes alike: half of that scatter, since
-  a resonance is then narrower than one error and the fit absorbs most of it;
-* Welch's estimate of a chirp: leakage, not noise, dominates, and the standard deviations
-  are 3 to 50 times the scatter between sessions. The bias itself is 1 to 7 times as large as
-  they are, and 4 to 20 times if the structure is wrong.
+* With errors that are independent between bins, they are within 20 % of the scatter of repeated
+  fits.
+* With errors common to the nine neighbouring bins that zero padding makes similar, they are half of
+  that scatter, because a resonance is then narrower than one error and the fit absorbs most of it.
+* With Welch's estimate of a chirp, leakage dominates over noise, and they are 3 to 50 times the
+  scatter between sessions. The bias is 1 to 7 times as large as they are, and 4 to 20 times if the
+  structure is wrong.
 
-So they rank parameters by how well the response determines them and are not confidence intervals.
+They therefore rank the parameters by how well the response determines them, but they are no
+confidence intervals.
 """
 
 import itertools
@@ -48,39 +51,44 @@ from rigd.beam import Beam, Damping
 
 # Fits
 
-_THINNED_POINTS: Final = 800
-_POLISHED: Final = 3
-_THINNED_TOLERANCE: Final = 1e-5
-_POLISHED_TOLERANCE: Final = 1e-12
-# Descents that end this close to each other, in every unknown, have found the same minimum.
-_SAME_MINIMUM: Final = 0.02
+_FEW_POINTS: Final = 800
+"""Number of points of the response in the first descents."""
+_REFINED_MINIMA: Final = 3
+"""Number of minima that are refined with all points."""
+_ROUGH_TOLERANCE: Final = 1e-5
+"""Relative tolerance of the first descents."""
+_REFINED_TOLERANCE: Final = 1e-12
+"""Relative tolerance of the refined minima."""
+_SAME_MINIMUM_DISTANCE: Final = 0.02
+"""Largest difference in any unknown between two descents that found the same minimum."""
 
 
 class FitError(ValueError):
-    """No model can be fitted to the frequency response."""
+    """Error if no model can be fitted to a frequency response."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrfFit:
-    """Fit of one structure with one weighting.
+    """Fit of one damping structure to a frequency response, with one weighting.
 
     Attributes
     ----------
     structure : Structure
+        Fitted structure.
     weighting : str
         Name of the weighting.
     damping : Damping
         Fitted damping, for use with `rigd.beam`.
     parameters : dict
-        zeta, alpha, gamma and lambda, the fixed ones included.
+        Values of zeta, alpha, gamma and lambda, fixed parameters included.
     std : dict or None
-        Standard deviations of the same, 0 for the fixed ones; None if a parameter rests on the edge
-        of its range or the data do not determine it. Computed as if the whole residual were random,
-        so they give no confidence intervals: see `analysis.paper._fit`.
+        Standard deviations of these parameters, 0 for fixed ones; None if a parameter is at a bound
+        or not determined by the data. They are computed as if the whole residual were random, so
+        they are no confidence intervals: see `analysis.paper._fit`.
     cost : float
-        Eq. (26) at the minimum, in (N·m/rad)².
+        Minimum of the cost function (Eq. 26), in (N·m/rad)².
     at_bounds : tuple of str
-        Free parameters that rest on the edge of the range searched.
+        Free parameters at a bound of the range searched.
     """
 
     structure: Structure
@@ -101,28 +109,29 @@ def fit_frf(
     *,
     tool_inertia_kg_m2: float = 0.0,
 ) -> FrfFit:
-    """Find the global minimum of Eq. (26) for one structure and weighting.
+    """Find the global minimum of the cost (Eq. 26) for one damping structure and weighting.
 
     Parameters
     ----------
     frequency_hz : ndarray, shape (n,)
-        Positive, increasing, evenly spaced.
+        Frequencies: positive, increasing, evenly spaced.
     response : ndarray of complex, shape (n,)
-        Measured torque per motor angle in N·m/rad, free of the delays of the instruments.
+        Measured torque per motor angle in N·m/rad, without the delays of the instruments.
     beam : Beam
-        Held fixed.
+        Beam, whose properties remain fixed.
     structure : Structure
+        Damping structure to be fitted.
     weighting : str or callable
-        See `analysis.models.weights`.
+        Weighting of the frequencies (see `analysis.models.weights`).
     tool_inertia_kg_m2 : float
         Inertia between torque sensor and beam, added to the model.
 
     Raises
     ------
     FitError
-        If the response holds fewer points than unknowns, or values that are not finite.
+        If the response has fewer points than unknowns, or values that are not finite.
     WeightingError
-        If there is no such weighting.
+        If the weighting does not exist.
 
     References
     ----------
@@ -162,30 +171,33 @@ def fit_many(
     *,
     tool_inertia_kg_m2: float = 0.0,
 ) -> tuple[FrfFit, ...]:
-    """Fit every structure with every weighting, structure by structure: see `fit_frf`.
+    """Fit several damping structures and weightings to a frequency response (see `fit_frf`).
 
-    Each fit has the same result as alone; only the preparation of the grids is common.
+    Each fit has the result of `fit_frf`; only the preparation of the frequency grids is common.
 
     Parameters
     ----------
     frequency_hz, response, beam, tool_inertia_kg_m2
-        As for `fit_frf`.
+        Response, beam and tool inertia, as for `fit_frf`.
     structures : iterable of Structure
-        By default the six of the reference paper.
+        Structures to be fitted, by default all of `analysis.models.STRUCTURES`.
     weightings : iterable of str or callable
-        By default the two of the reference paper.
+        Weightings, by default the two of the reference paper.
     """
     structures, weightings = tuple(structures), tuple(weightings)
-    _check(frequency_hz, response, structures)
+    _check_response(frequency_hz, response, structures)
     omega = 2 * np.pi * frequency_hz
     whole_model = FrequencyResponseModel(frequency_hz, beam, tool_inertia_kg_m2)
-    grids: list[tuple[_Grid, _Grid]] = []
+    grids: list[tuple[_FrequencyGrid, _FrequencyGrid]] = []
     for weighting in weightings:
-        every = weights(omega, weighting)
-        index, point_weights = thinned(response, every, _THINNED_POINTS)
+        all_weights = weights(omega, weighting)
+        index, point_weights = thinned(response, all_weights, _FEW_POINTS)
         few_model = FrequencyResponseModel(frequency_hz[index], beam, tool_inertia_kg_m2)
         grids.append(
-            (_Grid(few_model, response[index], point_weights), _Grid(whole_model, response, every))
+            (
+                _FrequencyGrid(few_model, response[index], point_weights),
+                _FrequencyGrid(whole_model, response, all_weights),
+            )
         )
     return tuple(
         _fit(structure, weighting_name(weighting), few, whole)
@@ -194,12 +206,13 @@ def fit_many(
     )
 
 
-_Linearised = tuple[NDArray[np.complex128], NDArray[np.complex128]]
+_Linearization = tuple[NDArray[np.complex128], NDArray[np.complex128]]
+"""Types of a deviation and of its derivatives with respect to the unknowns."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Grid:
-    """Points at which model and measurement are compared."""
+class _FrequencyGrid:
+    """Frequency points, with weights, at which model and measurement are compared."""
 
     model: FrequencyResponseModel
     measured: NDArray[np.complex128]
@@ -207,22 +220,24 @@ class _Grid:
 
 
 class _FrfProblem:
-    """Eq. (26) for one structure on one grid, as a function of the unknowns."""
+    """Cost (Eq. 26) of a damping structure on a frequency grid, as a function of unknowns."""
 
-    def __init__(self, unknowns: DampingUnknowns, grid: _Grid) -> None:
+    def __init__(self, unknowns: DampingUnknowns, grid: _FrequencyGrid) -> None:
         self.unknowns = unknowns
         self.grid = grid
-        self._recent: Recent[_Linearised] = Recent()
+        self._recent_linearizations: Recent[_Linearization] = Recent()
 
     def cost(self, x: NDArray[np.float64]) -> float:
+        """Return the cost (Eq. 26) at the unknowns x."""
         deviation = self.grid.model.evaluate(self.unknowns.damping(x)) - self.grid.measured
         return float(self.grid.weights @ (deviation.real**2 + deviation.imag**2))
 
-    def deviation_and_jacobian(self, x: NDArray[np.float64]) -> _Linearised:
-        """Return model minus measurement, (n,), and its derivatives by the unknowns, (k, n)."""
-        return self._recent.at(x, self._linearise)
+    def deviation_and_jacobian(self, x: NDArray[np.float64]) -> _Linearization:
+        """Return model minus measurement, (n,), and its derivatives with respect to x, (k, n)."""
+        return self._recent_linearizations.at(x, self._linearize)
 
-    def _linearise(self, x: NDArray[np.float64]) -> _Linearised:
+    def _linearize(self, x: NDArray[np.float64]) -> _Linearization:
+        """Return model minus measurement and its derivatives with respect to x."""
         model, gradient = self.grid.model.evaluate_with_gradient(
             self.unknowns.damping(x), self.unknowns.structure.free
         )
@@ -230,6 +245,7 @@ class _FrfProblem:
         return model - self.grid.measured, jacobian
 
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
+        """Return cost, gradient and Gauss-Newton Hessian at the unknowns x."""
         deviation, jacobian = self.deviation_and_jacobian(x)
         weighted = jacobian.conj() * self.grid.weights
         return NormalEquations(
@@ -239,55 +255,70 @@ class _FrfProblem:
         )
 
 
-def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfFit:
-    unknowns = DampingUnknowns.of(structure, whole.model.beam)
+def _fit(
+    structure: Structure,
+    weighting: str,
+    few_points_grid: _FrequencyGrid,
+    whole_grid: _FrequencyGrid,
+) -> FrfFit:
+    """Fit a damping structure: descents on few points, then refinement on all points."""
+    unknowns = DampingUnknowns.for_beam(structure, whole_grid.model.beam)
     bounds = Box(*unknowns.bounds)
-    thin, full = _FrfProblem(unknowns, few), _FrfProblem(unknowns, whole)
-    found = [
-        descend(thin.normal_equations, x, bounds, relative_tolerance=_THINNED_TOLERANCE)
-        for x in starts(structure, thin.cost)
-    ]
-    # To the bottom of the few points first, and on with the Hessian learnt there: that leaves one
-    # or two steps on every point.
-    polished = _different(
-        [_polished(thin, rough, bounds) for rough in _different(found)[:_POLISHED]]
+    few_problem, whole_problem = (
+        _FrfProblem(unknowns, few_points_grid),
+        _FrfProblem(unknowns, whole_grid),
     )
-    polished = [_polished(full, rough, bounds) for rough in polished]
-    best = min(polished, key=lambda minimum: minimum.cost)
+    rough_minima = [
+        descend(few_problem.normal_equations, x, bounds, relative_tolerance=_ROUGH_TOLERANCE)
+        for x in starting_points(structure, few_problem.cost)
+    ]
+    # The descents first converge on the few points. With the Hessian estimated there, one or two
+    # steps on all points remain.
+    refined = _distinct_minima(
+        [
+            _refine(few_problem, rough, bounds)
+            for rough in _distinct_minima(rough_minima)[:_REFINED_MINIMA]
+        ]
+    )
+    refined = [_refine(whole_problem, rough, bounds) for rough in refined]
+    best = min(refined, key=lambda minimum: minimum.cost)
     parameters = unknowns.parameters(best.x)
-    on_edge = (best.x <= bounds.lower) | (best.x >= bounds.upper)
+    at_bound = (best.x <= bounds.lower) | (best.x >= bounds.upper)
     return FrfFit(
         structure=structure,
         weighting=weighting,
         damping=unknowns.damping(best.x),
         parameters={name: parameters[name] for name in PARAMETERS},
-        std=None if on_edge.any() else _standard_deviations(full, best.x),
+        std=None if at_bound.any() else _standard_deviations(whole_problem, best.x),
         cost=best.cost,
-        at_bounds=tuple(name for name, held in zip(structure.free, on_edge, strict=True) if held),
+        at_bounds=tuple(
+            name for name, is_at_bound in zip(structure.free, at_bound, strict=True) if is_at_bound
+        ),
     )
 
 
-def _polished(problem: _FrfProblem, rough: Minimum, bounds: Box) -> Minimum:
-    """Continue to the minimum from the end of a rougher descent."""
+def _refine(problem: _FrfProblem, rough: Minimum, bounds: Box) -> Minimum:
+    """Continue a less accurate descent to the minimum."""
     return descend(
         problem.normal_equations,
         rough.x,
         bounds,
-        relative_tolerance=_POLISHED_TOLERANCE,
+        relative_tolerance=_REFINED_TOLERANCE,
         second_part=rough.second_part,
     )
 
 
-def _different(found: list[Minimum]) -> list[Minimum]:
-    """Return the distinct minima, the lowest first."""
+def _distinct_minima(minima: list[Minimum]) -> list[Minimum]:
+    """Return the distinct minima, the one of the lowest cost first."""
     distinct: list[Minimum] = []
-    for minimum in sorted(found, key=lambda m: m.cost):
-        if all(np.abs(minimum.x - other.x).max() > _SAME_MINIMUM for other in distinct):
+    for minimum in sorted(minima, key=lambda m: m.cost):
+        if all(np.abs(minimum.x - other.x).max() > _SAME_MINIMUM_DISTANCE for other in distinct):
             distinct.append(minimum)
     return distinct
 
 
 def _standard_deviations(problem: _FrfProblem, x: NDArray[np.float64]) -> dict[str, float] | None:
+    """Return the standard deviations of all parameters, or None if not determined."""
     deviation, jacobian = problem.deviation_and_jacobian(x)
     covariance = sandwich_covariance(deviation, jacobian, problem.grid.weights)
     if covariance is None:
@@ -298,11 +329,12 @@ def _standard_deviations(problem: _FrfProblem, x: NDArray[np.float64]) -> dict[s
     return {name: math.sqrt(max(float(free.get(name, 0.0)), 0.0)) for name in PARAMETERS}
 
 
-def _check(
+def _check_response(
     frequency_hz: NDArray[np.float64],
     response: NDArray[np.complex128],
     structures: tuple[Structure, ...],
 ) -> None:
+    """Raise if a response has too few points, values that are not finite, or a frequency of 0."""
     needed = max((len(structure.free) for structure in structures), default=0)
     if frequency_hz.size < max(needed, 3):
         raise FitError(
@@ -316,87 +348,87 @@ def _check(
         )
 
 
-# Points that stand for all
+# Representative points
 
 
 def thinned(
     measured: NDArray[np.complex128], weights: NDArray[np.float64], count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Choose points, densest on the flanks of peaks and under large weights.
+    """Choose representative points of a response, densest near peaks and at large weights.
 
     Parameters
     ----------
     measured : ndarray of complex, shape (n,)
+        Measured response.
     weights : ndarray, shape (n,)
-        Weights, of sum 1.
+        Weights of the points, with a sum of 1.
     count : int
-        How many points to choose at most.
+        Largest number of points to be chosen.
 
     Returns
     -------
     index : ndarray of int, shape (m,), m <= count
-        Increasing.
+        Indices of the chosen points, increasing.
     weights : ndarray, shape (m,)
-        Weight of each point with that of the omitted points around it. The sum is 1.
+        Weight of each chosen point, including the weights of omitted points around it. The sum
+        is 1.
     """
     n = measured.size
     if n <= count:
         return np.arange(n), weights
-    # Where the response is large, where it varies from bin to bin, and a third everywhere: with
-    # 800 of 7907 points the cost at a minimum then differs by less than 1 % from the whole one.
-    root = np.sqrt(weights)
-    size, variation = root * np.abs(measured), root * np.abs(np.gradient(measured))
+    # The density of the points has three equal parts: uniform, by the size of the response, and by
+    # its change from bin to bin. With 800 of 7907 points, the cost at a minimum then differs by
+    # less than 1 % from the cost with all points.
+    root_weights = np.sqrt(weights)
+    magnitude, variation = (
+        root_weights * np.abs(measured),
+        root_weights * np.abs(np.gradient(measured)),
+    )
     density = np.full(n, 1 / n)
-    for part in (size, variation):
-        density += part / max(float(part.sum()), np.finfo(float).tiny)
-    reached = np.cumsum(density)
-    marks = (np.arange(count) + 0.5) * (reached[-1] / count)
-    index = np.unique(np.searchsorted(reached, marks))
+    for contribution in (magnitude, variation):
+        density += contribution / max(float(contribution.sum()), np.finfo(float).tiny)
+    cumulative = np.cumsum(density)
+    levels = (np.arange(count) + 0.5) * (cumulative[-1] / count)
+    index = np.unique(np.searchsorted(cumulative, levels))
     borders = (index[:-1] + index[1:] + 1) // 2
     return index, np.add.reduceat(weights, np.concatenate(([0], borders)))
 
 
 # Starts
 
-# Sizes are relative to stiffness and to inertia at a mode: about twice a damping ratio.
-_SWEEP: Final[dict[Parameter, tuple[float, ...]]] = {
+_START_GRID: Final[dict[Parameter, tuple[float, ...]]] = {
     "zeta": tuple(math.log(size) for size in (1e-4, 1e-3, 1e-2, 1e-1)),
     "alpha": (0.3, 0.8, 1.3, 1.8),
     "gamma": tuple(math.log(size) for size in (1e-3, 1e-2, 1e-1, 1.0)),
     "lambda": (0.3, 0.8, 1.3, 1.8),
 }
+"""Values of the unknowns in the coarse grid. A coefficient is the logarithm of the damping relative
+to stiffness or inertia at a mode, about twice a damping ratio."""
 _MOST_STARTS: Final = 8
+"""Largest number of descents for each structure."""
 
 
-def starts(
+def starting_points(
     structure: Structure, cost: Callable[[NDArray[np.float64]], float]
 ) -> list[NDArray[np.float64]]:
-    """Choose starts for the unknowns of `structure`, the most promising first.
+    """Choose starting points of the descents for a damping structure, by increasing cost.
 
-    Parameters
-    ----------
-    structure : Structure
-    cost : callable
-        Cost at a vector of unknowns, shape (k,).
-
-    Returns
-    -------
-    list of ndarray, each of shape (k,)
-        At most eight: points of the sweep whose cost no neighbour along any axis undercuts.
+    `cost` is a function of the vector of unknowns, shape (k,). Return at most eight points of the
+    coarse grid, shape (k,), that have no neighbour of lower cost along any axis.
     """
-    axes = [_SWEEP[name] for name in structure.free]
+    axes = [_START_GRID[name] for name in structure.free]
     points = np.array(list(itertools.product(*axes)))
     costs = np.array([cost(x) for x in points]).reshape([len(axis) for axis in axes])
-    hollow = np.ones(costs.shape, dtype=bool)
+    is_minimum = np.ones(costs.shape, dtype=bool)
     for axis in range(costs.ndim):
-        rise = np.diff(costs, axis=axis)
-        # A point is not a hollow if the cost falls towards the next one, or rose from the last.
+        cost_differences = np.diff(costs, axis=axis)
+        # A point is no minimum if the next or the previous point along the axis has a lower cost.
         pad_end = [(0, 1) if k == axis else (0, 0) for k in range(costs.ndim)]
         pad_start = [(1, 0) if k == axis else (0, 0) for k in range(costs.ndim)]
-        hollow &= np.pad(rise, pad_end) >= 0
-        hollow &= np.pad(rise, pad_start) <= 0
-    hollows = np.flatnonzero(hollow)
-    best_first = hollows[np.argsort(costs.ravel()[hollows])]
+        is_minimum &= np.pad(cost_differences, pad_end) >= 0
+        is_minimum &= np.pad(cost_differences, pad_start) <= 0
+    minima = np.flatnonzero(is_minimum)
+    best_first = minima[np.argsort(costs.ravel()[minima])]
     return [points[i] for i in best_first[:_MOST_STARTS]]
 
 
@@ -408,24 +440,15 @@ def sandwich_covariance(
     jacobian: NDArray[np.complex128],
     weights: NDArray[np.float64],
 ) -> NDArray[np.float64] | None:
-    """Return the covariance of the unknowns, ``A⁻¹ B A⁻¹``, from the residual deviations.
+    """Return the covariance of the unknowns, ``A⁻¹ B A⁻¹``, shape (k, k).
 
-    A is the Gauss-Newton Hessian and B the covariance of the gradient, summed over neighbouring
-    bins as well as each bin alone (Newey and West, "A simple, positive semi-definite,
-    heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica 55 (1987)
-    703-708): zero padding and the window make neighbours similar.
+    A is the Gauss-Newton Hessian. B is the covariance of the gradient, estimated from the
+    deviations with correlations between neighbouring bins (Newey and West, "A simple, positive
+    semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix",
+    Econometrica 55 (1987) 703-708), because zero padding and the window make neighbours similar.
 
-    Parameters
-    ----------
-    deviation : ndarray of complex, shape (n,)
-        Model minus measurement at the minimum.
-    jacobian : ndarray of complex, shape (k, n)
-    weights : ndarray, shape (n,)
-
-    Returns
-    -------
-    ndarray, shape (k, k), or None
-        None if the data do not determine the unknowns.
+    `deviation` is the model minus the measurement at the minimum, shape (n,), `jacobian` has the
+    shape (k, n) and `weights` (n,). Return None if the data do not determine the unknowns.
     """
     hessian = ((jacobian.conj() * weights) @ jacobian.T).real
     scale = np.sqrt(np.diag(hessian))
@@ -434,22 +457,23 @@ def sandwich_covariance(
     scaled = hessian / np.outer(scale, scale)
     if np.linalg.cond(scaled) > 1e12:
         return None
-    scores = (jacobian.conj() * (weights * deviation)).real
-    span = _alike(np.sqrt(weights) * deviation)
-    # Bartlett's kernel over `span` bins is the mean square of sums over as many neighbours.
-    reached = np.cumsum(np.pad(scores, ((0, 0), (span, span - 1))), axis=1)
-    sums = reached[:, span:] - reached[:, :-span]
-    middle = sums @ sums.T / span
+    gradient_terms = (jacobian.conj() * (weights * deviation)).real
+    correlated = _correlated_bins(np.sqrt(weights) * deviation)
+    # Bartlett's kernel over a number of bins equals the mean square of sums over as many
+    # neighbours.
+    cumulative = np.cumsum(np.pad(gradient_terms, ((0, 0), (correlated, correlated - 1))), axis=1)
+    neighbour_sums = cumulative[:, correlated:] - cumulative[:, :-correlated]
+    gradient_covariance = neighbour_sums @ neighbour_sums.T / correlated
     inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
-    covariance: NDArray[np.float64] = inverse @ middle @ inverse
+    covariance: NDArray[np.float64] = inverse @ gradient_covariance @ inverse
     return covariance
 
 
-def _alike(deviation: NDArray[np.complex128]) -> int:
-    """Count correlated neighbouring bins: twice the lag of half the correlation."""
-    half = 0.5 * np.vdot(deviation, deviation).real
-    # A few lags, so not by transforms: those would cost as much as the model on every point.
+def _correlated_bins(deviation: NDArray[np.complex128]) -> int:
+    """Return the number of correlated neighbouring bins: twice the lag of half the correlation."""
+    half_correlation = 0.5 * np.vdot(deviation, deviation).real
+    # Only a few lags are needed. FFTs would cost as much as the model at every point.
     for lag in range(1, deviation.size):
-        if np.vdot(deviation[:-lag], deviation[lag:]).real < half:
+        if np.vdot(deviation[:-lag], deviation[lag:]).real < half_correlation:
             return 1 + 2 * lag
     return 1

@@ -2,7 +2,7 @@
 
 Each of six structures is fitted with two weightings. The indices are the distances between measured
 and fitted response, Eqs. (28) to (30), and the deviations of their resonant peaks, Eqs. (31) and
-(32); the predicted torque is compared in the time domain as well.
+(32). The predicted torque can be compared in the time domain, too.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Indices:
-    """Distance between two frequency responses of a torque to an angle.
+    """Fit indices: distances between a measured and a modelled frequency response.
 
     Attributes
     ----------
@@ -59,14 +59,14 @@ def fit_indices(
     measured: NDArray[np.complex128],
     model: NDArray[np.complex128],
 ) -> Indices:
-    """Evaluate Eqs. (28) to (30) on complex deviations ``|G - Ĝ|``, all of shape (n,).
+    """Return the fit indices of a model (Eqs. 28 to 30), from the deviations ``|G - Ĝ|``.
 
     Parameters
     ----------
     omega_rad_s : ndarray, shape (n,)
         Angular frequencies, positive.
     measured, model : ndarray of complex, shape (n,)
-        Responses in N·m/rad.
+        Measured and modelled response in N·m/rad.
 
     References
     ----------
@@ -87,17 +87,17 @@ def fit_indices(
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """A resonant peak: the bin where the magnitude is largest, and the magnitude there."""
+    """Resonant peak of a frequency response: the bin of the largest magnitude near a mode."""
 
     frequency_hz: float
-    """Frequency of the bin."""
+    """Frequency of the bin in Hz."""
     magnitude_db: float
-    """In dB re 1 unit of the response."""
+    """Magnitude at the bin, in dB relative to one unit of the response."""
 
 
 @dataclass(frozen=True, slots=True)
 class PeakDeviation:
-    """One session's term of Eqs. (31) and (32) for one mode."""
+    """Deviation of one session's resonant peak from a model's: a term of Eqs. (31) and (32)."""
 
     frequency_rad_s: float
     magnitude_db: float
@@ -108,22 +108,23 @@ def resonant_peaks(
     response: NDArray[np.complex128],
     mode_hz: NDArray[np.float64],
 ) -> tuple[Peak | None, ...]:
-    """Return the resonant peaks on the bins, as in the reference paper (not interpolated).
+    """Return the resonant peaks of a response near given modes, without interpolation of bins.
 
     Parameters
     ----------
     frequency_hz : ndarray, shape (n,)
-        Positive, increasing.
+        Frequencies of the bins: positive, increasing.
     response : ndarray of complex, shape (n,)
+        Frequency response.
     mode_hz : ndarray, shape (m,)
-        Approximate mode frequencies, increasing: a peak is searched between the geometric means of
-        neighbours, and as far beyond the first and last. The undamped frequencies suffice.
+        Approximate mode frequencies, increasing, such as the undamped ones. The peak of a mode is
+        searched between the geometric means with the neighbouring modes.
 
     Returns
     -------
     tuple of Peak or None, length m
-        None where no bin between those limits is a local maximum: the mode is damped away, or
-        lies outside the band. In dB re 1 unit of the response.
+        Peak of each mode. None if no bin between these limits is a local maximum, because of
+        strong damping, or because the mode lies outside the band.
 
     Examples
     --------
@@ -137,32 +138,35 @@ def resonant_peaks(
     """
     magnitude = np.abs(response)
     ratio = np.sqrt(mode_hz[1:] / mode_hz[:-1])
-    # A single mode is searched within half an octave.
+    # The peak of a single mode is searched within half an octave on either side.
     first, last = (ratio[0], ratio[-1]) if ratio.size else (np.sqrt(2.0), np.sqrt(2.0))
     lower = mode_hz / np.concatenate(([first], ratio))
     upper = mode_hz * np.concatenate((ratio, [last]))
-    inner = magnitude[1:-1]
-    summits = 1 + np.flatnonzero((inner > magnitude[:-2]) & (inner >= magnitude[2:]))
+    inner_magnitude = magnitude[1:-1]
+    maxima = 1 + np.flatnonzero(
+        (inner_magnitude > magnitude[:-2]) & (inner_magnitude >= magnitude[2:])
+    )
     peaks: list[Peak | None] = []
     for low, high in zip(lower, upper, strict=True):
-        candidates = summits[(frequency_hz[summits] >= low) & (frequency_hz[summits] <= high)]
+        candidates = maxima[(frequency_hz[maxima] >= low) & (frequency_hz[maxima] <= high)]
         if candidates.size == 0:
             peaks.append(None)
             continue
-        best = candidates[np.argmax(magnitude[candidates])]
-        peaks.append(Peak(float(frequency_hz[best]), 20 * float(np.log10(magnitude[best]))))
+        largest = candidates[np.argmax(magnitude[candidates])]
+        peaks.append(Peak(float(frequency_hz[largest]), 20 * float(np.log10(magnitude[largest]))))
     return tuple(peaks)
 
 
 def peak_deviation(measured: Peak, model: Peak) -> PeakDeviation:
-    """Return ``|omega_q - omega^_q|`` and ``||G| - |Ĝ||`` in dB, Eqs. (31) and (32).
+    """Return the absolute deviations of a resonant peak in frequency and in magnitude (dB).
 
-    The reference paper averages them over sessions; this is the term of one session.
+    These are the terms ``|omega_q - omega^_q|`` and ``||G| - |Ĝ||`` of one session, which the
+    reference paper averages over sessions (Eqs. 31 and 32).
 
     Parameters
     ----------
     measured, model : Peak
-        The same peak of either response.
+        Resonant peak of the same mode in the measured and in the modelled response.
 
     Examples
     --------
@@ -180,29 +184,30 @@ def peak_deviation(measured: Peak, model: Peak) -> PeakDeviation:
 # Torque in time
 
 _DECAY_OVER_RECORD = 2.7
-"""sigma T: what wraps around shrinks by exp(-2 sigma T), rounding errors grow by exp(sigma T)."""
+"""Decay rate sigma times the duration T of the record in `modelled_torque`. Circular wrap-around is
+reduced by exp(-2 sigma T), rounding errors grow by exp(sigma T)."""
 
 
 def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
-    """Return the causal response of the exact model to the whole record's measured angle.
+    """Return the torque that the exact model predicts from the measured angle of a whole record.
 
     The beam is assumed at rest before the first sample, at the angle of the segment ``rest`` or
-    else at the first angle. The record times exp(-sigma t) is padded with zeros and transformed:
-    this is its transform on s = sigma + j omega, where the part that wraps around has decayed. It
-    is multiplied with ``G(s) + J_tool s²`` and the difference of the two channels' delays,
-    transformed back, and divided by the exponential.
+    else at the first angle. The angle times exp(-sigma t) is padded with zeros and transformed,
+    which gives its transform at s = sigma + j omega; the exponential makes the circular
+    wrap-around decay. The transform is multiplied by ``G(s) + J_tool s²`` and by the difference of
+    the two channels' delays, transformed back, and divided by the exponential.
 
     Parameters
     ----------
     record
-        Its angle, beam, tool inertia and delays are used.
+        Record with angle, beam, tool inertia and delays.
     damping
-        Parameters of Eq. 25.
+        Damping parameters of Eq. 25.
 
     Returns
     -------
     ndarray, shape (n,)
-        Torque in N·m as the sensor would give it at the record's time stamps.
+        Torque in N·m as the sensor would report it at the record's time stamps.
     """
     samples = len(record.angle_rad)
     padded = 1 << (2 * samples - 1).bit_length()
@@ -220,19 +225,21 @@ def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
 def band_limited(
     values: NDArray[np.float64], rate_hz: float, band_hz: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Return the values limited to a band, by a mask on their Fourier transform (no delay).
+    """Return a signal limited to a frequency band, by a mask on its Fourier transform (no delay).
 
     Parameters
     ----------
     values : ndarray, shape (n,)
+        Signal.
     rate_hz
         Sampling rate.
     band_hz
-        First and last frequency that pass.
+        First and last frequency of the band.
 
     Returns
     -------
     ndarray, shape (n,)
+        Filtered signal.
     """
     padded = 1 << (2 * len(values) - 1).bit_length()
     frequency_hz = np.fft.rfftfreq(padded, 1.0 / rate_hz)
@@ -241,26 +248,26 @@ def band_limited(
     return np.asarray(np.fft.irfft(spectrum, padded)[: len(values)])
 
 
-_NEAR: Final = 0.1
-"""Half width of the band of the envelope, relative to its centre."""
+_ENVELOPE_HALF_WIDTH: Final = 0.1
+"""Half width of the band in which an envelope is computed, relative to its centre frequency."""
 
 
 def loudest_moment_s(values: NDArray[np.float64], rate_hz: float, frequency_hz: float) -> float:
-    """Return the time at which the oscillation near a frequency is largest.
+    """Return the time at which a signal's oscillation near a frequency is largest.
 
     Parameters
     ----------
     values : ndarray, shape (n,)
-        The signal.
+        Signal.
     rate_hz : float
-        Its sampling rate.
+        Sampling rate.
     frequency_hz : float
-        Middle of the band.
+        Centre frequency of the band.
 
     Returns
     -------
     float
-        Seconds from the first value.
+        Time in seconds after the first value.
 
     Examples
     --------
@@ -273,9 +280,9 @@ def loudest_moment_s(values: NDArray[np.float64], rate_hz: float, frequency_hz: 
     """
     padded = 1 << (len(values) - 1).bit_length()
     frequencies_hz = np.fft.rfftfreq(padded, 1.0 / rate_hz)
-    near = np.abs(frequencies_hz / frequency_hz - 1.0) <= _NEAR
+    in_band = np.abs(frequencies_hz / frequency_hz - 1.0) <= _ENVELOPE_HALF_WIDTH
     analytic = np.zeros(padded, dtype=np.complex128)
-    analytic[: len(frequencies_hz)][near] = np.fft.rfft(values, padded)[near]
+    analytic[: len(frequencies_hz)][in_band] = np.fft.rfft(values, padded)[in_band]
     envelope = np.abs(np.fft.ifft(analytic)[: len(values)])
     return float(np.argmax(envelope)) / rate_hz
 
@@ -283,30 +290,35 @@ def loudest_moment_s(values: NDArray[np.float64], rate_hz: float, frequency_hz: 
 # Analysis of a record
 
 MODES: Final = 3
+"""Number of modes whose peaks and poles are evaluated."""
+
 LARGEST_SHIFT: Final = 0.1
-"""Shift of a mode's frequency from the undamped beam's: a damping ratio of 0.4 makes as much."""
+"""Largest relative difference between the frequency of a fitted mode and the undamped beam's. A
+damping ratio of 0.4 causes such a difference."""
 
 
 @dataclass(frozen=True, slots=True)
 class FittedModel:
-    """One fit with its indices, modes and peaks.
+    """Fit of one structure and weighting, with its indices, modes and peaks.
 
     Attributes
     ----------
     fit : FrfFit
+        The fit.
     response : ndarray of complex, shape (n,)
-        The model with the tool inertia on the bins that were fitted, in N·m/rad.
+        Response of the model, with the tool inertia, at the fitted bins, in N·m/rad.
     indices : Indices
+        Distances from the measured response.
     modes : tuple of Mode
-        Modes of the beam alone, from its poles; empty where damping is so strong that one has none.
+        Modes of the beam without tool inertia, from its poles; empty if strong damping leaves a
+        mode without a pole.
     followed : tuple of bool
-        Mode by mode, whether it vibrates, and within `LARGEST_SHIFT` of the undamped beam's
-        frequency. If not, the fit does not follow that resonance: the mode is not that of the
-        antenna.
+        Whether each mode vibrates at a frequency within `LARGEST_SHIFT` of the undamped beam's. If
+        not, the fit does not describe that resonance of the antenna.
     peaks : tuple of Peak or None
-        Resonant peaks of `response`, mode by mode.
+        Resonant peaks of `response`, one for each mode.
     deviations : tuple of PeakDeviation or None
-        From the measured peaks; None where either has no peak.
+        Deviation of each peak from the measured one; None if either response has no peak.
     """
 
     fit: FrfFit
@@ -325,18 +337,20 @@ class WelchAnalysis:
     Attributes
     ----------
     record : Record
+        Analysed record.
     settings : WelchSettings
         Requested settings.
     segmentation : Segmentation
-        Segments at the record's rate.
+        Segment lengths in samples at the record's sampling rate.
     response : FrequencyResponse
-        In the band, without the channels' delays.
+        Estimated response in the band, without the channels' delays.
     whole_record : FrequencyResponse
-        Ratio of the transforms of the whole record, likewise, for comparison.
+        Ratio of the Fourier transforms of the whole record, for comparison, in the same band and
+        without the delays.
     peaks : tuple of Peak or None
-        Measured resonant peaks, mode by mode.
+        Measured resonant peaks, one for each mode.
     models : tuple of FittedModel
-        By type, then by weighting, in the order of the settings.
+        Fitted models by type, then by weighting, in the order of the settings.
     warnings : tuple of str
         Warnings for the analyst, including those of the record.
     """
@@ -361,27 +375,29 @@ def analyse(
     Parameters
     ----------
     record : Record
+        Record of a session.
     settings : WelchSettings
+        Estimator, segments, band, types and weightings.
     on_step : callable, optional
-        Called with a few words after each step: the estimate, then every type.
+        Called with the name of each step after it: the estimate, then each type.
 
     Raises
     ------
     SettingsError
-        The segments, the band or the weightings make no sense.
+        The segments, the band or the weightings are not valid.
     FrequencyResponseError
-        Nothing was excited, or the record is too short for the segments.
+        The motor did not move, or the record is too short for the segments.
     """
     _check_excited(record)
     response, whole_record = estimate(record, settings)
     on_step("frequency response")
-    peaks = _peaks(record.beam, response.frequency_hz, response.response)
+    peaks = _mode_peaks(record.beam, response.frequency_hz, response.response)
     beam_on_tool = FrequencyResponseModel(
         response.frequency_hz, record.beam, record.tool_inertia_kg_m2
     )
     models: list[FittedModel] = []
     for name in settings.types:
-        # A type at a time, so that progress can be shown; sharing among types is not worth much.
+        # One type at a time, so that progress can be shown. Common grids would save little time.
         try:
             fits = fit_many(
                 response.frequency_hz,
@@ -393,7 +409,9 @@ def analyse(
             )
         except (FitError, WeightingError) as error:
             raise SettingsError(f"{record.path}: {error}") from error
-        models.extend(_evaluated(fit, record.beam, response, beam_on_tool, peaks) for fit in fits)
+        models.extend(
+            _evaluate_fit(fit, record.beam, response, beam_on_tool, peaks) for fit in fits
+        )
         on_step(f"type {name}")
     return WelchAnalysis(
         record=record,
@@ -408,7 +426,7 @@ def analyse(
 
 
 def _check_excited(record: Record) -> None:
-    """Raise if the motor did not move, before the checks of segments and bands."""
+    """Raise if the motor did not move during a record."""
     angles = record.angle_rad[record.angle_known]
     if record.metadata.get("excitation") == "hold":
         raise FrequencyResponseError(
@@ -422,46 +440,48 @@ def _check_excited(record: Record) -> None:
         )
 
 
-def _evaluated(
+def _evaluate_fit(
     fit: FrfFit,
     beam: Beam,
     measured: FrequencyResponse,
     beam_on_tool: FrequencyResponseModel,
     measured_peaks: tuple[Peak | None, ...],
 ) -> FittedModel:
-    """Return a fitted model with all its indices."""
+    """Return a fitted model with its indices, modes and peaks."""
     response = beam_on_tool.evaluate(fit.damping)
-    peaks = _peaks(beam, measured.frequency_hz, response)
+    peaks = _mode_peaks(beam, measured.frequency_hz, response)
     try:
-        found = modes(beam, fit.damping, MODES)
+        beam_modes = modes(beam, fit.damping, MODES)
     except ArithmeticError:
-        found = ()
+        beam_modes = ()
     return FittedModel(
         fit=fit,
         response=response,
         indices=fit_indices(2 * np.pi * measured.frequency_hz, measured.response, response),
-        modes=found,
-        followed=_followed(found, beam),
+        modes=beam_modes,
+        followed=_vibrate_near_undamped(beam_modes, beam),
         peaks=peaks,
         deviations=tuple(
-            None if seen is None or modelled is None else peak_deviation(seen, modelled)
-            for seen, modelled in zip(measured_peaks, peaks, strict=True)
+            None
+            if measured_peak is None or model_peak is None
+            else peak_deviation(measured_peak, model_peak)
+            for measured_peak, model_peak in zip(measured_peaks, peaks, strict=True)
         ),
     )
 
 
-def _followed(found: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
-    """Return whether each mode vibrates near the frequency of the undamped beam."""
+def _vibrate_near_undamped(fitted_modes: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
+    """Return whether each mode vibrates near the frequency of the undamped beam's mode."""
     undamped_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
     return tuple(
         mode.damping_ratio < 1 and abs(mode.frequency_hz / own_hz - 1) < LARGEST_SHIFT
-        for mode, own_hz in zip(found, undamped_hz[: len(found)], strict=True)
+        for mode, own_hz in zip(fitted_modes, undamped_hz[: len(fitted_modes)], strict=True)
     )
 
 
-def _peaks(
+def _mode_peaks(
     beam: Beam, frequency_hz: NDArray[np.float64], response: NDArray[np.complex128]
 ) -> tuple[Peak | None, ...]:
-    """Return the resonant peaks near the beam's first undamped frequencies."""
+    """Return the resonant peaks of a response near the beam's first undamped frequencies."""
     mode_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
     return resonant_peaks(frequency_hz, response, mode_hz)

@@ -82,8 +82,10 @@ def test_low_bands_are_joined():
     hz = np.arange(100) * 0.1 + 10.0
     low = np.zeros(100, bool)
     low[[5, 40, 41, 42, 45, 99]] = True  # the lone ones are narrower than what is resolved
-    assert list(quick_look._bands(hz, low, 0.15)) == [(pytest.approx(14.0), pytest.approx(14.5))]
-    assert list(quick_look._bands(hz, ~low, 0.15)) == [(10.0, pytest.approx(19.8))]
+    assert list(quick_look._join_bins(hz, low, 0.15)) == [
+        (pytest.approx(14.0), pytest.approx(14.5))
+    ]
+    assert list(quick_look._join_bins(hz, ~low, 0.15)) == [(10.0, pytest.approx(19.8))]
 
 
 @pytest.mark.fit
@@ -128,24 +130,26 @@ def look_with(*hz, **others):
 )
 def test_modes_that_do_not_show_are_listed_in_english(unseen, words):
     look = look_with(2.5, 16.0, 44.0, session_id="now", flags=[], against_last=None)
-    look["coherence"] = quick_look._no_coherence()
+    look["coherence"] = quick_look._empty_coherence()
     for mode in look["modes"][:unseen]:
         mode["shown"] = False
-    assert f"  not visible in this record: {words}" in quick_look._text(look)
+    assert f"  not visible in this record: {words}" in quick_look._text_lines(look)
 
 
 def test_a_change_counts_from_three_standard_deviations_on():
     before = look_with(2.5, 16.0, 44.0)
     now = look_with(2.5 + 4.1e-3, 16.0 + 4.4e-3)
     now["modes"][1]["damping_ratio"] = estimated(0.0105, 1e-4)
-    against = quick_look._against(now["modes"], before)
+    against = quick_look._compare_modes(now["modes"], before)
     assert [mode["significant"] for mode in against["modes"]] == [False, True]
     assert against["sentence"] == (
         "Significant change against before: mode 2 +0.0044 Hz, damping +5 %."
     )
     before["modes"][1]["frequency_hz"]["flag"] = "part of the record is unexplained"
     now["modes"][1]["damping_ratio"]["interval_95"] = None
-    assert not any(m["significant"] for m in quick_look._against(now["modes"], before)["modes"])
+    assert not any(
+        m["significant"] for m in quick_look._compare_modes(now["modes"], before)["modes"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -192,7 +196,7 @@ def test_the_fitted_model_has_a_band_that_holds_it(chirps, selection):
 @pytest.mark.process
 def test_a_long_record_is_fitted_by_the_freest_structure_alone(chirps, selection, monkeypatch):
     paths, _ = chirps
-    monkeypatch.setattr(quick_look, "_JUDGED_S", 10.0)
+    monkeypatch.setattr(quick_look, "_LONGEST_FULL_ANALYSIS_S", 10.0)
     look = make_quick_look(paths[0])
     for told, mode in zip(look["modes"], selection.headline.modes, strict=True):
         # The same structure is selected, under a noise spectrum that hardly differs.

@@ -14,10 +14,10 @@ from analysis.models import WelchSettings
 from analysis.paper import FrequencyResponseError, SettingsError
 from analysis.record import load_record
 from analysis.suited import (
-    against_welch,
     record_band_hz,
     remarks,
     welch_analysis,
+    welch_exclusion_reason,
     welch_settings,
 )
 
@@ -69,7 +69,7 @@ def test_a_band_asked_for_is_of_all_fits(record_of):
 @pytest.mark.parametrize("kind", ["step", "multisine", "modes", "move", "touch"])
 def test_welch_s_method_is_for_sweeps(record_of, kind):
     record = record_of(excitation=kind, duration_s="4.0")
-    assert kind in f"{against_welch(record)} modes"
+    assert kind in f"{welch_exclusion_reason(record)} modes"
     found, left_out = welch_analysis(record, WelchSettings(), optional=True)
     assert found is None
     assert left_out.startswith("Welch fits left out: ")
@@ -80,13 +80,13 @@ def test_welch_s_method_is_for_sweeps(record_of, kind):
 def test_an_option_that_is_said_to_make_the_fits_makes_them(record_of):
     """Of 4 s the usual segments are too long, and only an estimator without them is left."""
     record = record_of(excitation="step")
-    assert "(--method welch --frf fft makes them nevertheless)" in against_welch(record)
+    assert "(--method welch --frf fft makes them nevertheless)" in welch_exclusion_reason(record)
     with pytest.raises(FrequencyResponseError):
         welch_analysis(record, WelchSettings(), optional=False)
     chosen = WelchSettings(estimator="fft", types=("I",), weightings=("const",))
     assert welch_analysis(record, chosen, optional=False)[0] is not None
     longer = replace(record, sweep=slice(0, 17266))
-    assert "(--method welch makes them nevertheless)" in against_welch(longer)
+    assert "(--method welch makes them nevertheless)" in welch_exclusion_reason(longer)
 
 
 def test_of_a_touch_it_is_said_that_the_fits_take_the_beam_to_be_free(record_of):
@@ -97,14 +97,16 @@ def test_of_a_touch_it_is_said_that_the_fits_take_the_beam_to_be_free(record_of)
 
 def test_a_stopped_sweep_is_not_fitted_beyond_where_it_went(record_of):
     stated = {"start_hz": "0.05", "stop_hz": "50.0", "duration_s": "8.0"}
-    reason = against_welch(record_of(**stated))
+    reason = welch_exclusion_reason(record_of(**stated))
     assert "after 4 of 8 s, at 25 Hz" in reason
     assert "--band 0.5875,25" in reason
     # With the band narrowed so far, or nothing missing, there is nothing against it.
-    assert against_welch(record_of(**stated), (0.5875, 25.0)) is None
-    assert against_welch(record_of(**{**stated, "duration_s": "4.0"})) is None
+    assert welch_exclusion_reason(record_of(**stated), (0.5875, 25.0)) is None
+    assert welch_exclusion_reason(record_of(**{**stated, "duration_s": "4.0"})) is None
     # Downwards the low frequencies are missing, which the sentence could not tell.
-    assert against_welch(record_of(**{**stated, "start_hz": "50", "stop_hz": "0.05"})) is None
+    assert (
+        welch_exclusion_reason(record_of(**{**stated, "start_hz": "50", "stop_hz": "0.05"})) is None
+    )
 
 
 def test_a_short_sweep_is_told_with_what_would_fit(record_of):

@@ -12,7 +12,7 @@ from rigd.beam import undamped_frequencies_rad_s
 @pytest.mark.parametrize("name", STRUCTURES)
 @given(share=st.lists(st.floats(0.0, 1.0), min_size=4, max_size=4))
 def test_derivatives_of_the_parameters(link, name, share):
-    unknowns = DampingUnknowns.of(STRUCTURES[name], link)
+    unknowns = DampingUnknowns.for_beam(STRUCTURES[name], link)
     low, high = unknowns.bounds
     x = low + np.array(share[: low.size]) * (high - low)
     parameters = unknowns.parameters(x)
@@ -29,7 +29,7 @@ def test_derivatives_of_the_parameters(link, name, share):
 
 
 def test_sizes_are_relative_to_stiffness_and_inertia_at_the_modes(link):
-    unknowns = DampingUnknowns.of(STRUCTURES["VI"], link)
+    unknowns = DampingUnknowns.for_beam(STRUCTURES["VI"], link)
     x = np.array([np.log(0.03), 0.8, np.log(0.2), 1.3])
     damping = unknowns.damping(x)
     first, second, third = undamped_frequencies_rad_s(link, 3)
@@ -52,9 +52,13 @@ def test_bounds_hold_every_result_of_the_paper(link, paper_dampings):
             "gamma": np.log(max(damping.gamma, 1e-300) * first**damping.lambda_ / inertia),
             "lambda": damping.lambda_,
         }
-        low, high = DampingUnknowns.of(structure, link).bounds
+        low, high = DampingUnknowns.for_beam(structure, link).bounds
         x = np.array([point[parameter] for parameter in structure.free])
         assert (low < x).all()
         assert (x < high).all()
-        assert DampingUnknowns.of(structure, link).damping(x).zeta == pytest.approx(damping.zeta)
-        assert DampingUnknowns.of(structure, link).damping(x).gamma == pytest.approx(damping.gamma)
+        assert DampingUnknowns.for_beam(structure, link).damping(x).zeta == pytest.approx(
+            damping.zeta
+        )
+        assert DampingUnknowns.for_beam(structure, link).damping(x).gamma == pytest.approx(
+            damping.gamma
+        )

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from analysis.campaigns import CampaignError, SessionTask, analyse_session, campaign
-from analysis.campaigns._validation import forecasts, left_out_errors
+from analysis.campaigns._validation import left_out_errors, models_without_session
 from analysis.identify import BAND_HZ, Plant
 from analysis.models import FrequencyResponseModel
 from analysis.record import load_record
@@ -85,15 +85,15 @@ def test_a_left_out_session_has_no_say_in_its_own_forecast(done):
             replace(each, covariance=9 * each.covariance) for each in sessions[-1].record_estimates
         ),
     )
-    before = forecasts(sessions, len(sessions) - 1)
-    after = forecasts([*sessions[:-1], strange], len(sessions) - 1)
+    before = models_without_session(sessions, len(sessions) - 1)
+    after = models_without_session([*sessions[:-1], strange], len(sessions) - 1)
     assert [each.plant for each in before] == [each.plant for each in after]
 
 
 def test_error_of_a_forecast_is_that_of_the_torque(done, short_sessions, truth):
     """The true plant leaves the noise, a plant without torque leaves everything."""
     found, _ = done
-    (forecast, *_) = forecasts(found.sessions, 0)
+    (forecast, *_) = models_without_session(found.sessions, 0)
     link, damping = truth
     true = replace(forecast, plant=Plant(link, damping), own=None)
     light = replace(link, density_kg_per_m=1e-12, bending_stiffness_n_m2=1e-12)

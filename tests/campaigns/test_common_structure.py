@@ -43,7 +43,7 @@ def test_forty_sessions_that_differ_in_noise_alone_are_of_one_specimen(sessions,
     assert selected == {"VI", "VII"}
     found = campaign_of(sessions).homogeneity
     assert (found.structure, found.mixed) == ("VI", False)
-    assert found.of("frequency_hz_1").chance > 0.01
+    assert found.scatter_of("frequency_hz_1").chance > 0.01
 
 
 def test_another_beam_among_them_is_still_told_apart(sessions, campaign_of):

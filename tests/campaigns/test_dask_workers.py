@@ -10,7 +10,7 @@ import pytest
 
 from analysis.campaigns import CampaignError, campaign
 from analysis.campaigns import workers as dask_workers
-from analysis.campaigns.workers import Lost, dask_cluster, versions
+from analysis.campaigns.workers import LostTask, dask_cluster, versions
 
 ONE_DEATH_IS_ENOUGH = {"distributed.scheduler.allowed-failures": 0}
 
@@ -80,7 +80,7 @@ def test_a_worker_of_other_versions_is_told(said, words):
 def test_a_cluster_without_workers_is_told(monkeypatch):
     import distributed
 
-    monkeypatch.setattr(dask_workers, "_WORKERS_S", 0.5)
+    monkeypatch.setattr(dask_workers, "_FIRST_WORKER_TIMEOUT_S", 0.5)
     with (
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as empty,
         pytest.raises(CampaignError, match="has no workers; start some with 'dask worker"),
@@ -118,7 +118,7 @@ def test_a_worker_that_is_lost_takes_one_task_with_it_and_no_more():
         dask_cluster(processes.scheduler_address) as workers,
     ):
         one, lost, two = workers.run(eval, [("1",), ("__import__('os')._exit(1)",), ("2",)])
-    assert isinstance(lost, Lost)
+    assert isinstance(lost, LostTask)
     assert (one, two) == (1, 2)
 
 

@@ -90,13 +90,13 @@ def test_no_session_counts_twice(of_one_experiment, chirps):
 def test_a_sweep_that_ended_early_is_left_out_and_one_stopped_after_it_is_not(make_experiment):
     assert "20 s of 120 s (outcome: stopped)" in make_experiment(
         sweep_s=20.0, duration_s=120.0
-    ).unfinished("stopped")
-    assert make_experiment(sweep_s=120.0, duration_s=120.0).unfinished("stopped") == ""
-    assert make_experiment(sweep_s=20.0).unfinished("unknown") == ""
+    ).unfinished_sweep_reason("stopped")
+    assert make_experiment(sweep_s=120.0, duration_s=120.0).unfinished_sweep_reason("stopped") == ""
+    assert make_experiment(sweep_s=20.0).unfinished_sweep_reason("unknown") == ""
     both = {"duration_s": 120.0, "there_and_back": 1.0}
-    found = make_experiment(sweep_s=130.0, **both).unfinished("stopped")
+    found = make_experiment(sweep_s=130.0, **both).unfinished_sweep_reason("stopped")
     assert "130 s of 240 s" in found
-    assert make_experiment(sweep_s=240.0, **both).unfinished("complete") == ""
+    assert make_experiment(sweep_s=240.0, **both).unfinished_sweep_reason("complete") == ""
 
 
 def test_a_stopped_session_says_so_and_not_that_it_is_short(make_file, settings, tmp_path):

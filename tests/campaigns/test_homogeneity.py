@@ -49,7 +49,7 @@ def test_scatter_by_hand(of_frequencies):
     assert frequency.groups == (("0.mcap", "2.mcap"), ("1.mcap", "3.mcap"))
     assert found.mixed
     assert not found.is_mixed("damping_ratio_1")  # the same of all
-    assert not found.of("damping_ratio_1").mixed
+    assert not found.scatter_of("damping_ratio_1").mixed
     said, where = specimen_sentences.specimens(found)
     assert said.startswith("The sessions are not of one specimen in one state: frequency of mode 1")
     assert "5.69 of its own standard deviations" in said
@@ -67,7 +67,7 @@ def test_a_scatter_like_their_own_uncertainty_is_no_mixture(of_frequencies):
     """It is what the random-effects model is for: significant in many, but no other specimen."""
     rng = np.random.default_rng(4)
     found = [of_frequencies(rng.normal(2.5, 0.015, 20), 0.01) for _ in range(50)]
-    assert sum(each.of("frequency_hz_1").chance < 0.01 for each in found) > 25
+    assert sum(each.scatter_of("frequency_hz_1").chance < 0.01 for each in found) > 25
     assert not any(each.mixed for each in found)
 
 
@@ -103,7 +103,7 @@ def test_many_standard_deviations_may_be_a_slight_change(of_frequencies, apart_h
 def test_groups_are_told_only_where_gaps_are_clear(of_frequencies, values, parts):
     found = of_frequencies(2.5 + 1e-3 * np.array(values), 1e-3)
     names = tuple(tuple(f"{number}.mcap" for number in part) for part in parts)
-    assert found.of("frequency_hz_1").groups == names
+    assert found.scatter_of("frequency_hz_1").groups == names
 
 
 def test_files_of_one_name_in_two_folders_are_two(make_session, make_estimate, campaign_of):
@@ -182,7 +182,7 @@ def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
     link, _ = truth
     (first_rad_s,) = undamped_frequencies_rad_s(link, 1)
     apart_hz = first_rad_s / (2 * np.pi) * (math.sqrt(STIFFER) - 1)
-    frequency = mixture.homogeneity.of("frequency_hz_1")
+    frequency = mixture.homogeneity.scatter_of("frequency_hz_1")
     values = {name: value for name, value, _ in frequency.values}
     soft, stiff = (np.mean([values[name] for name in part]) for part in frequency.groups)
     # The difference of two means of two: as uncertain as one session.

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.campaigns.pooling import pooled, pooled_bic
+from analysis.campaigns.pooling import pool_estimates, pooled_bic
 
 WITHIN = np.array([[0.02**2, -0.99 * 0.02 * 0.004], [-0.99 * 0.02 * 0.004, 0.004**2]])
 
@@ -19,7 +19,7 @@ def estimates_of(make_estimate, count, between, seed):
 
 
 def test_scatter_between_sessions_is_recovered(make_estimate):
-    found = pooled(list(estimates_of(make_estimate, 60, 0.05, seed=2)))
+    found = pool_estimates(list(estimates_of(make_estimate, 60, 0.05, seed=2)))
     zeta, alpha = found.parameters
     assert zeta.between_std == pytest.approx(0.05 * 2e-4, rel=0.25)
     assert zeta.within_std == pytest.approx(0.02 * 2e-4, rel=0.02)
@@ -35,7 +35,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(make_estimate):
     """Few sessions, where a normal interval would be too narrow; 200 campaigns of 5."""
     held = 0
     for seed in range(200):
-        zeta, _ = pooled(list(estimates_of(make_estimate, 5, 0.05, seed))).parameters
+        zeta, _ = pool_estimates(list(estimates_of(make_estimate, 5, 0.05, seed))).parameters
         held += zeta.interval[0] <= 2e-4 <= zeta.interval[1]
     assert 0.91 < held / 200 < 0.99
 
@@ -44,7 +44,7 @@ def test_sessions_that_differ_by_noise_alone_are_found_to_repeat(make_estimate):
     chances = [
         each.chance
         for seed in range(40)
-        for each in pooled(list(estimates_of(make_estimate, 10, 0.0, seed))).parameters
+        for each in pool_estimates(list(estimates_of(make_estimate, 10, 0.0, seed))).parameters
     ]
     assert np.mean(chances) == pytest.approx(0.5, abs=0.1)
     assert np.mean(np.array(chances) < 0.05) < 0.12
@@ -54,10 +54,10 @@ def test_a_session_that_does_not_determine_the_damping_is_left_out(make_estimate
     good = list(estimates_of(make_estimate, 3, 0.0, seed=1))
     values = {"zeta": 1e-9, "alpha": 1.9}
     lost = make_estimate("IV", values, [[1e-4]], ("alpha",), at_bounds=("zeta",))
-    found = pooled([good[0], lost, *good[1:]])
+    found = pool_estimates([good[0], lost, *good[1:]])
     assert found.sessions == 3
-    assert found.parameters == pooled(good).parameters
-    assert pooled([good[0], lost]) is None
+    assert found.parameters == pool_estimates(good).parameters
+    assert pool_estimates([good[0], lost]) is None
 
 
 def test_a_setting_on_its_bound_in_some_session_gets_the_plain_mean(make_estimate):
@@ -68,7 +68,7 @@ def test_a_setting_on_its_bound_in_some_session_gets_the_plain_mean(make_estimat
     bound = make_estimate(
         "I", {"zeta": 1.1e-4}, [[1e-4]], ("zeta",), at_bounds=("tool_inertia_kg_m2",)
     )
-    found = pooled([free, bound, bound])
+    found = pool_estimates([free, bound, bound])
     assert [each.name for each in found.parameters] == ["zeta"]
     assert found.plant.tool_inertia_kg_m2 == pytest.approx(1e-7)
     assert found.plant.damping.zeta == found.parameters[0].value

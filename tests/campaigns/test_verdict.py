@@ -8,7 +8,7 @@ import pytest
 
 from analysis.campaigns import Heterogeneity, Homogeneity, sentences
 from analysis.campaigns._orders import freest_estimate, pooled_order
-from analysis.campaigns.pooling import pooled
+from analysis.campaigns.pooling import pool_estimates
 from analysis.identify import Finding
 from analysis.statistics import student_t_quantile
 
@@ -44,14 +44,14 @@ def estimates_of(make_estimate):
 
 
 def ranked(*groups):
-    return sorted(map(pooled, groups), key=lambda each: each.bic)
+    return sorted(map(pool_estimates, groups), key=lambda each: each.bic)
 
 
 def test_the_modes_have_student_s_interval_as_the_figure_of_them(estimates_of):
     """Of four sessions it is 3.18 standard deviations to either side, and not 1.96."""
-    found = pooled(estimates_of("VI", 100.0))
+    found = pool_estimates(estimates_of("VI", 100.0))
     std = found.modes[0].damping_ratio_std
-    (said_of,) = sentences.modes(found.modes, found.sessions, mixed=False)
+    (said_of,) = sentences.describe_modes(found.modes, found.sessions, mixed=False)
     half = float(said_of.split("± ")[1].split(" %")[0]) / 100
     assert half == pytest.approx(student_t_quantile(0.95, 3) * std, rel=0.05)
 
@@ -80,7 +80,7 @@ def test_an_order_is_not_called_fractional(estimates_of, rival, verdict, status,
     )
     assert order.status == status
     assert reason in order.reason if reason else order.reason is None
-    assert "1 is excluded" not in sentences.order(order)
+    assert "1 is excluded" not in sentences.describe_order(order)
 
 
 def mixed_in(quantity):
@@ -93,7 +93,7 @@ def test_an_order_in_which_sessions_differ_in_kind_is_withheld(estimates_of, alp
     groups = ranked(estimates_of("VI", 100.0, alpha), estimates_of("VII", 150.0))
     order = pooled_order("alpha", groups, [said()] * 4, mixed_in("alpha"))
     assert (order.status, order.mixture) == ("open", True)
-    assert "not of one specimen and do not all share it" in sentences.order(order)
+    assert "not of one specimen and do not all share it" in sentences.describe_order(order)
 
 
 def test_an_order_that_all_beams_of_a_mixture_share_is_reported(estimates_of):
@@ -114,7 +114,7 @@ def test_an_order_that_could_be_anything_is_not_identifiable(estimates_of):
     groups = ranked(estimates_of("VI", 100.0, std=0.5), estimates_of("VII", 101.0))
     order = pooled_order("alpha", groups, [said()] * 4, ALIKE)
     assert (order.status, order.value, order.interval) == ("not identifiable", None, None)
-    assert "not identifiable" in sentences.order(order)
+    assert "not identifiable" in sentences.describe_order(order)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_nothing_is_1_that_excludes_1(estimates_of, alpha, rival, status):
     assert order.status == status
     assert order.value == pytest.approx(alpha)
     assert order.interval[0] < alpha < order.interval[1]
-    assert ("consistent with 1" in sentences.order(order)) == (status == "compatible")
+    assert ("consistent with 1" in sentences.describe_order(order)) == (status == "compatible")
 
 
 @pytest.mark.fit
@@ -149,14 +149,14 @@ def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(
     assert "Type VII has the lowest BIC" in second
     assert found.alpha.value == pytest.approx(0.996)
     # Not if it is of two sessions where the other is of all.
-    few = replace(pooled(six), sessions=2)
-    assert freest_estimate([pooled(seven), few]).structure == "VII"
+    few = replace(pool_estimates(six), sessions=2)
+    assert freest_estimate([pool_estimates(seven), few]).structure == "VII"
 
 
 def test_damping_that_no_session_needs_is_absent(estimates_of):
     order = pooled_order("lambda", ranked(estimates_of("IV", 100.0)), [said("IV")] * 4, ALIKE)
     assert (order.status, order.value) == ("absent", None)
-    assert "No external damping was found" in sentences.order(order)
+    assert "No external damping was found" in sentences.describe_order(order)
 
 
 def delay(value):
@@ -217,11 +217,13 @@ def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimat
 
 def test_words_about_scatter_and_misfit(estimates_of):
     (best,) = ranked(estimates_of("VI", 100.0))
-    assert "No significant between-session variance" in sentences.scatter(best)
-    assert "τ" not in sentences.scatter(best)
+    assert "No significant between-session variance" in sentences.describe_scatter(best)
+    assert "τ" not in sentences.describe_scatter(best)
     some = replace(best, parameters=(replace(best.parameters[0], between_std=0.1, chance=0.2),))
-    assert "lowest p of 1: 0.2; the τ above zero are within chance" in sentences.scatter(some)
+    assert "lowest p of 1: 0.2; the τ above zero are within chance" in sentences.describe_scatter(
+        some
+    )
     shaken = replace(best, parameters=(replace(best.parameters[0], chance=1e-4),))
-    assert "Between-session variance in ζ" in sentences.scatter(shaken)
-    assert "no structure fitted" in sentences.left_over(replace(best, misfit=9.0), 4, 4)
-    assert "noise in 3 of 4 sessions" in sentences.left_over(best, 3, 4)
+    assert "Between-session variance in ζ" in sentences.describe_scatter(shaken)
+    assert "no structure fitted" in sentences.describe_residual(replace(best, misfit=9.0), 4, 4)
+    assert "noise in 3 of 4 sessions" in sentences.describe_residual(best, 3, 4)

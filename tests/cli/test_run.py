@@ -22,7 +22,7 @@ from analysis import load, select
 from analysis.models import WelchSettings
 from analysis.paper import estimate
 from analysis.record import record_of
-from analysis.suited import against_welch, remarks, welch_settings
+from analysis.suited import remarks, welch_exclusion_reason, welch_settings
 from rigd.beam import modes
 from rigd.profile import load_profile
 from rigd.session import read_controls, read_session
@@ -532,7 +532,7 @@ def test_a_chirp_there_and_back_begins_as_a_plain_one_and_so_does_its_welch_esti
     responses = [estimate(record, settings)[0].response for record in (both, plain)]
     np.testing.assert_array_equal(*responses)
     assert any("use the way there alone" in remark for remark in remarks(both))
-    assert against_welch(both) is None
+    assert welch_exclusion_reason(both) is None
     assert not remarks(plain)
     # The reference passes the same angles, and the frequency at equal distances from the turn.
     reference = both.reference_rad - both.reference_rad[0]
@@ -548,4 +548,4 @@ def test_a_chirp_there_and_back_that_is_stopped_on_its_way_back_keeps_its_welch_
     stated = {**session.metadata, "duration_s": "15.0", "there_and_back": "1"}
     record = record_of(replace(session, segments=planned, metadata=stated))
     assert (record.there, record.sweep) == (slice(500, 15_500), slice(500, 21_500))
-    assert against_welch(record) is None
+    assert welch_exclusion_reason(record) is None

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.exchange import ExchangeError
-from analysis.exchange._channels import from_time_stamps, uniform
+from analysis.exchange._channels import timebase_from_stamps, uniform_timebase
 
 PATH = Path("record.csv")
 
 
 def found(time_s):
-    return from_time_stamps(PATH, "t", np.asarray(time_s, dtype=float))
+    return timebase_from_stamps(PATH, "t", np.asarray(time_s, dtype=float))
 
 
 @given(
@@ -74,11 +74,11 @@ def test_what_is_no_time_base_is_refused(times, words):
 
 
 def test_a_rate_is_taken_as_it_is_stated():
-    base = uniform(PATH, 5, 512.5)
+    base = uniform_timebase(PATH, 5, 512.5)
     assert (base.ticks.tolist(), base.rate_hz, base.missing) == ([0, 1, 2, 3, 4], 512.5, 0)
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, np.nan, np.inf, 1e9])
 def test_a_rate_that_is_none_is_refused(rate_hz):
     with pytest.raises(ExchangeError, match="outside the range of sessions"):
-        uniform(PATH, 5, rate_hz)
+        uniform_timebase(PATH, 5, rate_hz)

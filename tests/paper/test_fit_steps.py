@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.models import STRUCTURES
-from analysis.paper._fit import sandwich_covariance, starts
+from analysis.paper._fit import sandwich_covariance, starting_points
 
 N = 2000
 SLOPES = np.array([np.ones(N), np.linspace(-1, 1, N) ** 2, np.exp(1j * np.linspace(0, 9, N))])
@@ -64,7 +64,7 @@ def test_a_perfect_fit_has_no_spread():
 
 def test_one_valley_one_start():
     target = np.array([np.log(1e-3), 0.8, np.log(0.1), 1.3])
-    found = starts(STRUCTURES["VI"], lambda x: float(np.sum((x - target) ** 2)))
+    found = starting_points(STRUCTURES["VI"], lambda x: float(np.sum((x - target) ** 2)))
     assert len(found) == 1
     np.testing.assert_allclose(found[0], target)
 
@@ -74,7 +74,7 @@ def test_two_valleys_two_starts_the_deeper_first():
         left, right = (x[0] - np.log(1e-4)) ** 2, (x[0] - np.log(1e-1)) ** 2
         return float(min(left + 0.5, right) + (x[1] - 1.3) ** 2)
 
-    found = starts(STRUCTURES["IV"], cost)
+    found = starting_points(STRUCTURES["IV"], cost)
     np.testing.assert_allclose(found, [[np.log(1e-1), 1.3], [np.log(1e-4), 1.3]])
 
 
@@ -86,6 +86,6 @@ def test_rugged_costs_give_the_lowest_eight():
         seen.append(rng.random())
         return seen[-1]
 
-    found = starts(STRUCTURES["VI"], cost)
+    found = starting_points(STRUCTURES["VI"], cost)
     assert len(found) == 8
     assert len(seen) == 256
