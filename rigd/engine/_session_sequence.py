@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _SETTLING_S = 0.5
 """Time in s for which the motor is held before tick 0, and the beam rests before the last tare."""
 _VIRTUAL_POLL_S = 0.0002
-"""Pause in s between two polls of the shared state while virtual time stands still."""
+"""Pause in s between two polls of the shared state while virtual time does not advance."""
 _START_TIMEOUT_S = 10.0
 """Longest time in s that the control process waits for the supervisor to start the record."""
 _SUPERVISOR_TIMEOUT_S = 2.0

@@ -54,7 +54,7 @@ from rigd.session.layout import WRENCH_FIELDS
 _MAX_SILENCE_S = 1.0
 """Longest time in s for which a device may send no reading between sessions."""
 _STANDSTILL_POLL_S = 0.05
-"""Longest time in s to wait for an order of the supervisor while virtual time stands still."""
+"""Longest time in s to wait for an order of the supervisor while virtual time does not advance."""
 _ZERO_READING_S = 0.2
 """Duration in s of the readings whose last angle becomes the rig's zero."""
 _STANDSTILL_TICKS = 2

@@ -146,7 +146,7 @@ class StateField(IntEnum):
     TOUCHES = 23
     """Number of touches detected in the record."""
     HELD = 25
-    """Number of ticks of the record in which the angle was held because there was no next segment."""
+    """Number of recorded ticks in which the angle was held because no next segment was planned."""
     HELD_BEFORE = 29
     """Number of ticks in which the angle was held before the segment that began last."""
     BEGUN = 30
