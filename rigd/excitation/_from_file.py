@@ -20,15 +20,19 @@ from rigd.text_table import MissingColumnError, TableError, TextTable, read_tabl
 from rigd.text_table.titles import time_unit_s
 
 MOST_BYTES: Final = 256_000_000
+"""Largest size in bytes of a text file with a reference."""
 TIME: Final = "time_s"
+"""Heading of the column of times."""
 ANGLE: Final = "angle_rad"
+"""Heading of the column of angles."""
 _RADIANS: Final = ("rad", "radian", "radians")
+"""Names of the unit that a column of angles may state."""
 
 
 def from_csv(
     path: str | Path, *, rate_hz: float, rest_s: float = 1.0, ring_down_s: float = 15.0
 ) -> Excitation:
-    """Read a reference from a text file.
+    """Return an excitation whose reference angles are read from a text file.
 
     `rigd.text_table.read_table` detects separator, decimal sign, heading and encoding; an
     invalid line is an error.
@@ -36,13 +40,14 @@ def from_csv(
     Parameters
     ----------
     path
-        Either columns ``time_s`` and ``angle_rad`` (more columns are ignored; angles are
-        interpolated linearly to the ticks, times counted from the first), or a single column of
-        angles in rad, one per tick, with or without the heading ``angle_rad``.
+        Text file. Either it has the columns ``time_s`` and ``angle_rad`` (more columns are ignored,
+        angles are interpolated linearly to the ticks, and times are counted from the first row). Or
+        it has a single column of angles in rad, one per tick, with or without the heading
+        ``angle_rad``.
     rate_hz
         Ticks a second.
     rest_s, ring_down_s
-        Time before and after the trajectory.
+        Time in s before and after the trajectory.
 
     Raises
     ------
@@ -76,7 +81,7 @@ def from_csv(
 def _read_columns(
     path: Path,
 ) -> tuple[npt.NDArray[np.float64] | None, npt.NDArray[np.float64]]:
-    """Return times in s (None for one angle a tick) and angles in rad."""
+    """Read times in s and angles in rad; the times are None if the file has one angle a tick."""
     try:
         with open_plain_file(path, MOST_BYTES) as file:
             table = _table(file.buffer)
@@ -113,7 +118,7 @@ def _read_columns(
 
 
 def _table(stream: BinaryIO) -> TextTable:
-    """Read times and angles, or a single column."""
+    """Read a table with the columns of times and angles, or with a single column of angles."""
     try:
         return read_table(stream, (TIME, ANGLE), most_rows=MAX_SAMPLES)
     except MissingColumnError:

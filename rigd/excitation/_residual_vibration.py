@@ -13,19 +13,19 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 ARRIVED_RAD: Final = 1e-3
-"""Distance from its end within which the angle has arrived."""
+"""Distance in rad from the end of a move within which the angle counts as arrived."""
 
 _FOLLOWED_S: Final = 1.0
-"""Time after the reference for which the motion is simulated."""
+"""Shortest time in s after the reference for which the motion is simulated."""
 _SEEN_FOR_S: Final = 1.0
-"""Shortest ring-down for which the floor of the sensor is stated."""
+"""Duration in s that a shorter ring-down is replaced with to compute the sensor's noise floor."""
 _EXCEEDED_1_IN_1000: Final = 13.8
-"""Square of the amplitude that noise exceeds once in 1000 times, over the variance of its cosine
-and of its sine: exp(-a²/2) = 0.001."""
+"""Square of the amplitude a that noise exceeds once in 1000 times, over the variance of its cosine
+or sine component: exp(-a²/2) = 0.001."""
 
 
 class DisturbedRig(Protocol):
-    """Rig with friction, encoder steps and noise."""
+    """Interface to a rig's predicted behaviour with friction, encoder steps and noise."""
 
     @property
     def rate_hz(self) -> float:
@@ -33,51 +33,55 @@ class DisturbedRig(Protocol):
 
     @property
     def disturbed(self) -> Callable[[Real, int], tuple[Real, Real]]:
-        """Return angle (n, draws) and torque of the lowest modes (n, modes, draws)."""
+        """Function of a reference, shape (n,), and a number of lowest modes.
+
+        It returns the angle in rad, shape (n, draws), and the amplitude of each mode's coupling
+        torque in N·m, shape (n, modes, draws), for several random draws.
+        """
 
     @property
     def poles_rad_s(self) -> Complex:
-        """Poles of the modes, shape (m,)."""
+        """Poles of the modes in rad/s, shape (m,)."""
 
     @property
     def settling_s(self) -> float:
-        """Time in which the loop catches up with the reference."""
+        """Time in s after which the angle of the closed loop has reached the reference."""
 
     @property
     def torque_noise_nm(self) -> float:
-        """Noise of one reading of the coupling torque."""
+        """Standard deviation in N·m of the noise of one reading of the coupling torque."""
 
 
 @dataclass(frozen=True, slots=True)
 class MoveEnd:
-    """Arrival and residual vibration after the reference of a move.
+    """Predicted arrival time and residual vibration of a move.
 
     The vibration is the root of the sum of squares of the amplitudes of the modes below
-    `ROBUST_BELOW_HZ`, in the coupling torque, at the end of the reference; the modes above have
+    `ROBUST_BELOW_HZ`, in the coupling torque, at the end of the reference. The modes above have
     decayed when the motor has arrived.
     """
 
     arrival_s: float | None
-    """Time from the move's start after which the angle stays within `ARRIVED_RAD`; None: that is
-    more than a second after the reference's end."""
+    """Time in s from the start of the move after which the angle stays within `ARRIVED_RAD` of its
+    end; None: the motor arrives more than a second after the end of the reference."""
     residual_nm: float
-    """Residual vibration, with friction, encoder steps and noise of the sensor."""
+    """Coupling torque in N·m of the residual vibration, with friction, encoder steps and noise."""
     floor_nm: float
-    """Vibration read from the ring-down after the arrival because of the sensor's noise alone,
-    exceeded in one of 1000 cases: less cannot be detected."""
+    """Coupling torque in N·m that the sensor's noise alone simulates in the ring-down, exceeded in
+    one of 1000 cases. A smaller vibration cannot be detected."""
 
 
 def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
-    """Predict the arrival of a move and the vibration after it.
+    """Predict when the motor arrives at the end of a move, and the vibration after it.
 
     Parameters
     ----------
     rig
-        The rig.
+        Predicted behaviour of the rig.
     reference_rad
-        Shape (n,): at the ticks after the start, relative to the angle there.
+        Reference angle at the ticks after the start, relative to the start angle; shape (n,).
     ring_down_s
-        Time of the ring-down in the session.
+        Duration of the ring-down in the session, in s.
     """
     rate_hz, end = rig.rate_hz, reference_rad.size
     ringing = rig.poles_rad_s[np.abs(rig.poles_rad_s) < 2 * np.pi * ROBUST_BELOW_HZ]

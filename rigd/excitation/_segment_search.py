@@ -1,6 +1,6 @@
 """Search for the next segment of excitation: its sweeps, information and limits.
 
-Serves `rigd.excitation.experiment_design`.
+`rigd.excitation.experiment_design` uses it.
 """
 
 from collections.abc import Collection
@@ -28,69 +28,83 @@ from rigd.excitation.targets import Precision, Quantities
 Real = NDArray[np.float64]
 
 DURATIONS_S: Final = (1.0, 1.5, 2.0, 3.0)
-"""Candidate durations of a segment."""
+"""Durations in s of the candidate segments."""
 SHORTEST_S: Final = DURATIONS_S[0]
-"""Duration of the shortest segment."""
+"""Duration in s of the shortest segment."""
 
 _FADE_S: Final = 0.25
+"""Shortest duration in s of a sweep's fade at either end."""
 _SETTLING_S: Final = 0.25
+"""Time in s after a segment for which its response is checked against the limits."""
 _TAIL_S: Final = 1.0
-"""Time after a segment in which the modes that it does not excite are brought to rest."""
+"""Time in s after a segment over which the vibration of the modes is separated, and the modes that
+the segment does not excite are brought to rest."""
 HORIZON_S: Final = 8.0
-"""Planning horizon: a mode gives information on its damping only after it has rung for a while."""
+"""Planning horizon in s from the start of a segment. A mode gives information on its damping only
+after it has rung for a while."""
 _HALF_WIDTH_HZ: Final = 0.5
+"""Half the width in Hz of a narrow sweep through a mode."""
 _OVER: Final = 2.0
-"""Half the width of a sweep over a whole resonance, in its half-power half-widths."""
+"""Half the width of a sweep over a whole resonance, in half-power half-widths of the mode."""
 _SIDE_OFFSET: Final = 0.06
 """Distance of the off-resonance sweeps from a mode, relative to its frequency. They determine
-stiffness and tool inertia; without these the height of a resonance does not give the damping."""
+stiffness and tool inertia, without which the height of a resonance does not give the damping."""
 _LINES: Final = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
-"""Steady sines of the forecast, in half-power half-widths from a mode."""
+"""Distances of the forecast's steady sines from a mode, in half-power half-widths of the mode."""
 _PHASES: Final = 8
+"""Number of phases of a sweep that are compared."""
 _FRACTIONS: Final = (1.0, 0.8, 0.5)
-"""Fractions of a segment with which further bands are combined."""
+"""Factors by which a segment's amplitude is multiplied when a further band is added to it."""
 _ROUNDS: Final = 60
+"""Number of multiplicative steps in the search for a mixture of steady sines."""
 _EFFICIENCY: Final = 0.7
-"""Time of a mixture of steady sines over that of segments, which have to ring up (measured)."""
+"""Time of a mixture of steady sines over the time of segments with the same information, whose
+modes have to ring up (measured)."""
 _NEVER_S: Final = 1e5
+"""Time in s above which the targets count as never reached."""
 _TIGHTENINGS: Final = 3
+"""Largest number of times that the targets are relaxed to fit into the remaining time."""
 _THINNED: Final = 4
-"""While segments are compared, limits are checked in one tick of so many."""
+"""Number of ticks from one check of the limits to the next while candidates are compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class PrecisionForecast:
-    """Expected time until the targets are reached."""
+    """Forecast of the time until all target precisions are reached."""
 
     seconds: float
-    """Time until all targets are reached at the rate of the best segments; infinite: never."""
+    """Time in s until all targets are reached with the best segments; infinite: never."""
     reason: str
-    """Why the targets are not reached in the remaining time; empty if they are."""
+    """Reason why the targets are not reached in the remaining time; empty if they are reached."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segment:
-    """A segment of excitation; begins and ends at angle, speed and acceleration zero."""
+    """Planned segment of excitation, with the precision expected from it.
+
+    It begins and ends with angle, speed and acceleration zero.
+    """
 
     name: str
     """Modes, frequencies, duration and amplitudes, as text for the operator."""
     reference_rad: Real
-    """Shape (n,): one value per tick, relative to the start angle."""
+    """Reference angle at each tick, relative to the start angle; shape (n,)."""
     angle_rad: Real
-    """Shape (n,): the predicted angle."""
+    """Predicted angle of the motor at each tick; shape (n,)."""
     names: tuple[str, ...]
-    """Free parameters, in the order of the covariance."""
+    """Names of the free parameters, in the order of the covariance."""
     covariance: Real
-    """Shape (k, k): covariance expected at the end of the segment; see `information`."""
+    """Covariance of the free parameters that is expected at the end of the segment, shape (k, k);
+    see `information` for their units."""
     now: tuple[Precision, ...]
-    """Precision of each target expected at the beginning of the segment."""
+    """Precision of each target that is expected at the beginning of the segment."""
     expected: tuple[Precision, ...]
-    """Precision of each target expected at its end."""
+    """Precision of each target that is expected at the end of the segment."""
     forecast: PrecisionForecast
-    """When all targets are expected to be reached, from the beginning of the segment."""
+    """Forecast of the time from the beginning of the segment until all targets are reached."""
     fraction_of_limits: float
-    """Largest predicted fraction of a limit, or of the range of small slopes, with the remaining
-    vibration included."""
+    """Largest predicted fraction of a limit, or of the largest slope of the tip, including the
+    vibration from before the segment."""
 
 
 # Sweeps of which segments consist
@@ -98,70 +112,85 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class _Band:
-    """A band of frequencies to sweep, and the mode that it excites."""
+    """Band of frequencies that a candidate sweep covers, and the mode that it excites."""
 
     number: int
+    """Number of the mode, from 1."""
     middle_hz: float
+    """Centre of the band in Hz."""
     half_width_hz: float
+    """Half the width of the band in Hz; 0: a sine."""
     fade_s: float
+    """Duration in s of the fade at either end of the sweep."""
     at_mode: bool = True
+    """Whether the band is centred at the mode, not on one side of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sweep:
-    """Response to a sweep of amplitude 1 in one phase."""
+    """Reference and predicted response of a sweep of amplitude 1 rad in one phase."""
 
     reference_rad: Real
-    """(n,)."""
+    """Reference angle at each tick of the segment; shape (n,)."""
     angle_rad: Real
-    """(n,)."""
+    """Predicted angle of the motor at each tick of the segment; shape (n,)."""
     rows: Real
-    """(k, samples): whitened derivatives of the torque from the beginning of the segment."""
+    """Whitened derivatives of the torque by the free parameters from the beginning of the segment;
+    shape (k, samples)."""
     weighted: Real
-    """(q, samples): their weighted combinations."""
+    """Combinations of these derivatives with the weights of the mixture; shape (q, samples)."""
     channels: Real
-    """(6, ticks): limited quantities, as fractions of their limits."""
+    """Limited quantities, such as speed and torque, as fractions of their limits; shape
+    (6, ticks)."""
     slope: Real
-    """(samples,): slope of the tip up to the planning horizon, as a fraction of its limit."""
+    """Slope of the tip up to the planning horizon, as a fraction of its limit; shape (samples,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A possible segment at its amplitude."""
+    """Candidate for the next segment, at the largest amplitude that the limits allow."""
 
     duration_s: float
+    """Duration of the segment in s."""
     parts: tuple[tuple[_Band, float], ...]
-    """Bands and amplitudes in rad."""
+    """Bands of the segment, and their amplitudes in rad."""
     terms: tuple[tuple[float, _Sweep], ...]
-    """Sweeps and their factors; the segment is their sum."""
+    """Amplitudes in rad and unit sweeps, whose sum of products is the segment."""
     channels: Real
-    """(6, ticks): at one tick in `_THINNED`."""
+    """Limited quantities as fractions of their limits, at one tick in `_THINNED`; shape
+    (6, ticks)."""
     weighted: Real
-    """(q, samples)."""
+    """Combinations of the torque's derivatives with the weights of the mixture; shape
+    (q, samples)."""
     swing: Real
-    """(samples,): slope of the tip as a fraction of its limit."""
+    """Slope of the tip as a fraction of its limit; shape (samples,)."""
     value: float
-    """Information up to the planning horizon if the first band is driven on after the segment; in
-    seconds of the best mixture."""
+    """Information up to the planning horizon if the first band is driven on after the segment, as
+    the time in s in which the best mixture would give it."""
 
     def total(self, name: str) -> Real:
-        """Sum one of the arrays of `_Sweep` over the terms."""
+        """Return an array of the whole segment: the weighted sum of an attribute of its sweeps.
+
+        `name` is an attribute of `_Sweep`.
+        """
         values: Real = sum(factor * getattr(sweep, name) for factor, sweep in self.terms)
         return values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _GoingOn:
-    """Response of a mode that is driven on after a segment, in two phases."""
+    """Response to driving a mode further after a segment, in two phases of the sine."""
 
     weighted: Real
-    """(2, q, samples): for amplitude 1."""
+    """Weighted derivatives of the torque for a sine of amplitude 1 rad in either phase; shape
+    (2, q, samples)."""
     per_amplitude: Real
-    """(2, 2): factors that hold the amplitude of the mode constant, real and imaginary."""
+    """Amplitudes of the two sines that hold the mode's vibration constant, per real and imaginary
+    part of its amplitude; shape (2, 2)."""
 
 
 class SegmentSearch:
-    """Search for the best segment, with the quantities common to all candidates of one decision."""
+    """Search for the best next segment, with the quantities that all candidates have in common."""
 
     def __init__(
         self,
@@ -214,7 +243,7 @@ class SegmentSearch:
         self.swing = self.ringing[-1, :: self.model.factor][: self.samples]
 
     def bands(self) -> list[_Band]:
-        """Return the candidate bands: through every mode, and on either side of it."""
+        """Return the bands that candidate sweeps cover: through every mode, and on either side."""
         found = []
         for mode in self.modes:
             hz = mode.frequency_hz
@@ -238,7 +267,10 @@ class SegmentSearch:
         return found
 
     def lines(self) -> tuple[Real, Real]:
-        """Return frequencies (m,) in Hz and amplitudes (m,) of the angle in rad of steady sines."""
+        """Return the steady sines of the forecast, at the largest amplitudes that limits allow.
+
+        The results are frequencies in Hz and amplitudes of the angle in rad, each of shape (m,).
+        """
         steps = [
             (*(mode.damping_ratio * np.array(_LINES)), -_SIDE_OFFSET, _SIDE_OFFSET)
             for mode in self.modes
@@ -266,7 +298,10 @@ class SegmentSearch:
         return frequency_hz, 1.0 / (fractions / self.limits[:, None]).max(axis=0)
 
     def best(self, time_left_s: float, through: Collection[int] = ()) -> _Candidate:
-        """Return the best segment that fits into the time and drives one of the given modes."""
+        """Return the most informative candidate that fits into `time_left_s`.
+
+        It drives one of the modes in `through`, or any mode if `through` is empty.
+        """
         durations_s = [d for d in DURATIONS_S if d <= time_left_s + 1e-9]
         if not durations_s:
             raise ExcitationError(
@@ -276,7 +311,10 @@ class SegmentSearch:
         return max((self.best_of(d, through) for d in durations_s), key=lambda each: each.value)
 
     def best_of(self, duration_s: float, through: Collection[int]) -> _Candidate:
-        """Return the best segment of a duration: one mode first, then further ones in addition."""
+        """Return the most informative candidate of a given duration.
+
+        The best band comes first; bands of further modes are added if they give more information.
+        """
         bases = [(band, self.basis(band, duration_s)) for band in self.bands()]
         nothing = _Candidate(
             duration_s,
@@ -317,15 +355,20 @@ class SegmentSearch:
         return found
 
     def ticks(self, time_s: float) -> int:
+        """Return a time in s as a number of ticks of the rig."""
         return round(time_s * self.plant.rate_hz)
 
     def model_samples(self, time_s: float) -> int:
+        """Return a time in s as a number of samples of the torque model."""
         return round(time_s * self.model.sample_hz)
 
     def quieted(
         self, start: _Candidate, number: int, at_modes: dict[int, tuple[_Sweep, _Sweep]]
     ) -> _Candidate:
-        """Bring all modes but one to rest by the end of the segment, within the limits."""
+        """Return a candidate that also brings all modes but one to rest by the segment's end.
+
+        If the limits do not allow that, the modes' vibration is reduced as far as they allow.
+        """
         sweeps = [sweep for other, basis in at_modes.items() if other != number for sweep in basis]
         if not sweeps:
             return start
@@ -352,7 +395,7 @@ class SegmentSearch:
         )
 
     def basis(self, band: _Band, duration_s: float) -> tuple[_Sweep, _Sweep]:
-        """Return the sweeps through a band in two phases, a quarter of a period apart."""
+        """Return two unit sweeps through a band, whose phases differ by a quarter of a period."""
         rate_hz = self.plant.rate_hz
         n = self.ticks(duration_s)
         from_middle_s = np.arange(1, n + 1) / rate_hz - 0.5 * duration_s
@@ -368,7 +411,7 @@ class SegmentSearch:
         return self.sweep(window * np.sin(phase)), self.sweep(window * np.cos(phase))
 
     def sweep(self, reference_rad: Real) -> _Sweep:
-        """Return the response to a reference from rest."""
+        """Return the predicted response to a reference of amplitude 1 rad from rest, shape (n,)."""
         n = reference_rad.size
         longer = np.concatenate([reference_rad, np.zeros(round(_SETTLING_S * self.plant.rate_hz))])
         response = self.plant.respond(longer)
@@ -402,7 +445,11 @@ class SegmentSearch:
         basis: tuple[_Sweep, _Sweep],
         turn: int,
     ) -> _Candidate:
-        """Drive a band as far as the limits allow, in addition to a fraction of another segment."""
+        """Return a candidate with a further band, at the largest amplitude that limits allow.
+
+        The amplitudes of the candidate `base` are multiplied by `fraction`. The phase of the new
+        sweep is ``turn / _PHASES`` of a turn.
+        """
         angle = 2 * pi * turn / _PHASES
         sine, cosine = float(np.cos(angle)), float(np.sin(angle))
         first, second = basis
@@ -431,9 +478,9 @@ class SegmentSearch:
         )
 
     def value(self, band: _Band, weighted: Real, swing: Real, duration_s: float) -> float:
-        """Compute the information up to the horizon if a mode is driven on after a segment.
+        """Return the information up to the planning horizon if a mode is driven after a segment.
 
-        The drive holds the amplitude that the mode has at the end of the segment.
+        The motor then holds the amplitude that the mode has at the end of the segment.
         """
         first = self.model_samples(duration_s)
         rest = self.samples - first
@@ -447,14 +494,17 @@ class SegmentSearch:
 
     @cached_property
     def decays(self) -> Real:
-        """Matrix (2 m, n) from one second of slope to modal amplitudes, real and imaginary."""
+        """Matrix from one second of the tip's slope to the modes' complex amplitudes.
+
+        The shape is (2 m, n), with a row each for real and imaginary part of the m amplitudes.
+        """
         time_s = np.arange(self.model_samples(_TAIL_S)) / self.model.sample_hz
         free = np.exp(np.outer([mode.pole_rad_s for mode in self.modes], time_s))
         columns = np.stack([free.real, -free.imag], axis=1).reshape(-1, time_s.size)
         return np.linalg.pinv(columns.T)
 
     def going_on(self, band: _Band) -> _GoingOn:
-        """Return the response to driving a mode up to the planning horizon."""
+        """Return the response to driving the mode of a band by a sine up to the horizon."""
         if band.middle_hz not in self._going_on:
             duration_s = HORIZON_S - DURATIONS_S[0]
             sweeps = self.basis(replace(band, half_width_hz=0.0), duration_s)
@@ -473,7 +523,7 @@ class SegmentSearch:
         return self._going_on[band.middle_hz]
 
     def segment(self, chosen: _Candidate, time_left_s: float) -> Segment:
-        """Return a candidate as a segment, with the precisions expected of it."""
+        """Return the chosen candidate as a segment, with the precisions expected from it."""
         estimate, quantities = self.estimate, self.quantities
         samples = self.model_samples(chosen.duration_s)
         channels = chosen.total("channels")
@@ -495,7 +545,7 @@ class SegmentSearch:
         )
 
     def with_ring_up(self) -> float:
-        """Return the time of the best mixture plus the time in which its modes ring up.
+        """Return the time in s of the best mixture, plus the time in which its modes ring up.
 
         The information on the damping grows as ``1 - exp(-t / tau)`` at a constant amplitude.
         """
@@ -533,13 +583,13 @@ class SegmentSearch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mixture:
-    """Mixture of steady sines, without ring-up, that reaches all targets in the shortest time."""
+    """Mixture of steady sines that reaches all targets in the shortest time, without ring-up."""
 
     times_s: Real
-    """Shape (m,): time of each."""
+    """Time in s for which each sine lasts; shape (m,)."""
     weights: Real
-    """Shape (q, k): combinations of the torque's derivatives; the sum of their squares is the
-    information that brings the targets closer."""
+    """Combinations of the torque's derivatives by the parameters, the sum of whose squares is the
+    information that brings the targets closer; shape (q, k)."""
 
 
 def best_mixture(
@@ -550,7 +600,7 @@ def best_mixture(
     angle_rad: Real,
     missed: float = 1.0,
 ) -> Mixture:
-    """Find the times of steady sines that reach all targets soonest.
+    """Return the times of steady sines that together reach all targets soonest.
 
     Uses multiplicative steps, as `time_fractions`, with a multiplier for each quantity. By the
     equivalence theorem all sines of the best mixture give the same information per second on the
@@ -560,15 +610,15 @@ def best_mixture(
     Parameters
     ----------
     information
-        Shape (k, k): information that exists already.
+        Information that the record contains already, shape (k, k).
     estimate
         Beam, damping and noise.
     quantities
         The q target quantities.
     frequency_hz, angle_rad
-        Shape (m,): frequencies of the sines and amplitudes of the angle.
+        Frequencies of the sines and amplitudes of the angle, each of shape (m,).
     missed
-        Factor by which all deviations may exceed their targets.
+        Factor by which all standard deviations may exceed their targets.
     """
     rates = _information_rates(estimate, frequency_hz, angle_rad)
     target_stds = np.array(
@@ -598,7 +648,7 @@ def best_mixture(
 
 
 def _information_rates(estimate: BeamEstimate, frequency_hz: Real, angle_rad: Real) -> Real:
-    """Return the information per second of each steady sine, shape (m, k, k)."""
+    """Return the Fisher information per second of each steady sine, shape (m, k, k)."""
     kernels = whitened_kernels(estimate, 2j * pi * frequency_hz, 1.0) * (angle_rad / 2.0**0.5)
     rates: Real = np.einsum("if,jf->fij", kernels, kernels.conj()).real
     return rates
@@ -612,19 +662,21 @@ def least_deviations(
     angle_rad: Real,
     duration_s: float,
 ) -> Real:
-    """Return the deviation of each quantity with the best mixture of sines for it alone.
+    """Return the smallest standard deviation that each quantity can have in a record.
+
+    For each quantity the mixture of sines is the best for this quantity alone.
 
     Parameters
     ----------
     information, estimate, quantities, frequency_hz, angle_rad
         As for `best_mixture`.
     duration_s
-        Time of all sines together.
+        Total duration of all sines in s.
 
     Returns
     -------
     ndarray, shape (q,)
-        Expected lower bound for a record of that length.
+        Lower bound of each standard deviation for a record of this duration.
     """
     rates = _information_rates(estimate, frequency_hz, angle_rad)
     found = np.empty(len(quantities.gradients))
@@ -640,14 +692,15 @@ def least_deviations(
 
 
 def largest_factor(before: Real, unit: Real) -> float:
-    """Return the largest factor of a motion that holds its sum with another within -1 and 1.
+    """Return the largest factor by which a motion can be added without exceeding the limits.
 
-    Where the other motion exceeds this range by itself, the sum may be as large, but no larger.
+    All quantities are fractions of their limits, so the sum must be between -1 and 1. If the
+    existing motion exceeds this range by itself, the sum may be as large, but no larger.
 
     Parameters
     ----------
     before, unit
-        Shape (c, n): channels of the existing motion, and of the added one.
+        Quantities of the existing motion and of the added motion, shape (c, n).
     """
     size = np.abs(unit)
     room = np.maximum(1.0, np.abs(before)) - np.sign(unit) * before
@@ -657,7 +710,7 @@ def largest_factor(before: Real, unit: Real) -> float:
 
 
 def _in_words(chosen: _Candidate) -> str:
-    """Describe the bands of a segment, for the operator."""
+    """Return a text for the operator with modes, bands, duration and amplitudes of a segment."""
     parts = sorted(chosen.parts, key=lambda part: part[0].middle_hz)
     bands = [
         f"{band.middle_hz - band.half_width_hz:.3g}–{band.middle_hz + band.half_width_hz:.3g}"

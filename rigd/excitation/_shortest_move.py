@@ -1,6 +1,6 @@
 """The shortest move that leaves no vibration within a rig's limits: a linear programme.
 
-For a given duration the programme finds the accelerations that take the smallest fraction of the
+For a given duration the programme finds the accelerations that use the smallest fraction of the
 limits of torque, speed, tracking error and sensor, and leave every mode at rest. At the shortest
 duration that fraction is 1. The responses are those of the closed loop to a unit of acceleration:
 all limits are linear in the accelerations, and Coulomb friction is subtracted from the torque.
@@ -41,99 +41,110 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 LONGEST_S: Final = 60.0
-"""A longer move is an error."""
+"""Longest duration of a move in s; a longer one is an error."""
 
 _HELD_S: Final = 2e-3
-"""Least time for which an acceleration is held; longer in long moves."""
+"""Shortest time in s for which the acceleration is constant; it is longer in long moves."""
 _MOST_INTERVALS: Final = 60
+"""Largest number of intervals of constant acceleration, the unknowns of the linear programme."""
 _CLOSE: Final = 1.03
+"""Ratio of a sufficient duration to an insufficient one at which the search for the shortest move
+ends."""
 _NEARLY_ALL: Final = 0.93
-"""The search ends at this ratio of a sufficient time to an insufficient one, or where the move
-takes this fraction of the limits: a time shorter by 4 % would exceed them."""
+"""Fraction of the limits that a move must use for the search to end: a duration shorter by 4 %
+would exceed the limits."""
 _MOST_ROUNDS: Final = 14
+"""Largest number of durations that the search tries."""
 _FARTHEST: Final = 0.98
-"""Fraction of the angle limit at which a move may end; the remainder is for overshoot."""
+"""Largest fraction of the angle limit at which a move may end; the remainder is for overshoot."""
 _BACKWARD: Final = 0.01
-"""Fraction of its mean speed with which a robust move may go backward."""
+"""Largest backward speed of a robust move, as a fraction of its mean speed."""
 _LEAST_RAD: Final = 1e-3
+"""Smallest distance of a move in rad."""
 _BRAKING_STARTS: Final = 16
+"""Number of ticks along a reference from which braking is simulated."""
 _BRAKING_S: Final = (0.02, 5.0)
+"""Shortest and longest duration in s of a braking path that is tried."""
 
 
 class Response(Protocol):
-    """Response of the closed loop to a reference, as arrays (n,)."""
+    """Response of the closed loop to a reference, with a value for each tick; arrays (n,)."""
 
     @property
     def angle_rad(self) -> Real:
-        """At the output shaft."""
+        """Angle of the output shaft in rad."""
 
     @property
     def velocity_rad_s(self) -> Real:
-        """At the output shaft."""
+        """Speed of the output shaft in rad/s."""
 
     @property
     def torque_nm(self) -> Real:
-        """The command, not limited."""
+        """Torque command in N·m without the limit of the motor."""
 
     @property
     def coupling_torque_nm(self) -> Real:
-        """What the sensor measures."""
+        """Coupling torque in N·m that the sensor measures."""
 
 
 @dataclass(frozen=True, slots=True)
 class MovePlant:
-    """Model of a rig for planning a motion."""
+    """Linear model of the closed loop, with the rig's limits, for planning a motion."""
 
     rate_hz: float
     """Ticks a second."""
     respond: Callable[[Real], Response]
-    """Response of the closed loop to a reference (n,) from rest, without friction."""
+    """Function that returns the response of the closed loop to a reference in rad, shape (n,), from
+    rest and without friction."""
     disturbed: Callable[[Real, int], tuple[Real, Real]]
-    """Response to a reference (n,) from rest with friction, encoder steps and noise, in several
-    draws: angle (n, draws), and amplitude of the torque of the lowest modes (n, modes, draws)."""
+    """Function that returns the response to a reference in rad, shape (n,), from rest with
+    friction, encoder steps and noise, in several random draws. The second argument is the number of
+    lowest modes. The result is the angle in rad, shape (n, draws), and the amplitude of each mode's
+    coupling torque in N·m, shape (n, modes, draws)."""
     poles_rad_s: Complex
-    """Shape (m,): poles of the closed loop at the modes of the beam, one of each pair."""
+    """Poles of the closed loop at the modes of the beam, one of each pair; shape (m,)."""
     torque_per_state_nm_s: Real
-    """Shape (m,): amplitude of the coupling torque per `modal_state` of a mode."""
+    """Amplitude of the coupling torque per `modal_state` of a mode, in N·m·s; shape (m,)."""
     frequency_uncertainty: Real
-    """Shape (m,): relative standard uncertainty of the modes' frequencies."""
+    """Relative standard uncertainty of the modes' frequencies, shape (m,)."""
     torque_noise_nm: float
-    """Standard deviation of the noise of one reading of the coupling torque."""
+    """Standard deviation in N·m of the noise of one reading of the coupling torque."""
     settling_s: float
-    """Time in which the loop catches up with the reference."""
+    """Time in s after which the angle of the closed loop has reached the reference."""
     peak_torque_nm: float
-    """Largest torque of the motor."""
+    """Largest torque of the motor in N·m."""
     friction_nm: float
-    """Torque for friction, in addition to the linear response's."""
+    """Torque in N·m against friction, which adds to the torque of the linear response."""
     largest_acceleration_rad_s2: float
-    """Bound of the reference's acceleration, including the effect of the loop's filters."""
+    """Upper bound of the reference's acceleration, including the effect of the loop's filters."""
     velocity_rad_s: float
     """Limit of the speed."""
     tracking_error_rad: float
-    """Limit of reference minus angle."""
+    """Limit of the tracking error, reference minus angle."""
     coupling_torque_nm: float
-    """Range of the sensor."""
+    """Range of the sensor's coupling torque in N·m."""
     angle_rad: float
-    """Limit of the angle from the rig's zero, either way."""
+    """Limit of the angle from the rig's zero, to either side."""
     model: IdentifiedBeam | None = None
-    """Beam of an analysis; None: the profile's, or an estimate."""
+    """Beam of an analysis; None: the beam of the profile, or an estimate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
-    """A planned move."""
+    """Planned move of the motor to another angle, with its predicted residual vibration."""
 
     reference_rad: Real
-    """Shape (n,): at the ticks after the start, relative to the angle there; the last one stays."""
+    """Reference angle at the ticks after the start, relative to the start angle; shape (n,). The
+    last angle is that of the end of the move."""
     duration_s: float
-    """Time of the reference."""
+    """Duration of the move in s."""
     limit_fraction: float
-    """Largest predicted fraction of a limit; at most `LIMIT_FRACTION`."""
+    """Largest fraction of a limit that the move is predicted to use; at most `LIMIT_FRACTION`."""
     residual_nm: float
-    """Residual coupling torque of the modes in the linear loop: the sum of their amplitudes, each
-    for a frequency that is wrong by its standard uncertainty."""
+    """Coupling torque in N·m of the vibration after the move in the linear loop: the sum of the
+    modes' amplitudes, each for a frequency that is wrong by its standard uncertainty."""
     quintic_residual_nm: float
-    """The same for a quintic of the same duration."""
+    """Coupling torque in N·m of the vibration after a quintic path of the same duration."""
 
 
 def shortest_move(
@@ -144,22 +155,22 @@ def shortest_move(
     robust: bool = False,
     ringing: Complex | None = None,
 ) -> Move:
-    """Plan the shortest move that leaves no vibration.
+    """Plan the shortest move within a rig's limits that leaves no vibration.
 
     Parameters
     ----------
     plant
-        The rig.
+        Model of the rig.
     distance_rad
-        Angle from start to end, either sign.
+        Angle from start to end, of either sign.
     start_rad
-        Angle of the start from the rig's zero.
+        Start angle from the rig's zero.
     robust
-        Zeros of second order for the modes below `ROBUST_BELOW_HZ`, to tolerate a 1 % frequency
-        error, and no turning back; the move takes longer.
+        Whether the move has zeros of second order for the modes below `ROBUST_BELOW_HZ`, to
+        tolerate a 1 % frequency error, and does not turn back. It then takes longer.
     ringing
-        Shape (m,): state of the modes at the start as of `modal_state`, which the move cancels;
-        None: they are at rest.
+        Complex state of the modes at the start as `modal_state` returns it, shape (m,), which the
+        move cancels; None: the modes are at rest.
 
     Raises
     ------
@@ -187,7 +198,10 @@ def shortest_move(
 
 
 def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> float:
-    """Sum the residual amplitudes of the modes, each frequency wrong by its uncertainty."""
+    """Return the coupling torque in N·m of the vibration after a move.
+
+    It is the sum of the modes' amplitudes, each for a frequency wrong by its uncertainty.
+    """
     left = []
     for off in (-plant.frequency_uncertainty, plant.frequency_uncertainty):
         poles = plant.poles_rad_s * (1.0 + off)
@@ -199,7 +213,7 @@ def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> 
 
 
 class _MoveSearch:
-    """Search for the shortest time, with one linear programme for each candidate."""
+    """Search for the shortest duration of a move, with a linear programme for each duration."""
 
     def __init__(
         self,
@@ -232,12 +246,9 @@ class _MoveSearch:
             )
 
     def shortest(self) -> Real:
-        """Return the accelerations (n,) of the shortest move.
+        """Return the accelerations of the shortest move in rad/s², shape (n,).
 
-        Raises
-        ------
-        ExcitationError
-            If it would take more than `LONGEST_S`.
+        Raise `ExcitationError` if the move would take more than `LONGEST_S`.
         """
         rate_hz = self._plant.rate_hz
         most = round(LONGEST_S * rate_hz)
@@ -265,9 +276,10 @@ class _MoveSearch:
         return best
 
     def _least_limit_fraction(self, n: int) -> tuple[float, Real | None]:
-        """Return the smallest fraction of the limits for n ticks, and its accelerations (n,).
+        """Solve the linear programme for a move of n ticks.
 
-        The fraction is infinite without a solution.
+        Return the smallest fraction of the limits that such a move uses, and its accelerations in
+        rad/s², shape (n,). If there is no such move, return infinity and None.
         """
         from scipy.optimize import linprog
 
@@ -309,7 +321,10 @@ class _MoveSearch:
         return float(found.fun), np.repeat(found.x[:-1] * scale, np.diff(edges))
 
     def _ringing_rows(self, n: int) -> list[float]:
-        """Return the vibration of the initial state at the end, in the order of `zero_rows`."""
+        """Return the state at the end of the move that the initial vibration decays to.
+
+        Real and imaginary parts are in the order of the rows of `zero_rows`.
+        """
         assert self._ringing is not None
         rows: list[float] = []
         for pole, state in zip(self._plant.poles_rad_s, self._ringing, strict=True):
@@ -321,12 +336,15 @@ class _MoveSearch:
         return rows
 
     def _responses(self, n: int, edges: NDArray[np.intp], scale: float) -> tuple[Real, Real, Real]:
-        """Return rows over the intervals: fractions of limits; bounded quantities and their bounds.
+        """Return the inequalities of the linear programme for a move of n ticks.
+
+        They are linear maps from the acceleration in each interval: to fractions of the limits,
+        and to quantities with fixed bounds. The third array contains these bounds.
 
         A robust move from rest does not turn back: it goes directly to its end, and the friction
-        of the motor, whose sign the controller takes from the reference, does not reverse. One
-        that cancels a vibration has to go to and fro, as the shortest does, within the limit of
-        the angle.
+        of the motor, whose sign the controller takes from the reference, does not reverse. A move
+        that cancels a vibration, and the shortest move, go to and fro within the limit of the
+        angle.
         """
         plant = self._plant
         end = n + round(plant.settling_s * plant.rate_hz)
@@ -352,7 +370,7 @@ class _MoveSearch:
         return np.concatenate(rows), np.vstack([angle, -angle]), np.repeat(free_rad, len(coarse))
 
     def limit_fraction(self, reference: Real) -> float:
-        """Return the largest fraction of a limit that a reference takes, over all ticks."""
+        """Return the largest fraction of a limit that the response to a reference reaches."""
         plant = self._plant
         held = round(plant.settling_s * plant.rate_hz)
         whole = np.concatenate([[0.0], reference, np.full(held, reference[-1])])
@@ -376,10 +394,11 @@ def _next(
     fraction: float,
     order: int,
 ) -> int:
-    """Choose the number of ticks to try next, from the fractions of the limits on either side.
+    """Return the duration in ticks that the search for the shortest move tries next.
 
-    The fraction falls with a power of the time: about the third, and more where the modes, not the
-    distance, determine the time.
+    `too_short` and `found` are the longest insufficient and the shortest sufficient duration, with
+    the fractions of the limits that they use. The fraction falls with a power of the duration:
+    about the third, and more if the modes, not the distance, determine the duration.
     """
     if fraction_found == 0.0:  # none has sufficed yet
         return int(max(n + 2, round(1.03 * n * min(fraction, 4.0) ** 0.3)))
@@ -394,7 +413,7 @@ def _next(
 
 
 class _UnitResponse:
-    """Responses to a reference of acceleration 1, computed up to the needed length."""
+    """Responses of the closed loop to a constant acceleration of 1 rad/s², by quantity."""
 
     def __init__(self, plant: MovePlant) -> None:
         self._plant = plant
@@ -402,7 +421,7 @@ class _UnitResponse:
         self._ticks = 0
 
     def up_to(self, ticks: int) -> dict[str, Real]:
-        """Return the rows at least up to the given number of ticks."""
+        """Return the responses by quantity, each for at least the given number of ticks."""
         if ticks > self._ticks:
             self._ticks = max(2 * ticks, 1024)
             one = from_acceleration(np.ones(self._ticks), self._plant.rate_hz)
@@ -419,7 +438,11 @@ class _UnitResponse:
 
 
 def _over_intervals(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]) -> Real:
-    """Return the response (ticks, intervals) to an acceleration of 1 in each interval."""
+    """Return the response at some ticks to an acceleration of 1 in one interval only.
+
+    The shape is (ticks, intervals). `unit` is the response to a constant acceleration of 1, and
+    `edges` are the ticks at which the intervals begin and end.
+    """
     since = ticks[:, None] - edges
     begun: Real = np.where(since >= 0, unit[np.maximum(since, 0)], 0.0)
     return begun[:, :-1] - begun[:, 1:]
@@ -429,24 +452,24 @@ def _over_intervals(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]
 
 
 def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
-    """Return the shortest braking path that stays within the torque limit from any tick.
+    """Return the shortest braking path that needs no more than the motor's peak torque.
 
     Parameters
     ----------
     plant
-        The rig.
+        Model of the rig.
     reference_rad
-        Shape (n,): reference from rest, which may have to be braked.
+        Reference angle from rest, shape (n,), which may have to be braked at any tick.
 
     Raises
     ------
     ExcitationError
-        If no braking path of at most 5 s does.
+        If every braking path of at most 5 s needs more torque.
 
     Notes
     -----
-    The closed loop is simulated from starts all along the reference. After them the torque is
-    linear in speed and acceleration of the reference at the start.
+    The closed loop is simulated with braking from ticks all along the reference. During braking the
+    torque is linear in speed and acceleration of the reference at the start.
     """
     held = np.zeros(round(plant.settling_s * plant.rate_hz))
     starts = np.unique(np.linspace(2, reference_rad.size - 1, _BRAKING_STARTS).astype(int))
@@ -478,17 +501,17 @@ class MoveRig(Protocol):
 
     @property
     def start_rad(self) -> float:
-        """Present angle of the motor, from the rig's zero."""
+        """Present angle of the motor from the rig's zero, in rad."""
 
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
-        """Return the rig for planning, with the beam of an analysis; without a path the profile's.
+        """Return the model of the rig for planning, with the beam of an analysis.
 
         Parameters
         ----------
         path
-            Document of ``analyze --json``, or empty.
+            Document of ``analyze --json`` with the beam; empty: the beam of the profile.
         use
-            Purpose of the beam.
+            Purpose for which the beam is used.
         """
 
 
@@ -503,26 +526,26 @@ def move(
     ring_down_s: float = 5.0,
     rig: MoveRig | None = None,
 ) -> Excitation:
-    """Move to an angle in the shortest time that leaves no vibration; the motor stays there.
+    """Return the shortest move to another angle that leaves no vibration; the motor stays there.
 
     Parameters
     ----------
     rate_hz
         Ticks a second.
     angle_rad
-        Final angle, from the rig's zero.
+        Final angle from the rig's zero.
     by_rad
-        Distance, instead of `angle_rad`; either sign.
+        Distance from the present angle, of either sign, instead of `angle_rad`.
     path
-        JSON written by ``analyze --json``, whose beam the move is planned for; empty: the
-        profile's.
+        JSON written by ``analyze --json`` with the beam for which the move is planned; empty: the
+        beam of the profile.
     robust
         1: the move tolerates a 1 % frequency error and does not turn back, but takes longer.
-        0: the shortest.
+        0: the move is the shortest.
     rest_s, ring_down_s
-        Time before and after the move.
+        Time in s before and after the move.
     rig
-        The rig.
+        Rig that is moved.
 
     Raises
     ------
@@ -581,6 +604,6 @@ def move(
 
 
 def _by_at_most(farthest_rad: float, start_rad: float) -> str:
-    """Describe the largest allowed distance from the present angle."""
+    """Return the end of a message that states the range of distances which a move may have."""
     low, high = -farthest_rad - start_rad, farthest_rad - start_rad
     return f", that is by {low:.4g} to {high:.4g} rad from {start_rad:.4g} rad"

@@ -31,40 +31,46 @@ from rigd.units import with_percentage
 Real = NDArray[np.float64]
 
 PAUSE_S: Final = 0.5
-"""Pause for a fit, such as the first one: the record gains information while the beam rings."""
+"""Pause in s of the reference for a fit, such as the first. The record gains information meanwhile,
+because the beam still rings."""
 _FADE_S: Final = 0.25
+"""Duration in s of the scan's fade at either end."""
 _SCAN_FRACTION: Final = 0.8
-"""Fraction of the limits that the scan uses: the beam may differ from the profile's."""
+"""Largest fraction of the limits that the scan uses, since the beam may differ from the profile."""
 _AT_MODES: Final = (0.2, 1.0, 2.3, 6.3, 12.0)
+"""Frequencies over that of mode 1 at which the relative amplitude of the scan is given."""
 _SIZES: Final = (1.0, 0.4, 0.19, 0.15, 1.0)
-"""Amplitude of the scan at some frequencies over that of mode 1.
+"""Relative amplitudes of the scan at these frequencies, with 1 for its largest amplitude.
 
-Where the slope of the tip is limited and passed modes still ring, these amplitudes determine the
-dampings of the first three modes equally well. For random beams within a fifth of the profile, the
-least certain damping then has 0.63 times the deviation of a scan whose amplitude rises linearly.
+If the slope of the tip is limited and modes passed earlier still ring, these amplitudes determine
+the dampings of the first three modes equally well. For random beams within a fifth of the profile,
+the least certain damping then has 0.63 times the deviation of a scan whose amplitude rises
+linearly.
 """
 _BEND: Final = 1.25
-"""Power of the time with which the frequency rises: low modes get more time."""
+"""Power of the time with which the scan's frequency rises, so that low modes get more time."""
 _MAX_UNIFORMITY_PERCENT: Final = 10.0
+"""Largest valid value of the option `uniformity_percent`."""
 _EXAMPLE: Final = "--damping 1%"
+"""Example of a target on the command line, for an error message."""
 
 
 class ScanRig(DesignRig, Protocol):
-    """Interface to a rig for which a scan is planned."""
+    """Interface to a rig's predicted behaviour, for which a scan is planned."""
 
     def fraction_of_limits(self, reference_rad: Real) -> float:
-        """Return the largest predicted fraction of a limit for a reference (n,)."""
+        """Return the largest fraction of a limit that a reference in rad is predicted to use."""
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
-        """Return the largest predicted slope of the free end for a reference (n,)."""
+        """Return the largest predicted slope in rad of the beam's free end for a reference."""
 
     @property
     def beam(self) -> Beam:
-        """The specimen according to the profile."""
+        """Beam of the rig's profile."""
 
     @property
     def stated_estimate(self) -> BeamEstimate:
-        """Specimen of the profile with the sensor's noise, all parameters free."""
+        """Beam of the rig's profile and the sensor's noise, with all parameters free."""
 
     @property
     def uniformity(self) -> float:
@@ -73,21 +79,21 @@ class ScanRig(DesignRig, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PrecisionSearch:
-    """Targets and planned beginning of a session that ends when a precision is reached.
+    """Target precisions of a session that ends when they are reached, and its planned beginning.
 
     Attributes
     ----------
     targets
         Standard deviations to be reached.
     planned_ticks
-        Ticks of the reference that are planned before the session: rest, scan and a pause.
+        Number of ticks of the reference that are planned before the session: rest, scan and pause.
     scan
-        First tick of the scan, and its reference, shape (n,).
+        First tick of the scan, and its reference angle at each tick, shape (n,).
     tip_slope_rad
         Largest slope of the beam's free end.
     uniformity_percent
-        Relative standard deviation of each mode's frequency from that of a uniform beam; None: that
-        of the profile.
+        Relative standard deviation of each mode's frequency from that of a uniform beam; None: the
+        value of the profile.
     """
 
     targets: tuple[Target, ...]
@@ -111,7 +117,10 @@ def until(
     uniformity_percent: float | None = None,
     rig: ScanRig | None = None,
 ) -> Excitation:
-    """Scan all modes quickly, then choose the most informative excitation until a precision is met.
+    """Return the excitation of a session that continues until target precisions are reached.
+
+    It begins with a quick scan of all modes. The segments after it are planned during the session:
+    each is the most informative excitation.
 
     Parameters
     ----------
@@ -121,24 +130,24 @@ def until(
         Standard deviations to be reached: one or several of ``QUANTITY STD``, such as
         ``damping 1%; frequency 1:0.002Hz``; see `rigd.excitation.targets.parse_target`.
     at_most_s
-        Longest record.
+        Longest duration of the record in s.
     tip_slope_rad
         Largest slope of the beam's free end, of which the scan uses 80 % and segments 90 %. Beyond
         the default, the linear model is not exact.
     amplitude_rad
-        Largest amplitude of the scan, at its end; a sixth of it at mode 2, two fifths at mode 1.
-        Lower where the rig's limits or the slope require it.
+        Largest amplitude of the scan, at its end. The amplitude is a sixth of it at mode 2 and two
+        fifths at mode 1. It is lower if the rig's limits or the slope require it.
     start_hz, stop_hz
-        Band of the scan.
+        Lowest and highest frequency of the scan.
     scan_s
-        Duration of the scan.
+        Duration of the scan in s.
     rest_s
-        Time before the scan.
+        Time in s before the scan.
     uniformity_percent
         Relative standard deviation of each mode's frequency from that of a uniform beam, for the
-        fits; None: that of the profile.
+        fits; None: the value of the profile.
     rig
-        Limits the amplitude and adapts it to the modes; None: one amplitude for all frequencies.
+        Rig whose limits and modes determine the amplitude; None: one amplitude for all frequencies.
 
     Raises
     ------
@@ -229,7 +238,7 @@ def _refuse_below_floor(
     at_most_s: float,
     tip_slope_rad: float,
 ) -> None:
-    """Raise if the tolerance of the geometry leaves a parameter less precise than requested."""
+    """Raise `ExcitationError` if the tolerance of the geometry makes a target unreachable."""
     floors = geometry_floors(
         rig.stated_estimate, rig, targets, uniformity, at_most_s, tip_slope_rad
     )
@@ -252,7 +261,10 @@ def _refuse_below_floor(
 
 
 def _scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None) -> Real:
-    """Return a sweep (n,) of amplitude up to 1 suited to a beam, at rest at both ends."""
+    """Return the scan of n ticks with a largest amplitude of 1, at rest at both ends; shape (n,).
+
+    With a beam, the amplitude depends on the frequency relative to the beam's first mode.
+    """
     t = np.arange(n) / rate_hz
     u = t * (rate_hz / n)
     frequency_hz = start_hz + (stop_hz - start_hz) * u**_BEND
@@ -270,7 +282,7 @@ def _scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | 
 
 
 def _parsed(targets: str) -> tuple[Target, ...]:
-    """Parse the targets."""
+    """Parse target precisions, separated by semicolons; raise `ExcitationError` without any."""
     requested = []
     for text in targets.split(";"):
         if text.strip():
