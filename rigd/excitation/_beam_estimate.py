@@ -22,7 +22,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating[Any, Any]]
 
 BAND_HZ: Final = 50.0
-"""Upper end of the band that the whole-record fit compares."""
+"""Upper end in Hz of the band that the whole-record fit uses."""
 
 OF_UNIFORM: Final = (
     "zeta",
@@ -34,67 +34,70 @@ OF_UNIFORM: Final = (
     "delay_s",
     "tool_inertia_kg_m2",
 )
-"""Parameters of the fit of a uniform beam on a rigid clamp."""
+"""Names of the parameters in the fit of a uniform beam on a rigid clamp."""
 
 _OF_ENDS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
+"""Names of the parameters that describe the two ends of the beam."""
 
 PARAMETERS: Final = (*OF_UNIFORM, *_OF_ENDS)
-"""Parameters of the fit; the `LOGARITHMIC` ones count by their logarithm."""
+"""Names of all parameters of the fit. Those in `LOGARITHMIC` are fitted as logarithms."""
 
 LOGARITHMIC: Final = frozenset(
     {"zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"}
 )
+"""Names of the parameters that are fitted as logarithms."""
 
 BY_PARAMETER: Final = {
     "density_over_stiffness": "ln_density_over_stiffness",
     "bending_stiffness_n_m2": "ln_stiffness",
 }
-"""Names by which the exact model is differentiated, where they differ."""
+"""Name of each parameter in the derivatives of the exact model, if it differs there."""
 
 _OF_RIG: Final = ("delay_s", "tool_inertia_kg_m2", *_OF_ENDS)
-"""Parameters in addition to beam and damping; 0 by default."""
+"""Names of the parameters in addition to those of beam and damping; their default value is 0."""
 
 TOLERATED: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
-"""Difference between a mode of the antenna and that of the beam: its standard deviation over the
-uniformity, as the analyser defines it. The mode's number follows the name."""
+"""Constants of a mode that may deviate from those of a uniform beam, with the standard deviation of
+the deviation over the uniformity, as in the analyser. In the names of free parameters the number of
+the mode follows."""
 
 MODAL: Final = (*TOLERATED, "ln_damping_ratio", "residue_phase_rad")
-"""Free constants of each mode of the modal model."""
+"""Names of the free constants of each mode in the modal model."""
 
 _BACKGROUND: Final = 5
-"""Terms of the modal model's background."""
+"""Number of terms of the modal model's background, a polynomial in s."""
 
 
 @dataclass(frozen=True, slots=True)
 class BeamEstimate:
-    """Estimated beam, with the noise of its torque."""
+    """Estimated beam and damping, with the noise of the measured torque."""
 
     beam: Beam
-    """Length as given, density and stiffness as estimated."""
+    """Beam with the given length, and the estimated density and stiffness."""
     damping: Damping
-    """Damping as estimated; a coefficient of 0 means that the structure has no such damping."""
+    """Estimated damping; a coefficient of 0 means that the structure has no such damping."""
     names: tuple[str, ...]
-    """Free parameters of the fit, of `PARAMETERS`, and deviations of modes."""
+    """Names of the fit's free parameters: some of `PARAMETERS`, and deviations of modes."""
     noise_frequency_hz: Real
-    """Shape (m,), increasing: frequencies of the noise spectrum."""
+    """Frequencies of the noise spectrum in increasing order, shape (m,)."""
     noise_nm2_per_hz: Real
-    """Shape (m,): one-sided power spectral density of the torque's noise."""
+    """One-sided power spectral density of the torque's noise, shape (m,)."""
     delay_s: float = 0.0
     """Delay of the torque relative to the angle."""
     tool_inertia_kg_m2: float = 0.0
     """Inertia between torque sensor and beam."""
     tip_mass_kg: float = 0.0
-    """Point mass at the tip."""
+    """Point mass at the tip of the beam."""
     root_compliance_rad_per_nm: float = 0.0
     """Rotation of the clamp per torque."""
     stiffness_offsets: tuple[float, ...] = ()
-    """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
+    """Relative differences of the stiffness of modes 2, 3, … from that of the uniform beam."""
     uniformity: float = 0.0
-    """Relative standard deviation of each mode's frequency from that of the beam."""
+    """Relative standard deviation of each mode's frequency from that of the uniform beam."""
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "BeamEstimate":
-        """Return an estimate from JSON.
+        """Return the estimate of a beam that a JSON document contains.
 
         Parameters
         ----------
@@ -146,11 +149,11 @@ class BeamEstimate:
         Parameters
         ----------
         beam, damping
-            As stated.
+            Known beam and damping.
         noise_nm2_per_hz
-            One-sided power spectral density of the torque's noise, white.
+            One-sided power spectral density of the torque's white noise.
         tip_mass_kg
-            Point mass at the tip, fixed.
+            Point mass at the tip, which is not a free parameter.
         """
         absent = {
             *(() if damping.zeta else ("zeta", "alpha")),
@@ -166,7 +169,7 @@ class BeamEstimate:
         )
 
     def check(self) -> None:
-        """Raise if the estimate cannot predict a record.
+        """Raise `ExcitationError` if the estimate cannot predict a record.
 
         Raises
         ------
@@ -203,14 +206,15 @@ class BeamEstimate:
             raise ExcitationError("The estimate of the beam has no free parameter in names.")
 
     def with_tolerance(self, uniformity: float) -> "BeamEstimate":
-        """Return the estimate with modes free within a tolerance of the geometry.
+        """Return the estimate of a beam whose modes may deviate from those of a uniform beam.
 
-        The orders of the damping are free as well.
+        The deviations of the modes, and the orders of the damping, are free parameters as well.
 
         Parameters
         ----------
         uniformity
-            Relative standard deviation of each mode's frequency; 0 changes nothing.
+            Relative standard deviation of each mode's frequency from that of a uniform beam; 0: the
+            estimate is returned unchanged.
         """
         if not uniformity:
             return self
@@ -222,7 +226,7 @@ class BeamEstimate:
         return replace(self, names=free, uniformity=uniformity)
 
     def modal(self) -> "BeamEstimate":
-        """Return the estimate with free constants of each mode and a background only."""
+        """Return the estimate of a modal model: the parameters are each mode's and a background."""
         modes = [mode.number for mode in self.modes()]
         constants = [f"{name}_{number}" for number in modes for name in MODAL]
         background = [f"background_{power}" for power in range(_BACKGROUND)]
@@ -230,7 +234,7 @@ class BeamEstimate:
 
     @property
     def values(self) -> dict[str, float]:
-        """Return the values of all `PARAMETERS` by name."""
+        """Values of all `PARAMETERS` by name."""
         beam, damping = self.beam, self.damping
         return dict(
             zip(
@@ -246,7 +250,10 @@ class BeamEstimate:
 
     @property
     def loaded(self) -> LoadedBeam | None:
-        """The beam with tip mass and root compliance; None if it has none and none is free."""
+        """Beam with tip mass, root compliance and offsets of the modes' stiffness.
+
+        It is None if all of these are 0 and not free, so that the beam is uniform.
+        """
         at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
         if not at_ends and set(_OF_ENDS).isdisjoint(self.names):
             return None
@@ -254,7 +261,7 @@ class BeamEstimate:
 
     @property
     def loaded_beam(self) -> LoadedBeam:
-        """The beam with tip mass and root compliance."""
+        """Beam with tip mass, root compliance and stiffness offsets, which may all be 0."""
         return LoadedBeam(
             self.beam,
             self.damping,
@@ -264,12 +271,12 @@ class BeamEstimate:
         )
 
     def modes(self, highest_hz: float = BAND_HZ) -> tuple["EstimatedMode", ...]:
-        """Return the modes that oscillate below a frequency, with their gradients.
+        """Return the beam's modes below a frequency, with their derivatives by the parameters.
 
         Parameters
         ----------
         highest_hz
-            Upper end of the band.
+            Highest frequency of a mode.
         """
         count = 2
         while True:
@@ -318,38 +325,39 @@ CHANGES: Final[Mapping[str, Callable[[complex, complex], tuple[complex, complex]
     "residue_phase_rad": lambda _, residue: (0j, 1j * residue),
     "background": lambda *_: (0j, 0j),
 }
-"""Derivatives of the pole and the residue of a mode by its constants."""
+"""Functions that return the derivatives of a mode's pole and residue by one of its constants, from
+pole and residue."""
 
 
 @dataclass(frozen=True, slots=True)
 class EstimatedMode:
-    """A mode of the estimated beam with locked hub."""
+    """Mode of the estimated beam with locked hub."""
 
     number: int
-    """From 1."""
+    """Number of the mode, from 1."""
     pole_rad_s: complex
-    """Upper one of the pair."""
+    """Pole of the mode with positive imaginary part."""
     gradient: Complex
-    """Shape (k,): derivatives of the pole by the free parameters."""
+    """Derivatives of the pole by the free parameters, shape (k,)."""
 
     @property
     def frequency_hz(self) -> float:
-        """Frequency of the free decay."""
+        """Frequency of the mode's free decay in Hz."""
         return self.pole_rad_s.imag / (2 * pi)
 
     @property
     def damping_ratio(self) -> float:
-        """Fraction of critical damping."""
+        """Damping ratio of the mode, as a fraction of critical damping."""
         return -self.pole_rad_s.real / abs(self.pole_rad_s)
 
     @property
     def frequency_gradient_hz(self) -> Real:
-        """Derivatives of the frequency, shape (k,)."""
+        """Derivatives of the mode's frequency in Hz by the free parameters, shape (k,)."""
         return np.asarray(self.gradient.imag / (2 * pi), dtype=np.float64)
 
     @property
     def damping_gradient(self) -> Real:
-        """Derivatives of the damping ratio, shape (k,)."""
+        """Derivatives of the mode's damping ratio by the free parameters, shape (k,)."""
         p, size = self.pole_rad_s, abs(self.pole_rad_s)
         of_size = (p.conjugate() * self.gradient).real / size
         slope = -self.gradient.real / size - self.damping_ratio * of_size / size
@@ -357,7 +365,11 @@ class EstimatedMode:
 
 
 def parameter_scales(estimate: BeamEstimate) -> Real:
-    """Return factors from derivatives of the exact model to those by the free parameters."""
+    """Return the factors that convert derivatives of the exact model to the fit's parameters.
+
+    The fit uses the logarithms of zeta and gamma, so their factors are zeta and gamma. The other
+    factors are 1.
+    """
     values = estimate.values
     names = [name for name in estimate.names if name in PARAMETERS]
     return np.array([values[name] if name in ("zeta", "gamma") else 1.0 for name in names])

@@ -1,14 +1,14 @@
 """Fisher information of a record on the parameters of the beam, before or after it is recorded.
 
-The torque caused by a motion of the motor is known except for the parameters. Its derivatives,
-whitened with the spectrum of the noise, give the precision of a whole-record fit: the inverse of
-their Gram matrix is the lower bound of any unbiased estimate's covariance (Cramér and
-Rao), and the fit of `analysis` attains it. The nuisance terms of that fit are projected out here
-as well: free decay from before the record, offset and drift of the torque.
+The torque caused by a motion of the motor is known except for the parameters. Its derivatives by
+the parameters, whitened with the spectrum of the noise, determine the precision of a whole-record
+fit: the inverse of their Gram matrix is the lower bound of any unbiased estimate's covariance
+(Cramér and Rao), and the fit of `analysis` attains it. The nuisance terms of that fit are projected
+out here as well: free decay from before the record, offset and drift of the torque.
 
 The computation is in the time domain, at a reduced rate: the derivatives of a record and of a
-segment after it add up sample by sample. A segment costs no more than its own length, and the
-vibration after all earlier ones counts.
+segment after it add up sample by sample. The computing time of a segment depends on its own length
+only, and the vibration after all earlier segments counts.
 
 References
 ----------
@@ -47,12 +47,15 @@ _PRIOR_STD: Final = {
     "bending_stiffness_n_m2": 0.5,
     "delay_s": 0.05,
 }
-"""Prior knowledge without a record: coefficients within a factor of 20, orders within (0, 2)."""
+"""Prior standard deviation of each parameter without a record: coefficients are known within a
+factor of 20, and orders are in (0, 2)."""
 
 _RATE_OVER_BAND: Final = 2.4
+"""Smallest rate of the samples over the upper end of the band."""
 _TAPER: Final = 1.1
+"""Frequency at which the weight of the noise has faded to 0, over the upper end of the band."""
 _DECAY: Final = 5.0
-"""The wrap-around of a transform of twice the length has decayed by exp(-5)."""
+"""Exponent by which the wrap-around of a transform of twice the length has decayed: exp(-5)."""
 
 
 # Whitened derivatives of the torque
@@ -60,26 +63,30 @@ _DECAY: Final = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueModel:
-    """Exact model on the frequencies of records of one length, for any motion."""
+    """Exact beam model, evaluated once at the frequencies of records of a given length.
+
+    It then predicts torque and slope of the tip for any motion of the motor.
+    """
 
     estimate: BeamEstimate
     """Parameters of the model."""
     rate_hz: float
-    """Rate of the angle."""
+    """Rate of the angle in ticks a second."""
     ticks: int
-    """Length of the records, at that rate: a multiple of `factor`."""
+    """Length of the records in ticks, a multiple of `factor`."""
     factor: int
-    """One tick in so many is a sample."""
+    """Number of ticks from one sample to the next."""
     sigma_per_s: float
-    """Real part of the Laplace variable."""
+    """Real part of the Laplace variable in 1/s."""
     kernels: Complex
-    """Shape (k, K): whitened derivatives of the response from angle to torque."""
+    """Whitened derivatives of the response from angle to torque by the free parameters, shape
+    (k, K)."""
     channels: Complex
-    """Shape (2, K): responses from angle to torque in N·m/rad, and to the slope of the tip."""
+    """Responses from angle to torque in N·m/rad and to the slope of the tip, shape (2, K)."""
 
     @classmethod
     def of(cls, estimate: BeamEstimate, rate_hz: float, ticks: int) -> "TorqueModel":
-        """Evaluate the model for records of at least so many ticks.
+        """Return the model for records of at least a given number of ticks.
 
         Parameters
         ----------
@@ -88,7 +95,7 @@ class TorqueModel:
         rate_hz
             Rate of the angle.
         ticks
-            Least length.
+            Smallest length of the records in ticks.
         """
         factor = reduction(rate_hz)
         # Twice the length, and one of which a transform is quick.
@@ -109,25 +116,35 @@ class TorqueModel:
 
     @property
     def sample_hz(self) -> float:
-        """Rate of the samples."""
+        """Rate of the samples in Hz, at which derivatives of the torque are computed."""
         return self.rate_hz / self.factor
 
     def spectrum(self, angle_rad: Real) -> Complex:
-        """Return the transform of an angle from rest, (n,) with n at most `ticks`, in the band."""
+        """Return the Laplace transform of a motor angle at the frequencies of the band.
+
+        The angle in rad begins at rest and has the shape (n,), with n at most `ticks`.
+        """
         time_s = np.arange(angle_rad.size) / self.rate_hz
         faded = angle_rad * np.exp(-self.sigma_per_s * time_s)
         spectrum: Complex = np.fft.rfft(faded, 2 * self.ticks)[: self.kernels.shape[1]]
         return spectrum
 
     def rows(self, spectrum: Complex) -> Real:
-        """Return whitened derivatives of the torque, shape (k, ticks / factor)."""
+        """Return whitened derivatives of the torque by the parameters at each sample.
+
+        `spectrum` is the transform of the angle. The shape is (k, ticks / factor).
+        """
         return self._in_time(self.kernels * (spectrum / self.factor), self.ticks // self.factor, 1)
 
     def motion(self, spectrum: Complex) -> Real:
-        """Return torque (N·m) and slope of the tip (rad) at every tick, shape (2, ticks)."""
+        """Return torque in N·m and slope of the tip in rad at every tick, shape (2, ticks).
+
+        `spectrum` is the transform of the angle.
+        """
         return self._in_time(self.channels * spectrum, self.ticks, self.factor)
 
     def _in_time(self, spectra: Complex, samples: int, finer: int) -> Real:
+        """Return Laplace transforms as functions of time, at `finer` values per sample."""
         time_s = np.arange(samples) * (self.factor / finer / self.rate_hz)
         values = np.fft.irfft(spectra, 2 * samples)[:, :samples]
         values *= np.exp(self.sigma_per_s * time_s)
@@ -135,7 +152,7 @@ class TorqueModel:
 
 
 def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Complex]:
-    """Return the responses from the angle to torques in N·m/rad and to the slope of the tip.
+    """Return the transfer functions from the motor's angle to torques and to the slope of the tip.
 
     Parameters
     ----------
@@ -147,8 +164,8 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
     Returns
     -------
     of_beam, measured, slope
-        Torque on the beam; measured torque, with tool inertia and delay; slope of the tip against
-        the root.
+        Torque on the beam in N·m/rad; measured torque in N·m/rad, with tool inertia and delay;
+        slope of the tip relative to the root, per angle.
     """
     loaded = estimate.loaded
     if loaded is None:
@@ -162,7 +179,9 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
 
 
 def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Complex:
-    """Differentiate the response from angle to torque, in units of the noise; shape (k, K).
+    """Return derivatives of the response from angle to torque by the parameters, shape (k, K).
+
+    They are whitened: divided by the noise spectrum so that the noise of a sample has variance 1.
 
     Parameters
     ----------
@@ -171,7 +190,7 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     s
         Laplace variable in rad/s, shape (K,).
     sample_hz
-        Rate of the samples whose noise is to have variance 1.
+        Rate of the samples.
     """
     names = [name for name in estimate.names if name in PARAMETERS]
     wrt = [BY_PARAMETER.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")]
@@ -201,7 +220,10 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
 
 
 def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
-    """Differentiate the response by the constants of free modes and of the background."""
+    """Return derivatives of the response by the constants of free modes and of the background.
+
+    The shape is (number of constants, K).
+    """
     poles = {mode.number: mode.pole_rad_s for mode in estimate.modes()}
     rows = []
     for name in estimate.names:
@@ -222,14 +244,17 @@ def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
 
 
 def reduction(rate_hz: float) -> int:
-    """Return how many ticks make a sample of the band."""
+    """Return the number of ticks from one sample to the next, so that samples contain the band."""
     return max(int(rate_hz / (_RATE_OVER_BAND * BAND_HZ)), 1)
 
 
 def _whitening(
     estimate: BeamEstimate, frequency_hz: NDArray[np.floating[Any]], sample_hz: float
 ) -> Real:
-    """Return the weight that gives a sample's noise variance 1, fading at the end of the band."""
+    """Return the weights at some frequencies that give the noise of a sample variance 1.
+
+    They fade to 0 above the end of the band.
+    """
     density = np.interp(
         frequency_hz, estimate.noise_frequency_hz, np.log(estimate.noise_nm2_per_hz)
     )
@@ -240,7 +265,7 @@ def _whitening(
 
 
 def _quick(least: int) -> int:
-    """Return a length with a fast transform, at most an eighth above the least one."""
+    """Return a length for a fast Fourier transform: `least`, or at most an eighth more."""
     unit = 1 << max(0, least.bit_length() - 4)
     return -(-least // unit) * unit
 
@@ -250,33 +275,36 @@ def _quick(least: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordSoFar:
-    """Information of a record up to now, and the vibration that continues after it."""
+    """Fisher information of a record up to now, and the vibration that continues after it."""
 
     estimate: BeamEstimate
-    """Estimate from which it was computed."""
+    """Estimate of the beam from which the information is computed."""
     before: Real
-    """(k + m, k + m): Gram matrix of the derivatives and of m nuisance terms up to now."""
+    """Gram matrix of the torque's derivatives and of m nuisance terms up to now, shape
+    (k + m, k + m)."""
     ahead: Real
-    """(k + m, samples): the same derivatives and terms from now on, the motor held."""
+    """Derivatives and nuisance terms from now on if the motor is held, shape (k + m, samples)."""
     ringing: Real
-    """(2, ticks): torque (N·m) and slope of the tip (rad) from now on, the motor held."""
+    """Torque in N·m and slope of the tip in rad from now on if the motor is held, shape
+    (2, ticks)."""
 
     @classmethod
     def of(
         cls, angle_rad: Real, estimate: BeamEstimate, rate_hz: float, ahead_s: float = 0.0
     ) -> "RecordSoFar":
-        """Evaluate a record.
+        """Return the information of a record of the motor's angle.
 
         Parameters
         ----------
         angle_rad
-            Shape (n,): motor angle so far, measured or predicted; the beam rested at the first.
+            Motor angle so far, measured or predicted, shape (n,). The beam is at rest at the first
+            tick.
         estimate
             Beam, damping and noise.
         rate_hz
             Rate of the angle.
         ahead_s
-            Time from now on for which the vibration is computed.
+            Time in s from now on for which the continuing vibration is computed.
         """
         factor = reduction(rate_hz)
         # Rest before it, so that a sample lies at its end.
@@ -300,18 +328,18 @@ class RecordSoFar:
 
     @property
     def through(self) -> Real:
-        """Projection of the nuisance terms out of the derivatives: (k, k + m)."""
+        """Matrix that projects the nuisance terms out of the derivatives, shape (k, k + m)."""
         k = len(self.estimate.names)
         return np.concatenate([np.eye(k), -_explained(self.before, k)], axis=1)
 
     def after(self, more: Real | None, samples: int) -> Real:
-        """Return the information (k, k) after a number of further samples.
+        """Return the information on the parameters after further samples, shape (k, k).
 
         Parameters
         ----------
         more
-            Shape (k, n): derivatives that a segment adds from now on, n at least `samples`; None:
-            the motor is held.
+            Derivatives that a segment adds from now on, shape (k, n) with n at least `samples`;
+            None: the motor is held.
         samples
             Number of further samples that count.
         """
@@ -326,13 +354,14 @@ def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real
     """Return a record's Fisher information on the free parameters of the beam, shape (k, k).
 
     Free decay from before the record, and offset and drift of the torque, are unknown as well and
-    reduce the information. In the order of ``estimate.names``; zeta, gamma, density over stiffness
-    and stiffness count by their logarithms. Its inverse is the least covariance.
+    reduce the information. The parameters are in the order of ``estimate.names``. For zeta, gamma,
+    density over stiffness and stiffness they are the logarithms. The inverse of the information is
+    the smallest covariance that an unbiased estimate can have.
 
     Parameters
     ----------
     angle_rad
-        Shape (n,): motor angle, measured or predicted; the beam rested at the first.
+        Motor angle, measured or predicted, shape (n,). The beam is at rest at the first tick.
     estimate
         Beam, damping, noise, and the free parameters.
     rate_hz
@@ -364,7 +393,7 @@ def projected(gram: Real, k: int) -> Real:
     Parameters
     ----------
     gram
-        Shape (k + m, k + m): of the derivatives.
+        Gram matrix of the derivatives by all parameters, shape (k + m, k + m).
     k
         Number of parameters of interest.
     """
@@ -373,7 +402,10 @@ def projected(gram: Real, k: int) -> Real:
 
 
 def _explained(gram: Real, k: int) -> Real:
-    """Return the regression of the first k derivatives on the others, shape (k, m)."""
+    """Return the coefficients of the regression of the first k derivatives on the m others.
+
+    The shape is (k, m), and `gram` is the Gram matrix of all derivatives.
+    """
     size = np.sqrt(np.maximum(np.diag(gram)[k:], 1e-300))
     unit = gram[k:, k:] / np.outer(size, size) + 1e-12 * np.eye(size.size)
     factors: Real = np.linalg.solve(unit, gram[k:, :k] / size[:, None]).T / size
@@ -381,7 +413,7 @@ def _explained(gram: Real, k: int) -> Real:
 
 
 def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
-    """Return the covariance for an information, with prior knowledge of each parameter."""
+    """Return the covariance of the parameters for a Fisher information plus prior knowledge."""
     prior = np.array([_prior_std(name, estimate) for name in estimate.names])
     # In units of the prior the matrix is well scaled wherever something is known.
     unit = information * np.outer(prior, prior) + np.eye(len(prior))
@@ -391,6 +423,7 @@ def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
 
 
 def _prior_std(name: str, estimate: BeamEstimate) -> float:
+    """Return the standard deviation of a parameter that is known before any record."""
     beam = estimate.beam
     kind = name.rpartition("_")[0]
     if kind == "background":
@@ -407,7 +440,10 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
 
 
 def _nuisance(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
-    """Return whitened decays from the first sample, offset and drift, shape (m, samples)."""
+    """Return the whitened nuisance terms of a record: free decays, offset and drift of the torque.
+
+    The shape is (m, samples).
+    """
     time_s = np.arange(samples) / sample_hz
     poles = np.array([mode.pole_rad_s for mode in estimate.modes()])
     decays = np.exp(np.outer(poles, time_s))

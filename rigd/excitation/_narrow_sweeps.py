@@ -1,11 +1,11 @@
 """Narrow sweeps over the modes of a beam: their bands, amplitudes and times.
 
-A table of modes gives the bands. The rig's limits give the amplitude in each, and the information
-on the damping gives the time in each. That is measured by the Fisher
-information of the exact model (`rigd.beam`): information from the torque, with white noise of any
-size on it, on the damping's parameters, with density, stiffness, delay and tool inertia free as
-well. A band that is swept slowly gives information in proportion to the time spent there, so the
-times follow from the information of each band per second.
+A table of modes determines the bands, the rig's limits determine the amplitude in each band, and
+the information on the damping determines the time in each band. It is the Fisher information of the
+exact model (`rigd.beam`) on the damping's parameters, from the torque with white noise of any size,
+with density, stiffness, delay and tool inertia free as well. A band that is swept slowly gives
+information in proportion to the time spent there, so the times follow from the information of each
+band per second.
 """
 
 import json
@@ -39,24 +39,31 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _EASINGS: Final = 8
+"""Largest number of times that the amplitude of a sweep is reduced to stay within the limits."""
 _CLOSE_ENOUGH: Final = 1.005
+"""Factor by which a sweep may exceed its fraction of the limits, which ends the reductions."""
 
 LEAST_TIME_FRACTION: Final = 0.5
-"""Least time of a band, as a fraction of an equal division: no mode is left out."""
+"""Shortest time of a band over the time of an equal division, so that no mode is left out."""
 
 SAME_MODE: Final = 1.1
-"""Fits of one record differ by less than this factor in a mode's frequency; the frequencies of a
-slender beam differ by more."""
+"""Largest ratio of two frequencies that belong to one mode. Fits of one record differ by less in a
+mode's frequency; the frequencies of a slender beam's modes differ by more."""
 
 
 # Table of modes
 
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+"""Type of a finite number above 0 in a document."""
 _NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+"""Type of a finite number of at least 0 in a document."""
 
 
 class _Entry(BaseModel):
-    """Mode of one fit; null where the fit has none, 0 Hz where it does not oscillate."""
+    """Mode of one fit in an analyser's document.
+
+    A value is None if the fit has none, and the frequency is 0 Hz if the mode does not oscillate.
+    """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -67,11 +74,12 @@ class _Entry(BaseModel):
 
     @property
     def oscillates(self) -> bool:
+        """Whether the mode has a frequency above 0 Hz and a damping ratio."""
         return bool(self.frequency_hz) and self.damping_ratio is not None
 
 
 class _Number(BaseModel):
-    """Number of a headline."""
+    """Value with its standard deviation in the main results of an analysis."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -80,7 +88,7 @@ class _Number(BaseModel):
 
 
 class _HeadlineMode(BaseModel):
-    """Mode of a headline: of the modal model where the record shows it."""
+    """Mode in the main results of an analysis: of the modal model, if the record shows it."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -89,7 +97,7 @@ class _HeadlineMode(BaseModel):
 
     @property
     def entry(self) -> _Entry:
-        """Return it in the form of one fit's mode."""
+        """The mode in the form of a single fit's mode."""
         return _Entry(
             frequency_hz=self.frequency_hz.value,
             damping_ratio=self.damping_ratio.value or None,
@@ -106,7 +114,7 @@ class _Headline(BaseModel):
 
 
 class _Document(BaseModel):
-    """The part of the analyser's document that is used here."""
+    """Analyser's document, reduced to the keys from which modes are read."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -116,24 +124,28 @@ class _Document(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class FoundMode:
-    """A mode, from one fit or from several."""
+    """Mode of a beam, estimated by one fit or as the median of several fits."""
 
     frequency_hz: float
+    """Frequency of the free decay in Hz."""
     damping_ratio: float
+    """Damping ratio, as a fraction of critical damping."""
     uncertainty_hz: float
-    """Uncertainty of the frequency: two standard deviations, stated or from the fits' scatter."""
+    """Uncertainty of the frequency in Hz: two standard deviations, stated or from the scatter of
+    the fits."""
 
 
 def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
-    """Read the modes, lowest frequency first.
+    """Read the modes of a beam from an analyser's document, lowest frequency first.
 
     Parameters
     ----------
     path
         JSON with the key ``modes``: a list of objects with ``frequency_hz`` (Hz, of the free decay)
-        and ``damping_ratio``, and optionally ``frequency_std_hz``. Other keys are ignored. Where
-        several fits found a mode, their medians are used; fits of the estimator ``record`` have
-        priority over others. Modes of ``headlines``, those of the modal model, replace all these.
+        and ``damping_ratio``, and optionally ``frequency_std_hz``. Other keys are ignored. If
+        several fits found a mode, their medians are used. Fits of the estimator ``record`` have
+        priority over others. Modes of ``headlines``, which are those of the modal model, replace
+        all these.
 
     Raises
     ------
@@ -159,6 +171,7 @@ def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
 
 
 def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
+    """Return the content of a JSON file, or raise `ExcitationError` if it cannot be read."""
     try:
         return read_json(path)
     except DocumentError as error:
@@ -168,7 +181,7 @@ def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
 
 
 def _complaint(detail: ErrorDetails) -> str:
-    """Describe one invalid value, in one sentence with a remedy."""
+    """Return a sentence that names an invalid value in a document, with a remedy."""
     where = ""
     for part in detail["loc"]:
         where += f"[{part}]" if isinstance(part, int) else f".{part}" if where else part
@@ -191,7 +204,7 @@ def _complaint(detail: ErrorDetails) -> str:
 
 
 def _groups(entries: Sequence[_Entry]) -> Iterator[list[_Entry]]:
-    """Group the entries of several fits that describe one mode."""
+    """Yield lists of entries of several fits that describe the same mode, by rising frequency."""
     group: list[_Entry] = []
     for entry in sorted(entries, key=_frequency_hz):
         if group and _frequency_hz(entry) > SAME_MODE * _frequency_hz(group[0]):
@@ -203,6 +216,7 @@ def _groups(entries: Sequence[_Entry]) -> Iterator[list[_Entry]]:
 
 
 def _merged(group: Sequence[_Entry]) -> FoundMode:
+    """Return the median of several fits' entries for one mode."""
     middle_hz = median(_frequency_hz(entry) for entry in group)
     stated_hz = median(entry.frequency_std_hz or 0.0 for entry in group)
     # Fits of unsuitable structures lie far off: the median of the distances tolerates them.
@@ -215,47 +229,57 @@ def _merged(group: Sequence[_Entry]) -> FoundMode:
 
 
 def _frequency_hz(entry: _Entry) -> float:
+    """Return the frequency of a mode's entry in Hz, or 0 if it has none."""
     return entry.frequency_hz or 0.0
 
 
 # Bands, and the time spent in each
 
 _POINTS: Final = 64
-"""Frequencies in a band at which the information is computed."""
+"""Number of frequencies in a band at which the information is computed."""
 
 _ROUNDS: Final = 500
+"""Number of multiplicative steps in the search for the best division of the time."""
 _REGULARISATION: Final = 1e-12
-"""Relative regularisation: few bands leave some combinations of parameters undetermined."""
+"""Relative regularisation of the information matrix, since few bands leave some combinations of
+parameters undetermined."""
 
 
 class SweepRig(Protocol):
-    """Interface to a rig's predicted behaviour before it moves."""
+    """Interface to a rig's predicted behaviour, for which narrow sweeps are planned."""
 
     @property
     def beam(self) -> Beam:
-        """The specimen according to the profile."""
+        """Beam of the rig's profile."""
 
     def tracking(self, frequency_hz: Real) -> Complex:
-        """Return angle over reference, in the shape of the frequencies."""
+        """Return the frequency response from reference to angle at some frequencies in Hz."""
 
     def fraction_of_limits(self, reference_rad: Real) -> float:
-        """Return the largest predicted fraction of a limit for a reference (n,)."""
+        """Return the largest fraction of a limit that a reference in rad is predicted to use."""
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
-        """Return the largest predicted slope of the free end for a reference (n,)."""
+        """Return the largest predicted slope in rad of the beam's free end for a reference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """A narrow band that is swept linearly from its lower to its upper end."""
+    """Narrow band of frequencies around a mode, which is swept linearly upwards."""
 
     mode: FoundMode
+    """Mode in the band."""
     start_hz: float
+    """Lower end of the band in Hz."""
     stop_hz: float
+    """Upper end of the band in Hz."""
 
     @classmethod
     def of_mode(cls, mode: FoundMode, widths: float) -> "Band":
-        """Return the band around a mode: so many half-power widths beyond its uncertainty."""
+        """Return the band around a mode.
+
+        On either side it extends by the uncertainty of the frequency and by `widths` half-power
+        widths.
+        """
         half_hz = widths * 2.0 * mode.damping_ratio * mode.frequency_hz + mode.uncertainty_hz
         # A sweep needs a period: strongly damped modes would begin at 0 Hz or below.
         return cls(
@@ -265,12 +289,12 @@ class Band:
 
     @property
     def decay_s(self) -> float:
-        """Time constant with which the mode rings up and down."""
+        """Time constant in s with which the mode in the band rings up and decays."""
         return 1.0 / (2.0 * pi * self.mode.frequency_hz * self.mode.damping_ratio)
 
 
 def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig) -> Real:
-    """Return the time fractions of the bands that determine the damping most precisely.
+    """Return the fractions of the time in each band that determine the damping most precisely.
 
     They minimise the geometric mean of the standard deviations of the damping's parameters, with
     all other parameters free, by multiplicative steps (D. M. Titterington, 1976; for criteria
@@ -279,9 +303,9 @@ def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: 
     Parameters
     ----------
     bands, amplitudes_rad
-        Bands, and the amplitude of the reference in each.
+        Bands, and the amplitude of the reference in each band.
     rig
-        Gives the angle for a reference.
+        Predicted behaviour of the rig.
 
     Returns
     -------
@@ -304,10 +328,10 @@ def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: 
 
 
 def damping_of(modes: Sequence[FoundMode], beam: Beam) -> Damping:
-    """Fit a first-order damping, internal and external, to the modes' damping ratios.
+    """Return the internal and external damping of order 1 that fits the modes' damping ratios best.
 
-    Relative least squares of ``2 ratio = zeta omega + gamma / ((rho/EI) omega)``; no coefficient
-    is negative.
+    It minimises the relative squares of ``2 ratio = zeta omega + gamma / ((rho/EI) omega)`` with
+    coefficients that are not negative.
     """
     omega = np.array([2.0 * pi * mode.frequency_hz for mode in modes])
     ratio = np.array([mode.damping_ratio for mode in modes])
@@ -323,9 +347,10 @@ def damping_of(modes: Sequence[FoundMode], beam: Beam) -> Damping:
 def _information_rates(
     bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig, damping: Damping
 ) -> tuple[Real, int]:
-    """Return the information per second of each band, (bands, k, k), damping parameters first.
+    """Return the Fisher information per second of each band, and the number of damping parameters.
 
-    Coefficients are relative. The order of an absent damping cannot be estimated.
+    The information has the shape (bands, k, k), with the damping's parameters first. Coefficients
+    are relative. The order of an absent damping cannot be estimated.
     """
     factors = {"zeta": damping.zeta, "alpha": 1.0, "gamma": damping.gamma, "lambda": 1.0}
     orders = {"alpha": damping.zeta, "lambda": damping.gamma}
@@ -344,9 +369,9 @@ def _information_rates(
 
 
 def _tuned(beam: Beam, frequency_hz: float) -> Beam:
-    """Change the density so that the nearest undamped mode has the given frequency.
+    """Return the beam with another density, so that its nearest mode has the given frequency.
 
-    The profile's beam is wrong by more than the width of such a band.
+    The profile's beam is wrong by more than the width of a band.
     """
     omega = 2.0 * pi * frequency_hz
     modes_rad_s = undamped_frequencies_rad_s(beam, 12)
@@ -375,7 +400,7 @@ def modes(
     tip_slope_rad: float = SMALL_SLOPE_RAD,
     rig: SweepRig | None = None,
 ) -> Excitation:
-    """Return linear sweeps through narrow bands around modes, one after the other.
+    """Return an excitation with a linear sweep through a narrow band around each mode.
 
     Parameters
     ----------
@@ -384,22 +409,24 @@ def modes(
     path
         JSON with the modes: see `rigd.excitation._narrow_sweeps.read_modes`.
     amplitude_rad
-        Amplitude in each band; lower where the rig's limits or the slope of the tip require it.
+        Amplitude in each band. It is lower if the rig's limits or the slope of the tip require it.
     stop_hz
-        Modes above it are left out.
+        Highest frequency of a mode that is swept.
     widths
-        Half-power widths swept on either side of a mode, in addition to its uncertainty.
+        Number of half-power widths swept on either side of a mode, in addition to the uncertainty
+        of its frequency.
     duration_s
-        Duration of all sweeps together.
+        Total duration of all sweeps in s.
     rest_s, ring_down_s
-        Time before and after them.
+        Time in s before and after the sweeps.
     taper_s
-        Raised-cosine fade at both ends of every sweep: angle and speed are zero at the joints.
+        Duration in s of the raised-cosine fade at both ends of every sweep, so that angle and speed
+        are zero where two sweeps meet.
     tip_slope_rad
         Largest slope of the beam's free end, of which the sweeps use 90 %.
     rig
-        Limits the amplitudes, and divides the time by the information on the damping. None:
-        equal amplitudes and times.
+        Rig whose limits determine the amplitudes, and whose beam determines the times by the
+        information on the damping; None: equal amplitudes and times.
 
     Raises
     ------
@@ -453,7 +480,7 @@ def modes(
 
 
 def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Band]:
-    """Return the bands in the order of their sweeps: the slowest decay comes first."""
+    """Read modes from a document and return their bands, that of the slowest decay first."""
     found = read_modes(path)
     inside = [mode for mode in found if mode.frequency_hz <= stop_hz]
     if not inside:
@@ -470,9 +497,10 @@ def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Ba
 def _within_limits(
     sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: SweepRig
 ) -> list[float]:
-    """Return the amplitude of each sweep, reduced where the rig's limits require it.
+    """Return the amplitude of each sweep in rad, reduced where the rig's limits require it.
 
-    One after the other, since a mode still rings during the next sweep.
+    Each sweep is predicted together with those before it, since a mode still rings during the next
+    sweep.
     """
     amplitudes_rad = []
     before_rad = np.empty(0)
@@ -492,13 +520,16 @@ def _within_limits(
 
 
 def _lengths(fractions: Real, ticks: int) -> list[int]:
-    """Divide ticks by fractions, without losing one to rounding."""
+    """Return numbers of ticks in proportion to fractions, whose sum is exactly `ticks`."""
     ends = np.round(np.cumsum(fractions) * ticks).astype(int)
     return [int(length) for length in np.diff(ends, prepend=0)]
 
 
 def _at_least(fractions: Real) -> Real:
-    """Raise fractions to the least one, at the cost of the others in proportion."""
+    """Return fractions of the time of which none is less than `LEAST_TIME_FRACTION` allows.
+
+    The other fractions are reduced in proportion, so that the sum remains 1.
+    """
     least = LEAST_TIME_FRACTION / len(fractions)
     low = fractions < least
     for _ in fractions:
@@ -509,7 +540,10 @@ def _at_least(fractions: Real) -> Real:
 
 
 def _unit_sweep(band: Band, ticks: int, fades: int, rate_hz: float) -> Real:
-    """Return a sweep of amplitude 1, (ticks,), with raised-cosine ends of ``fades / 2`` ticks."""
+    """Return a sweep of amplitude 1 through a band, shape (ticks,).
+
+    Both ends have a raised-cosine fade of ``fades / 2`` ticks.
+    """
     duration_s = ticks / rate_hz
     t = np.arange(ticks) / rate_hz
     phase = (

@@ -1,9 +1,9 @@
-"""Passes in search of an obstacle: out at a constant speed until something is met, and back.
+"""Passes in search of an obstacle: out at a constant speed until the beam touches it, and back.
 
 Each pass has its own block of time: rest, way out, pause, way back without an obstacle. When the
-loop detects a touch, it leaves the reference for another one that fits into the same block
-(`after_touch`): it brakes, holds, and returns to the beginning of the pass. A session therefore
-has the same number of ticks with and without a touch. Neither way makes the beam ring.
+loop detects a touch, it replaces the rest of the reference in this block (`after_touch`): the motor
+brakes, holds, and returns to the beginning of the pass. A session therefore has the same number of
+ticks with and without a touch. Neither way excites a vibration.
 """
 
 from dataclasses import dataclass, replace
@@ -31,35 +31,36 @@ from rigd.identified_beam import TOUCH
 Real = NDArray[np.float64]
 
 _PEAK_SPEED = 2.0
-"""Largest speed of the way back over its mean: that of a minimum-jerk path, with a margin."""
+"""Ratio of the largest speed to the mean speed on the way back: that of a minimum-jerk path, with a
+margin."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchPass:
-    """Ticks of one pass."""
+    """Ticks at which the parts of one pass in search of an obstacle begin and end."""
 
     begins: int
-    """Start of the way out; the rest before it belongs to the pass."""
+    """Tick at which the way out begins; the rest before it belongs to the pass."""
     returns: int
-    """Start of the way back."""
+    """Tick at which the way back begins."""
     ends: int
     """First tick after the pass."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """Passes in search of an obstacle, as the control loop needs them."""
+    """Passes in search of an obstacle, and the control loop's reaction to a touch."""
 
     passes: tuple[TouchPass, ...]
-    """In their order."""
+    """Passes in the order of time."""
     braking: Braking
-    """Table of the braking path."""
+    """Path on which the motor brakes after a touch."""
     hold_ticks: int
-    """Ticks from a touch to the way back."""
+    """Number of ticks from a touch to the way back."""
     back: Real
-    """Way back from 0 to 1, at the ticks after its start."""
+    """Path of the way back from 0 to 1, at the ticks after its start."""
     force_limit_n: float
-    """Contact force above which the torque is switched off."""
+    """Contact force in N above which the torque is switched off."""
 
 
 def touch(
@@ -77,14 +78,14 @@ def touch(
     path: str | Path = "",
     rig: MoveRig | None = None,
 ) -> Excitation:
-    """Slew until something is met, then brake, hold and withdraw.
+    """Return an excitation that moves the beam until it touches an obstacle, and then back.
 
     Parameters
     ----------
     rate_hz
         Ticks a second.
     angle_rad
-        Farthest angle, from the rig's zero.
+        Farthest angle from the rig's zero.
     speed_rad_s
         Speed on the way out.
     acceleration_rad_s2
@@ -92,17 +93,17 @@ def touch(
     passes
         Number of passes.
     hold_s
-        Time from a touch to the way back, and at the farthest angle if there is none.
+        Time in s from a touch to the way back; without a touch, time at the farthest angle.
     settle_s
-        Rest before each pass.
+        Time in s at rest before each pass.
     force_limit_n
-        Contact force above which the torque is switched off and the session ends as a fault; it is
-        watched where the rig measures the base shear.
+        Contact force above which the torque is switched off and the session ends as a fault. It is
+        checked if the rig measures the base shear.
     rest_s, ring_down_s
-        Time before and after all passes.
+        Time in s before and after all passes.
     path
-        JSON written by ``analyze --json``, whose beam the torque is compared with; empty: the
-        profile's.
+        JSON written by ``analyze --json`` with the beam whose predicted torque is compared with the
+        measured torque; empty: the beam of the profile.
     rig
         Rig that is moved.
 
@@ -196,25 +197,25 @@ def after_touch(
     recent_rad: tuple[float, float, float],
     start_rad: float,
 ) -> Real:
-    """Return the rest of a pass after a touch: brake, hold, go back to its start.
+    """Return the reference for the rest of a pass after a touch: brake, hold, and return.
 
     Parameters
     ----------
     approach
-        The search.
+        Passes and reaction to a touch.
     ends
         First tick after the pass.
     tick
-        Tick of the detection, before the way back begins.
+        Tick at which the touch was detected, before the way back begins.
     recent_rad
-        Reference two ticks before, one tick before, and at this tick.
+        Reference angles two ticks before `tick`, one tick before it, and at it.
     start_rad
-        Reference where the pass began.
+        Reference angle at the beginning of the pass.
 
     Returns
     -------
     ndarray of shape (ends - tick - 1,)
-        Reference of the ticks after this one, in rad.
+        Reference angles in rad at the ticks after `tick`.
     """
     braking, back = approach.braking, approach.back
     before, last, now = recent_rad

@@ -14,45 +14,52 @@ from rigd.excitation._signals import ExcitationError
 Real = NDArray[np.float64]
 
 OF_MODES: Final = ("damping", "frequency")
+"""Names of the target quantities that belong to a mode."""
 QUANTITIES: Final = (*OF_MODES, "zeta", "alpha", "gamma", "lambda")
-"""Quantities with a target: damping ratio and frequency of modes, or a parameter."""
+"""Names of the quantities whose precision can be a target: damping ratio and frequency of modes,
+and the parameters of the damping."""
 
 _UNITS: Final = {"frequency": "Hz"}
+"""Unit of each target quantity that has one."""
 _NO_ANSWER: Final = {"damping": 0.01, "zeta": 0.5, "alpha": 0.5, "gamma": 0.5, "lambda": 0.5}
-"""Deviations, in units of the quantity, that are useless: such a request has lost its %."""
+"""Standard deviation of each quantity, in its unit, from which a target is useless: the percent
+sign was probably forgotten."""
 _MOST_MODES: Final = 20
+"""Largest number of a mode in a target."""
 _OF_COEFFICIENT: Final = {"alpha": "zeta", "lambda": "gamma"}
+"""Coefficient of the damping to which each order belongs."""
 _KIND: Final = {"zeta": "internal", "alpha": "internal", "gamma": "external", "lambda": "external"}
+"""Kind of damping to which each parameter belongs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Requested standard deviation of a quantity."""
+    """Target precision of a session: the requested standard deviation of a quantity."""
 
     quantity: str
-    """One of `QUANTITIES`."""
+    """Name of the quantity, one of `QUANTITIES`."""
     std: float
-    """Standard deviation: a fraction of the value if `relative`, else in the unit of the quantity
-    (a ratio, Hz, s^alpha, s^lambda/m⁴)."""
+    """Requested standard deviation: a fraction of the value if `relative`, else in the unit of the
+    quantity (a ratio, Hz, s^alpha, s^lambda/m⁴)."""
     relative: bool
-    """Whether it is a fraction of the value."""
+    """Whether the standard deviation is a fraction of the value."""
     mode: int | None = None
     """Number of the mode, from 1; None: every mode in the band, or not a quantity of modes."""
 
     @property
     def name(self) -> str:
-        """Name of the quantity, for the operator."""
+        """Name of the quantity with the number of its mode, for the operator."""
         return self.quantity if self.mode is None else f"{self.quantity} of mode {self.mode}"
 
     def __str__(self) -> str:
-        """Return quantity and deviation, for the operator."""
+        """Return quantity and requested standard deviation as text, for the operator."""
         unit = _UNITS.get(self.quantity, "")
         size = f"{100 * self.std:g} %" if self.relative else f"{self.std:g} {unit}".rstrip()
         return f"{self.name} to {size}"
 
 
 def parse_target(quantity: str, text: str) -> Target:
-    """Parse the target precision of an option.
+    """Parse the target precision of a quantity from the text of an option, such as ``2:0.5%``.
 
     Parameters
     ----------
@@ -66,7 +73,7 @@ def parse_target(quantity: str, text: str) -> Target:
     Raises
     ------
     ExcitationError
-        If it is not such a text.
+        If quantity or text is invalid.
 
     Examples
     --------
@@ -123,22 +130,22 @@ def parse_target(quantity: str, text: str) -> Target:
 
 @dataclass(frozen=True, slots=True)
 class Precision:
-    """Present precision of one quantity, and its target."""
+    """Precision of one quantity in comparison with its target."""
 
     target: Target
-    """The target, of one mode if the quantity belongs to modes."""
+    """Target of the quantity, with the number of the mode if the quantity belongs to a mode."""
     value: float
-    """Estimated value."""
+    """Estimated value of the quantity."""
     std: float
-    """Its standard deviation."""
+    """Standard deviation of the estimated value."""
     target_std: float
     """Target standard deviation, in the same unit; 0 for a percentage of a value of 0."""
     impossible: str = ""
-    """Why no record can determine the quantity; empty if one can."""
+    """Reason why no record can determine the quantity; empty if a record can."""
 
     @property
     def ratio(self) -> float:
-        """Standard deviation over its target: reached at 1 and below."""
+        """Ratio of the standard deviation to its target, which is reached at 1 and below."""
         if self.impossible:
             return inf
         return self.std / self.target_std if self.target_std > 0.0 else inf
@@ -151,23 +158,23 @@ class Precision:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantities:
-    """All target quantities, linearised at an estimate."""
+    """Target quantities of a session as linear functions of the parameters near an estimate."""
 
     items: tuple[Precision, ...]
-    """One for each quantity; their deviations are still unknown."""
+    """Value and target of each quantity; the standard deviations are still unknown."""
     gradients: Real
-    """Shape (q, k): derivatives by the free parameters."""
+    """Derivatives of the quantities by the free parameters, shape (q, k)."""
 
     @classmethod
     def of(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
-        """Linearise the target quantities.
+        """Return the target quantities, linearised at an estimate of the beam.
 
         Parameters
         ----------
         targets
-            Targets; one without a mode number applies to every mode in the band.
+            Targets. A target without a mode number applies to every mode in the band.
         estimate
-            Point of linearisation.
+            Estimate at which the quantities are linearised.
         """
         modes = estimate.modes()
         items, gradients = [], []
@@ -182,12 +189,14 @@ class Quantities:
         return cls(tuple(items), np.array(gradients).reshape(len(items), len(estimate.names)))
 
     def ratios(self, covariance: Real) -> Real:
-        """Return deviations over their targets, shape (q,); 0 for impossible ones.
+        """Return the ratio of each quantity's standard deviation to its target, shape (q,).
+
+        The ratio is 0 for a quantity that no record can determine.
 
         Parameters
         ----------
         covariance
-            Shape (k, k), of the free parameters.
+            Covariance of the free parameters, shape (k, k).
         """
         variance = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
         target_std = np.array([inf if each.impossible else each.target_std for each in self.items])
@@ -195,7 +204,7 @@ class Quantities:
         return ratios
 
     def precisions(self, covariance: Real) -> tuple[Precision, ...]:
-        """Return the precision of every target for a covariance (k, k)."""
+        """Return the precision of every target for a covariance of the parameters, shape (k, k)."""
         return tuple(
             replace(each, std=sqrt(max(float(slope @ covariance @ slope), 0.0)))
             for each, slope in zip(self.items, self.gradients, strict=True)
@@ -203,6 +212,7 @@ class Quantities:
 
 
 def _of_single_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
+    """Return a target for each mode, if the given target applies to every mode in the band."""
     if target.quantity not in OF_MODES or target.mode is not None:
         return [target]
     return [replace(target, mode=mode.number) for mode in modes]
@@ -211,7 +221,10 @@ def _of_single_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[T
 def _linearised(
     target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
 ) -> tuple[float, Real, str]:
-    """Return value, derivatives (k,) and, if it cannot be determined, the reason."""
+    """Return the value of a target quantity and its derivatives by the parameters, shape (k,).
+
+    The third result is the reason why no record can determine the quantity, or an empty text.
+    """
     gradient = np.zeros(len(estimate.names))
     name = target.quantity
     if name in OF_MODES:
