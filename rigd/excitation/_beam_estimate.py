@@ -24,7 +24,7 @@ Complex = NDArray[np.complexfloating[Any, Any]]
 BAND_HZ: Final = 50.0
 """Upper end in Hz of the band that the whole-record fit uses."""
 
-OF_UNIFORM: Final = (
+UNIFORM_BEAM_PARAMETERS: Final = (
     "zeta",
     "alpha",
     "gamma",
@@ -36,35 +36,35 @@ OF_UNIFORM: Final = (
 )
 """Names of the parameters in the fit of a uniform beam on a rigid clamp."""
 
-_OF_ENDS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
+_END_PARAMETERS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
 """Names of the parameters that describe the two ends of the beam."""
 
-PARAMETERS: Final = (*OF_UNIFORM, *_OF_ENDS)
-"""Names of all parameters of the fit. Those in `LOGARITHMIC` are fitted as logarithms."""
+PARAMETERS: Final = (*UNIFORM_BEAM_PARAMETERS, *_END_PARAMETERS)
+"""Names of all parameters of the fit; `LOGARITHMIC_PARAMETERS` are fitted as logarithms."""
 
-LOGARITHMIC: Final = frozenset(
+LOGARITHMIC_PARAMETERS: Final = frozenset(
     {"zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"}
 )
 """Names of the parameters that are fitted as logarithms."""
 
-BY_PARAMETER: Final = {
+DERIVATIVE_NAMES: Final = {
     "density_over_stiffness": "ln_density_over_stiffness",
     "bending_stiffness_n_m2": "ln_stiffness",
 }
 """Name of each parameter in the derivatives of the exact model, if it differs there."""
 
-_OF_RIG: Final = ("delay_s", "tool_inertia_kg_m2", *_OF_ENDS)
+_ADDITIONAL_PARAMETERS: Final = ("delay_s", "tool_inertia_kg_m2", *_END_PARAMETERS)
 """Names of the parameters in addition to those of beam and damping; their default value is 0."""
 
-TOLERATED: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
+TOLERATED_DEVIATIONS: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
 """Constants of a mode that may deviate from those of a uniform beam, with the standard deviation of
 the deviation over the uniformity, as in the analyser. In the names of free parameters the number of
 the mode follows."""
 
-MODAL: Final = (*TOLERATED, "ln_damping_ratio", "residue_phase_rad")
+MODAL_CONSTANTS: Final = (*TOLERATED_DEVIATIONS, "ln_damping_ratio", "residue_phase_rad")
 """Names of the free constants of each mode in the modal model."""
 
-_BACKGROUND: Final = 5
+_BACKGROUND_TERMS: Final = 5
 """Number of terms of the modal model's background, a polynomial in s."""
 
 
@@ -130,7 +130,7 @@ class BeamEstimate:
                 names=tuple(name for name in document["names"] if name in PARAMETERS),
                 noise_frequency_hz=np.array(noise["frequency_hz"], dtype=np.float64),
                 noise_nm2_per_hz=np.array(noise["nm2_per_hz"], dtype=np.float64),
-                **{key: float(document.get(key, 0.0)) for key in _OF_RIG},
+                **{key: float(document.get(key, 0.0)) for key in _ADDITIONAL_PARAMETERS},
                 stiffness_offsets=tuple(map(float, document.get("stiffness_offsets", ()))),
             )
         except KeyError as error:
@@ -162,7 +162,7 @@ class BeamEstimate:
         return cls(
             beam,
             damping,
-            tuple(name for name in OF_UNIFORM if name not in absent),
+            tuple(name for name in UNIFORM_BEAM_PARAMETERS if name not in absent),
             np.array([1.0]),
             np.array([noise_nm2_per_hz]),
             tip_mass_kg=tip_mass_kg,
@@ -177,7 +177,7 @@ class BeamEstimate:
             If a value is not finite or out of range, or no parameter is free.
         """
         beam, damping = self.beam, self.damping
-        for key, value, least, below in (
+        for key, value, least, upper_bound in (
             ("beam.length_m", beam.length_m, 1e-6, np.inf),
             ("beam.density_kg_per_m", beam.density_kg_per_m, 1e-12, np.inf),
             ("beam.bending_stiffness_n_m2", beam.bending_stiffness_n_m2, 1e-12, np.inf),
@@ -185,10 +185,10 @@ class BeamEstimate:
             ("damping.alpha", damping.alpha, 0.0, 2.0),
             ("damping.gamma", damping.gamma, 0.0, np.inf),
             ("damping.lambda", damping.lambda_, 0.0, 2.0),
-            *((key, getattr(self, key), -np.inf, np.inf) for key in _OF_RIG),
+            *((key, getattr(self, key), -np.inf, np.inf) for key in _ADDITIONAL_PARAMETERS),
             *(("stiffness_offsets", each, -0.9, 10.0) for each in self.stiffness_offsets),
         ):
-            if not (isfinite(value) and least <= value < below):
+            if not (isfinite(value) and least <= value < upper_bound):
                 raise ExcitationError(f"The estimate of the beam has {key} = {value}.")
         frequency_hz, density = self.noise_frequency_hz, self.noise_nm2_per_hz
         if not (
@@ -221,15 +221,15 @@ class BeamEstimate:
         orders = [name for name in ("alpha", "lambda") if name not in self.names]
         present = {"alpha": self.damping.zeta, "lambda": self.damping.gamma}
         modes = [mode.number for mode in self.modes()]
-        deviations = [f"{name}_{number}" for number in modes for name in TOLERATED]
+        deviations = [f"{name}_{number}" for number in modes for name in TOLERATED_DEVIATIONS]
         free = (*self.names, *(name for name in orders if present[name]), *deviations)
         return replace(self, names=free, uniformity=uniformity)
 
     def modal(self) -> "BeamEstimate":
         """Return the estimate of a modal model: the parameters are each mode's and a background."""
         modes = [mode.number for mode in self.modes()]
-        constants = [f"{name}_{number}" for number in modes for name in MODAL]
-        background = [f"background_{power}" for power in range(_BACKGROUND)]
+        constants = [f"{name}_{number}" for number in modes for name in MODAL_CONSTANTS]
+        background = [f"background_{power}" for power in range(_BACKGROUND_TERMS)]
         return replace(self, names=(*constants, *background), uniformity=1.0)
 
     @property
@@ -242,7 +242,7 @@ class BeamEstimate:
                 (
                     *(damping.zeta, damping.alpha, damping.gamma, damping.lambda_),
                     *(beam.density_over_stiffness, beam.bending_stiffness_n_m2),
-                    *(getattr(self, key) for key in _OF_RIG),
+                    *(getattr(self, key) for key in _ADDITIONAL_PARAMETERS),
                 ),
                 strict=True,
             )
@@ -254,8 +254,10 @@ class BeamEstimate:
 
         It is None if all of these are 0 and not free, so that the beam is uniform.
         """
-        at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
-        if not at_ends and set(_OF_ENDS).isdisjoint(self.names):
+        differs_from_uniform = (
+            self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
+        )
+        if not differs_from_uniform and set(_END_PARAMETERS).isdisjoint(self.names):
             return None
         return self.loaded_beam
 
@@ -281,10 +283,10 @@ class BeamEstimate:
         count = 2
         while True:
             z = clamped_free_eigenvalues(count)
-            reached = (z / self.beam.length_m) ** 2 > 2 * pi * highest_hz * np.sqrt(
+            is_above_band = (z / self.beam.length_m) ** 2 > 2 * pi * highest_hz * np.sqrt(
                 self.beam.density_over_stiffness
             )
-            if reached[-1]:
+            if is_above_band[-1]:
                 break
             count *= 2
         loaded = self.loaded
@@ -292,33 +294,39 @@ class BeamEstimate:
             poles_for_eigenvalues(z, self.beam, self.damping) if loaded is None else loaded.poles(z)
         )
         parameters = [name for name in self.names if name in PARAMETERS]
-        names = [BY_PARAMETER.get(name, name) for name in parameters]
-        shown = {
+        names = [DERIVATIVE_NAMES.get(name, name) for name in parameters]
+        poles_in_band = {
             number: pole
             for number, pole in enumerate(pairs[:, 0].tolist(), start=1)
             if np.isfinite(pole) and 0.0 < pole.imag < 2 * pi * highest_hz
         }
         if loaded is None:
             stiffness = (z / self.beam.length_m) ** 4
-            moved: Iterable[Complex] = (
+            pole_gradients_by_mode: Iterable[Complex] = (
                 pole_gradient(pole, float(stiffness[number - 1]), self.beam, self.damping, names)
-                for number, pole in shown.items()
+                for number, pole in poles_in_band.items()
             )
         else:
-            moved = loaded.pole_gradients(np.array([*shown.values()], dtype=np.complex128), names)
+            pole_gradients_by_mode = loaded.pole_gradients(
+                np.array([*poles_in_band.values()], dtype=np.complex128), names
+            )
         scales = parameter_scales(self)
         found = []
-        for (number, pole), row in zip(shown.items(), moved, strict=True):
+        for (number, pole), row in zip(poles_in_band.items(), pole_gradients_by_mode, strict=True):
             gradient = np.zeros(len(self.names), dtype=np.complex128)
             gradient[: len(parameters)] = row * scales
             for index, name in enumerate(self.names):
                 if name.endswith(f"_{number}"):
-                    gradient[index] = CHANGES[name.rpartition("_")[0]](pole, 0j)[0]
+                    gradient[index] = POLE_AND_RESIDUE_DERIVATIVES[name.rpartition("_")[0]](
+                        pole, 0j
+                    )[0]
             found.append(EstimatedMode(number, pole, gradient))
         return tuple(found)
 
 
-CHANGES: Final[Mapping[str, Callable[[complex, complex], tuple[complex, complex]]]] = {
+POLE_AND_RESIDUE_DERIVATIVES: Final[
+    Mapping[str, Callable[[complex, complex], tuple[complex, complex]]]
+] = {
     "ln_frequency": lambda pole, _: (pole, 0j),
     "ln_damping_ratio": lambda pole, _: (complex(pole.real), 0j),
     "ln_residue": lambda _, residue: (0j, residue),
@@ -359,8 +367,8 @@ class EstimatedMode:
     def damping_gradient(self) -> Real:
         """Derivatives of the mode's damping ratio by the free parameters, shape (k,)."""
         p, size = self.pole_rad_s, abs(self.pole_rad_s)
-        of_size = (p.conjugate() * self.gradient).real / size
-        slope = -self.gradient.real / size - self.damping_ratio * of_size / size
+        size_gradient = (p.conjugate() * self.gradient).real / size
+        slope = -self.gradient.real / size - self.damping_ratio * size_gradient / size
         return np.asarray(slope, dtype=np.float64)
 
 

@@ -27,11 +27,11 @@ from rigd.beam import transfer, transfer_and_gradient
 from rigd.beam.tip import tip_response
 from rigd.excitation._beam_estimate import (
     BAND_HZ,
-    BY_PARAMETER,
-    CHANGES,
-    MODAL,
+    DERIVATIVE_NAMES,
+    MODAL_CONSTANTS,
     PARAMETERS,
-    TOLERATED,
+    POLE_AND_RESIDUE_DERIVATIVES,
+    TOLERATED_DEVIATIONS,
     BeamEstimate,
     Complex,
     Real,
@@ -50,11 +50,11 @@ _PRIOR_STD: Final = {
 """Prior standard deviation of each parameter without a record: coefficients are known within a
 factor of 20, and orders are in (0, 2)."""
 
-_RATE_OVER_BAND: Final = 2.4
+_SAMPLE_RATE_OVER_BAND: Final = 2.4
 """Smallest rate of the samples over the upper end of the band."""
-_TAPER: Final = 1.1
+_FADED_OVER_BAND: Final = 1.1
 """Frequency at which the weight of the noise has faded to 0, over the upper end of the band."""
-_DECAY: Final = 5.0
+_WRAP_AROUND_DECAY: Final = 5.0
 """Exponent by which the wrap-around of a transform of twice the length has decayed: exp(-5)."""
 
 
@@ -97,17 +97,17 @@ class TorqueModel:
         ticks
             Smallest length of the records in ticks.
         """
-        factor = reduction(rate_hz)
+        factor = ticks_per_sample(rate_hz)
         # Twice the length, and one of which a transform is quick.
         half = -(-ticks // factor)
-        half = _quick(half)
+        half = _fast_transform_length(half)
         ticks = half * factor
         samples = 2 * half
         sample_hz = rate_hz / factor
-        sigma = _DECAY * sample_hz / samples
+        sigma = _WRAP_AROUND_DECAY * sample_hz / samples
         frequency_hz = np.fft.rfftfreq(samples, 1.0 / sample_hz)
         # Higher frequencies belong neither to the band nor to a visible mode.
-        frequency_hz = frequency_hz[frequency_hz <= _TAPER * BAND_HZ]
+        frequency_hz = frequency_hz[frequency_hz <= _FADED_OVER_BAND * BAND_HZ]
         s = sigma + 2j * pi * frequency_hz
         kernels = whitened_kernels(estimate, s, sample_hz)
         return cls(
@@ -125,8 +125,8 @@ class TorqueModel:
         The angle in rad begins at rest and has the shape (n,), with n at most `ticks`.
         """
         time_s = np.arange(angle_rad.size) / self.rate_hz
-        faded = angle_rad * np.exp(-self.sigma_per_s * time_s)
-        spectrum: Complex = np.fft.rfft(faded, 2 * self.ticks)[: self.kernels.shape[1]]
+        decaying_angle_rad = angle_rad * np.exp(-self.sigma_per_s * time_s)
+        spectrum: Complex = np.fft.rfft(decaying_angle_rad, 2 * self.ticks)[: self.kernels.shape[1]]
         return spectrum
 
     def rows(self, spectrum: Complex) -> Real:
@@ -134,18 +134,20 @@ class TorqueModel:
 
         `spectrum` is the transform of the angle. The shape is (k, ticks / factor).
         """
-        return self._in_time(self.kernels * (spectrum / self.factor), self.ticks // self.factor, 1)
+        return self._inverse_transform(
+            self.kernels * (spectrum / self.factor), self.ticks // self.factor, 1
+        )
 
     def motion(self, spectrum: Complex) -> Real:
         """Return torque in N·m and slope of the tip in rad at every tick, shape (2, ticks).
 
         `spectrum` is the transform of the angle.
         """
-        return self._in_time(self.channels * spectrum, self.ticks, self.factor)
+        return self._inverse_transform(self.channels * spectrum, self.ticks, self.factor)
 
-    def _in_time(self, spectra: Complex, samples: int, finer: int) -> Real:
-        """Return Laplace transforms as functions of time, at `finer` values per sample."""
-        time_s = np.arange(samples) * (self.factor / finer / self.rate_hz)
+    def _inverse_transform(self, spectra: Complex, samples: int, values_per_sample: int) -> Real:
+        """Return Laplace transforms as functions of time, with some values per sample."""
+        time_s = np.arange(samples) * (self.factor / values_per_sample / self.rate_hz)
         values = np.fft.irfft(spectra, 2 * samples)[:, :samples]
         values *= np.exp(self.sigma_per_s * time_s)
         return values
@@ -193,33 +195,35 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
         Rate of the samples.
     """
     names = [name for name in estimate.names if name in PARAMETERS]
-    wrt = [BY_PARAMETER.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")]
+    derivative_names = [
+        DERIVATIVE_NAMES.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")
+    ]
     loaded = estimate.loaded
-    g = of_beam = np.zeros((0, s.size), dtype=np.complex128)
+    g = beam_gradient = np.zeros((0, s.size), dtype=np.complex128)
     if names:
-        g, of_beam = (
-            transfer_and_gradient(s, estimate.beam, estimate.damping, wrt)
+        g, beam_gradient = (
+            transfer_and_gradient(s, estimate.beam, estimate.damping, derivative_names)
             if loaded is None
-            else loaded.transfer_and_gradient(s.astype(np.complex128), wrt)
+            else loaded.transfer_and_gradient(s.astype(np.complex128), derivative_names)
         )
-    late = np.exp(-s * estimate.delay_s)
+    delay_factor = np.exp(-s * estimate.delay_s)
     kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
-    kernels[len(names) :] = _by_constants(estimate, s) * late
-    rows = iter(of_beam)
+    kernels[len(names) :] = _derivatives_by_constants(estimate, s) * delay_factor
+    rows = iter(beam_gradient)
     for out, name, scale in zip(
         kernels[: len(names)], names, parameter_scales(estimate), strict=True
     ):
         if name == "delay_s":
-            out[:] = -s * (g + estimate.tool_inertia_kg_m2 * s * s) * late
+            out[:] = -s * (g + estimate.tool_inertia_kg_m2 * s * s) * delay_factor
         elif name == "tool_inertia_kg_m2":
-            out[:] = s * s * late
+            out[:] = s * s * delay_factor
         else:
-            out[:] = scale * next(rows) * late
-    kernels *= _whitening(estimate, s.imag / (2 * pi), sample_hz)
+            out[:] = scale * next(rows) * delay_factor
+    kernels *= _whitening_weights(estimate, s.imag / (2 * pi), sample_hz)
     return kernels
 
 
-def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
+def _derivatives_by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
     """Return derivatives of the response by the constants of free modes and of the background.
 
     The shape is (number of constants, K).
@@ -235,7 +239,7 @@ def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
             continue
         pole = poles[int(number)]
         residue = complex(estimate.loaded_beam.residues(np.array([pole]))[0]) * pole**2
-        by_pole, by_residue = CHANGES[kind](pole, residue)
+        by_pole, by_residue = POLE_AND_RESIDUE_DERIVATIVES[kind](pole, residue)
         upper, lower = s - pole, s - pole.conjugate()
         row = residue * by_pole / upper**2 + by_residue / upper
         other = (residue * by_pole).conjugate() / lower**2 + by_residue.conjugate() / lower
@@ -243,12 +247,12 @@ def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
     return np.array(rows, dtype=np.complex128).reshape(-1, s.size)
 
 
-def reduction(rate_hz: float) -> int:
+def ticks_per_sample(rate_hz: float) -> int:
     """Return the number of ticks from one sample to the next, so that samples contain the band."""
-    return max(int(rate_hz / (_RATE_OVER_BAND * BAND_HZ)), 1)
+    return max(int(rate_hz / (_SAMPLE_RATE_OVER_BAND * BAND_HZ)), 1)
 
 
-def _whitening(
+def _whitening_weights(
     estimate: BeamEstimate, frequency_hz: NDArray[np.floating[Any]], sample_hz: float
 ) -> Real:
     """Return the weights at some frequencies that give the noise of a sample variance 1.
@@ -258,13 +262,13 @@ def _whitening(
     density = np.interp(
         frequency_hz, estimate.noise_frequency_hz, np.log(estimate.noise_nm2_per_hz)
     )
-    fade = np.clip((frequency_hz / BAND_HZ - 1.0) / (_TAPER - 1.0), 0.0, 1.0)
+    fade = np.clip((frequency_hz / BAND_HZ - 1.0) / (_FADED_OVER_BAND - 1.0), 0.0, 1.0)
     weight: Real = np.exp(-0.5 * density) * np.sqrt(2.0 / sample_hz)
     weight *= 0.5 + 0.5 * np.cos(pi * fade)
     return weight
 
 
-def _quick(least: int) -> int:
+def _fast_transform_length(least: int) -> int:
     """Return a length for a fast Fourier transform: `least`, or at most an eighth more."""
     unit = 1 << max(0, least.bit_length() - 4)
     return -(-least // unit) * unit
@@ -306,7 +310,7 @@ class RecordSoFar:
         ahead_s
             Time in s from now on for which the continuing vibration is computed.
         """
-        factor = reduction(rate_hz)
+        factor = ticks_per_sample(rate_hz)
         # Rest before it, so that a sample lies at its end.
         angle_rad = np.concatenate([np.zeros(-angle_rad.size % factor), angle_rad - angle_rad[0]])
         ahead = -(-round(ahead_s * rate_hz) // factor)
@@ -316,7 +320,7 @@ class RecordSoFar:
         rows = np.concatenate(
             [
                 model.rows(spectrum)[:, : samples + ahead],
-                _nuisance(estimate, samples + ahead, model.sample_hz),
+                _nuisance_terms(estimate, samples + ahead, model.sample_hz),
             ]
         )
         ringing = np.zeros((2, 0))
@@ -330,7 +334,7 @@ class RecordSoFar:
     def through(self) -> Real:
         """Matrix that projects the nuisance terms out of the derivatives, shape (k, k + m)."""
         k = len(self.estimate.names)
-        return np.concatenate([np.eye(k), -_explained(self.before, k)], axis=1)
+        return np.concatenate([np.eye(k), -_regression_coefficients(self.before, k)], axis=1)
 
     def after(self, more: Real | None, samples: int) -> Real:
         """Return the information on the parameters after further samples, shape (k, k).
@@ -347,7 +351,7 @@ class RecordSoFar:
         if more is not None:
             rows = rows.copy()
             rows[: more.shape[0]] += more[:, :samples]
-        return projected(self.before + rows @ rows.T, len(self.estimate.names))
+        return projected_information(self.before + rows @ rows.T, len(self.estimate.names))
 
 
 def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real:
@@ -387,7 +391,7 @@ def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real
     return RecordSoFar.of(angle_rad, estimate, rate_hz).after(None, 0)
 
 
-def projected(gram: Real, k: int) -> Real:
+def projected_information(gram: Real, k: int) -> Real:
     """Return the information on the first k parameters if all others are unknown, shape (k, k).
 
     Parameters
@@ -397,11 +401,11 @@ def projected(gram: Real, k: int) -> Real:
     k
         Number of parameters of interest.
     """
-    information: Real = gram[:k, :k] - _explained(gram, k) @ gram[k:, :k]
+    information: Real = gram[:k, :k] - _regression_coefficients(gram, k) @ gram[k:, :k]
     return 0.5 * (information + information.T)
 
 
-def _explained(gram: Real, k: int) -> Real:
+def _regression_coefficients(gram: Real, k: int) -> Real:
     """Return the coefficients of the regression of the first k derivatives on the m others.
 
     The shape is (k, m), and `gram` is the Gram matrix of all derivatives.
@@ -428,8 +432,8 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
     kind = name.rpartition("_")[0]
     if kind == "background":
         return 10.0 * beam.bending_stiffness_n_m2 / beam.length_m
-    if kind in MODAL:
-        return TOLERATED.get(kind, 1.0) * estimate.uniformity
+    if kind in MODAL_CONSTANTS:
+        return TOLERATED_DEVIATIONS.get(kind, 1.0) * estimate.uniformity
     if name == "tool_inertia_kg_m2":
         return beam.inertia_kg_m2
     if name == "tip_mass_kg":
@@ -439,7 +443,7 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
     return _PRIOR_STD[name]
 
 
-def _nuisance(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
+def _nuisance_terms(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
     """Return the whitened nuisance terms of a record: free decays, offset and drift of the torque.
 
     The shape is (m, samples).
@@ -447,7 +451,7 @@ def _nuisance(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
     time_s = np.arange(samples) / sample_hz
     poles = np.array([mode.pole_rad_s for mode in estimate.modes()])
     decays = np.exp(np.outer(poles, time_s))
-    weight = _whitening(estimate, poles.imag / (2 * pi), sample_hz)[:, None]
-    slow = _whitening(estimate, np.zeros(1), sample_hz)[0]
+    weight = _whitening_weights(estimate, poles.imag / (2 * pi), sample_hz)[:, None]
+    slow = _whitening_weights(estimate, np.zeros(1), sample_hz)[0]
     level = np.stack([np.ones(samples), time_s]) * slow
     return np.concatenate([decays.real * weight, decays.imag * weight, level])

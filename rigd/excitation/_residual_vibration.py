@@ -12,14 +12,14 @@ from rigd.excitation.moves import ROBUST_BELOW_HZ
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-ARRIVED_RAD: Final = 1e-3
+ARRIVAL_TOLERANCE_RAD: Final = 1e-3
 """Distance in rad from the end of a move within which the angle counts as arrived."""
 
-_FOLLOWED_S: Final = 1.0
+_MIN_SIMULATED_S: Final = 1.0
 """Shortest time in s after the reference for which the motion is simulated."""
-_SEEN_FOR_S: Final = 1.0
+_MIN_RING_DOWN_S: Final = 1.0
 """Duration in s that a shorter ring-down is replaced with to compute the sensor's noise floor."""
-_EXCEEDED_1_IN_1000: Final = 13.8
+_SQUARED_AMPLITUDE_1_IN_1000: Final = 13.8
 """Square of the amplitude a that noise exceeds once in 1000 times, over the variance of its cosine
 or sine component: exp(-a²/2) = 0.001."""
 
@@ -62,8 +62,9 @@ class MoveEnd:
     """
 
     arrival_s: float | None
-    """Time in s from the start of the move after which the angle stays within `ARRIVED_RAD` of its
-    end; None: the motor arrives more than a second after the end of the reference."""
+    """Time in s from the start of the move after which the angle stays within
+    `ARRIVAL_TOLERANCE_RAD` of its end; None: the motor arrives more than a second after the end of
+    the reference."""
     residual_nm: float
     """Coupling torque in N·m of the residual vibration, with friction, encoder steps and noise."""
     floor_nm: float
@@ -71,7 +72,7 @@ class MoveEnd:
     one of 1000 cases. A smaller vibration cannot be detected."""
 
 
-def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
+def predict_move_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
     """Predict when the motor arrives at the end of a move, and the vibration after it.
 
     Parameters
@@ -90,17 +91,23 @@ def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> M
     decay_per_s = -ringing.real
     # The loop has followed up and the motor is at rest; from here the amplitudes only decay.
     measured = end + round(2 * rig.settling_s * rate_hz)
-    held = np.full(max(measured - end + 1, round(_FOLLOWED_S * rate_hz)), reference_rad[-1])
+    held = np.full(max(measured - end + 1, round(_MIN_SIMULATED_S * rate_hz)), reference_rad[-1])
     angle, torque = rig.disturbed(np.concatenate([[0.0], reference_rad, held]), ringing.size)
-    away = np.flatnonzero((np.abs(angle - reference_rad[-1]) > ARRIVED_RAD).any(axis=1))
-    arrived = int(away[-1]) + 1 if away.size else 0
+    ticks_outside = np.flatnonzero(
+        (np.abs(angle - reference_rad[-1]) > ARRIVAL_TOLERANCE_RAD).any(axis=1)
+    )
+    arrived = int(ticks_outside[-1]) + 1 if ticks_outside.size else 0
     amplitude = torque[measured] * np.exp(decay_per_s * (measured - end) / rate_hz)[:, None]
     # Variance of a decaying cosine's amplitude in white noise, by least squares.
-    first_s, last_s = max(arrived - end, 0) / rate_hz, max(ring_down_s, _SEEN_FOR_S)
-    decayed = [np.exp(-2 * decay_per_s * at_s) for at_s in (first_s, max(last_s, 2 * first_s))]
-    variance = rig.torque_noise_nm**2 * 4 * decay_per_s / (decayed[0] - decayed[1]) / rate_hz
+    first_s, last_s = max(arrived - end, 0) / rate_hz, max(ring_down_s, _MIN_RING_DOWN_S)
+    decay_factors = [
+        np.exp(-2 * decay_per_s * at_s) for at_s in (first_s, max(last_s, 2 * first_s))
+    ]
+    variance = (
+        rig.torque_noise_nm**2 * 4 * decay_per_s / (decay_factors[0] - decay_factors[1]) / rate_hz
+    )
     return MoveEnd(
         arrival_s=arrived / rate_hz if arrived < angle.shape[0] - 1 else None,
         residual_nm=float(np.sqrt((amplitude**2).sum(axis=0).mean())),
-        floor_nm=float(np.sqrt(_EXCEEDED_1_IN_1000 * variance.sum())),
+        floor_nm=float(np.sqrt(_SQUARED_AMPLITUDE_1_IN_1000 * variance.sum())),
     )

@@ -15,55 +15,55 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._residual_vibration import predict_end
+from rigd.excitation._residual_vibration import predict_move_end
 from rigd.excitation._signals import (
     LIMIT_FRACTION,
     Excitation,
     ExcitationError,
-    assemble,
-    finite,
+    assemble_excitation,
     lay_out_segments,
-    within_a_turn,
+    require_finite,
+    require_within_turn,
 )
 from rigd.excitation.moves import (
     ROBUST_BELOW_HZ,
     Braking,
-    braked,
+    braked_reference,
     braking_path,
     from_acceleration,
     modal_state,
     quintic,
-    zero_rows,
+    residual_vibration_map,
 )
 from rigd.identified_beam import MOVE, IdentifiedBeam, Use
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-LONGEST_S: Final = 60.0
+LONGEST_MOVE_S: Final = 60.0
 """Longest duration of a move in s; a longer one is an error."""
 
-_HELD_S: Final = 2e-3
+_MIN_INTERVAL_S: Final = 2e-3
 """Shortest time in s for which the acceleration is constant; it is longer in long moves."""
-_MOST_INTERVALS: Final = 60
+_MAX_INTERVALS: Final = 60
 """Largest number of intervals of constant acceleration, the unknowns of the linear programme."""
-_CLOSE: Final = 1.03
+_CONVERGED_DURATION_RATIO: Final = 1.03
 """Ratio of a sufficient duration to an insufficient one at which the search for the shortest move
 ends."""
-_NEARLY_ALL: Final = 0.93
+_CONVERGED_LIMIT_FRACTION: Final = 0.93
 """Fraction of the limits that a move must use for the search to end: a duration shorter by 4 %
 would exceed the limits."""
-_MOST_ROUNDS: Final = 14
+_MAX_ROUNDS: Final = 14
 """Largest number of durations that the search tries."""
-_FARTHEST: Final = 0.98
+_MAX_END_ANGLE_FRACTION: Final = 0.98
 """Largest fraction of the angle limit at which a move may end; the remainder is for overshoot."""
-_BACKWARD: Final = 0.01
+_MAX_BACKWARD_SPEED_FRACTION: Final = 0.01
 """Largest backward speed of a robust move, as a fraction of its mean speed."""
-_LEAST_RAD: Final = 1e-3
+_MIN_DISTANCE_RAD: Final = 1e-3
 """Smallest distance of a move in rad."""
 _BRAKING_STARTS: Final = 16
 """Number of ticks along a reference from which braking is simulated."""
-_BRAKING_S: Final = (0.02, 5.0)
+_BRAKING_DURATIONS_S: Final = (0.02, 5.0)
 """Shortest and longest duration in s of a braking path that is tried."""
 
 
@@ -175,7 +175,7 @@ def shortest_move(
     Raises
     ------
     ExcitationError
-        If no move of at most `LONGEST_S` stays within the limits.
+        If no move of at most `LONGEST_MOVE_S` stays within the limits.
 
     Notes
     -----
@@ -184,16 +184,16 @@ def shortest_move(
     the limits of the rig instead of an impulse's.
     """
     search = _MoveSearch(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
-    acceleration = search.shortest()
+    acceleration = search.shortest_accelerations()
     reference = from_acceleration(acceleration, plant.rate_hz)
     n = reference.size
-    usual = distance_rad * quintic(n / plant.rate_hz, plant.rate_hz)
+    quintic_rad = distance_rad * quintic(n / plant.rate_hz, plant.rate_hz)
     return Move(
         reference_rad=reference,
         duration_s=n / plant.rate_hz,
         limit_fraction=search.limit_fraction(reference),
         residual_nm=_residual_nm(plant, reference, ringing),
-        quintic_residual_nm=_residual_nm(plant, usual, ringing),
+        quintic_residual_nm=_residual_nm(plant, quintic_rad, ringing),
     )
 
 
@@ -202,14 +202,14 @@ def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> 
 
     It is the sum of the modes' amplitudes, each for a frequency wrong by its uncertainty.
     """
-    left = []
-    for off in (-plant.frequency_uncertainty, plant.frequency_uncertainty):
-        poles = plant.poles_rad_s * (1.0 + off)
+    residuals_nm = []
+    for frequency_error in (-plant.frequency_uncertainty, plant.frequency_uncertainty):
+        poles = plant.poles_rad_s * (1.0 + frequency_error)
         state = modal_state(np.concatenate([[0.0], reference]), plant.rate_hz, poles)
         if ringing is not None:
             state = state + ringing * np.exp(poles * reference.size / plant.rate_hz)
-        left.append(np.abs(state) * plant.torque_per_state_nm_s)
-    return float(np.maximum(*left).sum())
+        residuals_nm.append(np.abs(state) * plant.torque_per_state_nm_s)
+    return float(np.maximum(*residuals_nm).sum())
 
 
 class _MoveSearch:
@@ -228,16 +228,16 @@ class _MoveSearch:
         self._start_rad = start_rad
         self._order = order
         self._ringing = ringing
-        self._unit = _UnitResponse(plant)
-        rung_nm = 0.0
+        self._unit_response = _UnitResponse(plant)
+        ringing_torque_nm = 0.0
         if ringing is not None:
-            rung_nm = float(np.abs(ringing) @ plant.torque_per_state_nm_s)
+            ringing_torque_nm = float(np.abs(ringing) @ plant.torque_per_state_nm_s)
         # The remaining vibration is fed forward to the motor, and is in the sensor's reading.
         self._limits = {
-            "torque": LIMIT_FRACTION * plant.peak_torque_nm - plant.friction_nm - rung_nm,
+            "torque": LIMIT_FRACTION * plant.peak_torque_nm - plant.friction_nm - ringing_torque_nm,
             "velocity": LIMIT_FRACTION * plant.velocity_rad_s,
             "tracking": LIMIT_FRACTION * plant.tracking_error_rad,
-            "coupling": LIMIT_FRACTION * plant.coupling_torque_nm - rung_nm,
+            "coupling": LIMIT_FRACTION * plant.coupling_torque_nm - ringing_torque_nm,
         }
         if min(self._limits.values()) <= 0.0:
             raise ExcitationError(
@@ -245,33 +245,38 @@ class _MoveSearch:
                 "sensor.range for a move; wait until the beam is at rest."
             )
 
-    def shortest(self) -> Real:
+    def shortest_accelerations(self) -> Real:
         """Return the accelerations of the shortest move in rad/s², shape (n,).
 
-        Raise `ExcitationError` if the move would take more than `LONGEST_S`.
+        Raise `ExcitationError` if the move would take more than `LONGEST_MOVE_S`.
         """
         rate_hz = self._plant.rate_hz
-        most = round(LONGEST_S * rate_hz)
+        longest_ticks = round(LONGEST_MOVE_S * rate_hz)
         slowest_rad_s = float(np.abs(self._plant.poles_rad_s).min())
         n = round((1.0 if self._order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
-        too_short, found, fraction_short, fraction_found = 8, most + 1, inf, 0.0
+        too_short, found, fraction_short, fraction_found = 8, longest_ticks + 1, inf, 0.0
         best: Real | None = None
-        for _ in range(_MOST_ROUNDS):
+        for _ in range(_MAX_ROUNDS):
             fraction, acceleration = self._least_limit_fraction(n)
             if fraction <= 1.0:
                 found, fraction_found, best = n, fraction, acceleration
             else:
                 too_short, fraction_short = n, fraction
-            if fraction_found >= _NEARLY_ALL or found <= max(_CLOSE * too_short, too_short + 1):
+            if fraction_found >= _CONVERGED_LIMIT_FRACTION or found <= max(
+                _CONVERGED_DURATION_RATIO * too_short, too_short + 1
+            ):
                 break
-            if too_short >= most:
+            if too_short >= longest_ticks:
                 break
-            n = _next(too_short, found, fraction_short, fraction_found, n, fraction, self._order)
-            n = min(n, most)
+            n = _next_duration_ticks(
+                too_short, found, fraction_short, fraction_found, n, fraction, self._order
+            )
+            n = min(n, longest_ticks)
         if best is None:
             raise ExcitationError(
-                f"No move of at most {LONGEST_S:g} s by {self._distance_rad:g} rad stays within "
-                "the limits of the profile; choose a smaller angle, or check limits.velocity_rad_s."
+                f"No move of at most {LONGEST_MOVE_S:g} s by {self._distance_rad:g} rad stays "
+                "within the limits of the profile; choose a smaller angle, or check "
+                "limits.velocity_rad_s."
             )
         return best
 
@@ -284,35 +289,39 @@ class _MoveSearch:
         from scipy.optimize import linprog
 
         plant, rate_hz = self._plant, self._plant.rate_hz
-        held = max(1, round(_HELD_S * rate_hz))
-        intervals = min(ceil(n / held), _MOST_INTERVALS)
+        held = max(1, round(_MIN_INTERVAL_S * rate_hz))
+        intervals = min(ceil(n / held), _MAX_INTERVALS)
         edges = np.round(np.linspace(0, n, intervals + 1)).astype(int)
         scale = plant.largest_acceleration_rad_s2
 
-        zeros = zero_rows(n, rate_hz, plant.poles_rad_s, self._order)
+        zeros = residual_vibration_map(n, rate_hz, plant.poles_rad_s, self._order)
         per_interval = np.add.reduceat(zeros, edges[:-1], axis=1) * scale
         steps = np.diff(edges) / rate_hz
         # The centre of an interval's held acceleration, as `from_acceleration` sums them up.
-        left_s = (n - (edges[:-1] + edges[1:] - 1) / 2) / rate_hz
-        equal = np.concatenate([[steps * scale], [steps * left_s * scale], per_interval])
-        goal = np.zeros(len(equal))
-        goal[1] = self._distance_rad
+        remaining_s = (n - (edges[:-1] + edges[1:] - 1) / 2) / rate_hz
+        equality_matrix = np.concatenate(
+            [[steps * scale], [steps * remaining_s * scale], per_interval]
+        )
+        equality_values = np.zeros(len(equality_matrix))
+        equality_values[1] = self._distance_rad
         if self._ringing is not None:
-            goal[2:] = np.negative(self._ringing_rows(n))
-        size = np.linalg.norm(equal, axis=1)
+            equality_values[2:] = np.negative(self._ringing_rows(n))
+        size = np.linalg.norm(equality_matrix, axis=1)
 
-        limited, bounded, bounds = self._responses(n, edges, scale)
+        limited, bounded, bounds = self._inequalities(n, edges, scale)
         limited = np.concatenate([limited, np.eye(intervals)])
         fraction_column = -np.ones((len(limited), 1))
-        none = np.zeros((len(bounded), 1))
-        least = np.block([[limited, fraction_column], [-limited, fraction_column], [bounded, none]])
-        below = np.concatenate([np.zeros(2 * len(limited)), bounds])
+        zero_column = np.zeros((len(bounded), 1))
+        inequality_matrix = np.block(
+            [[limited, fraction_column], [-limited, fraction_column], [bounded, zero_column]]
+        )
+        upper_bounds = np.concatenate([np.zeros(2 * len(limited)), bounds])
         found = linprog(
             np.append(np.zeros(intervals), 1.0),
-            A_ub=least,
-            b_ub=below,
-            A_eq=np.column_stack([equal / size[:, None], np.zeros(len(equal))]),
-            b_eq=goal / size,
+            A_ub=inequality_matrix,
+            b_ub=upper_bounds,
+            A_eq=np.column_stack([equality_matrix / size[:, None], np.zeros(len(equality_matrix))]),
+            b_eq=equality_values / size,
             bounds=[(None, None)] * intervals + [(0.0, None)],
             method="highs-ds",
         )
@@ -323,19 +332,21 @@ class _MoveSearch:
     def _ringing_rows(self, n: int) -> list[float]:
         """Return the state at the end of the move that the initial vibration decays to.
 
-        Real and imaginary parts are in the order of the rows of `zero_rows`.
+        Real and imaginary parts are in the order of the rows of `residual_vibration_map`.
         """
         assert self._ringing is not None
         rows: list[float] = []
         for pole, state in zip(self._plant.poles_rad_s, self._ringing, strict=True):
-            later = state * np.exp(pole * n / self._plant.rate_hz)
+            end_state = state * np.exp(pole * n / self._plant.rate_hz)
             # The row of the derivative weighs the start by 1.
-            twice = self._order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
-            for _ in range(2 if twice else 1):
-                rows += [later.real, later.imag] if pole.imag != 0.0 else [later.real]
+            second_order = self._order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
+            for _ in range(2 if second_order else 1):
+                rows += [end_state.real, end_state.imag] if pole.imag != 0.0 else [end_state.real]
         return rows
 
-    def _responses(self, n: int, edges: NDArray[np.intp], scale: float) -> tuple[Real, Real, Real]:
+    def _inequalities(
+        self, n: int, edges: NDArray[np.intp], scale: float
+    ) -> tuple[Real, Real, Real]:
         """Return the inequalities of the linear programme for a move of n ticks.
 
         They are linear maps from the acceleration in each interval: to fractions of the limits,
@@ -350,22 +361,26 @@ class _MoveSearch:
         end = n + round(plant.settling_s * plant.rate_hz)
         # The ends of all intervals and the ticks between them: the solution exploits every gap.
         middles = np.round((edges[:-1] + edges[1:]) / 2).astype(int)
-        tail = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MOST_INTERVALS // 2]
+        tail = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MAX_INTERVALS // 2]
         fine = np.unique(np.concatenate([edges, middles if n > 2 * len(edges) else [], tail]))
         fine = fine.astype(int)
         coarse = fine[::2]
-        unit = self._unit.up_to(end)
+        unit_responses = self._unit_response.for_ticks(end)
         rows = [
-            _over_intervals(unit[name], edges, coarse if name == "coupling" else fine)
+            _interval_responses(unit_responses[name], edges, coarse if name == "coupling" else fine)
             * (scale / self._limits[name])
             for name in self._limits
         ]
         if self._order > 1 and self._ringing is None:
             forward = np.copysign(scale, self._distance_rad)
-            backward = -forward * _over_intervals(unit["velocity"], edges, coarse)
+            backward = -forward * _interval_responses(unit_responses["velocity"], edges, coarse)
             mean_rad_s = abs(self._distance_rad) * plant.rate_hz / n
-            return np.concatenate(rows), backward, np.full(len(coarse), _BACKWARD * mean_rad_s)
-        angle = scale * _over_intervals(unit["angle"], edges, coarse)
+            return (
+                np.concatenate(rows),
+                backward,
+                np.full(len(coarse), _MAX_BACKWARD_SPEED_FRACTION * mean_rad_s),
+            )
+        angle = scale * _interval_responses(unit_responses["angle"], edges, coarse)
         free_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
         return np.concatenate(rows), np.vstack([angle, -angle]), np.repeat(free_rad, len(coarse))
 
@@ -373,19 +388,19 @@ class _MoveSearch:
         """Return the largest fraction of a limit that the response to a reference reaches."""
         plant = self._plant
         held = round(plant.settling_s * plant.rate_hz)
-        whole = np.concatenate([[0.0], reference, np.full(held, reference[-1])])
-        response = plant.respond(whole)
+        whole_reference_rad = np.concatenate([[0.0], reference, np.full(held, reference[-1])])
+        response = plant.respond(whole_reference_rad)
         peaks = (
             (np.abs(response.torque_nm).max() + plant.friction_nm) / plant.peak_torque_nm,
             np.abs(response.velocity_rad_s).max() / plant.velocity_rad_s,
-            np.abs(whole - response.angle_rad).max() / plant.tracking_error_rad,
+            np.abs(whole_reference_rad - response.angle_rad).max() / plant.tracking_error_rad,
             np.abs(response.coupling_torque_nm).max() / plant.coupling_torque_nm,
             np.abs(self._start_rad + response.angle_rad).max() / plant.angle_rad,
         )
         return float(max(peaks))
 
 
-def _next(
+def _next_duration_ticks(
     too_short: int,
     found: int,
     fraction_short: float,
@@ -420,7 +435,7 @@ class _UnitResponse:
         self._rows: dict[str, Real] = {}
         self._ticks = 0
 
-    def up_to(self, ticks: int) -> dict[str, Real]:
+    def for_ticks(self, ticks: int) -> dict[str, Real]:
         """Return the responses by quantity, each for at least the given number of ticks."""
         if ticks > self._ticks:
             self._ticks = max(2 * ticks, 1024)
@@ -437,14 +452,16 @@ class _UnitResponse:
         return self._rows
 
 
-def _over_intervals(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]) -> Real:
+def _interval_responses(
+    unit_responses: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]
+) -> Real:
     """Return the response at some ticks to an acceleration of 1 in one interval only.
 
-    The shape is (ticks, intervals). `unit` is the response to a constant acceleration of 1, and
-    `edges` are the ticks at which the intervals begin and end.
+    The shape is (ticks, intervals). `unit_responses` is the response to a constant acceleration of
+    1, and `edges` are the ticks at which the intervals begin and end.
     """
     since = ticks[:, None] - edges
-    begun: Real = np.where(since >= 0, unit[np.maximum(since, 0)], 0.0)
+    begun: Real = np.where(since >= 0, unit_responses[np.maximum(since, 0)], 0.0)
     return begun[:, :-1] - begun[:, 1:]
 
 
@@ -473,15 +490,15 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
     """
     held = np.zeros(round(plant.settling_s * plant.rate_hz))
     starts = np.unique(np.linspace(2, reference_rad.size - 1, _BRAKING_STARTS).astype(int))
-    free_nm = plant.peak_torque_nm - plant.friction_nm
-    duration_s, longest_s = _BRAKING_S
+    available_torque_nm = plant.peak_torque_nm - plant.friction_nm
+    duration_s, longest_s = _BRAKING_DURATIONS_S
     while duration_s <= longest_s:
         braking = braking_path(duration_s, plant.rate_hz)
         fraction = 0.0
         for tick in starts:
-            path = braked(reference_rad, int(tick), braking)
+            path = braked_reference(reference_rad, int(tick), braking)
             response = plant.respond(np.concatenate([path, held + path[-1]]))
-            fraction = max(fraction, float(np.abs(response.torque_nm).max()) / free_nm)
+            fraction = max(fraction, float(np.abs(response.torque_nm).max()) / available_torque_nm)
             if fraction > 1.0:
                 break
         if fraction <= 1.0:
@@ -560,50 +577,53 @@ def move(
         raise ExcitationError("Give either angle_rad or by_rad (rad): where to, or by how much.")
     for option, value_rad in (("angle_rad", angle_rad), ("by_rad", by_rad)):
         if value_rad is not None:
-            finite(option, value_rad, "rad")
+            require_finite(option, value_rad, "rad")
     if robust not in (0, 1):
         raise ExcitationError(f"robust = {robust} is neither 0 nor 1; choose one.")
     start_rad = rig.start_rad
     target_rad = start_rad + by_rad if angle_rad is None else angle_rad  # type: ignore[operator]
-    within_a_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
+    require_within_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
     plant = rig.move_plant(path, MOVE)
-    farthest_rad = _FARTHEST * plant.angle_rad
+    farthest_rad = _MAX_END_ANGLE_FRACTION * plant.angle_rad
     if not abs(target_rad) <= farthest_rad:
         raise ExcitationError(
             f"The move would end at {target_rad:.4g} rad, and limits.angle_rad = "
             f"{plant.angle_rad:g} rad allows {farthest_rad:.4g} rad from the zero to either side; "
-            f"choose at most that{'' if by_rad is None else _by_at_most(farthest_rad, start_rad)}."
+            "choose at most "
+            f"that{'' if by_rad is None else _allowed_range(farthest_rad, start_rad)}."
         )
     distance_rad = target_rad - start_rad
-    if abs(distance_rad) < _LEAST_RAD:
+    if abs(distance_rad) < _MIN_DISTANCE_RAD:
         raise ExcitationError(
-            f"The motor stands at {start_rad:.4g} rad already, and a move is of {_LEAST_RAD:g} rad "
-            "at least; choose another angle."
+            f"The motor stands at {start_rad:.4g} rad already, and a move is of "
+            f"{_MIN_DISTANCE_RAD:g} rad at least; choose another angle."
         )
-    planned = shortest_move(plant, distance_rad, start_rad=start_rad, robust=bool(robust))
-    segments = lay_out_segments(rate_hz, rest_s, planned.duration_s, ring_down_s)
-    end = predict_end(plant, planned.reference_rad, ring_down_s)
+    planned_move = shortest_move(plant, distance_rad, start_rad=start_rad, robust=bool(robust))
+    segments = lay_out_segments(rate_hz, rest_s, planned_move.duration_s, ring_down_s)
+    end = predict_move_end(plant, planned_move.reference_rad, ring_down_s)
     parameters: dict[str, float | int | str] = {
         "angle_rad": target_rad,
         "by_rad": distance_rad,
         "file": Path(path).name if path else "",
         "robust": robust,
-        "duration_s": planned.duration_s,
+        "duration_s": planned_move.duration_s,
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
-        "limits_share": planned.limit_fraction,
+        "limits_share": planned_move.limit_fraction,
         "residual_nm": end.residual_nm,
         "residual_floor_nm": end.floor_nm,
-        "frequency_residual_nm": planned.residual_nm,
-        "quintic_residual_nm": planned.quintic_residual_nm,
+        "frequency_residual_nm": planned_move.residual_nm,
+        "quintic_residual_nm": planned_move.quintic_residual_nm,
     }
     if end.arrival_s is not None:
         parameters["arrival_s"] = end.arrival_s
-    made = assemble("move", parameters, rate_hz, segments, planned.reference_rad)
-    return replace(made, stays=True, model=plant.model)
+    excitation = assemble_excitation(
+        "move", parameters, rate_hz, segments, planned_move.reference_rad
+    )
+    return replace(excitation, stays=True, model=plant.model)
 
 
-def _by_at_most(farthest_rad: float, start_rad: float) -> str:
+def _allowed_range(farthest_rad: float, start_rad: float) -> str:
     """Return the end of a message that states the range of distances which a move may have."""
     low, high = -farthest_rad - start_rad, farthest_rad - start_rad
     return f", that is by {low:.4g} to {high:.4g} rad from {start_rad:.4g} rad"

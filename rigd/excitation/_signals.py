@@ -112,7 +112,7 @@ def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
 # Checks of options
 
 
-def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
+def to_whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
     """Convert a time in s to ticks; raise `ExcitationError` unless it is a whole number of ticks.
 
     `option` is the name of the option in the message.
@@ -126,7 +126,7 @@ def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
     return ticks
 
 
-def finite(option: str, value: float, unit: str) -> None:
+def require_finite(option: str, value: float, unit: str) -> None:
     """Raise `ExcitationError` if an option's value is not finite, or has no size of a real rig."""
     if not isfinite(value):
         raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
@@ -136,21 +136,21 @@ def finite(option: str, value: float, unit: str) -> None:
         )
 
 
-def positive(option: str, value: float, unit: str) -> None:
+def require_positive(option: str, value: float, unit: str) -> None:
     """Raise `ExcitationError` unless an option's value is a finite number above 0."""
-    finite(option, value, unit)
+    require_finite(option, value, unit)
     if value <= 0.0:
         raise ExcitationError(f"{option} = {value:g} {unit} must be more than 0 {unit}.")
 
 
-def not_negative(option: str, value: float) -> None:
+def require_not_negative(option: str, value: float) -> None:
     """Raise `ExcitationError` unless an option's time is finite and at least 0 s."""
-    finite(option, value, "s")
+    require_finite(option, value, "s")
     if value < 0.0:
         raise ExcitationError(f"{option} = {value:g} s must not be negative.")
 
 
-def within_a_turn(option: str, value_rad: float) -> None:
+def require_within_turn(option: str, value_rad: float) -> None:
     """Raise `ExcitationError` if an option's angle is more than a full turn to either side."""
     if abs(value_rad) > 2.0 * pi:
         raise ExcitationError(
@@ -159,12 +159,14 @@ def within_a_turn(option: str, value_rad: float) -> None:
         )
 
 
-def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool = False) -> None:
+def require_frequency(
+    option: str, value: float, rate_hz: float, *, zero_allowed: bool = False
+) -> None:
     """Raise `ExcitationError` unless a frequency is above 0 Hz and at most a quarter of the rate.
 
     With `zero_allowed`, 0 Hz is valid as well.
     """
-    finite(option, value, "Hz")
+    require_finite(option, value, "Hz")
     highest = rate_hz / SAMPLES_PER_PERIOD
     if not (value > 0.0 or (zero_allowed and value == 0.0)):
         bound = "must not be negative" if zero_allowed else "must be more than 0 Hz"
@@ -186,9 +188,9 @@ def lay_out_segments(
 
     The times are rounded to ticks, and the rounding changes the length of the ring-down only.
     """
-    not_negative("rest_s", rest_s)
-    positive("duration_s", duration_s, "s")
-    not_negative("ring_down_s", ring_down_s)
+    require_not_negative("rest_s", rest_s)
+    require_positive("duration_s", duration_s, "s")
+    require_not_negative("ring_down_s", ring_down_s)
     around_s = rest_s + ring_down_s
     check_ticks("The session", (duration_s + around_s) * rate_hz, rate_hz, around_s)
     first = round(rate_hz * rest_s)
@@ -221,7 +223,7 @@ def check_ticks(what: str, ticks: float, rate_hz: float, around_s: float = 0.0) 
         )
 
 
-def assemble(
+def assemble_excitation(
     kind: str,
     parameters: Mapping[str, float | int | str],
     rate_hz: float,
@@ -290,10 +292,10 @@ def chirp(
     >>> sweep.segments
     {'rest': (0, 1000), 'sweep': (1000, 121000), 'ring_down': (121000, 136000)}
     """
-    positive("amplitude_rad", amplitude_rad, "rad")
-    within_a_turn("amplitude_rad", amplitude_rad)
-    frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
-    frequency("stop_hz", stop_hz, rate_hz)
+    require_positive("amplitude_rad", amplitude_rad, "rad")
+    require_within_turn("amplitude_rad", amplitude_rad)
+    require_frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
+    require_frequency("stop_hz", stop_hz, rate_hz)
     if there_and_back not in (0, 1):
         raise ExcitationError(
             f"there_and_back = {there_and_back} must be 0 (one sweep) or 1 (two sweeps)."
@@ -320,7 +322,7 @@ def chirp(
         "taper_s": taper_s,
         **({"there_and_back": 1} if there_and_back else {}),
     }
-    return assemble("chirp", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("chirp", parameters, rate_hz, segments, sweep)
 
 
 def hold(
@@ -351,7 +353,7 @@ def hold(
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters = {"duration_s": duration_s, "rest_s": rest_s, "ring_down_s": ring_down_s}
     sweep = np.zeros(segments["sweep"][1] - segments["sweep"][0])
-    return assemble("hold", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("hold", parameters, rate_hz, segments, sweep)
 
 
 def step(
@@ -386,12 +388,12 @@ def step(
     >>> step(rate_hz=1000, amplitude_rad=0.01).reference_rad[[999, 1000, -1]]
     array([0.  , 0.01, 0.01])
     """
-    finite("amplitude_rad", amplitude_rad, "rad")
+    require_finite("amplitude_rad", amplitude_rad, "rad")
     if amplitude_rad == 0.0:
         raise ExcitationError(
             "amplitude_rad = 0 rad is not a step; give an angle other than zero, or use hold."
         )
-    within_a_turn("amplitude_rad", amplitude_rad)
+    require_within_turn("amplitude_rad", amplitude_rad)
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters = {
         "amplitude_rad": amplitude_rad,
@@ -400,7 +402,7 @@ def step(
         "ring_down_s": ring_down_s,
     }
     sweep = np.full(segments["sweep"][1] - segments["sweep"][0], amplitude_rad)
-    return assemble("step", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("step", parameters, rate_hz, segments, sweep)
 
 
 def multisine(
@@ -457,15 +459,15 @@ def multisine(
     >>> print(f"crest factor {signal.parameters['crest_factor']:.2f}")
     crest factor 3.30
     """
-    positive("amplitude_rad", amplitude_rad, "rad")
-    within_a_turn("amplitude_rad", amplitude_rad)
-    frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
-    frequency("stop_hz", stop_hz, rate_hz)
-    positive("period_s", period_s, "s")
+    require_positive("amplitude_rad", amplitude_rad, "rad")
+    require_within_turn("amplitude_rad", amplitude_rad)
+    require_frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
+    require_frequency("stop_hz", stop_hz, rate_hz)
+    require_positive("period_s", period_s, "s")
     if seed < 0:
         raise ExcitationError(f"seed = {seed} is negative; give a whole number from 0 on.")
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
-    ticks = whole_ticks("period_s", period_s, rate_hz)
+    ticks = to_whole_ticks("period_s", period_s, rate_hz)
     periods = round(duration_s / period_s)
     if periods < 1 or abs(periods * period_s - duration_s) > 1e-9 * duration_s:
         raise ExcitationError(
@@ -488,7 +490,7 @@ def multisine(
         "seed": seed,
         "crest_factor": crest_factor,
     }
-    return assemble("multisine", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("multisine", parameters, rate_hz, segments, sweep)
 
 
 def _random_phase_period(
@@ -523,7 +525,7 @@ def _sweep_time(segments: Mapping[str, tuple[int, int]], rate_hz: float) -> Floa
 
 def _taper(t: FloatArray, duration_s: float, taper_s: float) -> FloatArray | float:
     """Return the factors at times `t` that fade a sweep in and out, each within `taper_s`."""
-    not_negative("taper_s", taper_s)
+    require_not_negative("taper_s", taper_s)
     if taper_s == 0.0:
         return 1.0
     if 2.0 * taper_s > duration_s:

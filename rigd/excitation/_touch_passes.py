@@ -17,20 +17,20 @@ from rigd.excitation._shortest_move import MoveRig, shortest_braking
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
-    assemble,
+    assemble_excitation,
     check_ticks,
-    finite,
     lay_out_segments,
-    not_negative,
-    positive,
-    within_a_turn,
+    require_finite,
+    require_not_negative,
+    require_positive,
+    require_within_turn,
 )
 from rigd.excitation.moves import Braking, slew, still_path
 from rigd.identified_beam import TOUCH
 
 Real = NDArray[np.float64]
 
-_PEAK_SPEED = 2.0
+_PEAK_OVER_MEAN_SPEED = 2.0
 """Ratio of the largest speed to the mean speed on the way back: that of a minimum-jerk path, with a
 margin."""
 
@@ -117,18 +117,18 @@ def touch(
     """
     if rig is None:
         raise ExcitationError("touch is made for a rig; none was given.")
-    finite("angle_rad", angle_rad, "rad")
-    within_a_turn("angle_rad", angle_rad)
+    require_finite("angle_rad", angle_rad, "rad")
+    require_within_turn("angle_rad", angle_rad)
     by_rad = angle_rad - rig.start_rad
     if by_rad == 0.0:
         raise ExcitationError(
             f"angle_rad = {angle_rad:g} rad is where the motor stands; give another angle."
         )
-    positive("speed_rad_s", speed_rad_s, "rad/s")
-    positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
-    positive("force_limit_n", force_limit_n, "N")
-    positive("hold_s", hold_s, "s")
-    not_negative("settle_s", settle_s)
+    require_positive("speed_rad_s", speed_rad_s, "rad/s")
+    require_positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
+    require_positive("force_limit_n", force_limit_n, "N")
+    require_positive("hold_s", hold_s, "s")
+    require_not_negative("settle_s", settle_s)
     if passes < 1:
         raise ExcitationError(f"passes = {passes} must be at least 1.")
     at_least_s = settle_s + abs(by_rad) / speed_rad_s + hold_s
@@ -150,8 +150,10 @@ def touch(
         )
     slowest_rad_s = float(np.abs(plant.poles_rad_s).min(initial=np.inf))
     # At least one period of the slowest mode: a path that leaves it at rest is then gentle.
-    back_s = max(_PEAK_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s)
-    back = still_path(back_s, rate_hz, plant.poles_rad_s)
+    return_duration_s = max(
+        _PEAK_OVER_MEAN_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s
+    )
+    back = still_path(return_duration_s, rate_hz, plant.poles_rad_s)
     settle = np.zeros(ceil(settle_s * rate_hz))
     single_pass = np.concatenate([settle, out, np.full(hold_ticks, by_rad), by_rad * (1.0 - back)])
     check_ticks("The session", passes * single_pass.size, rate_hz)
@@ -186,8 +188,10 @@ def touch(
         "braking_s": braking.duration_s,
     }
     sweep = np.tile(single_pass, passes)
-    made = assemble("touch", parameters, rate_hz, segments, sweep, approach=approach)
-    return replace(made, model=plant.model)
+    excitation = assemble_excitation(
+        "touch", parameters, rate_hz, segments, sweep, approach=approach
+    )
+    return replace(excitation, model=plant.model)
 
 
 def after_touch(
@@ -222,12 +226,12 @@ def after_touch(
     acceleration = (now - 2 * last + before) * braking.rate_hz**2
     speed = (now - last) * braking.rate_hz + acceleration / (2 * braking.rate_hz)
     reference = np.full(ends - tick - 1, start_rad)
-    stopping = braking.path(now, speed, acceleration)
-    returns = reference.size - back.size
-    hold = min(approach.hold_ticks, returns)
-    stays_rad = stopping[-1]
-    reference[:hold] = stays_rad
+    braking_rad = braking.path(now, speed, acceleration)
+    return_index = reference.size - back.size
+    hold = min(approach.hold_ticks, return_index)
+    held_rad = braking_rad[-1]
+    reference[:hold] = held_rad
     # A touch during the pause needs no braking; the remaining pause follows.
-    reference[: min(hold, len(stopping))] = stopping[:hold]
-    reference[hold : hold + back.size] = stays_rad + (start_rad - stays_rad) * back
+    reference[: min(hold, len(braking_rad))] = braking_rad[:hold]
+    reference[hold : hold + back.size] = held_rad + (start_rad - held_rad) * back
     return reference

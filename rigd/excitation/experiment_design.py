@@ -35,12 +35,12 @@ from rigd.excitation._segment_search import (
 )
 from rigd.excitation._shortest_move import MovePlant
 from rigd.excitation._signals import ExcitationError
-from rigd.excitation.targets import OF_MODES, Precision, Quantities, Target
+from rigd.excitation.targets import MODE_QUANTITIES, Precision, Quantities, Target
 
 Real = NDArray[np.float64]
 
 
-_BY_GEOMETRY: Final = 1.5
+_GEOMETRY_DOMINANCE_RATIO: Final = 1.5
 """Ratio of the smallest standard deviation with the tolerance of the geometry to that without it,
 above which the tolerance is the reason for missing a target."""
 
@@ -123,10 +123,10 @@ def next_segment(
         raise ExcitationError("No precision is requested; give for example --damping 1%.")
     plant = rig.plant_with(estimate.loaded_beam)
     record = RecordSoFar.of(angle_rad_so_far, estimate, plant.rate_hz, HORIZON_S)
-    decision = SegmentSearch(
+    search = SegmentSearch(
         estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
     )
-    return decision.segment(decision.best(time_left_s, driven), time_left_s)
+    return search.segment(search.best_candidate(time_left_s, driven), time_left_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ class GeometryFloor:
     def below(self) -> bool:
         """Whether the tolerance of the geometry makes the target unreachable."""
         target_std = self.target.std * (abs(self.value) if self.target.relative else 1.0)
-        return target_std < self.std and self.std > _BY_GEOMETRY * self.exact_std
+        return target_std < self.std and self.std > _GEOMETRY_DOMINANCE_RATIO * self.exact_std
 
 
 def geometry_floors(
@@ -183,23 +183,25 @@ def geometry_floors(
     ExcitationError
         If no mode can be driven.
     """
-    targets = [target for target in targets if target.quantity not in OF_MODES]
+    targets = [target for target in targets if target.quantity not in MODE_QUANTITIES]
     if not targets or not uniformity:
         return ()
     plant = rig.plant_with(estimate.loaded_beam)
-    rest = RecordSoFar.of(np.zeros(1), estimate, plant.rate_hz, SHORTEST_S)
+    resting_record = RecordSoFar.of(np.zeros(1), estimate, plant.rate_hz, SHORTEST_S)
     quantities = Quantities.of(targets, estimate)
-    decision = SegmentSearch(estimate, quantities, plant, rig.start_rad, rest, tip_slope_rad)
-    tolerant = estimate.with_tolerance(uniformity)
+    search = SegmentSearch(
+        estimate, quantities, plant, rig.start_rad, resting_record, tip_slope_rad
+    )
+    tolerant_estimate = estimate.with_tolerance(uniformity)
     floors = [
         least_deviations(
             np.zeros((len(each.names), len(each.names))),
             each,
             Quantities.of(targets, each),
-            *decision.lines(),
+            *search.steady_sines(),
             duration_s,
         )
-        for each in (tolerant, estimate)
+        for each in (tolerant_estimate, estimate)
     ]
     return tuple(
         GeometryFloor(item.target, item.value, std, exact_std)

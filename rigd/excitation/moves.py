@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._signals import positive
+from rigd.excitation._signals import require_positive
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -23,7 +23,7 @@ ROBUST_BELOW_HZ = 60.0
 """Frequency in Hz below which a robust move has zeros of second order for the modes. Higher modes
 are too weak to matter after a change of 1 % in their frequency."""
 
-_MOST_PEAK = 24.0
+_MAX_PEAK_ACCELERATION = 24.0
 """Largest acceleration of a path over ``distance / duration²``: four times that of a quintic. A
 path shorter than about half a period of a mode would exceed it, and then has fewer zeros."""
 
@@ -81,11 +81,13 @@ def still_path(duration_s: float, rate_hz: float, poles_rad_s: Complex) -> Real:
     """
     n = max(1, round(duration_s * rate_hz))
     for order in (2, 1):
-        rows = np.concatenate([_motion_rows(n, rate_hz), zero_rows(n, rate_hz, poles_rad_s, order)])
+        rows = np.concatenate(
+            [_motion_map(n, rate_hz), residual_vibration_map(n, rate_hz, poles_rad_s, order)]
+        )
         if len(rows) > n:
             continue
-        acceleration, met = _least_norm(rows, np.array([0.0, 1.0]))
-        if met and np.abs(acceleration).max() * (n / rate_hz) ** 2 <= _MOST_PEAK:
+        acceleration, solved = _least_norm_solution(rows, np.array([0.0, 1.0]))
+        if solved and np.abs(acceleration).max() * (n / rate_hz) ** 2 <= _MAX_PEAK_ACCELERATION:
             return from_acceleration(acceleration, rate_hz)
     return quintic(duration_s, rate_hz)
 
@@ -126,33 +128,35 @@ def slew(
     ExcitationError
         If speed or acceleration is not positive.
     """
-    positive("speed_rad_s", speed_rad_s, "rad/s")
-    positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
+    require_positive("speed_rad_s", speed_rad_s, "rad/s")
+    require_positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
     slowest_rad_s = float(np.abs(poles_rad_s.imag[poles_rad_s.imag != 0]).min(initial=np.inf))
     speed = speed_rad_s
     n = max(4 * len(poles_rad_s), round(rate_hz * np.pi / slowest_rad_s), 8)
     while True:
-        pulse = _pulse(n, rate_hz, poles_rad_s)
+        pulse = _speed_change_pulse(n, rate_hz, poles_rad_s)
         # Both pulses together cover the distance of one at full speed.
         speed = min(speed_rad_s, abs(distance_rad) * rate_hz / n)
         if pulse is not None and speed * np.abs(pulse).max() <= acceleration_rad_s2:
             break
         n = n + max(1, n // 20)
-    cruise = round(abs(distance_rad) / speed * rate_hz) - n
+    cruise_ticks = round(abs(distance_rad) / speed * rate_hz) - n
     # With a whole number of cruise ticks the speed is slightly lower than requested.
-    speed = abs(distance_rad) * rate_hz / (n + cruise)
-    acceleration = np.concatenate([pulse, np.zeros(cruise), -pulse])
+    speed = abs(distance_rad) * rate_hz / (n + cruise_ticks)
+    acceleration = np.concatenate([pulse, np.zeros(cruise_ticks), -pulse])
     return from_acceleration(np.copysign(speed, distance_rad) * acceleration, rate_hz)
 
 
-def _pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | None:
+def _speed_change_pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | None:
     """Return accelerations (n,) of least norm that change the speed by 1 and leave modes at rest.
 
     Return None if `n` ticks are too few.
     """
-    rows = np.concatenate([_motion_rows(n, rate_hz)[:1], zero_rows(n, rate_hz, poles_rad_s, 1)])
-    pulse, met = _least_norm(rows, np.array([1.0]))
-    return pulse if met else None
+    rows = np.concatenate(
+        [_motion_map(n, rate_hz)[:1], residual_vibration_map(n, rate_hz, poles_rad_s, 1)]
+    )
+    pulse, solved = _least_norm_solution(rows, np.array([1.0]))
+    return pulse if solved else None
 
 
 def from_acceleration(acceleration_rad_s2: Real, rate_hz: float) -> Real:
@@ -169,13 +173,13 @@ def from_acceleration(acceleration_rad_s2: Real, rate_hz: float) -> Real:
     return reference
 
 
-def _motion_rows(n: int, rate_hz: float) -> Real:
+def _motion_map(n: int, rate_hz: float) -> Real:
     """Return the linear map, shape (2, n), from n accelerations to change of speed and distance."""
-    ticks_left = n - np.arange(n)
-    return np.stack([np.full(n, 1.0 / rate_hz), ticks_left / rate_hz**2])
+    remaining_ticks = n - np.arange(n)
+    return np.stack([np.full(n, 1.0 / rate_hz), remaining_ticks / rate_hz**2])
 
 
-def zero_rows(n: int, rate_hz: float, poles_rad_s: Complex, order: int) -> Real:
+def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, order: int) -> Real:
     """Return the linear map from n accelerations to the modes' residual vibration after them.
 
     Its product with the accelerations is zero if the path leaves all modes at rest. Each mode has a
@@ -194,29 +198,31 @@ def zero_rows(n: int, rate_hz: float, poles_rad_s: Complex, order: int) -> Real:
     order
         Order of the zeros: 1 or 2.
     """
-    left_s = (n - np.arange(n)) / rate_hz
+    remaining_s = (n - np.arange(n)) / rate_hz
     rows: list[Real] = []
     for pole in poles_rad_s:
-        transform = np.exp(pole * left_s) / rate_hz
-        twice = order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
-        for row in (transform, transform * left_s / left_s[0]) if twice else (transform,):
+        transform = np.exp(pole * remaining_s) / rate_hz
+        second_order = order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
+        for row in (
+            (transform, transform * remaining_s / remaining_s[0]) if second_order else (transform,)
+        ):
             rows.append(row.real)
             if pole.imag != 0.0:
                 rows.append(row.imag)
     return np.array(rows).reshape(-1, n)
 
 
-def _least_norm(rows: Real, wanted: Real) -> tuple[Real, bool]:
+def _least_norm_solution(rows: Real, wanted: Real) -> tuple[Real, bool]:
     """Return the least-norm solution a of ``rows @ a = wanted``, and whether it is a solution.
 
     Rows beyond the length of `wanted` have the right-hand side 0.
     """
-    goal = np.zeros(len(rows))
-    goal[: wanted.size] = wanted
+    right_hand_side = np.zeros(len(rows))
+    right_hand_side[: wanted.size] = wanted
     scale = np.linalg.norm(rows, axis=1)
-    solution = np.linalg.lstsq(rows / scale[:, None], goal / scale, rcond=1e-12)[0]
-    missed = np.abs(rows @ solution - goal) / scale
-    return solution, bool(missed.max() <= 1e-9 * np.linalg.norm(solution))
+    solution = np.linalg.lstsq(rows / scale[:, None], right_hand_side / scale, rcond=1e-12)[0]
+    residuals = np.abs(rows @ solution - right_hand_side) / scale
+    return solution, bool(residuals.max() <= 1e-9 * np.linalg.norm(solution))
 
 
 def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Complex:
@@ -240,8 +246,8 @@ def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Co
     """
     acceleration = np.diff(reference_rad, n=2, prepend=(reference_rad[0],) * 2) * rate_hz**2
     # r[k+1] - 2 r[k] + r[k-1] belongs to tick k: one before the sample in which it shows.
-    left_s = np.arange(acceleration.size, 0, -1) / rate_hz
-    state: Complex = np.exp(np.outer(poles_rad_s, left_s)) @ acceleration / rate_hz
+    remaining_s = np.arange(acceleration.size, 0, -1) / rate_hz
+    state: Complex = np.exp(np.outer(poles_rad_s, remaining_s)) @ acceleration / rate_hz
     return state
 
 
@@ -311,7 +317,7 @@ def braking_path(duration_s: float, rate_hz: float) -> Braking:
     >>> round(path_rad[-1], 6)  # half the way of a motor that goes on
     0.65
     """
-    positive("duration_s", duration_s, "s")
+    require_positive("duration_s", duration_s, "s")
     n = max(2, round(duration_s * rate_hz))
     time_s = n / rate_hz
     u = np.arange(1, n + 1) / n
@@ -320,7 +326,7 @@ def braking_path(duration_s: float, rate_hz: float) -> Braking:
     return Braking(rate_hz, tuple(per_speed.tolist()), tuple(per_acceleration.tolist()))
 
 
-def braked(reference_rad: Sequence[float] | Real, tick: int, braking: Braking) -> Real:
+def braked_reference(reference_rad: Sequence[float] | Real, tick: int, braking: Braking) -> Real:
     """Return a reference up to a tick, followed by the braking path, as in the control loop.
 
     Parameters

@@ -8,27 +8,37 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._beam_estimate import BAND_HZ, LOGARITHMIC, BeamEstimate, EstimatedMode
+from rigd.excitation._beam_estimate import (
+    BAND_HZ,
+    LOGARITHMIC_PARAMETERS,
+    BeamEstimate,
+    EstimatedMode,
+)
 from rigd.excitation._signals import ExcitationError
 
 Real = NDArray[np.float64]
 
-OF_MODES: Final = ("damping", "frequency")
+MODE_QUANTITIES: Final = ("damping", "frequency")
 """Names of the target quantities that belong to a mode."""
-QUANTITIES: Final = (*OF_MODES, "zeta", "alpha", "gamma", "lambda")
+QUANTITIES: Final = (*MODE_QUANTITIES, "zeta", "alpha", "gamma", "lambda")
 """Names of the quantities whose precision can be a target: damping ratio and frequency of modes,
 and the parameters of the damping."""
 
 _UNITS: Final = {"frequency": "Hz"}
 """Unit of each target quantity that has one."""
-_NO_ANSWER: Final = {"damping": 0.01, "zeta": 0.5, "alpha": 0.5, "gamma": 0.5, "lambda": 0.5}
+_USELESS_STD: Final = {"damping": 0.01, "zeta": 0.5, "alpha": 0.5, "gamma": 0.5, "lambda": 0.5}
 """Standard deviation of each quantity, in its unit, from which a target is useless: the percent
 sign was probably forgotten."""
-_MOST_MODES: Final = 20
+_MAX_MODE_NUMBER: Final = 20
 """Largest number of a mode in a target."""
-_OF_COEFFICIENT: Final = {"alpha": "zeta", "lambda": "gamma"}
+_COEFFICIENT_OF_ORDER: Final = {"alpha": "zeta", "lambda": "gamma"}
 """Coefficient of the damping to which each order belongs."""
-_KIND: Final = {"zeta": "internal", "alpha": "internal", "gamma": "external", "lambda": "external"}
+_DAMPING_KIND: Final = {
+    "zeta": "internal",
+    "alpha": "internal",
+    "gamma": "external",
+    "lambda": "external",
+}
 """Kind of damping to which each parameter belongs."""
 
 
@@ -54,8 +64,8 @@ class Target:
     def __str__(self) -> str:
         """Return quantity and requested standard deviation as text, for the operator."""
         unit = _UNITS.get(self.quantity, "")
-        size = f"{100 * self.std:g} %" if self.relative else f"{self.std:g} {unit}".rstrip()
-        return f"{self.name} to {size}"
+        std_text = f"{100 * self.std:g} %" if self.relative else f"{self.std:g} {unit}".rstrip()
+        return f"{self.name} to {std_text}"
 
 
 def parse_target(quantity: str, text: str) -> Target:
@@ -90,27 +100,27 @@ def parse_target(quantity: str, text: str) -> Target:
     example = {"damping": "1% or 2:0.5%", "frequency": "0.01% or 1:0.002Hz"}.get(
         quantity, "5% or 0.01"
     )
-    before, colon, size = text.strip().rpartition(":")
+    mode_text, colon, std_text = text.strip().rpartition(":")
     mode = None
     if colon:
-        if quantity not in OF_MODES:
+        if quantity not in MODE_QUANTITIES:
             raise ExcitationError(
                 f"{option}: {quantity} is no quantity of a mode; give for example {example}."
             )
-        if not before.strip().isdecimal() or not 1 <= int(before) <= _MOST_MODES:
+        if not mode_text.strip().isdecimal() or not 1 <= int(mode_text) <= _MAX_MODE_NUMBER:
             raise ExcitationError(
-                f"{option}: {before.strip()!r} is no number of a mode, 1 to {_MOST_MODES}; give "
-                f"for example {example}."
+                f"{option}: {mode_text.strip()!r} is no number of a mode, 1 to {_MAX_MODE_NUMBER}; "
+                f"give for example {example}."
             )
-        mode = int(before)
-    size = size.strip()
-    relative = size.endswith("%")
-    number = size.removesuffix("%") if relative else size.removesuffix(unit)
+        mode = int(mode_text)
+    std_text = std_text.strip()
+    relative = std_text.endswith("%")
+    number = std_text.removesuffix("%") if relative else std_text.removesuffix(unit)
     try:
         std = float(number)
     except ValueError:
         raise ExcitationError(
-            f"{option}: {size!r} is no standard deviation; give a percentage of the value or a "
+            f"{option}: {std_text!r} is no standard deviation; give a percentage of the value or a "
             f"number{f' in {unit}' if unit else ''}, for example {example}."
         ) from None
     std = std / 100 if relative else std
@@ -119,11 +129,11 @@ def parse_target(quantity: str, text: str) -> Target:
             f"{option}: the standard deviation must be finite and more than 0; give for example "
             f"{example}."
         )
-    most = _NO_ANSWER.get(quantity, inf)
-    if not relative and std >= most:
+    useless_std = _USELESS_STD.get(quantity, inf)
+    if not relative and std >= useless_std:
         raise ExcitationError(
             f"{option}: a standard deviation of {std:g} is no precision of {quantity}, since it is "
-            f"not below {most:g}; for a percentage of the value write {text.strip()}%."
+            f"not below {useless_std:g}; for a percentage of the value write {text.strip()}%."
         )
     return Target(quantity, std, relative, mode)
 
@@ -179,12 +189,14 @@ class Quantities:
         modes = estimate.modes()
         items, gradients = [], []
         for target in targets:
-            for one in _of_single_modes(target, modes):
-                value, gradient, impossible = _linearised(one, estimate, modes)
-                target_std = one.std * abs(value) if one.relative else one.std
+            for single_target in _targets_of_modes(target, modes):
+                value, gradient, impossible = _linearise(single_target, estimate, modes)
+                target_std = (
+                    single_target.std * abs(value) if single_target.relative else single_target.std
+                )
                 if target_std == 0.0 and not impossible:
-                    impossible = f"{one.name} is 0: no percentage of it is a precision"
-                items.append(Precision(one, value, inf, target_std, impossible))
+                    impossible = f"{single_target.name} is 0: no percentage of it is a precision"
+                items.append(Precision(single_target, value, inf, target_std, impossible))
                 gradients.append(gradient)
         return cls(tuple(items), np.array(gradients).reshape(len(items), len(estimate.names)))
 
@@ -211,14 +223,14 @@ class Quantities:
         )
 
 
-def _of_single_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
+def _targets_of_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
     """Return a target for each mode, if the given target applies to every mode in the band."""
-    if target.quantity not in OF_MODES or target.mode is not None:
+    if target.quantity not in MODE_QUANTITIES or target.mode is not None:
         return [target]
     return [replace(target, mode=mode.number) for mode in modes]
 
 
-def _linearised(
+def _linearise(
     target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
 ) -> tuple[float, Real, str]:
     """Return the value of a target quantity and its derivatives by the parameters, shape (k,).
@@ -227,7 +239,7 @@ def _linearised(
     """
     gradient = np.zeros(len(estimate.names))
     name = target.quantity
-    if name in OF_MODES:
+    if name in MODE_QUANTITIES:
         mode = next((each for each in modes if each.number == target.mode), None)
         if mode is None:
             seen = ", ".join(str(each.number) for each in modes) or "none"
@@ -236,9 +248,9 @@ def _linearised(
             return mode.damping_ratio, mode.damping_gradient, ""
         return mode.frequency_hz, mode.frequency_gradient_hz, ""
     value = estimate.values[name]
-    coefficient = _OF_COEFFICIENT.get(name, name)
+    coefficient = _COEFFICIENT_OF_ORDER.get(name, name)
     if estimate.values[coefficient] == 0.0 or name not in estimate.names:
-        free = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
-        return value, gradient, f"{_KIND[name]} damping {free} in the estimate so far"
-    gradient[estimate.names.index(name)] = value if name in LOGARITHMIC else 1.0
+        obstacle = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
+        return value, gradient, f"{_DAMPING_KIND[name]} damping {obstacle} in the estimate so far"
+    gradient[estimate.names.index(name)] = value if name in LOGARITHMIC_PARAMETERS else 1.0
     return value, gradient, ""
