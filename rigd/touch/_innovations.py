@@ -3,9 +3,8 @@
 The exact model of the free beam predicts torque and base shear from the angle. The difference from
 the measurement is noise, earlier vibration of the beam, the model's own error, or a touch.
 Vibration and error are slow and at the beam's own frequencies: an observer (a stationary Kalman
-filter of the first modes and of the zeros of both channels) follows them. The innovations are the
-part that it cannot predict from one tick to the next: white noise without a touch.
-
+filter of the first modes and of the zeros of torque and shear) follows them. The innovations are
+the part that the observer cannot predict from one tick to the next: white noise without a touch.
 
 Filter and observer are linear, so that a tick is the product of one matrix with one vector:
 [state, angle, torque, shear] → [next state, whitened innovations, whitened prediction].
@@ -31,29 +30,37 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 _MOST_MODES = 40
+"""Number of modes of the beam from which the filter's modes are chosen."""
 _FASTEST = 0.42
-"""Fastest mode of the filter, as a fraction of the rate; the taps approximate the others."""
+"""Highest frequency of a mode of the filter over the tick rate; delay taps approximate higher
+modes."""
 _LEAST_FRACTION = 0.5
-"""Least imaginary part of a pole over its magnitude; real poles approximate the others."""
+"""Smallest ratio of imaginary part to magnitude for a pole of the filter; real poles approximate
+modes that are more strongly damped."""
 _LADDER = 10
-"""Real poles for the branch cut of the fractional orders."""
+"""Number of real poles that approximate the branch cut of fractional orders."""
 _SLOWEST_RAD_S = 0.03
+"""Slowest of these real poles in rad/s."""
 _TAPS = 4
+"""Number of delay taps of the filter: past angles with a coefficient each."""
 _FIT_FROM_HZ, _FIT_TO = 0.02, 0.45
+"""Band in which the filter is fitted: lower end in Hz, and upper end over the tick rate."""
 _WEIGHTED_FROM_HZ, _KNEE_HZ = 0.3, 50.0
-"""Band in which the relative error has full weight. Motors hardly move above it, where a close fit
-would only amplify the encoder's steps."""
+"""Lower and upper end in Hz of the band in which the relative error of the fit has full weight.
+Motors hardly move above it, where a close fit would only amplify the encoder's steps."""
 _OBSERVED_MODES = 4
+"""Number of modes whose vibration the observer follows."""
 _OBSERVER_RAD_S = 6.0
-"""Bandwidth of the observer for vibration: slow against a touch (at 15 rad/s it absorbs a tenth of
-one within 10 ms), fast against the phase drift of a model with a 1 % frequency error."""
+"""Bandwidth in rad/s of the observer for vibration. It is slow compared with a touch (at 15 rad/s
+the observer absorbs a tenth of a touch within 10 ms), and fast compared with the phase drift of a
+model with a 1 % frequency error."""
 _ZERO_RAD_S = 0.5
-"""The same for the zero of a channel."""
+"""Bandwidth in rad/s of the observer for the zeros of torque and shear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedBeam:
-    """Discrete model of the free beam with its observer, for one rate and sensor.
+    """Discrete model of the free beam with an observer, for one tick rate and sensor.
 
     Examples
     --------
@@ -67,27 +74,28 @@ class ObservedBeam:
     """
 
     matrix: Real
-    """(n + 4, n + 3), see above; without shear its row and column are zero."""
+    """Matrix of a tick from [state, angle, torque, shear] to [next state, whitened innovations,
+    whitened prediction], shape (n + 4, n + 3). Without shear its row and column are zero."""
     gain: Real
-    """(n, 2): effect of each whitened innovation on the next state."""
+    """Effect of each whitened innovation on the next state, shape (n, 2)."""
     whitening: Real
-    """(2, 2): from innovations to whitened ones."""
+    """Matrix from innovations of torque and shear to whitened innovations, shape (2, 2)."""
     states: int
-    """n."""
+    """Number n of states."""
     channels: int
-    """1: torque alone; 2: torque and base shear."""
+    """Number of measured quantities: 1 for torque alone, 2 for torque and base shear."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelNoise:
-    """Noise of one sample of each channel."""
+    """Standard deviations of the noise in one sample of torque, base shear and angle."""
 
     torque_nm: float
     """Standard deviation of the coupling torque."""
     shear_n: float | None
     """Standard deviation of the base shear; None: it is not measured."""
     angle_rad: float = 0.0
-    """Standard deviation of the angle; a resolution of 7e-5 rad gives 2e-5 rad."""
+    """Standard deviation of the angle; a resolution of 7e-5 rad corresponds to 2e-5 rad."""
 
 
 def observed_beam(
@@ -100,7 +108,7 @@ def observed_beam(
     torque_after_angle_s: float = 0.0,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> ObservedBeam:
-    """Design filter and observer.
+    """Design the filter and observer that compute the innovations of a beam's torque and shear.
 
     Parameters
     ----------
@@ -109,17 +117,18 @@ def observed_beam(
     rate_hz
         Ticks a second.
     noise
-        Noise of the channels.
+        Noise of torque, base shear and angle.
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     torque_after_angle_s
-        Delay of a tick's wrench relative to its angle, without the filters.
+        Delay of a tick's wrench relative to its angle, without the delay of the filters.
     sensor_filter
         Filters of the wrench.
 
     Returns
     -------
     ObservedBeam
+        Model for an `InnovationFilter`.
     """
     filter_ = _fit(beam, damping, rate_hz, tool_inertia_kg_m2, torque_after_angle_s, sensor_filter)
     both = noise.shear_n is not None
@@ -146,19 +155,22 @@ def observed_beam(
 
 
 class InnovationFilter:
-    """Runs an `ObservedBeam`; starts at rest at the first angle.
+    """Filter that computes the innovations of torque and shear tick by tick.
+
+    It starts with the beam at rest at the first angle.
 
     Parameters
     ----------
     model
-        From `observed_beam`.
+        Model from `observed_beam`.
 
     Attributes
     ----------
     whitened
-        Innovations of torque and shear, in their standard deviations and uncorrelated.
+        Innovations of torque and shear in the last tick, whitened: uncorrelated, in units of their
+        standard deviations.
     predicted
-        Torque and shear predicted from the angle alone, in the same unit.
+        Torque and shear predicted from the angle alone, in the same units.
     """
 
     __slots__ = (
@@ -199,18 +211,18 @@ class InnovationFilter:
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> None:
-        """Process the readings of a tick.
+        """Compute the innovations of a tick from its readings.
 
         Parameters
         ----------
         angle_rad, torque_nm, shear_n
-            Readings; the shear is without effect where the model has none.
+            Readings. The shear has no effect if the model has no shear.
         missed
-            Ticks that were missed before this one: their angle is interpolated.
+            Number of ticks that were missed before this tick; their angles are interpolated.
         angle_stale
-            Whether the angle is an old one: it is extrapolated instead.
+            Whether the angle is older than the tick; it is then extrapolated from earlier angles.
         wrench_stale
-            Whether torque and shear are old: they are ignored.
+            Whether torque and shear are older than the tick; they are then ignored.
         """
         if self._rest_rad is None:
             self._rest_rad = angle_rad
@@ -229,12 +241,13 @@ class InnovationFilter:
 
     @property
     def predicted_shear_n(self) -> float:
-        """Base shear predicted from the angle alone; 0 where the model has none."""
+        """Base shear in N predicted from the angle alone; 0 if the model has no shear."""
         of_torque, of_shear = self._unwhitening
         torque, shear = self.predicted
         return of_torque * torque + of_shear * shear
 
     def _run(self, turned_rad: float, torque_nm: float, shear_n: float) -> None:
+        """Compute one tick with the angle relative to rest, torque and shear."""
         n = self._n
         input_, output = self._vectors
         input_[n] = turned_rad
@@ -248,7 +261,7 @@ class InnovationFilter:
         self._angle_before_rad, self._angle_rad = self._angle_rad, turned_rad
 
     def _pass(self, turned_rad: float, torque_nm: float, shear_n: float) -> None:
-        """Step without a wrench: undo the effect of the old one on the state."""
+        """Compute one tick without a valid wrench, whose effect on the state is undone."""
         self._run(turned_rad, torque_nm, shear_n)
         self._vectors[0][: self._n] -= self._gain @ np.array(self.whitened)
         self.whitened = 0.0, 0.0
@@ -259,14 +272,17 @@ class InnovationFilter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Filter:
-    """``x' = a x + b θ``, ``[torque, shear] = c x + d θ``."""
+    """State space that predicts torque and shear of the free beam from the angle θ.
+
+    The equations are ``x' = a x + b θ`` and ``[torque, shear] = c x + d θ``.
+    """
 
     a: Real
     b: Real
     c: Real
     d: Real
     noise_gain: Real
-    """(2,): rms of each channel for white noise of 1 rad in the angle."""
+    """Standard deviations of torque and shear per white noise of 1 rad in the angle, shape (2,)."""
 
 
 def _fit(
@@ -277,7 +293,10 @@ def _fit(
     later_s: float,
     sensor_filter: SensorFilter,
 ) -> _Filter:
-    """Fit discrete poles, at the exact ones, and some taps to the exact response."""
+    """Return the discrete filter whose response fits that of the exact model best.
+
+    Its poles are those of the exact model, and some real poles and delay taps approximate the rest.
+    """
     pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_MOST_MODES), beam, damping)
     upper = pairs[_ringing(pairs[:, 0], rate_hz), 0]
     turning: Complex = np.exp(upper / rate_hz)
@@ -314,13 +333,20 @@ def _fit(
 
 
 def _ringing(upper: Complex, rate_hz: float) -> NDArray[np.bool_]:
-    """Return which modes ring, and slowly enough; a mode without a pole (NaN) does not."""
+    """Return which of the poles belong to modes that the filter represents, as a mask.
+
+    Such a mode oscillates, at a frequency well below half the tick rate. A pole of NaN does not.
+    """
     ringing: NDArray[np.bool_] = upper.imag > _LEAST_FRACTION * np.abs(upper)
     return ringing & (upper.imag < 2 * pi * _FASTEST * rate_hz)
 
 
 def _columns(s_ticks: Complex, turning: Complex, decaying: Real) -> Complex:
-    """Return the responses to combine: real and imaginary part of each pole, and taps."""
+    """Return the frequency responses of the filter's terms, whose weighted sum is the response.
+
+    The terms are the real and the imaginary part of each complex pole, the real poles and the delay
+    taps. `s_ticks` is the Laplace variable times the period.
+    """
     delay = np.exp(-s_ticks)[:, None]
     up, down = 1 / (1 - turning * delay), 1 / (1 - turning.conj() * delay)
     cut = 1 / (1 - decaying * delay)
@@ -328,7 +354,7 @@ def _columns(s_ticks: Complex, turning: Complex, decaying: Real) -> Complex:
 
 
 def _state_space(turning: Complex, decaying: Real, coefficients: Real, noise_gain: Real) -> _Filter:
-    """Return the state space of the fit; the states exclude the angle of the tick."""
+    """Return the fitted filter as a state space, whose state excludes the angle of the tick."""
     m, k = turning.size, decaying.size
     n = 2 * m + k + _TAPS - 1
     a, b = np.zeros((n, n)), np.zeros(n)
@@ -360,18 +386,22 @@ def _state_space(turning: Complex, decaying: Real, coefficients: Real, noise_gai
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Observer:
-    """``x' = a x + gain e``, ``e = y - c x``, and the whitening of e."""
+    """Observer of the motion that the angle does not explain, with the innovations e.
+
+    The equations are ``x' = a x + gain e`` and ``e = y - c x``.
+    """
 
     a: Real
     c: Real
     gain: Real
     whitening: Real
+    """Matrix from innovations to whitened innovations, shape (2, 2)."""
 
 
 def _observer(
     beam: Beam, damping: Damping, rate_hz: float, noise: ChannelNoise, noise_gain: Real
 ) -> _Observer:
-    """Return the stationary Kalman filter of ringing modes and drifting zeros."""
+    """Return the stationary Kalman filter that follows vibrating modes and drifting zeros."""
     from scipy.linalg import solve_discrete_are
 
     z = clamped_free_eigenvalues(_OBSERVED_MODES)

@@ -1,9 +1,9 @@
 """Springy obstacle at rest: point, instant and stiffness from the integration of the contact.
 
-A grid of starts over all three is integrated for the first samples, the best of each position for
-some more, and the best of those are refined by least squares (Levenberg and Marquardt, derivatives
-by differences, all candidates in one batch). A bouncing contact has many local minima, hence the
-many starts.
+A candidate is a set of values for the three parameters. A grid of candidates is integrated for the
+first samples, and the best candidates of each position for more samples. The best of these are
+refined by least squares (Levenberg and Marquardt, derivatives by differences, all candidates in one
+batch). A bouncing contact has many local minima, which is why there are so many candidates.
 """
 
 from collections.abc import Callable
@@ -21,64 +21,68 @@ from rigd.touch._kernels import ContactKernels, lagrange, mixed
 Real = NDArray[np.float64]
 
 PARAMETERS = ("x_m", "time_s", "ln_stiffness", "rate_m_per_s", "mobility_m_per_n_s")
-"""Columns of candidates: the last two are omitted for an obstacle at rest."""
+"""Names of the parameters of an obstacle, in the order of a candidate's columns; the last two are
+omitted for an obstacle at rest."""
 
 STIFFEST = log(1e6)
+"""Logarithm of the largest stiffness of an obstacle in N/m."""
 SOFTEST = log(10.0)
+"""Logarithm of the smallest stiffness of an obstacle in N/m."""
 
 Prediction = Callable[[Real, "WhitenedWindow"], Real]
-"""Effect of candidates (k, p) on the channels in a window, shape (k, c, samples)."""
+"""Function that predicts the effect of candidates, shape (k, p), on torque and base shear in a
+window of samples, shape (k, c, samples)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """Ranges of the parameters of a kind of candidate."""
+    """Ranges and step sizes of the p parameters of one kind of obstacle; arrays of shape (p,)."""
 
     low: Real
-    """Least value of each, shape (p,)."""
+    """Smallest value of each parameter."""
     high: Real
-    """Greatest value."""
+    """Largest value of each parameter."""
     difference: Real
-    """Change of each for a derivative."""
+    """Change of each parameter for a numerical derivative."""
     scale: Real
-    """Significant change: an iteration changes a parameter by at most eight times it."""
+    """Significant change of each parameter; an iteration changes it by at most eight times this."""
     smallest: Real
-    """Least standard deviation for drawing samples."""
+    """Smallest standard deviation of each parameter for drawing samples."""
     loose: Real
-    """Greatest standard deviation for drawing samples."""
+    """Largest standard deviation of each parameter for drawing samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class WhitenedWindow:
-    """Whitened innovations of some samples, to compare candidates with."""
+    """Whitened innovations in a range of samples, with which predictions are compared."""
 
     motion: FreeMotion
-    """Free motion of the record."""
+    """Motion of the beam without a touch in the record."""
     first: int
-    """First sample."""
+    """Index of the first sample."""
     end: int
-    """Sample after the last."""
+    """Index of the sample after the last."""
     whitening: Real
     """Inverse Cholesky factor of the covariance of noise and uncertainties of the free motion."""
     data: Real
-    """Whitened innovations, shape (n,)."""
+    """Whitened innovations of torque and base shear, shape (n,)."""
 
     @classmethod
     def of(
         cls, motion: FreeMotion, first: int, end: int, deviations: Real | None = None
     ) -> "WhitenedWindow":
-        """Whiten the samples from `first` on.
+        """Return the whitened innovations of the samples from `first` to `end`.
 
         Parameters
         ----------
         motion
-            Free motion of the record.
+            Motion of the beam without a touch in the record.
         first, end
-            Its samples.
+            Index of the first sample, and of the sample after the last.
         deviations
-            Effects of all uncertainties on the channels, one standard deviation each, shape
-            (c, n, r) from sample `first`; None: those of the free motion, without their
-            transmission by a touch.
+            Effects of all uncertainties on torque and shear, for one standard deviation each, shape
+            (c, n, r) from sample `first`. None: the effects of the free motion's uncertainty are
+            used, without those that the touch transmits.
         """
         if deviations is None:
             deviations = motion.design[:, first:end] @ motion.spread
@@ -90,12 +94,14 @@ class WhitenedWindow:
         return cls(motion, first, end, whitening, whitening @ raw)
 
     def residuals(self, predicted: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-        """Return the whitened residuals, in the precision of the prediction.
+        """Return the whitened innovations minus predicted effects of touches, shape (k, n).
+
+        The result has the floating-point precision of the prediction.
 
         Parameters
         ----------
         predicted
-            Effect of a touch on the channels, shape (k, c, samples).
+            Effect of each touch on torque and base shear, shape (k, c, samples).
         """
         noise, whitening, data = (
             each.astype(predicted.dtype, copy=False)
@@ -106,16 +112,16 @@ class WhitenedWindow:
 
 
 class Touching:
-    """Integrates the contact of candidates for one record.
+    """Integration in time of the contact with obstacles, for the record of one touch.
 
     Parameters
     ----------
     kernels
-        Contact kernels on the steps of the integration, at positions.
+        Contact kernels at some positions, on the time steps of the integration.
     x_m
-        Positions of the free motion's displacement.
+        Positions at which the displacement of the free motion is given.
     motion
-        Free motion of the record.
+        Motion of the beam without a touch in the record.
     """
 
     __slots__ = ("_kernels", "_motion", "_x_m")
@@ -130,24 +136,25 @@ class Touching:
         side: float | None = None,
         kernels: ContactKernels | None = None,
     ) -> tuple[Real, Real]:
-        """Return the effect on the channels in the window, and the force.
+        """Return the effect of obstacles on torque and shear, and the contact forces.
 
         Parameters
         ----------
         parameters
-            Rows of `PARAMETERS`, at least the first three, shape (k, p).
+            Candidates with the columns of `PARAMETERS`, at least the first three, shape (k, p).
         window
-            The samples.
+            Samples for which the effect is predicted.
         side
-            Direction in which the beam presses, 1 or -1; None: that of its motion.
+            Direction in which the beam presses, 1 or -1; None: the direction of its motion.
         kernels
-            Kernels at the only position, one row; None: they are interpolated.
+            Kernels with one row for the only position; None: they are interpolated.
 
         Returns
         -------
         channels : ndarray, shape (k, c, samples)
+            Effect on torque and base shear.
         force : ndarray, shape (k, n)
-            On the beam, at the steps from the touch on, in N.
+            Force on the beam in N, at the steps from the touch on.
         """
         motion = self._motion
         x, instant = parameters[:, 0], parameters[:, 1]
@@ -169,17 +176,20 @@ class Touching:
         return self.effects(tables, force, instant, window), force
 
     def passed_on(self, parameters: Real, window: WhitenedWindow, moved_m: Real) -> Real:
-        """Return the effect of other free motions through the contact, (r, c, samples).
+        """Return how changes of the free motion act on torque and shear through the contact.
+
+        Another free motion meets the obstacle at another instant, which changes the contact force.
+        The shape is (r, c, samples).
 
         Parameters
         ----------
         parameters
             Position, instant and logarithm of the stiffness of an obstacle at rest.
         window
-            The samples.
+            Samples for which the effect is predicted.
         moved_m
-            Change of the displacement at its position, on the free motion's steps from its first
-            on, shape (r, columns).
+            Changes of the displacement at the obstacle's position, on the free motion's steps from
+            its first step on, shape (r, columns).
         """
         x, instant = parameters[:1], parameters[1:2]
         steps = self.steps(instant, window)
@@ -194,14 +204,14 @@ class Touching:
         return self.effects(tables, -side * (pressing[1:] - pressing[0]), instants, window)
 
     def steps(self, instant: Real, window: WhitenedWindow) -> int:
-        """Return the number of steps from the earliest instant to the end of the window.
+        """Return the number of time steps from the earliest touch to the end of the window.
 
         Parameters
         ----------
         instant
             Instants of touch, shape (k,).
         window
-            The samples.
+            Samples at whose end the integration ends.
         """
         step_s = self._kernels.step_s
         steps = int(np.ceil((self._motion.t[window.end - 1] - instant.min()) / step_s)) + 3
@@ -213,25 +223,25 @@ class Touching:
         Parameters
         ----------
         parameters
-            One row of `PARAMETERS`, at least the first two.
+            One candidate with at least position and instant.
         """
         return float(self.approach(parameters[:1], parameters[1:2], 1)[1][0])
 
     def effects(
         self, tables: tuple[Real, ...], force: Real, instant: Real, window: WhitenedWindow
     ) -> Real:
-        """Return the effect of forces on the channels in the window, shape (k, c, samples).
+        """Return the effect of contact forces on torque and base shear, shape (k, c, samples).
 
         Parameters
         ----------
         tables
-            Kernel of each channel, rows as the force has or one.
+            Kernel of torque, and of shear if it is measured, with as many rows as `force` or one.
         force
-            On the beam, on the kernels' steps, shape (k, n).
+            Forces on the beam at the steps of the kernels, shape (k, n).
         instant
-            Instant of the first step of each, shape (k,).
+            Instant of each force's first step, shape (k,).
         window
-            The samples.
+            Samples for which the effect is predicted.
         """
         motion = self._motion
         step_s = self._kernels.step_s
@@ -245,22 +255,24 @@ class Touching:
     def approach(
         self, x: Real, instant: Real, steps: int, given: float | None = None
     ) -> tuple[Real, Real]:
-        """Return the motion of the free beam beyond its position at an instant, and its side.
+        """Return how far the free beam would move beyond the obstacle, and in which direction.
 
         Parameters
         ----------
         x, instant
-            Positions and instants, shape (k,).
+            Positions and instants of touches, shape (k,).
         steps
-            Number of steps from the instants on.
+            Number of time steps from the instants on.
         given
-            The side, 1 or -1; None: that of the motion at the instant.
+            Direction of the motion, 1 or -1; None: the direction at the instant of touch.
 
         Returns
         -------
         beyond : ndarray, shape (k, steps)
-            In m.
+            Displacement of the free beam from its displacement at the touch, in m, positive in the
+            direction of the motion.
         side : ndarray, shape (k,)
+            Direction of the motion, 1 or -1.
         """
         motion = self._motion
         first, weights = lagrange(x, self._x_m)
@@ -274,7 +286,7 @@ class Touching:
         return side[:, None] * (free - free[:, :1]), side
 
     def _on_steps(self, moved: Real, instant: Real, steps: int) -> Real:
-        """Return rows of displacements on the kernels' steps, each from its instant on."""
+        """Interpolate rows of displacements to the kernels' time steps, each from its instant on."""
         motion = self._motion
         begin = (instant - motion.first_s) / motion.step_s
         between = max(1, round(motion.step_s / self._kernels.step_s))
@@ -287,18 +299,19 @@ class Touching:
 
 @dataclass(frozen=True, slots=True)
 class Descended:
-    """Minima of the candidates."""
+    """Local minima of the sum of squared residuals that least squares found."""
 
     parameters: Real
-    """Rows of `PARAMETERS`, shape (k, p)."""
+    """Parameters of each minimum, with the columns of `PARAMETERS`; shape (k, p)."""
     chi2: Real
-    """Sum of squared residuals of each, shape (k,)."""
+    """Sum of squared residuals at each minimum, shape (k,)."""
     jacobian: Real
-    """Derivatives of the residuals, shape (k, n, p)."""
+    """Derivatives of the residuals by the parameters, shape (k, n, p)."""
 
 
 _SETTLED = 0.1
-"""The iteration ends with a step that reduces the cost by less, or is predicted to and fails."""
+"""Reduction of the sum of squared residuals below which a step of least squares is the last. For a
+step that fails, the predicted reduction counts."""
 
 
 def descend(
@@ -309,22 +322,22 @@ def descend(
     rounds: int = 12,
     free: NDArray[np.bool_] | None = None,
 ) -> Descended:
-    """Minimise the residuals from each start.
+    """Minimise the sum of squared residuals from each start by least squares; return the minima.
 
     Parameters
     ----------
     predict
         Function that predicts the effect of candidates.
     window
-        The samples.
+        Whitened innovations with which the predictions are compared.
     starts
-        Candidates, shape (k, p).
+        Candidates from which the iterations start, shape (k, p).
     space
-        Ranges of their parameters.
+        Ranges of the parameters.
     rounds
-        Most iterations.
-        Which parameters of each start are free, shape (k, p); None: all.
-        Which parameters of each start are to be changed, shape (k, p); None: all.
+        Largest number of iterations.
+    free
+        Whether each parameter of each start is free, shape (k, p); None: all are free.
     """
     at = np.clip(starts, space.low, space.high)
     damping = np.full(len(at), 1e-2)
@@ -364,7 +377,7 @@ def descend(
 def _linearised(
     predict: Prediction, window: WhitenedWindow, at: Real, space: Space
 ) -> tuple[Real, Real]:
-    """Return residuals (k, n) and their derivatives (k, n, p)."""
+    """Return the residuals of candidates, (k, n), and derivatives by the parameters, (k, n, p)."""
     width = at.shape[1]
     shifts = np.where(at + space.difference > space.high, -space.difference, space.difference)
     rows = np.concatenate([at, *(at + np.eye(width)[i] * shifts for i in range(width))])
@@ -374,18 +387,20 @@ def _linearised(
 
 
 class Starts:
-    """Grid of starts over position, instant and stiffness, integrated together in coarse steps.
+    """Grid of candidates over position, instant and stiffness, from which the search starts.
+
+    All candidates are integrated together in coarse time steps.
 
     Parameters
     ----------
     kernels
         Contact kernels whose step divides the sampling period.
     every
-        One in so many of their positions is a start.
+        Number of the kernels' positions from one position of the grid to the next.
     rate_hz
         Samples a second.
     samples
-        Number of samples to compare.
+        Number of samples that are compared.
     """
 
     __slots__ = ("_channels", "_every", "_kernel", "_ratio", "_samples", "_step_s", "_x_m")
@@ -406,16 +421,17 @@ class Starts:
         ]  # (positions, steps, samples)
 
     def marched(self, motion: FreeMotion, window: WhitenedWindow, latest: int) -> tuple[Real, Real]:
-        """Integrate all starts, and return them with their sums of squared residuals.
+        """Return all candidates of the grid, and their sums of squared residuals.
 
         Parameters
         ----------
         motion
-            Free motion of the record.
+            Motion of the beam without a touch in the record.
         window
-            The samples.
+            Whitened innovations with which the candidates are compared.
         latest
-            Last sample at which the touch may begin; the window's first is the earliest.
+            Index of the last sample at which the touch may begin. The earliest is the first sample
+            of the window.
         """
         samples = np.arange(window.first + 1, latest + 1)
         batches = np.array_split(samples, -(-samples.size // _INSTANTS))
@@ -424,7 +440,10 @@ class Starts:
         return np.stack(starts, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
     def _chi2(self, motion: FreeMotion, window: WhitenedWindow, samples: NDArray[np.intp]) -> Real:
-        """Return the sums of squared residuals, shape (positions, instants, kinds)."""
+        """Return sums of squared residuals for touches at some samples.
+
+        The shape is (positions, instants, stiffnesses).
+        """
         positions, kinds = self._x_m.size, STIFFNESSES.size
         length = window.end - int(samples[0])
         steps = self._ratio * length
@@ -458,22 +477,22 @@ class Starts:
 
 
 _INSTANTS = 16
-"""Instants of the starts that are integrated at once."""
+"""Number of instants of touch in the grid that are integrated at once."""
 STIFFNESSES = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 100000.0])
-"""Stiffnesses of the starts, in N/m."""
+"""Stiffnesses of the grid's candidates in N/m."""
 
 
 def chi2_of(predict: Prediction, window: WhitenedWindow, candidates: Real) -> Real:
-    """Return the sum of squared residuals of candidates, shape (k,).
+    """Return the sum of squared residuals of each candidate, shape (k,).
 
     Parameters
     ----------
     predict
-        Function that predicts their effect.
+        Function that predicts the effect of candidates.
     window
-        The samples.
+        Whitened innovations with which the predictions are compared.
     candidates
-        Shape (k, p).
+        Parameters of the candidates, shape (k, p).
     """
     residual = window.residuals(predict(candidates, window))
     chi2: Real = np.einsum("kn,kn->k", residual, residual)
