@@ -1,4 +1,4 @@
-"""Report of a touch: the common result of its likeliest explanations, and its kind.
+"""Estimate of a touch: the common result of its likeliest explanations, and its kind.
 
 Standard deviations and intervals of the values include the noise, the model's uncertainty and all
 positions that are about as likely.
@@ -23,29 +23,32 @@ from rigd.touch._results import Estimated, TouchEstimate
 Real = NDArray[np.float64]
 
 _TWO_SIDED_95 = 1.959964
+"""Number of standard deviations of a normal distribution's two-sided 95 % interval."""
 _LEAST_STD_M = (3e-4, 5e-4)
-"""Uncertainty from the bounces of hard contacts beyond the linear one, and near the tip. With this
-addition the errors of 130 simulated touches agree with the intervals."""
+"""Additional standard deviation of the position in m, from the bounces of hard contacts: elsewhere,
+and near the tip. With this addition the errors of 130 simulated touches agree with the
+intervals."""
 _LEAST_OF_TWO_M = 2e-3
-"""The same for the first of two contacts, which are integrated in longer steps."""
+"""Additional standard deviation in m of the position of the first of two obstacles, whose contact
+is integrated in longer time steps."""
 _EARLY_S = (0.006, 0.01, 0.022)
-"""Additional time after the detection with which an unexplained touch is compared. Later a second
-point may be touched."""
+"""Times in s after the detection up to which an unexplained touch is evaluated in addition. Later a
+second point may be touched."""
 _WIDE = 8.0
-"""Drop of the log-likelihood at the ends of an interval for an unexplained touch."""
+"""Drop of the log-likelihood at the ends of the position's interval for an unexplained touch."""
 
 
 def answer(explainer: Explainer, explained: Explained, *, scan: bool) -> TouchEstimate:
-    """Return the estimate of the likeliest explanation, and the kind of touch.
+    """Return the estimate of a touch from the likeliest explanations of its record.
 
     Parameters
     ----------
     explainer
-        Explainer of the record.
+        Search that found the explanations.
     explained
-        Its explanations.
+        Explanations of the record.
     scan
-        Whether to return the likelihood of all positions; else it is empty.
+        Whether the estimate contains the likelihood of all positions; otherwise it is empty.
     """
     explanations, window = explained.explanations, explained.window
     rest = explanations[0]
@@ -96,10 +99,10 @@ def answer(explainer: Explainer, explained: Explained, *, scan: bool) -> TouchEs
 
 
 def _roughly(explainer: Explainer) -> Estimated:
-    """Return the point of an unexplained touch: where any force could cause it, early and later.
+    """Return the position of an unexplained touch in m, with a wide interval.
 
-    Later more than one point may be touched, so the result of the first samples alone counts too,
-    and all with wide intervals.
+    The interval contains all positions at which any force could cause the first samples, or the
+    first and later samples. Later more than one point may be touched.
     """
     early = [explainer.tables.blind.scan(explainer.window(seconds)) for seconds in _EARLY_S]
     ends = np.array([scan.interval(_WIDE)[2:] for scan in (explainer.blind, *early)])
@@ -108,14 +111,14 @@ def _roughly(explainer: Explainer) -> Estimated:
 
 
 def _widened(explainer: Explainer, estimate: Estimated) -> Estimated:
-    """Widen the interval of a point to all positions at which any force could act."""
+    """Return the estimate of a position with an interval that contains those for any force."""
     *_, low, high = explainer.blind.interval()
     low, high = min(low, estimate.interval_95[0]), max(high, estimate.interval_95[1])
     return Estimated(estimate.value, max(estimate.std, (high - low) / 4), (low, high))
 
 
 def _position(explainer: Explainer, rivals: list[Explanation]) -> Estimated:
-    """Return the point of touch, with the additional uncertainty from bounces."""
+    """Return the position of the touch in m, with the additional uncertainty from bounces."""
     estimate = _known(rivals, 0)
     tip = estimate.value > NEAR_TIP * explainer.tables.model.beam.length_m
     least = _LEAST_OF_TWO_M if rivals[0].kind == "two" else _LEAST_STD_M[int(tip)]
@@ -134,7 +137,11 @@ def _position(explainer: Explainer, rivals: list[Explanation]) -> Estimated:
 def _forces(
     explainer: Explainer, best: Explanation, window: WhitenedWindow
 ) -> tuple[Real, Real, Estimated]:
-    """Return the force in time and its peak, over all likely candidates."""
+    """Return the contact force over time, its instants, and its peak with an interval.
+
+    Force and instants are those of the likeliest parameters. The interval of the peak contains the
+    spread over the posterior distribution.
+    """
     rng = np.random.default_rng(2)
     posterior = best.posterior
     some = rng.choice(posterior.weights.size, 48, p=posterior.weights)
@@ -161,7 +168,10 @@ def _forces(
 
 
 def _rivals(best: Explanation, other: Explanation) -> bool:
-    """Return whether another explanation is about as likely, with a penalty per parameter."""
+    """Return whether another explanation is about as likely as the best one.
+
+    An explanation with more parameters must be clearly better.
+    """
     if best.kind == "rigid" and other.kind in ("moving", "yielding"):
         return other.chi2 < best.chi2 - DOUBTFUL
     if best.kind == "rigid" and other.kind == "two":
@@ -170,7 +180,11 @@ def _rivals(best: Explanation, other: Explanation) -> bool:
 
 
 def _known(rivals: list[Explanation], column: int, shift: float = 0.0) -> Estimated:
-    """Return a parameter that all likely explanations have, with an interval over all of them."""
+    """Return the estimate of a parameter that all likely explanations have in common.
+
+    `column` is the column of the parameter, `shift` is added to its value, and the interval
+    contains those of all explanations.
+    """
     ends = np.array([each.posterior.quantiles(column, (0.025, 0.975)) for each in rivals])
     low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
     mean, std = rivals[0].posterior.mean(column), rivals[0].posterior.std(column)
@@ -180,7 +194,10 @@ def _known(rivals: list[Explanation], column: int, shift: float = 0.0) -> Estima
 
 
 def _stiffness(posterior: Posterior) -> Estimated | None:
-    """Return the stiffness if the data bound it on both sides; the mean is over its logarithm."""
+    """Return the estimate of the stiffness in N/m, or None if the data do not bound it.
+
+    The value is the exponential of the logarithm's median.
+    """
     low, middle, high = posterior.quantiles(2, (0.025, 0.5, 0.975))
     if high > STIFFEST - 0.7 or low < SOFTEST + 0.3 or high - low > np.log(100):
         return None

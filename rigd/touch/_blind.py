@@ -1,8 +1,9 @@
 """Any force at one point: the likelihood of the point for any behaviour of the obstacle.
 
-The force is white of unknown size (hats of half a sample), so torque and shear are Gaussian with a
-covariance that depends on the point; the agreement of the two decides. This works for obstacles
-that move, yield or come from outside as well as for springs, with a larger uncertainty.
+The force is white noise of unknown size, on steps of half a sample. Torque and shear are then
+Gaussian with a covariance that depends on the point, and the likeliest point is the one at which
+both agree with the measurement. This works for obstacles that move, yield or come from outside as
+well as for springs, with a larger uncertainty.
 """
 
 from dataclasses import dataclass
@@ -16,33 +17,35 @@ from rigd.touch._physical import WhitenedWindow
 Real = NDArray[np.float64]
 
 _SIZES_N = np.array([0.1, 0.4, 1.6, 6.4])
-"""Candidate standard deviations of the force."""
+"""Standard deviations of the force in N that are compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class BlindScan:
-    """Likelihood over the positions."""
+    """Likelihood of a touch by any force, at each position along the beam."""
 
     x_m: Real
-    """Positions, shape (m,)."""
+    """Positions along the beam, shape (m,)."""
     log_likelihood: Real
-    """Log-likelihood at each, for the likeliest size of the force, shape (m,)."""
+    """Logarithm of the likelihood at each position, for the likeliest size of the force; shape
+    (m,)."""
     chi2: float
-    """Sum of squared residuals at the best position in units of its model's expectation."""
+    """Sum of squared whitened residuals at the likeliest position."""
     degrees: int
-    """Its expectation."""
+    """Expectation of this sum."""
     force_n: Real
-    """Force on the beam at the best position, shape (2 · samples,)."""
+    """Estimated force on the beam at the likeliest position, shape (2 · samples,)."""
     force_std_n: float
-    """Size of the force at that position."""
+    """Standard deviation of the force that is likeliest at this position."""
 
     def interval(self, drop: float = 1.92) -> tuple[float, float, float, float]:
-        """Return the best position, its standard deviation and the ends of the likely positions.
+        """Return the likeliest position, its standard deviation and the ends of its interval, in m.
 
         Parameters
         ----------
         drop
-            Difference in log-likelihood of the ends; 1.92 for 95 %.
+            Difference of the log-likelihood between the likeliest position and the ends; 1.92 for
+            an interval of 95 %.
         """
         fine = np.linspace(self.x_m[0], self.x_m[-1], 4000)
         curve = np.interp(fine, self.x_m, self.log_likelihood)
@@ -62,16 +65,16 @@ class BlindScan:
 
 
 class Blind:
-    """Effects of any force, for the likelihood of records of one length.
+    """Computation of the likelihood of a touch by any force, prepared for one length of records.
 
     Parameters
     ----------
     kernels
-        Contact kernels with two steps a sample.
+        Contact kernels with two time steps a sample.
     every
-        One in so many of their positions is scanned.
+        Number of the kernels' positions from one scanned position to the next.
     samples
-        Most samples.
+        Largest number of samples.
     """
 
     __slots__ = ("_effects", "_x_m")
@@ -85,12 +88,12 @@ class Blind:
         ]  # (positions, samples, forces)
 
     def scan(self, window: WhitenedWindow) -> BlindScan:
-        """Return the likelihood over the positions.
+        """Return the likelihood of a touch by any force at each position.
 
         Parameters
         ----------
         window
-            Whitened innovations, at most as many samples as prepared.
+            Whitened innovations of at most the prepared number of samples.
         """
         count = window.end - window.first
         noise = window.motion.noise

@@ -1,8 +1,9 @@
 """Contact with a springy obstacle, integrated in time for many candidates at once.
 
-The obstacle presses with ``N = max(0, k · penetration)``; the beam yields by its displacement
-kernel. Steps begin at the instant of touch, so that the prediction depends smoothly on it. The
-force of a step is implicit: a stiff obstacle is as stable as a soft one.
+The obstacle presses with the force ``N = max(0, k · penetration)``, and the beam yields by its
+displacement kernel, its response to a triangular pulse ("hat") of force. Steps begin at the instant
+of touch, so that the prediction depends smoothly on it. The force of a step is implicit, so that
+the integration is as stable with a stiff obstacle as with a soft one.
 """
 
 from typing import TypeVar
@@ -14,11 +15,13 @@ Real = NDArray[np.float64]
 _Precision = TypeVar("_Precision", np.float32, np.float64)
 
 _BLOCK, _SHORT_BLOCK = 16, 6
-"""Steps whose earlier forces are summed at once. Between them a step costs three operations on the
-remaining steps of the block: shorter blocks suit many candidates."""
+"""Numbers of steps in a block, for which the effects of all earlier forces are summed at once.
+Within a block a step takes three operations on the remaining steps, so that shorter blocks are
+faster with many candidates."""
 _MANY = 1000
+"""Number of candidates from which shorter blocks are used."""
 _SAMPLES = 16
-"""Samples convolved at once, all with the history of the last of them."""
+"""Number of samples that are convolved at once, all with the history of the last of them."""
 
 
 def march(
@@ -29,28 +32,28 @@ def march(
     rate_m_per_s: Real | float = 0.0,
     mobility_m_per_n_s: Real | float = 0.0,
 ) -> NDArray[_Precision]:
-    """Return the force with which the beam presses, at each step since the touch.
+    """Return the force with which the beam presses on an obstacle, at each step since the touch.
 
     Parameters
     ----------
     kernel
         Displacement in the direction of the force per hat of force, shape (k, n).
     approach
-        How far the beam would be beyond the point of touch without the force, shape (k, n), or
-        (k, g, n) for g candidates of each kernel; the first of the n is 0.
+        Distance by which the beam would be beyond the point of touch without the force, shape
+        (k, n), or (k, g, n) for g candidates of each kernel. It is 0 at the first step.
     stiffness_n_per_m
         Stiffness of the obstacle, shape (k,) or (k, g).
     step_s
-        Time between two columns.
+        Time between two steps.
     rate_m_per_s
         Speed of the obstacle away from the beam, shape (k,) or a number.
     mobility_m_per_n_s
-        Speed at which the obstacle yields per force, likewise.
+        Speed at which the obstacle yields per force, shape (k,) or a number.
 
     Returns
     -------
     ndarray, shape of `approach`
-        Magnitude in N, 0 without contact.
+        Magnitude of the force in N, 0 without contact.
     """
     shape = approach.shape
     kernels, steps = kernel.shape
@@ -124,19 +127,20 @@ def march_two(
     Parameters
     ----------
     own
-        Displacement at each position per hat of force there, shape (k, n).
+        Displacement at each obstacle's position per hat of force there, shape (k, n).
     cross
-        Displacement at one position per hat of force at the other, in the directions of the forces.
+        Displacement at one position per hat of force at the other, in the directions of the forces;
+        shape (k, n).
     approach
-        How far the beam would be beyond each position without any force, shape (k, n); none at the
-        first step.
+        Distance by which the beam would be beyond each obstacle without any force, shape (k, n).
+        It is not positive at the first step.
     stiffness_n_per_m
         Stiffness of each obstacle, shape (k,).
 
     Returns
     -------
     tuple of ndarray, shape (k, n)
-        Magnitude in N, 0 without contact.
+        Magnitude of each force in N, 0 without contact.
     """
     count, steps = cross.shape
     # Force of a step without all others, (n, 2, k).
@@ -188,18 +192,19 @@ def march_two(
 
 
 def shifted(table: Real, begin: Real, count: int) -> Real:
-    """Return each row from a position between its columns on (cubic, four points).
+    """Shift each row of a table by a fraction of columns, by cubic interpolation.
 
-    Before the first column the values are 0; after the last one they are constant.
+    The result has the shape (k, count). Before the first column the values are 0, and after the
+    last column they are constant.
 
     Parameters
     ----------
     table
-        Shape (k, n).
+        Rows of values, shape (k, n).
     begin
-        Column of the first value, shape (k,).
+        Column of each row's first value in the result, shape (k,); it may be between two columns.
     count
-        Number of values, one column apart.
+        Number of values of the result, one column apart.
     """
     whole = np.floor(begin).astype(np.intp)
     u = (begin - whole)[:, None]
@@ -224,16 +229,18 @@ def shifted(table: Real, begin: Real, count: int) -> Real:
 
 
 def responses(kernels: tuple[Real, ...], force: Real, every: int, samples: int) -> Real:
-    """Convolve a force with kernels, every so many steps; shape (k, kernels, samples).
+    """Return the responses to a force at some of its time steps, shape (k, kernels, samples).
+
+    They are the convolution of the force with the kernels.
 
     Parameters
     ----------
     kernels
-        Responses to a hat of force, each of shape (k, n) or (1, n); 0 from column n on.
+        Responses to a hat of force, each of shape (k, n) or (1, n), which are 0 from column n on.
     force
         Force at each step, shape (k, (samples - 1) · every + 1).
     every
-        Steps between two samples; the first sample is at the first step.
+        Number of steps from one sample to the next; the first sample is at the first step.
     samples
         Number of samples.
     """

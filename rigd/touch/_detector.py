@@ -144,7 +144,7 @@ class TouchDetector:
         self._recent = 1.0
 
     def disarm(self) -> None:
-        """Stop to detect touches; the model continues to follow the motion of the beam."""
+        """Stop detecting touches, while the model continues to follow the beam's motion."""
         self._armed = False
         self.level = 0.0
 

@@ -1,7 +1,7 @@
 """Position, instant and force of a touch, from its record.
 
-The touch began some time before its detection. The shortest possible time is tried first: the
-samples before it determine the motion of the free beam.
+The touch began some time before its detection. The shortest possible time is assumed first. The
+samples before the touch determine the motion of the free beam.
 """
 
 import numpy as np
@@ -14,31 +14,34 @@ from rigd.touch._results import TouchEstimate
 from rigd.touch._tables import NOTICED_S, Tables
 
 _LEAST_QUIET = 100
-"""Samples before a touch without which no estimate is possible."""
+"""Smallest number of samples before a touch with which an estimate is possible."""
 _HOPELESS = 3.0
-"""Above this misfit per sample of an obstacle at rest, the touch may have begun earlier."""
+"""Mean square residual of an obstacle at rest, over noise, above which the touch may have begun
+earlier."""
 
 
 def estimate_touch(record: TouchRecord, model: TouchModel) -> TouchEstimate:
-    """Estimate one touch; for several with one model, prepare a `TouchEstimator`.
+    """Estimate position, instant, force and stiffness of one touch from its record.
+
+    For several touches with one model, prepare a `TouchEstimator`.
 
     Parameters
     ----------
     record
         Samples from 0.3 s or more before the touch.
     model
-        The beam.
+        Model of the beam.
     """
     return TouchEstimator(model, record.rate_hz).estimate(record)
 
 
 class TouchEstimator:
-    """Estimates touches with one model; its preparation takes a second.
+    """Estimator of touches with one model of the beam; its preparation takes a second.
 
     Parameters
     ----------
     model
-        The beam.
+        Model of the beam.
     rate_hz
         Samples a second.
     """
@@ -50,32 +53,32 @@ class TouchEstimator:
         self._tables = Tables(model, rate_hz)
 
     def estimate(self, record: TouchRecord, *, scan: bool = True) -> TouchEstimate:
-        """Estimate one touch from the samples so far.
+        """Return the estimate of one touch from the samples so far.
 
         Parameters
         ----------
         record
-            Samples from 0.3 s or more before the touch; more samples after the detection improve
-            the answer, up to 0.2 s.
+            Samples from 0.3 s or more before the touch. More samples after the detection, up to
+            0.2 s, improve the estimate.
         scan
-            Whether to return the likelihood of all positions; else it is empty.
+            Whether the estimate contains the likelihood of all positions; otherwise it is empty.
         """
         return self.follow().update(record, scan=scan)
 
     def follow(self) -> "GrowingEstimate":
-        """Return an estimate of one touch that is updated while its record grows."""
+        """Return an empty estimate of one touch, to be updated while its record grows."""
         return GrowingEstimate(self._tables)
 
 
 class GrowingEstimate:
-    """Successive estimates of one touch, each of which continues from the previous one.
+    """Estimation of one touch while its record grows; each estimate starts from the previous one.
 
-    All its records begin with the same sample.
+    All records begin with the same sample.
 
     Parameters
     ----------
     tables
-        Tables of the model at this rate.
+        Precomputed quantities of the model at the record's rate.
     """
 
     __slots__ = ("_earlier", "_explained_by", "_tables")
@@ -86,7 +89,7 @@ class GrowingEstimate:
         self._explained_by: float | None = None
 
     def preview(self, record: TouchRecord) -> None:
-        """Search the possible positions in advance, as part of the first estimate.
+        """Search the likely positions of the touch in advance, so that the first estimate is fast.
 
         Parameters
         ----------
@@ -102,17 +105,17 @@ class GrowingEstimate:
     def update(
         self, record: TouchRecord, *, scan: bool = True, first: bool = False
     ) -> TouchEstimate:
-        """Estimate the touch from the samples so far.
+        """Return the estimate of the touch from the samples so far.
 
         Parameters
         ----------
         record
             Samples from 0.3 s or more before the touch.
         scan
-            Whether to return the likelihood of all positions; else it is empty.
+            Whether the estimate contains the likelihood of all positions; otherwise it is empty.
         first
-            Whether this is the first answer: it tries one and two obstacles at rest only, and
-            reports any other touch as of unknown kind, since other kinds take a second.
+            Whether this is the first estimate. It then tries one and two obstacles at rest only,
+            because other kinds take a second, and reports any other touch as of unknown kind.
         """
         result = None
         searched = record.angle_rad.size
@@ -137,18 +140,21 @@ class GrowingEstimate:
         return result or self._without_answer(record)
 
     def _reaches(self, record: TouchRecord, noticed_s: float) -> bool:
-        """Return whether there are enough samples of the free beam."""
+        """Return whether there are enough samples before a touch `noticed_s` before detection."""
         return record.detected - round(noticed_s * self._tables.rate_hz) >= _LEAST_QUIET
 
     def _explainer(self, record: TouchRecord, noticed_s: float) -> Explainer:
-        """Return the explainer of a record, which continues from that of the previous record."""
+        """Return the search for explanations of a record, for one time from touch to detection.
+
+        It starts from the results with the previous, shorter record.
+        """
         earlier = self._earlier.get(noticed_s)
         if earlier is None or earlier.given is not record:
             self._earlier[noticed_s] = Explainer(self._tables, record, noticed_s, earlier)
         return self._earlier[noticed_s]
 
     def _began_earlier(self, record: TouchRecord, noticed_s: float) -> bool:
-        """Return whether the touch seems to begin before the samples that may contain it."""
+        """Return whether the touch seems to begin more than `noticed_s` before its detection."""
         if noticed_s == NOTICED_S[-1]:
             return False
         here = self._explainer(record, noticed_s)
@@ -161,7 +167,7 @@ class GrowingEstimate:
         return longer.seems_to_begin < here.first and longer.misfit < 0.5 * here.misfit
 
     def _without_answer(self, record: TouchRecord) -> TouchEstimate:
-        """Return the empty estimate for too few samples before the touch."""
+        """Return the estimate without any result, for a record with too few samples."""
         nothing = np.zeros(0)
         channels = 1 if record.shear_n is None else 2
         return TouchEstimate(

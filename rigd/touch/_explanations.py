@@ -1,8 +1,8 @@
 """Explanations of the record of one touch: candidates of each kind, and their residuals.
 
 A springy obstacle at rest, integrated in time through its bounces, explains the innovations of
-torque and base shear. Alternatives are two obstacles, those that move or yield, a knock, and any
-force at all. `_answer` decides which of them are reported.
+torque and base shear. Alternatives are two obstacles, an obstacle that moves or yields, a knock
+(one pulse of force), and any force at all. `_answer` decides which of them are reported.
 """
 
 from dataclasses import dataclass, replace
@@ -35,87 +35,105 @@ from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 Real = NDArray[np.float64]
 
 _STAGES_S = (FIRST_S, 0.1, FINAL_S)
-"""Times after the detection to be explained; the longest only if an obstacle at rest explains the
-shorter ones and the point is still uncertain."""
+"""Times in s after the detection up to which the record is explained, in this order. The longest is
+used only if an obstacle at rest explains the shorter parts and the point is still uncertain."""
 _COVERED_S = 0.1
-"""Time after the detection up to which the effects of all uncertainties are included at once."""
+"""Time in s after the detection up to which the effects of all uncertainties are included at
+once."""
 _WORTH = 1.2
-"""A further stage requires this factor in the number of samples."""
+"""Smallest factor by which the number of samples must grow for a further stage."""
 _WELL_KNOWN_M = 2e-3
+"""Standard deviation of the position in m below which a longer part of the record is not used."""
 _CLOUD = 96
-"""Starts for a longer part of the record, from the posterior of a shorter one."""
+"""Number of candidates for a longer part of the record, drawn from the posterior of a shorter
+part."""
 NEAR_TIP = 0.8
-"""Fraction of the length beyond which contacts are shorter, and steps finer."""
+"""Fraction of the beam's length beyond which contacts are shorter, so that time steps are finer."""
 _NEARBY_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
+"""Distances in m of additional candidates from the best ones near the tip."""
 _AT_TIP = 0.95
-"""Beyond this fraction a longer record adds nothing: its many short contacts fit anywhere."""
+"""Fraction of the beam's length beyond which a longer record adds nothing, because its many short
+contacts fit anywhere."""
 
 _LEAST_SCALE = 1.2
-"""Least assumed variance of the residuals: the noise itself is estimated from few samples."""
+"""Smallest assumed variance of the whitened residuals, since the noise itself is estimated from few
+samples."""
 _DOUBT_OF_TWO = 4.0
-"""Where two obstacles clearly explain more than one, the sum of squared residuals is divided by
-this: the errors of the model decide which of the several minima is the lowest."""
+"""Divisor of the sum of squared residuals if two obstacles clearly explain more than one: errors of
+the model then decide which of several minima is the lowest."""
 CLEAR = 16.0
-"""Difference in the sum of squared residuals that decides between two kinds."""
+"""Difference in the sum of squared residuals that decides between two kinds of obstacle."""
 DOUBTFUL = 9.0
-"""Reduction by a moving or yielding obstacle up to which one at rest stays possible: an obstacle at
-rest gains that much by chance in one of a hundred touches."""
+"""Reduction of the sum of squared residuals by a moving or yielding obstacle up to which an
+obstacle at rest is still possible. In one of a hundred touches of an obstacle at rest the reduction
+is that large by chance."""
 _POSSIBLE = 5.0
-"""Reduction by two obstacles up to which the point stays uncertain."""
+"""Reduction of the sum of squared residuals by two obstacles from which they are possible, so that
+the position is less certain."""
 _HOPEFUL = 0.8
-"""Reduction after a few iterations from which two obstacles get more of them."""
+"""Reduction of the sum of squared residuals after a few iterations, from which the search for two
+obstacles continues."""
 _WORSE = 3.5
-"""Standard deviations by which the sum of squared residuals may exceed its expectation."""
+"""Number of standard deviations by which the sum of squared residuals may exceed its
+expectation."""
 POOR = 2.0
-"""Standard deviations beyond which the explanation may be wrong: other kinds are tried, and the
-interval of the point is that for any force."""
+"""Number of standard deviations of the sum of squared residuals beyond which the explanation may be
+wrong: other kinds are tried, and the interval of the point is that for any force."""
 _WORSE_LATER = 2.5
-"""The same for the addition of a longer record. Bounces amplify small errors of the model: where
-the later ones are explained less well, the first result is closer to the truth."""
+"""Number of standard deviations by which the sum of squared residuals of the later samples alone
+may exceed its expectation. Bounces amplify small errors of the model. If the later bounces are
+explained less well, the first result is closer to the truth."""
 
 _RATES_M_PER_S = np.array([-1.5, -0.7, -0.3, -0.1, 0.1, 0.25, 0.5])
+"""Speeds of moving obstacles with which the search starts."""
 _MOBILITIES = np.array([0.01, 0.04, 0.15, 0.6])
+"""Mobilities of yielding obstacles, in m/s per N, with which the search starts."""
 _STIFFNESSES = np.array([300.0, 3000.0, 30000.0])
-"""Starts of obstacles that move (m/s) or yield (m/s per N), and their stiffnesses."""
+"""Stiffnesses in N/m of moving or yielding obstacles with which the search starts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Best explanation of the record by obstacles of one kind."""
+    """Best explanation of a touch's record by obstacles of one kind."""
 
     kind: str
+    """Kind of obstacle: rigid, moving, yielding, two or knock."""
     posterior: Posterior
+    """Posterior distribution of the obstacle's parameters."""
     parameters: Real
+    """Likeliest parameters, shape (p,)."""
     chi2: float
+    """Sum of squared residuals of the likeliest parameters."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """Possible explanations of a record, and their range."""
+    """Possible explanations of a touch's record, and the part of the record that they explain."""
 
     explanations: list[Explanation]
-    """An obstacle at rest comes first."""
+    """Explanations by kind; that by an obstacle at rest comes first."""
     window: WhitenedWindow
-    """The explained part of the record."""
+    """Part of the record that is explained."""
     later_doubtful: bool
     """Whether the later samples, which are left out, contradict an obstacle at rest."""
     untried: bool
-    """Whether another kind may be likelier, but none was tried."""
+    """Whether another kind of obstacle may be likelier, but was not tried."""
 
 
 class Explainer:
-    """Explains the record of one touch.
+    """Search for the obstacles that explain the record of one touch.
 
     Parameters
     ----------
     tables
-        Tables of the model at this rate.
+        Precomputed tables of the model at the record's rate.
     record
         Samples from 0.3 s or more before the touch.
     noticed_s
-        Longest time from the touch to its detection.
+        Longest time in s from the touch to its detection.
     earlier
-        Explainer of the beginning of the same record; its results are the starting point.
+        Search with the beginning of the same record, from whose results this search starts; None:
+        it starts from a grid.
     """
 
     def __init__(
@@ -150,27 +168,30 @@ class Explainer:
 
     @property
     def first(self) -> int:
-        """First sample of the record that may contain the touch."""
+        """Index of the first sample of the record that may contain the touch."""
         return self.begin + self.quiet
 
     @property
     def begins_too_late(self) -> bool:
-        """Whether the touch seems to begin before the samples that may contain it."""
+        """Whether the likeliest touch begins before the samples that may contain it."""
         return bool(self.starts[0, 1] < self.motion.t[self.quiet] + 2.5 / self.rate)
 
     @property
     def seems_to_begin(self) -> int:
-        """Sample before which the likeliest touch of the first grid search begins."""
+        """Index of the sample before which the likeliest touch of the grid search begins."""
         after_s = float(self.starts[0, 1] - self.motion.t[self.quiet])
         return self.first + round(after_s * self.rate)
 
     @property
     def misfit(self) -> float:
-        """Residual of an obstacle at rest in the first samples, relative to the noise's."""
+        """Mean square of the residuals of an obstacle at rest in the first samples, over noise."""
         return float(self._descended.chi2.min() / self._first_samples.data.size)
 
     def explain(self, *, first: bool) -> Explained:
-        """Explain the record by obstacles at rest and, except the `first` time, by other kinds."""
+        """Return the explanations of the record by one or two obstacles at rest and other kinds.
+
+        With `first` set, other kinds than obstacles at rest are not tried, because that takes long.
+        """
         rest, window, two, later_doubtful = self._over_stages()
         explanations = [rest]
         untried = False
@@ -189,9 +210,10 @@ class Explainer:
     def _over_stages(self) -> tuple[Explanation, WhitenedWindow, Explanation | None, bool]:
         """Explain longer and longer parts of the record by an obstacle at rest.
 
-        Returns the explanation of the longest explained part, or else the first failed one, and
-        that part; two obstacles, if they explain a part that a single one does not; and whether the
-        following samples contradict it.
+        Return four results: the explanation of the longest part that an obstacle at rest explains,
+        or of the first part that it does not explain; this part; the explanation by two obstacles,
+        or None unless they explain a part that a single obstacle does not; and whether the
+        following samples contradict the first explanation.
         """
         available_s = self.available / self.rate
         stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
@@ -229,39 +251,45 @@ class Explainer:
         return *before, None, False
 
     def _enough(self, rest: Explanation, window: WhitenedWindow, seconds: float) -> bool:
-        """Return whether a longer part of the record would add nothing."""
+        """Return whether a longer part of the record would not improve the estimate."""
         x_m = rest.posterior.mean(0)
         known = rest.posterior.std(0) < _WELL_KNOWN_M or x_m > _AT_TIP * self.edges[1]
         return seconds > FIRST_S and bool(known or not self.fits(rest, window))
 
     def _take_along(self, likeliest: Real, seconds: float) -> None:
-        """Include the uncertainties for this length of the record."""
+        """Compute the effects of all uncertainties up to `seconds` after the detection.
+
+        They are computed for the first candidate of `likeliest`, unless this was done before.
+        """
         if self._covered_s < seconds:
             self._covered_s = min(max(seconds, _COVERED_S), self.available / self.rate)
             whole = WhitenedWindow.of(self.motion, self.quiet, self.end(self._covered_s))
             self.deviations = deviations(self.tables, self.record, likeliest[:1], whole)
 
     def _further(self, rest: Explanation) -> Real:
-        """Return starts for a longer part of the record."""
+        """Return candidates for a longer part of the record, from the result for a shorter part."""
         return np.vstack([rest.parameters, self._cloud(rest.posterior)])
 
     @cached_property
     def blind(self) -> BlindScan:
-        """Likelihood of any force in the first samples; takes as long as the remaining estimate."""
+        """Likelihood of a touch by any force at each position, from the first samples.
+
+        Its computation takes as long as the remaining estimate.
+        """
         return self.tables.blind.scan(self.window(FIRST_S))
 
     # Data for the comparison of candidates
 
     def window(self, seconds: float) -> WhitenedWindow:
-        """Return the samples from before the touch to a time after the detection."""
+        """Return the whitened innovations from before the touch to a time after the detection."""
         return WhitenedWindow.of(self.motion, self.quiet, self.end(seconds), self.deviations)
 
     def end(self, seconds: float) -> int:
-        """Return the sample at a time after the detection, or the end of the record."""
+        """Return the index of the sample at a time after the detection, or the record's end."""
         return self.detected + min(self.available, round(seconds * self.rate))
 
     def space(self, width: int) -> Space:
-        """Return the ranges of `PARAMETERS`."""
+        """Return the ranges of the first `width` parameters of `PARAMETERS`."""
         t = self.motion.t
         return Space(
             low=np.array([self.edges[0], t[self.quiet + 1], SOFTEST, -3.0, 0.0])[:width],
@@ -273,9 +301,10 @@ class Explainer:
         )
 
     def predicting(self, rows: Real, *, first: bool = False) -> Prediction:
-        """Return the prediction in short steps, half as long near the tip: contacts are shorter.
+        """Return the function that predicts the effect of obstacles near the candidates `rows`.
 
-        `first`: elsewhere twice as long steps for the beginning.
+        Its time steps are half as long near the tip, where contacts are shorter. With `first` set,
+        they are twice as long elsewhere, for a first search.
         """
         tables = self.tables
         tip = bool(np.median(rows[:, 0]) > NEAR_TIP * tables.model.beam.length_m)
@@ -286,7 +315,7 @@ class Explainer:
     # Springy obstacle at rest
 
     def _best_of_grid(self) -> Real:
-        """Return the likeliest candidates of the grid, some of each position."""
+        """Return the four likeliest candidates of the grid for each position."""
         window = self.window(GRID_S)
         grid = self.tables.starts(window.end - window.first)
         starts, chi2 = grid.marched(self.motion, window, self.detected)
@@ -297,12 +326,15 @@ class Explainer:
 
     @cached_property
     def _first_samples(self) -> WhitenedWindow:
-        """Samples for the candidates of the grid: their uncertainties are not included yet."""
+        """Whitened innovations with which the grid's candidates are compared.
+
+        The effects of uncertainties through the contact are not included yet.
+        """
         return WhitenedWindow.of(self.motion, self.quiet, self.end(FIRST_S))
 
     @cached_property
     def starts(self) -> Real:
-        """The likeliest candidates of the grid, compared over more samples."""
+        """The 12 likeliest candidates of the grid, compared over more samples."""
         coarse = Touching(self.tables.coarse, self.tables.x_m, self.motion)
         again = chi2_of(
             lambda rows, window: coarse.predicted(rows, window)[0],
@@ -313,12 +345,15 @@ class Explainer:
 
     @cached_property
     def _descended(self) -> Descended:
-        """Minima from these starts, in longer steps."""
+        """Minima that least squares found from the likeliest candidates, in longer time steps."""
         predict = self.predicting(self.starts, first=True)
         return descend(predict, self._first_samples, self.starts, self.space(3), rounds=7)
 
     def _with_neighbours(self, starts: Real) -> Real:
-        """Add starts near the best ones close to the tip, where the minima are close together."""
+        """Return candidates, with further ones nearby if they are close to the beam's tip.
+
+        Minima are close together there.
+        """
         if np.median(starts[:, 0]) <= NEAR_TIP * self.tables.model.beam.length_m:
             return starts
         nearby = np.repeat(starts[None, :2], _NEARBY_M.size, axis=0)
@@ -326,7 +361,7 @@ class Explainer:
         return np.vstack([starts, nearby.reshape(-1, starts.shape[1])])
 
     def _cloud(self, posterior: Posterior) -> Real:
-        """Return candidates for a longer window, from the posterior of a shorter one."""
+        """Return random candidates for a longer window, from the posterior of a shorter window."""
         rng = np.random.default_rng(1)
         chosen = posterior.samples[rng.choice(posterior.weights.size, _CLOUD, p=posterior.weights)]
         width = chosen.shape[1]
@@ -339,7 +374,7 @@ class Explainer:
     def explained(
         self, kind: str, predict: Prediction, window: WhitenedWindow, starts: Real, space: Space
     ) -> Explanation:
-        """Find the minima from the starts, and sample around them."""
+        """Return the explanation by one kind of obstacle: search for minima, and sample around."""
         if starts.shape[0] > 12:
             starts = starts[np.argsort(chi2_of(predict, window, starts))[:12]]
         found = descend(predict, window, starts, space, rounds=9)
@@ -354,7 +389,10 @@ class Explainer:
         space: Space,
         doubt: float = 1.0,
     ) -> Explanation:
-        """Sample around minima; `doubt` divides differences of chi²."""
+        """Return an explanation with samples of the posterior around the minima in `found`.
+
+        `doubt` is a factor on the variance of the residuals.
+        """
         width = found.parameters.shape[1]
         near = np.flatnonzero(found.chi2 < found.chi2.min() + 30)
         covariances = np.array(
@@ -382,24 +420,30 @@ class Explainer:
     # Other kinds
 
     def fits(self, explanation: Explanation, window: WhitenedWindow, worse: float = _WORSE) -> bool:
-        """Return whether the residual is no larger than noise, estimated from few samples."""
+        """Return whether an explanation's residuals are no larger than noise.
+
+        `worse` is the number of standard deviations by which they may exceed their expectation.
+        """
         return bool(explanation.chi2 < self.most(window.data.size, worse))
 
     def most(self, degrees: int, worse: float = _WORSE) -> float:
-        """Return the greatest sum of squared residuals that noise explains."""
+        """Return the largest sum of squared residuals that noise explains.
+
+        `degrees` is its expectation, and `worse` the allowed number of standard deviations.
+        """
         of_noise = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
         return float(degrees + worse * np.sqrt(2 * degrees + of_noise))
 
     def _later_is_worse(
         self, longer: Explanation, over: WhitenedWindow, shorter: Explanation, until: WhitenedWindow
     ) -> bool:
-        """Return whether the shorter of two windows is explained, but not the added part."""
+        """Return whether a shorter window is explained, but not the samples of a longer one."""
         added = over.data.size - until.data.size
         more = longer.chi2 - shorter.chi2
         return self.fits(shorter, until) and more > self.most(added, _WORSE_LATER)
 
     def _changes(self, rest: Explanation, window: WhitenedWindow) -> bool:
-        """Return whether the obstacle at rest becomes likelier if it may move or yield."""
+        """Return whether a moving or yielding obstacle is clearly likelier than one at rest."""
         extra = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
         starts = np.hstack([np.tile(rest.parameters, (len(extra), 1)), extra])
         free = np.hstack([np.ones((len(extra), rest.parameters.size), dtype=bool), extra != 0])
@@ -416,7 +460,7 @@ class Explainer:
         return bool(found.chi2.min() < rest.chi2 - DOUBTFUL)
 
     def _others(self, window: WhitenedWindow) -> list[Explanation]:
-        """Explain the window by obstacles that move or yield, and by a knock."""
+        """Return the explanations of the window by a moving or yielding obstacle, and a knock."""
         blind, side = self.blind, self.side()
         likely = blind.x_m[np.argsort(-blind.log_likelihood)[:24]]
         instants = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
@@ -442,13 +486,13 @@ class Explainer:
         return found
 
     def pairing(self) -> Pairing:
-        """Return the integration of two obstacles on this record."""
+        """Return the integration of the contact with two obstacles for this record."""
         tables = self.tables
         touching = Touching(tables.coarse, tables.x_m, self.motion)
         return Pairing(touching, tables.coarse, tables.crossing)
 
     def _two(self, rest: Explanation, window: WhitenedWindow) -> Explanation | None:
-        """Explain the window by two obstacles, if they may explain more than one at rest does."""
+        """Return the explanation by two obstacles, or None if one obstacle explains as much."""
         pairing = self.pairing()
         space = pairing.space(self.space(3))
         # The first samples show in less time whether more iterations are worthwhile.
@@ -468,11 +512,17 @@ class Explainer:
         return self._sampled("two", pairing.channels, window, found, space, doubt)
 
     def side(self) -> float:
-        """Return the direction in which the beam presses: opposite to the force."""
+        """Return the direction in which the beam presses on the obstacle, 1 or -1.
+
+        It is opposite to the direction of the likeliest force on the beam.
+        """
         return -1.0 if self.blind.force_n.sum() > 0 else 1.0
 
     def _marching(self, kind: str, kernels: ContactKernels, side: float) -> Prediction:
-        """Return the prediction of obstacles whose fourth parameter is their rate or mobility."""
+        """Return the function that predicts the effect of moving or yielding obstacles.
+
+        Their fourth parameter is the speed or the mobility.
+        """
         touching = Touching(kernels, self.tables.x_m, self.motion)
 
         def predicted(candidates: Real, window: WhitenedWindow) -> Real:
@@ -483,6 +533,7 @@ class Explainer:
         return predicted
 
     def _moving_space(self, kind: str) -> Space:
+        """Return the ranges of the four parameters of a moving or yielding obstacle."""
         ranges = self.space(5)
         columns = [0, 1, 2, 3 if kind == "moving" else 4]
         return Space(
@@ -496,7 +547,7 @@ class Explainer:
 
 
 def _distinct(found: Descended) -> Real:
-    """Return the minima without those close to a better one, the best first."""
+    """Return the parameters of minima that are not close to a better minimum, the best first."""
     order = np.argsort(found.chi2)
     distinct: list[Real] = []
     for row in found.parameters[order[found.chi2[order] < 2 * found.chi2.min() + 60]]:

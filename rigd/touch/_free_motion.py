@@ -2,7 +2,7 @@
 
 The measured angle drives the exact model from the record's beginning on. Earlier motion (the beam
 may be vibrating from its slew) adds free vibrations of unknown amplitude. They are fitted to the
-samples before the touch, together with an offset and a drift of each channel.
+samples before the touch, together with an offset and a drift of torque and base shear.
 """
 
 from copy import copy
@@ -25,23 +25,26 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 FINER = 4
-"""Values of the angle per sample, interpolated by a spline."""
+"""Number of time steps of the free motion per sample, to which a spline interpolates the angle."""
 _BAND = 0.5
-"""Fraction of these frequencies that the angle contains: its own Nyquist frequency, twice."""
+"""Fraction of the frequencies up to the time steps' Nyquist frequency that are used: up to twice
+the Nyquist frequency of the samples."""
 _HIGHEST_HZ = 330.0
+"""Highest frequency in Hz of a free vibration that is fitted."""
 _SETTLE_S = 0.03
-"""Time after the record's end in which the angle comes to rest: no jump that rings before it."""
+"""Time constant in s with which the angle comes to rest after the record's end. A jump there would
+cause vibrations before it."""
 _SPEED_S = 0.02
-"""Time over which the speed at the record's beginning is measured."""
+"""Time in s over which the speed at the record's beginning is measured."""
 _NODES = 36
-"""Positions from which the displacement at all others is interpolated."""
+"""Number of positions from which the displacement at all other positions is interpolated."""
 BEFORE = 24
-"""Samples over which the effect of one sample in a spline fades."""
+"""Number of samples over which the effect of one sample in a spline fades."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchRecord:
-    """Samples around a touch, from 0.3 s or more before it."""
+    """Samples of angle, torque and base shear around a touch, from 0.3 s or more before it."""
 
     rate_hz: float
     """Samples a second."""
@@ -55,7 +58,7 @@ class TouchRecord:
     """Index of the sample of the detection."""
 
     def until(self, samples: int) -> "TouchRecord":
-        """Return the first samples as a record.
+        """Return a record that contains only the first samples.
 
         Parameters
         ----------
@@ -69,18 +72,18 @@ class TouchRecord:
 
 
 class FreeBeam:
-    """Part of the free motion that depends on the model and the record's length only.
+    """Responses of the free beam to its angle, prepared for records of one length.
 
     Parameters
     ----------
     model
-        The beam.
+        Model of the beam.
     x_m
-        Positions of the displacement, shape (m,).
+        Positions at which the displacement is computed, shape (m,).
     rate_hz
         Samples a second.
     samples
-        Most samples of a record.
+        Largest number of samples in a record.
     """
 
     __slots__ = (
@@ -117,19 +120,22 @@ class FreeBeam:
         self._sample = self.line.transformed(_finer(unit, rate_hz, self.line)[0])
 
     def at(self, x_m: Real) -> "FreeBeam":
-        """Return the same beam with other positions.
+        """Return the free beam with other positions of the displacement.
 
         Parameters
         ----------
         x_m
-            Positions of the displacement, shape (m,).
+            Positions at which the displacement is computed, shape (m,).
         """
         other = copy(self)
         other._set_positions(x_m)
         return other
 
     def _set_positions(self, x_m: Real) -> None:
-        """Set the positions; many are interpolated from few: to 1e-7 for waves of 1 kHz."""
+        """Set the positions at which the displacement is computed.
+
+        Many positions are interpolated from a few nodes, with an error of 1e-7 for waves of 1 kHz.
+        """
         self.x_m = x_m
         nodes_m, self._between = x_m, np.eye(x_m.size)
         if x_m.size > _NODES:
@@ -138,19 +144,20 @@ class FreeBeam:
         self.modes = self.modes.at(x_m / self.model.beam.length_m)
 
     def per_sample(self, index: int, samples: int) -> Real:
-        """Return the displacement caused by one sample of the angle, in m/rad.
+        """Return the displacement at a position that one sample of the angle causes, in m/rad.
 
         Parameters
         ----------
         index
             Index of the position.
         samples
-            Number of samples after it.
+            Number of samples after the sample of the angle.
 
         Returns
         -------
         ndarray, shape (FINER · (BEFORE + samples),)
-            On the fine steps, from `BEFORE` samples before it: the spline acts ahead of a sample.
+            Displacement on the fine time steps, from `BEFORE` samples before the sample of the
+            angle, because the spline through the samples acts ahead of each sample.
         """
         response = (self._between[index] @ self._displacement) * self._sample
         return self.line.in_time(response, FINER * (BEFORE + samples))
@@ -158,18 +165,18 @@ class FreeBeam:
     def motion(
         self, record: TouchRecord, quiet: int, first: int, turned: "Turned | None" = None
     ) -> "FreeMotion":
-        """Return the free motion of one record.
+        """Return the innovations of a record, and the motion of the beam without a touch.
 
         Parameters
         ----------
         record
-            The samples.
+            Samples around the touch.
         quiet
             Number of samples that are certainly before the touch.
         first
-            First sample of the displacement.
+            Index of the sample from which the displacement is computed.
         turned
-            Transform of the record's angle from another beam; None: it is computed.
+            Transform of the record's angle, if it is known from another beam; None: it is computed.
         """
         n = record.angle_rad.size
         rate = self.rate_hz
@@ -221,48 +228,57 @@ class FreeMotion:
     innovations: Real
     """Innovations of torque and, if measured, shear, shape (c, n)."""
     noise: Real
-    """Standard deviation of each channel before the touch, shape (c,)."""
+    """Standard deviation of the innovations of torque and shear before the touch, shape (c,)."""
     design: Real
-    """Columns fitted before the touch, shape (c, n, q)."""
+    """Design matrix of the fit to the samples before the touch, shape (c, n, q): free vibrations,
+    offset and drift."""
     spread: Real
-    """Cholesky factor of the covariance of the q amplitudes."""
+    """Cholesky factor of the covariance of the q fitted amplitudes, shape (q, q)."""
     turned: "Turned"
-    """The angle that drives the beam."""
+    """Transform of the angle that drives the beam."""
     ringing: "FreeVibration"
-    """The free vibrations among them."""
+    """Free vibrations that were fitted."""
     angle_noise_rad: float
-    """Standard deviation of a sample of the angle."""
+    """Standard deviation of the noise in one sample of the angle."""
     displacement_m: Real
-    """Displacement at the positions, on fine steps, shape (m, k)."""
+    """Displacement of the beam at the positions on fine time steps, shape (m, k)."""
     first_s: float
-    """Instant of the first step."""
+    """Instant of the displacement's first time step."""
     step_s: float
-    """Time between two steps."""
+    """Time between two steps of the displacement."""
 
 
 def _angle_noise(angle: Real) -> float:
-    """Return the scatter of the samples, with encoder steps: fourth differences remove motion."""
+    """Return the standard deviation of the angle's noise in rad, including encoder steps.
+
+    Fourth differences of the samples remove the motion.
+    """
     return float(np.sqrt(np.mean(np.diff(angle, 4) ** 2) / 70))
 
 
 @dataclass(frozen=True, slots=True)
 class Turned:
-    """Transform of a record's angle: initial straight motion, and spectrum of the remainder."""
+    """Laplace transform of a record's angle, after subtraction of a motion at constant speed."""
 
     spectrum: Complex
-    """Remainder, at the frequencies of a Laplace line."""
+    """Transform of the angle minus the motion at constant speed."""
     start_rad: float
+    """Angle at the record's beginning."""
     speed_rad_s: float
+    """Speed at the record's beginning."""
 
     @classmethod
     def of(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "Turned":
-        """Transform the samples of an angle."""
+        """Return the transform of an angle's samples at the frequencies of a Laplace line."""
         rest, start_rad, speed_rad_s = _finer(angle_rad, rate_hz, line)
         return cls(line.transformed(rest), start_rad, speed_rad_s)
 
 
 def _finer(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float, float]:
-    """Return the angle on the line's steps minus its initial straight motion, and that motion."""
+    """Interpolate an angle to the line's time steps, and subtract a motion at constant speed.
+
+    Return the remaining angle, and angle and speed at the record's beginning.
+    """
     from scipy.interpolate import CubicSpline
 
     t = np.arange(angle.size) / rate_hz
@@ -282,19 +298,20 @@ def _finer(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float,
 
 @dataclass(frozen=True, slots=True)
 class FreeVibration:
-    """Free vibrations of the first modes, as columns of cosines and sines that decay."""
+    """Free vibrations of the beam's first modes: decaying cosines and sines to be fitted."""
 
     poles: Complex
-    """Shape (modes,), in rad/s."""
+    """Poles of the modes in rad/s, shape (modes,)."""
     root: Complex
-    """Torque and shear per amplitude, shape (2, modes)."""
+    """Torque and base shear per amplitude of each mode, shape (2, modes)."""
     scale: Real
-    """Unit of the amplitudes, shape (modes,)."""
+    """Unit of each mode's amplitude, shape (modes,)."""
     shapes: Real
-    """Displacement at the positions per amplitude, shape (modes, positions)."""
+    """Displacement at the positions per amplitude of each mode, shape (modes, positions)."""
 
     @classmethod
     def of(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
+        """Return the free vibrations of a model, with the displacement at positions `x_m`."""
         beam, damping = model.beam, model.damping
         most = 12
         found = poles(beam, damping, most)[:, 0]
@@ -312,7 +329,7 @@ class FreeVibration:
         return whole.at(x_m / beam.length_m)
 
     def at(self, fractions: Real) -> "FreeVibration":
-        """Return the same vibrations at other positions.
+        """Return the free vibrations with the displacement at other positions.
 
         Parameters
         ----------
@@ -323,7 +340,7 @@ class FreeVibration:
         return replace(self, shapes=shapes * self.scale[:, None])
 
     def channels(self, t: Real) -> Real:
-        """Return torque and shear, shape (2, t, 2 · modes).
+        """Return torque and shear of each vibration at some times, shape (2, t, 2 · modes).
 
         Parameters
         ----------
@@ -335,7 +352,9 @@ class FreeVibration:
         return np.array([np.hstack([part.real, -part.imag]) for part in parts])
 
     def displacement(self, t: NDArray[np.floating], amplitudes: Real) -> Real:
-        """Return displacements (positions, t, r) or, for r = 1 without its axis, (positions, t).
+        """Return the beam's displacement for given amplitudes of the free vibrations.
+
+        The shape is (positions, t, r), or (positions, t) for amplitudes without the axis r.
 
         Parameters
         ----------
@@ -355,14 +374,23 @@ class FreeVibration:
 
 @dataclass(frozen=True, slots=True)
 class _Fitted:
+    """Fit of free vibrations, offset and drift to the samples before a touch."""
+
     values: Real
+    """Fitted amplitudes, shape (q,)."""
     covariance: Real
+    """Covariance of the amplitudes, shape (q, q)."""
     noise: list[float]
+    """Standard deviation of torque and shear around the fit."""
     innovations: list[Real]
+    """Torque and shear minus the fit at all samples."""
 
     @classmethod
     def to(cls, innovations: list[Real], designs: list[Real], quiet: int) -> "_Fitted":
-        """Fit the quiet samples by weighted least squares; two rounds estimate the weights."""
+        """Fit the first `quiet` samples by weighted least squares.
+
+        Repeated fits estimate the noise of torque and shear, which gives the weights.
+        """
         noise = [1.0] * len(innovations)
         for _ in range(3):
             a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])

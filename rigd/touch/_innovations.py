@@ -295,7 +295,8 @@ def _fit(
 ) -> _Filter:
     """Return the discrete filter whose response fits that of the exact model best.
 
-    Its poles are those of the exact model, and some real poles and delay taps approximate the rest.
+    Its poles are those of the exact model. Some real poles and delay taps approximate the remaining
+    response.
     """
     pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_MOST_MODES), beam, damping)
     upper = pairs[_ringing(pairs[:, 0], rate_hz), 0]

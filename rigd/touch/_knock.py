@@ -1,4 +1,4 @@
-"""A knock from outside: one pulse of force, independent of the antenna's motion."""
+"""A knock from outside: one pulse of force that is independent of the antenna's motion."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,19 +9,22 @@ from rigd.touch._physical import Space, Touching, WhitenedWindow
 Real = NDArray[np.float64]
 
 _DURATIONS_S = np.array([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
+"""Durations of the pulse in s with which the search starts."""
 
 
 class Knocking:
-    """Half-sine pulses of force: position, instant, logarithm of the duration, and peak.
+    """Effect of a knock on the record of a touch: a half-sine pulse of force.
+
+    A candidate has four columns: position, instant, logarithm of the duration, and peak.
 
     Parameters
     ----------
     touching
-        Integration on the record's steps.
+        Integration of the contact for the record.
     kernels
-        Contact kernels of those steps.
+        Contact kernels on the time steps of the integration.
     every
-        One in so many of their positions is a start.
+        Number of the kernels' positions from one starting position of the search to the next.
     """
 
     __slots__ = ("_every", "_kernels", "_touching")
@@ -30,14 +33,14 @@ class Knocking:
         self._touching, self._kernels, self._every = touching, kernels, every
 
     def predicted(self, parameters: Real, window: WhitenedWindow) -> Real:
-        """Return the effect on the channels, shape (k, c, samples).
+        """Return the effect of knocks on torque and base shear, shape (k, c, samples).
 
         Parameters
         ----------
         parameters
-            Rows of position, instant, ln of the duration and peak, shape (k, 4).
+            Position, instant, logarithm of the duration and peak of each knock, shape (k, 4).
         window
-            The samples.
+            Samples for which the effect is predicted.
         """
         motion = window.motion
         last = motion.t[window.end - 1]
@@ -50,16 +53,16 @@ class Knocking:
         return self._touching.effects(tables, force, parameters[:, 1], window)
 
     def starts(self, window: WhitenedWindow, latest: int, count: int) -> Real:
-        """Return the likeliest candidates of a grid, each with its best peak, shape (count, 4).
+        """Return the likeliest knocks of a grid, each with its best peak, shape (count, 4).
 
         Parameters
         ----------
         window
-            The samples.
+            Whitened innovations with which the knocks are compared.
         latest
-            Last sample at which the knock may begin.
+            Index of the last sample at which the knock may begin.
         count
-            Number of candidates.
+            Number of knocks that are returned.
         """
         positions = self._kernels.x_m[:: self._every]
         grid = np.stack(
@@ -97,7 +100,7 @@ class Knocking:
 
     @staticmethod
     def space(x_m: tuple[float, float], instants: tuple[float, float]) -> Space:
-        """Return the ranges of the parameters.
+        """Return the ranges of a knock's four parameters.
 
         Parameters
         ----------

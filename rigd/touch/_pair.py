@@ -1,8 +1,8 @@
 """Two obstacles at rest, the second touched with or after the first.
 
 Each force bends the beam also at the other position, so both contacts are integrated together. Two
-soft obstacles that are touched at about the same time are similar to one between them: every touch
-that one obstacle explains is therefore tested for a second one.
+soft obstacles that are touched at about the same time have a similar effect as one obstacle between
+them. Every touch that one obstacle explains is therefore tested for a second obstacle.
 """
 
 import numpy as np
@@ -15,30 +15,35 @@ from rigd.touch._physical import SOFTEST, Space, Touching, WhitenedWindow
 Real = NDArray[np.float64]
 
 _AFTER_S = np.array([0.0, 0.008, 0.025, 0.06])
-"""Times in starts after which a free beam would touch the second obstacle."""
+"""Times in s from the first touch to that of the second obstacle by a free beam, with which the
+search starts."""
 _POSITIONS = 12
+"""Number of positions of the second obstacle with which the search starts."""
 _TRIED_N_PER_M = 100.0
-"""Stiffness from whose effect others follow in starts: that of soft ones is proportional to it."""
+"""Stiffness of the second obstacle whose effect is computed; the effect of other soft obstacles is
+proportional to their stiffness."""
 _SHARED = np.array([[0.6, 1.6], [0.8, 1.3], [0.6, 2.5]])
-"""Two obstacles equivalent to one: their positions relative to it, each with half of the moment."""
+"""Positions of two obstacles that are equivalent to one obstacle, over its position. Each of the
+two has half of the moment."""
 _FARTHEST_M = 0.3
+"""Largest distance in m of the free beam from the second obstacle at the first touch."""
 
 
 class Pairing:
-    """Integrates the contact with two obstacles.
+    """Integration in time of the contact with two obstacles, for the record of one touch.
 
-    Candidates have six columns: position, instant and logarithm of the stiffness of the first, then
-    the position of the second, the free beam's distance from it at that instant in m, and the
-    logarithm of its stiffness.
+    Candidates have six columns: position, instant and logarithm of the stiffness of the first
+    obstacle, then the position of the second obstacle, the free beam's distance from it at that
+    instant in m, and the logarithm of its stiffness.
 
     Parameters
     ----------
     touching
-        Integration on the record's steps.
+        Integration of the contact with one obstacle.
     kernels
-        Contact kernels of those steps.
+        Contact kernels on the time steps of the integration.
     crossing
-        Kernels between the positions, likewise.
+        Kernels from a force at one position to the displacement at another, on the same steps.
     """
 
     __slots__ = ("_crossing", "_kernels", "_touching")
@@ -47,20 +52,21 @@ class Pairing:
         self._touching, self._kernels, self._crossing = touching, kernels, crossing
 
     def predicted(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
-        """Return the effect on the channels in the window, and the force of the first obstacle.
+        """Return the effect of two obstacles on torque and shear, and the force of the first.
 
         Parameters
         ----------
         parameters
             Candidates, shape (k, 6).
         window
-            The samples.
+            Samples for which the effect is predicted.
 
         Returns
         -------
         channels : ndarray, shape (k, c, samples)
+            Effect on torque and base shear.
         force : ndarray, shape (k, n)
-            On the beam, at the steps from the touch on, in N.
+            Force of the first obstacle on the beam in N, at the steps from the touch on.
         """
         touching, instant = self._touching, parameters[:, 1]
         steps = touching.steps(instant, window)
@@ -85,22 +91,29 @@ class Pairing:
         return first + second, forces[0]
 
     def channels(self, parameters: Real, window: WhitenedWindow) -> Real:
-        """Return the effect on the channels alone; the arguments are those of `predicted`."""
+        """Return the effect of two obstacles on torque and shear, shape (k, c, samples).
+
+        The arguments are those of `predicted`.
+        """
         return self.predicted(parameters, window)[0]
 
     def starts(self, one: Real, window: WhitenedWindow, space: Space, count: int) -> Real:
-        """Return candidates that are like one obstacle, or have a second one, shape (k, 6).
+        """Return pairs of obstacles from which the search starts, shape (k, 6).
+
+        Some have a similar effect as one obstacle, others have a second obstacle in addition to it.
 
         Parameters
         ----------
         one
-            Position, instant and logarithm of the stiffness of the one that explains the record.
+            Position, instant and logarithm of the stiffness of the single obstacle that explains
+            the record best.
         window
-            The samples.
+            Whitened innovations with which the pairs are compared.
         space
-            Ranges of the candidates.
+            Ranges of the parameters.
         count
-            Number of positions of a second one, the likeliest by its first-order effect.
+            Number of positions of a second obstacle: those with the largest reduction of the
+            residuals, by first-order effects.
         """
         shared = np.tile(np.concatenate([one, one]), (len(_SHARED), 1))
         shared[:, [0, 3]] *= _SHARED
@@ -109,7 +122,10 @@ class Pairing:
         return np.vstack([shared, self._with_another(one, window, space, count)])
 
     def _with_another(self, one: Real, window: WhitenedWindow, space: Space, count: int) -> Real:
-        """Return the likeliest second obstacles by their first-order effect."""
+        """Return one obstacle with each of the likeliest second obstacles, shape (count, 6).
+
+        Their likelihood is computed from the first-order effect of the second obstacle.
+        """
         x_m = np.linspace(space.low[3], space.high[3], _POSITIONS)
         instants = np.full(_POSITIONS, one[1])
         steps = self._touching.steps(instants, window)
@@ -141,7 +157,7 @@ class Pairing:
 
     @staticmethod
     def exchanged(parameters: Real) -> Real:
-        """Return candidates in which the second is touched first and the first right after it.
+        """Return pairs in which the second obstacle is touched first, the other right after it.
 
         Parameters
         ----------
@@ -154,12 +170,12 @@ class Pairing:
 
     @staticmethod
     def space(one: Space) -> Space:
-        """Return the ranges of the candidates.
+        """Return the ranges of the six parameters of two obstacles.
 
         Parameters
         ----------
         one
-            Ranges of one obstacle at rest.
+            Ranges of the parameters of one obstacle at rest.
         """
         return Space(
             low=np.concatenate([one.low, [one.low[0], 0.0, one.low[2]]]),

@@ -286,7 +286,7 @@ class Touching:
         return side[:, None] * (free - free[:, :1]), side
 
     def _on_steps(self, moved: Real, instant: Real, steps: int) -> Real:
-        """Interpolate rows of displacements to the kernels' time steps, each from its instant on."""
+        """Interpolate displacements to the kernels' time steps, each row from its instant on."""
         motion = self._motion
         begin = (instant - motion.first_s) / motion.step_s
         between = max(1, round(motion.step_s / self._kernels.step_s))

@@ -19,35 +19,37 @@ from numpy.typing import NDArray
 Real = NDArray[np.float64]
 
 _FREEDOM = 4.0
-"""Degrees of freedom of the Student distributions for drawing samples: heavy tails."""
+"""Degrees of freedom of the Student distributions from which samples are drawn; they have heavy
+tails."""
 _CENTRES = 16
+"""Largest number of Student distributions in a round, centred at the best samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """Weighted samples."""
+    """Posterior distribution of an obstacle's parameters, as weighted samples."""
 
     samples: Real
-    """Rows of parameters, shape (n, p)."""
+    """Parameters of each sample, shape (n, p)."""
     weights: Real
-    """Weights with the sum 1, shape (n,)."""
+    """Weight of each sample, with the sum 1; shape (n,)."""
     chi2: Real
-    """Sum of squared residuals of each."""
+    """Sum of squared residuals of each sample, shape (n,)."""
 
     @property
     def effective(self) -> float:
-        """Number of samples of equal weight with the same precision."""
+        """Effective number of samples: number of equal weights with the same precision."""
         return float(1 / np.sum(self.weights**2))
 
     def quantiles(self, column: int, levels: tuple[float, ...]) -> Real:
-        """Return weighted quantiles of a parameter.
+        """Return quantiles of a parameter's posterior distribution.
 
         Parameters
         ----------
         column
             Column of the parameter.
         levels
-            Between 0 and 1.
+            Probabilities of the quantiles, between 0 and 1.
         """
         values = self.samples[:, column]
         order = np.argsort(values)
@@ -55,7 +57,7 @@ class Posterior:
         return np.interp(levels, cumulated, values[order])
 
     def mean(self, column: int) -> float:
-        """Return the weighted mean of a parameter.
+        """Return the posterior mean of a parameter.
 
         Parameters
         ----------
@@ -65,7 +67,7 @@ class Posterior:
         return float(self.weights @ self.samples[:, column])
 
     def std(self, column: int) -> float:
-        """Return the weighted standard deviation of a parameter.
+        """Return the posterior standard deviation of a parameter.
 
         Parameters
         ----------
@@ -95,21 +97,21 @@ def sampled(
     chi2_of
         Function that returns the sum of squared residuals of rows of parameters.
     centres
-        Minima, shape (k, p).
+        Minima of the sum of squared residuals, around which samples are drawn, shape (k, p).
     covariances
-        Covariance of each, shape (k, p, p).
+        Covariance of the parameters at each minimum, shape (k, p, p).
     bounds
-        Low and high end of each parameter.
+        Lower and upper ends of the parameters' ranges.
     scale
         Variance of a residual.
     count
-        Samples in a round.
+        Number of samples in a round.
     rounds
-        Most rounds.
+        Largest number of rounds.
     enough
         Effective number of samples that ends the rounds.
     smallest
-        Least standard deviation for drawing samples, shape (p,).
+        Smallest standard deviation for drawing samples, shape (p,).
     """
     rng = np.random.default_rng(0)  # the same record gives the same answer
     width = centres.shape[1]
@@ -162,7 +164,10 @@ def sampled(
 
 
 def _density(samples: Real, centres: Real, covariances: Real, mixture: Real) -> Real:
-    """Return the density of a mixture of Student distributions, except for a constant factor."""
+    """Return the density of a mixture of Student distributions at samples, shape (n,).
+
+    A constant factor is omitted.
+    """
     width = samples.shape[1]
     total = np.zeros(samples.shape[0])
     for centre, covariance, weight in zip(centres, covariances, mixture, strict=True):

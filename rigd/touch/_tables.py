@@ -1,4 +1,4 @@
-"""Quantities for touches that depend on the beam and the rate only, computed once."""
+"""Quantities for the estimation of touches that depend on beam and rate only, computed once."""
 
 from typing import Final
 
@@ -12,14 +12,16 @@ from rigd.touch._physical import Starts
 from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 
 NOTICED_S: Final = (0.013, 0.04, 0.12)
-"""Longest times from a touch to its detection: longer ones are tried if the shorter fail."""
+"""Longest times in s from a touch to its detection that are assumed. Longer times are tried if
+shorter times fail."""
 GRID_S: Final = 0.022
-"""Time after the detection for the comparison with the grid of starts."""
+"""Time in s after the detection whose samples are compared with the grid of candidates."""
 _SPACING_M = 0.007
+"""Largest distance in m between two positions of the contact kernels."""
 
 
 class Tables:
-    """Quantities that depend on the model and the rate only."""
+    """Precomputed quantities for the estimation of touches with one model at one rate."""
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
         self.model, self.rate_hz = model, rate_hz
@@ -51,10 +53,10 @@ class Tables:
             for name, std in model.std.items()
             if std > 0
         ]
-        """Beams with one uncertain parameter changed by one standard deviation each."""
+        """Beams in each of which one uncertain parameter is changed by its standard deviation."""
 
     def starts(self, samples: int) -> Starts:
-        """Return the grid of starts for a number of samples."""
+        """Return the grid of candidates for a comparison over a number of samples."""
         if samples not in self._starts:
             self._starts[samples] = Starts(self.coarse, 2, self.rate_hz, samples)
         return self._starts[samples]

@@ -1,7 +1,7 @@
-"""Uncertainties, and their effects on the innovations of a touch.
+"""Effects of uncertainties on the innovations of a touch.
 
-Includes the model's parameters, the steps of the integration, the free motion and the encoder's
-steps, with their effects on the instant of touch.
+The uncertainties are those of the model's parameters, the time steps of the integration, the free
+motion and the encoder's steps, with their effects on the instant of touch.
 """
 
 import numpy as np
@@ -16,18 +16,20 @@ Real = NDArray[np.float64]
 
 
 def deviations(tables: Tables, record: TouchRecord, best: Real, whole: WhitenedWindow) -> Real:
-    """Return the effects of uncertainties on the innovations, (c, n, r), for 1 standard deviation.
+    """Return the effects of r uncertainties on the innovations, for one standard deviation each.
+
+    The shape is (c, n, r), with c = 1 for torque alone and 2 for torque and base shear.
 
     Parameters
     ----------
     tables
-        What depends on the model and the rate.
+        Precomputed quantities of the model at the record's rate.
     record
-        The samples.
+        Samples around the touch.
     best
         Position, instant and logarithm of the stiffness of the likeliest obstacle, shape (1, 3).
     whole
-        The samples, whose first is certainly before the touch.
+        Innovations from a sample that is certainly before the touch to the end.
     """
     motion, quiet = whole.motion, whole.first
     fine = Touching(tables.finest, tables.x_m, motion).predicted(best, whole)[0][0]
@@ -58,7 +60,10 @@ def deviations(tables: Tables, record: TouchRecord, best: Real, whole: WhitenedW
 
 
 def _ringing(tables: Tables, touching: Touching, best: Real, whole: WhitenedWindow) -> Real:
-    """Return the effects of the free motion's uncertainty, with that on the instant of touch."""
+    """Return the effects of the free motion's uncertainty on the innovations, (q, c, n).
+
+    They include the effects through the contact, such as another instant of touch.
+    """
     motion = whole.motion
     spread = motion.spread
     count = motion.ringing.poles.size * 2
@@ -72,7 +77,10 @@ def _ringing(tables: Tables, touching: Touching, best: Real, whole: WhitenedWind
 
 
 def _angle_noise(tables: Tables, touching: Touching, best: Real, whole: WhitenedWindow) -> Real:
-    """Return the effects of the encoder's steps on the instant of touch."""
+    """Return the effects of the encoder's noise through the contact on the innovations.
+
+    There is one for each sample of the angle; the shape is (samples, c, n).
+    """
     motion = whole.motion
     samples = np.arange(whole.first, whole.end)
     nearest = int(np.argmin(np.abs(tables.x_m - best[0])))
