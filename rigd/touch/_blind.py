@@ -16,12 +16,12 @@ from rigd.touch._physical import WhitenedWindow
 
 Real = NDArray[np.float64]
 
-_SIZES_N = np.array([0.1, 0.4, 1.6, 6.4])
+_FORCE_STDS_N = np.array([0.1, 0.4, 1.6, 6.4])
 """Standard deviations of the force in N that are compared."""
 
 
 @dataclass(frozen=True, slots=True)
-class BlindScan:
+class AnyForceLikelihood:
     """Likelihood of a touch by any force, at each position along the beam."""
 
     x_m: Real
@@ -48,23 +48,23 @@ class BlindScan:
             an interval of 95 %.
         """
         fine = np.linspace(self.x_m[0], self.x_m[-1], 4000)
-        curve = np.interp(fine, self.x_m, self.log_likelihood)
+        log_likelihood = np.interp(fine, self.x_m, self.log_likelihood)
         best = int(np.argmax(self.log_likelihood))
         at = float(self.x_m[best])
         if 0 < best < self.x_m.size - 1:
             low, mid, high = self.log_likelihood[best - 1 : best + 2]
-            bend = low - 2 * mid + high
-            if bend < 0:
+            curvature = low - 2 * mid + high
+            if curvature < 0:
                 spacing = self.x_m[1] - self.x_m[0]
-                at += float(np.clip(0.5 * (low - high) / bend, -1, 1) * spacing)
-        likely = fine[curve >= curve.max() - drop]
-        weights = np.exp(curve - curve.max())
+                at += float(np.clip(0.5 * (low - high) / curvature, -1, 1) * spacing)
+        likely_m = fine[log_likelihood >= log_likelihood.max() - drop]
+        weights = np.exp(log_likelihood - log_likelihood.max())
         mean = np.sum(weights * fine) / np.sum(weights)
         std = float(np.sqrt(np.sum(weights * (fine - mean) ** 2) / np.sum(weights)))
-        return at, std, min(float(likely[0]), at), max(float(likely[-1]), at)
+        return at, std, min(float(likely_m[0]), at), max(float(likely_m[-1]), at)
 
 
-class Blind:
+class AnyForceEstimator:
     """Computation of the likelihood of a touch by any force, prepared for one length of records.
 
     Parameters
@@ -87,7 +87,7 @@ class Blind:
             for table in (kernels.torque, kernels.shear)
         ]  # (positions, samples, forces)
 
-    def scan(self, window: WhitenedWindow) -> BlindScan:
+    def scan(self, window: WhitenedWindow) -> AnyForceLikelihood:
         """Return the likelihood of a touch by any force at each position.
 
         Parameters
@@ -107,28 +107,28 @@ class Blind:
         effects = window.whitening @ effects
         data = window.data
         n = data.size
-        square = effects @ effects.transpose(0, 2, 1)
-        large = float(data @ data) + 1.0
-        found = np.empty((_SIZES_N.size, self._x_m.size))
-        quadratic = np.empty_like(found)
+        force_covariance = effects @ effects.transpose(0, 2, 1)
+        corner = float(data @ data) + 1.0
+        log_likelihoods = np.empty((_FORCE_STDS_N.size, self._x_m.size))
+        quadratic = np.empty_like(log_likelihoods)
         bordered = np.empty((self._x_m.size, n + 1, n + 1))
         bordered[:, n, :n] = bordered[:, :n, n] = data
-        bordered[:, n, n] = large
-        for i, size in enumerate(_SIZES_N):
-            bordered[:, :n, :n] = size**2 * square + np.eye(n)
+        bordered[:, n, n] = corner
+        for i, std_index in enumerate(_FORCE_STDS_N):
+            bordered[:, :n, :n] = std_index**2 * force_covariance + np.eye(n)
             factor = np.linalg.cholesky(bordered)
             diagonal = np.diagonal(factor, axis1=1, axis2=2)
-            quadratic[i] = large - diagonal[:, n] ** 2
-            found[i] = -0.5 * quadratic[i] - np.log(diagonal[:, :n]).sum(axis=1)
-        size, position = np.unravel_index(np.argmax(found), found.shape)
-        variance = _SIZES_N[size] ** 2
-        whole = variance * square[position] + np.eye(n)
-        force = variance * effects[position].T @ np.linalg.solve(whole, data)
-        return BlindScan(
+            quadratic[i] = corner - diagonal[:, n] ** 2
+            log_likelihoods[i] = -0.5 * quadratic[i] - np.log(diagonal[:, :n]).sum(axis=1)
+        std_index, position = np.unravel_index(np.argmax(log_likelihoods), log_likelihoods.shape)
+        variance = _FORCE_STDS_N[std_index] ** 2
+        covariance = variance * force_covariance[position] + np.eye(n)
+        force = variance * effects[position].T @ np.linalg.solve(covariance, data)
+        return AnyForceLikelihood(
             x_m=self._x_m,
-            log_likelihood=found.max(axis=0),
-            chi2=float(quadratic[size, position]),
+            log_likelihood=log_likelihoods.max(axis=0),
+            chi2=float(quadratic[std_index, position]),
             degrees=n,
             force_n=force,
-            force_std_n=float(_SIZES_N[size]),
+            force_std_n=float(_FORCE_STDS_N[std_index]),
         )

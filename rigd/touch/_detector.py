@@ -27,12 +27,12 @@ from rigd.touch._signatures import WatchedBeam
 
 Real = NDArray[np.float64]
 
-_INDEPENDENT: Final = 0.5
+_INDEPENDENT_FRACTION: Final = 0.5
 """Fraction of the comparisons with overlapping signatures that count as independent, measured at 4
 to 5 standard deviations."""
-_AGE_TICKS: Final = 8
+_ERROR_ACCUMULATION_TICKS: Final = 8
 """Number of ticks over which an error of the model is assumed to add up."""
-_RECENT: Final = 1 / 600
+_RECENT_WEIGHT: Final = 1 / 600
 """Weight of a tick in the recent mean square of the comparisons."""
 
 
@@ -61,7 +61,7 @@ class DetectorSettings:
         >>> round(DetectorSettings().threshold(1000.0, signatures=500), 2)
         6.69
         """
-        tests_per_hour = 3600.0 * rate_hz * max(1.0, _INDEPENDENT * signatures)
+        tests_per_hour = 3600.0 * rate_hz * max(1.0, _INDEPENDENT_FRACTION * signatures)
         return -NormalDist().inv_cdf(0.5 * self.false_alarms_per_hour / tests_per_hour)
 
 
@@ -112,7 +112,7 @@ class TouchDetector:
         signatures = beam.signatures
         self._filter = InnovationFilter(beam.observed)
         self._threshold = settings.threshold(rate_hz, len(signatures))
-        self._tolerance2 = _AGE_TICKS * settings.model_tolerance**2
+        self._tolerance2 = _ERROR_ACCUMULATION_TICKS * settings.model_tolerance**2
         self._armed = False
         self._measuring = True
         self._squares = [0.0, 0.0]
@@ -201,7 +201,7 @@ class TouchDetector:
         compared, mean_squares = self._compared, self._mean_squares
         self._compare(self._windows[slot], compared)
         # A touch must not raise its own threshold: comparisons that may include it wait.
-        self._recent += _RECENT * (mean_squares[slot] - self._recent)
+        self._recent += _RECENT_WEIGHT * (mean_squares[slot] - self._recent)
         mean_squares[slot] = float(compared.dot(compared)) / compared.size
         self._slot = slot + 1 if slot + 1 < len(self._windows) else 0
         u, v = filter_.predicted

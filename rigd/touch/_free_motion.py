@@ -24,21 +24,21 @@ from rigd.touch._model import TouchModel
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-FINER = 4
+STEPS_PER_SAMPLE = 4
 """Number of time steps of the free motion per sample, to which a spline interpolates the angle."""
-_BAND = 0.5
+_BAND_FRACTION = 0.5
 """Fraction of the frequencies up to the time steps' Nyquist frequency that are used: up to twice
 the Nyquist frequency of the samples."""
-_HIGHEST_HZ = 330.0
+_MAX_MODE_HZ = 330.0
 """Highest frequency in Hz of a free vibration that is fitted."""
-_SETTLE_S = 0.03
+_SETTLING_S = 0.03
 """Time constant in s with which the angle comes to rest after the record's end. A jump there would
 cause vibrations before it."""
-_SPEED_S = 0.02
+_SPEED_WINDOW_S = 0.02
 """Time in s over which the speed at the record's beginning is measured."""
-_NODES = 36
+_NODE_COUNT = 36
 """Number of positions from which the displacement at all other positions is interpolated."""
-BEFORE = 24
+SPLINE_FADE_SAMPLES = 24
 """Number of samples over which the effect of one sample in a spline fades."""
 
 
@@ -104,20 +104,20 @@ class FreeBeam:
         from scipy.fft import next_fast_len
 
         self.model, self.x_m, self.rate_hz = model, x_m, rate_hz
-        n = next_fast_len(FINER * round(1.6 * samples + 0.1 * rate_hz), real=True)
-        self.line = LaplaceLine(n, 1 / (FINER * rate_hz), _BAND)
+        n = next_fast_len(STEPS_PER_SAMPLE * round(1.6 * samples + 0.1 * rate_hz), real=True)
+        self.line = LaplaceLine(n, 1 / (STEPS_PER_SAMPLE * rate_hz), _BAND_FRACTION)
         s = self.line.s
         self._grid = grid = PointForceGrid(s, model.beam, model.damping)
-        late = model.sensor_filter.response(s)
-        late *= np.exp(-s * (model.wrench_delay_s - model.angle_delay_s))
+        filter_response = model.sensor_filter.response(s)
+        filter_response *= np.exp(-s * (model.wrench_delay_s - model.angle_delay_s))
         inertia = model.tool_inertia_kg_m2 * s * s
-        self._torque: Complex = late * (grid.torque_per_angle() + inertia)
-        self._shear: Complex = late * grid.shear_per_angle()
+        self._torque: Complex = filter_response * (grid.torque_per_angle() + inertia)
+        self._shear: Complex = filter_response * grid.shear_per_angle()
         self.modes = FreeVibration.of(model, np.empty(0))
         self._set_positions(x_m)
-        unit = np.zeros(3 * BEFORE)
-        unit[BEFORE] = 1.0
-        self._sample = self.line.transformed(_finer(unit, rate_hz, self.line)[0])
+        unit = np.zeros(3 * SPLINE_FADE_SAMPLES)
+        unit[SPLINE_FADE_SAMPLES] = 1.0
+        self._sample = self.line.to_laplace(_interpolate_angle(unit, rate_hz, self.line)[0])
 
     def at(self, x_m: Real) -> "FreeBeam":
         """Return the free beam with other positions of the displacement.
@@ -138,8 +138,8 @@ class FreeBeam:
         """
         self.x_m = x_m
         nodes_m, self._between = x_m, np.eye(x_m.size)
-        if x_m.size > _NODES:
-            nodes_m, self._between = chebyshev_nodes(x_m, _NODES)
+        if x_m.size > _NODE_COUNT:
+            nodes_m, self._between = chebyshev_nodes(x_m, _NODE_COUNT)
         self._displacement: Complex = self._grid.per_angle(nodes_m).T
         self.modes = self.modes.at(x_m / self.model.beam.length_m)
 
@@ -155,15 +155,19 @@ class FreeBeam:
 
         Returns
         -------
-        ndarray, shape (FINER · (BEFORE + samples),)
-            Displacement on the fine time steps, from `BEFORE` samples before the sample of the
-            angle, because the spline through the samples acts ahead of each sample.
+        ndarray, shape (STEPS_PER_SAMPLE · (SPLINE_FADE_SAMPLES + samples),)
+            Displacement on the fine time steps, from `SPLINE_FADE_SAMPLES` samples before the
+            sample of the angle, because the spline through the samples acts ahead of each sample.
         """
         response = (self._between[index] @ self._displacement) * self._sample
-        return self.line.in_time(response, FINER * (BEFORE + samples))
+        return self.line.to_time(response, STEPS_PER_SAMPLE * (SPLINE_FADE_SAMPLES + samples))
 
     def motion(
-        self, record: TouchRecord, quiet: int, first: int, turned: "Turned | None" = None
+        self,
+        record: TouchRecord,
+        quiet: int,
+        first: int,
+        angle_transform: "AngleTransform | None" = None,
     ) -> "FreeMotion":
         """Return the innovations of a record, and the motion of the beam without a touch.
 
@@ -180,42 +184,48 @@ class FreeBeam:
         """
         n = record.angle_rad.size
         rate = self.rate_hz
-        turned = turned or Turned.of(record.angle_rad, rate, self.line)
-        spectrum, start, speed = turned.spectrum, turned.start_rad, turned.speed_rad_s
+        angle_transform = angle_transform or AngleTransform.of(record.angle_rad, rate, self.line)
+        spectrum, start, speed = (
+            angle_transform.spectrum,
+            angle_transform.start_rad,
+            angle_transform.speed_rad_s,
+        )
         channels = [(record.torque_nm, self._torque)]
         if record.shear_n is not None:
             channels.append((record.shear_n, self._shear))
         t = np.arange(n) / rate
-        late = self.model.wrench_delay_s - self.model.angle_delay_s
-        columns = self.modes.channels(t - late)
+        delay_s = self.model.wrench_delay_s - self.model.angle_delay_s
+        vibration_columns = self.modes.channels(t - delay_s)
         innovations, designs = [], []
         for i, (measured, transfer) in enumerate(channels):
-            free = self.line.in_time(transfer * spectrum, FINER * n)[::FINER]
-            innovations.append(measured - free)
+            free_reading = self.line.to_time(transfer * spectrum, STEPS_PER_SAMPLE * n)[
+                ::STEPS_PER_SAMPLE
+            ]
+            innovations.append(measured - free_reading)
             drift = np.zeros((n, 2 * len(channels)))
             drift[:, 2 * i] = 1.0
             drift[:, 2 * i + 1] = t - t[quiet // 2]
-            designs.append(np.hstack([columns[i], drift]))
-        fitted = _Fitted.to(innovations, designs, quiet)
-        steps = FINER * n
-        at_nodes = self.line.in_time(self._displacement * spectrum, steps)
-        moved = self._between @ at_nodes[:, FINER * first :]
-        fine = np.arange(FINER * first, steps) / (FINER * rate)
-        moved += self.x_m[:, None] * (start + speed * fine)
+            designs.append(np.hstack([vibration_columns[i], drift]))
+        fitted = _FreeMotionFit.to(innovations, designs, quiet)
+        steps = STEPS_PER_SAMPLE * n
+        at_nodes = self.line.to_time(self._displacement * spectrum, steps)
+        displacement_m = self._between @ at_nodes[:, STEPS_PER_SAMPLE * first :]
+        fine = np.arange(STEPS_PER_SAMPLE * first, steps) / (STEPS_PER_SAMPLE * rate)
+        displacement_m += self.x_m[:, None] * (start + speed * fine)
         amplitudes = fitted.values[: self.modes.shapes.shape[0] * 2]
-        moved += self.modes.displacement(fine, amplitudes)
+        displacement_m += self.modes.displacement(fine, amplitudes)
         return FreeMotion(
             t=t - self.model.wrench_delay_s,
             innovations=np.array(fitted.innovations),
             noise=np.array(fitted.noise),
             design=np.array(designs),
             spread=np.linalg.cholesky(fitted.covariance).astype(np.float64),
-            turned=turned,
+            angle_transform=angle_transform,
             ringing=self.modes,
             angle_noise_rad=_angle_noise(record.angle_rad[:quiet]),
-            displacement_m=moved,
+            displacement_m=displacement_m,
             first_s=first / rate - self.model.angle_delay_s,
-            step_s=1 / (FINER * rate),
+            step_s=1 / (STEPS_PER_SAMPLE * rate),
         )
 
 
@@ -234,7 +244,7 @@ class FreeMotion:
     offset and drift."""
     spread: Real
     """Cholesky factor of the covariance of the q fitted amplitudes, shape (q, q)."""
-    turned: "Turned"
+    angle_transform: "AngleTransform"
     """Transform of the angle that drives the beam."""
     ringing: "FreeVibration"
     """Free vibrations that were fitted."""
@@ -257,7 +267,7 @@ def _angle_noise(angle: Real) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Turned:
+class AngleTransform:
     """Laplace transform of a record's angle, after subtraction of a motion at constant speed."""
 
     spectrum: Complex
@@ -268,13 +278,13 @@ class Turned:
     """Speed at the record's beginning."""
 
     @classmethod
-    def of(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "Turned":
+    def of(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "AngleTransform":
         """Return the transform of an angle's samples at the frequencies of a Laplace line."""
-        rest, start_rad, speed_rad_s = _finer(angle_rad, rate_hz, line)
-        return cls(line.transformed(rest), start_rad, speed_rad_s)
+        rest, start_rad, speed_rad_s = _interpolate_angle(angle_rad, rate_hz, line)
+        return cls(line.to_laplace(rest), start_rad, speed_rad_s)
 
 
-def _finer(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float, float]:
+def _interpolate_angle(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float, float]:
     """Interpolate an angle to the line's time steps, and subtract a motion at constant speed.
 
     Return the remaining angle, and angle and speed at the record's beginning.
@@ -282,18 +292,18 @@ def _finer(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float,
     from scipy.interpolate import CubicSpline
 
     t = np.arange(angle.size) / rate_hz
-    some = max(4, round(_SPEED_S * rate_hz))
-    curve = np.polyfit(t[:some], angle[:some], 2)
+    window_samples = max(4, round(_SPEED_WINDOW_S * rate_hz))
+    curve = np.polyfit(t[:window_samples], angle[:window_samples], 2)
     start, speed = float(curve[2]), float(curve[1])
     relative = angle - start - speed * t
     spline = CubicSpline(t, relative)
-    fine = np.arange(FINER * angle.size) * line.step_s
-    inside = fine[fine <= t[-1]]
-    after = np.arange(1, line.n - inside.size + 1) * line.step_s
+    fine = np.arange(STEPS_PER_SAMPLE * angle.size) * line.step_s
+    record_steps_s = fine[fine <= t[-1]]
+    after = np.arange(1, line.n - record_steps_s.size + 1) * line.step_s
     end = np.polyfit(t[-6:] - t[-1], relative[-6:], 1)[0]
-    ending = relative[-1] + end * _SETTLE_S * (1 - np.exp(-after / _SETTLE_S))
+    ending = relative[-1] + end * _SETTLING_S * (1 - np.exp(-after / _SETTLING_S))
     fade = 0.5 + 0.5 * np.cos(np.pi * np.minimum(after / after[-1], 1.0))
-    return np.concatenate([spline(inside), ending * fade]), start, speed
+    return np.concatenate([spline(record_steps_s), ending * fade]), start, speed
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,20 +323,20 @@ class FreeVibration:
     def of(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
         """Return the free vibrations of a model, with the displacement at positions `x_m`."""
         beam, damping = model.beam, model.damping
-        most = 12
-        found = poles(beam, damping, most)[:, 0]
-        count = max(1, int(np.sum(found.imag < 2 * np.pi * _HIGHEST_HZ)))
-        found = found[:count]
+        candidate_modes = 12
+        mode_poles = poles(beam, damping, candidate_modes)[:, 0]
+        count = max(1, int(np.sum(mode_poles.imag < 2 * np.pi * _MAX_MODE_HZ)))
+        mode_poles = mode_poles[:count]
         wave = clamped_free_eigenvalues(count) / beam.length_m
         sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
-        stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * found**damping.alpha)
+        stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * mode_poles**damping.alpha)
         ratio = root_shear_ratio(count)
         root = stiffness * np.stack([-2 * sign * wave**2, -2 * sign * ratio * wave**3])
-        root *= model.sensor_filter.response(found)
+        root *= model.sensor_filter.response(mode_poles)
         # Units of the amplitudes that give about the same torque in each mode.
         scale = 1 / np.abs(root[0])
-        whole = cls(found.astype(np.complex128), root * scale, scale, np.empty((count, 0)))
-        return whole.at(x_m / beam.length_m)
+        unplaced = cls(mode_poles.astype(np.complex128), root * scale, scale, np.empty((count, 0)))
+        return unplaced.at(x_m / beam.length_m)
 
     def at(self, fractions: Real) -> "FreeVibration":
         """Return the free vibrations with the displacement at other positions.
@@ -347,8 +357,8 @@ class FreeVibration:
         t
             Times from the record's beginning.
         """
-        swing = np.exp(np.multiply.outer(t, self.poles))
-        parts = [swing * root for root in self.root]
+        oscillation = np.exp(np.multiply.outer(t, self.poles))
+        parts = [oscillation * root for root in self.root]
         return np.array([np.hstack([part.real, -part.imag]) for part in parts])
 
     def displacement(self, t: NDArray[np.floating], amplitudes: Real) -> Real:
@@ -364,16 +374,16 @@ class FreeVibration:
             Amplitudes of cosines and sines, shape (2 · modes, r) or (2 · modes,).
         """
         count = self.poles.size
-        swing = np.exp(np.multiply.outer(t, self.poles)).T
-        columns = amplitudes.reshape(2 * count, -1)
-        moved = np.multiply(swing.real[:, :, None], columns[:count, None])
-        moved -= np.multiply(swing.imag[:, :, None], columns[count:, None])
-        shown: Real = self.shapes.T @ moved.reshape(count, -1)
-        return shown.reshape(-1, t.size, *amplitudes.shape[1:])
+        oscillation = np.exp(np.multiply.outer(t, self.poles)).T
+        vibration_columns = amplitudes.reshape(2 * count, -1)
+        displacement_m = np.multiply(oscillation.real[:, :, None], vibration_columns[:count, None])
+        displacement_m -= np.multiply(oscillation.imag[:, :, None], vibration_columns[count:, None])
+        displacement: Real = self.shapes.T @ displacement_m.reshape(count, -1)
+        return displacement.reshape(-1, t.size, *amplitudes.shape[1:])
 
 
 @dataclass(frozen=True, slots=True)
-class _Fitted:
+class _FreeMotionFit:
     """Fit of free vibrations, offset and drift to the samples before a touch."""
 
     values: Real
@@ -386,7 +396,7 @@ class _Fitted:
     """Torque and shear minus the fit at all samples."""
 
     @classmethod
-    def to(cls, innovations: list[Real], designs: list[Real], quiet: int) -> "_Fitted":
+    def to(cls, innovations: list[Real], designs: list[Real], quiet: int) -> "_FreeMotionFit":
         """Fit the first `quiet` samples by weighted least squares.
 
         Repeated fits estimate the noise of torque and shear, which gives the weights.
@@ -399,10 +409,10 @@ class _Fitted:
             regularisation = 1e-9 * np.trace(normal) / normal.shape[0]
             covariance = np.linalg.inv(normal + regularisation * np.eye(normal.shape[0]))
             values = covariance @ (a.T @ b)
-            left = [e - d @ values for e, d in zip(innovations, designs, strict=True)]
-            free = max(quiet - values.size / len(left), quiet / 2)
-            noise = [float(np.sqrt(np.sum(e[:quiet] ** 2) / free)) for e in left]
+            residuals = [e - d @ values for e, d in zip(innovations, designs, strict=True)]
+            degrees_of_freedom = max(quiet - values.size / len(residuals), quiet / 2)
+            noise = [float(np.sqrt(np.sum(e[:quiet] ** 2) / degrees_of_freedom)) for e in residuals]
         a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
         normal = a.T @ a
         covariance = np.linalg.inv(normal + regularisation * np.eye(normal.shape[0]))
-        return cls(values, covariance, noise, left)
+        return cls(values, covariance, noise, residuals)

@@ -18,18 +18,18 @@ from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-WRAPPED = 14.0
+WRAP_AROUND_EXPONENT = 14.0
 """Exponent ``sigma T`` of the wrap-around's decay, with which it is 1e-6 of the values at the end
 of the period."""
 
-_OVERSAMPLED = 2
+_OVERSAMPLING = 2
 """Number of steps of the inverse transform per step of the kernels, since the spectrum of a hat is
 small above half the step's rate."""
 
-_MODES = 20
+_CROSS_MODE_COUNT = 20
 """Number of modes that transmit a force to another position."""
 
-_EDGE_M = 0.003
+_FIRST_POSITION_M = 0.003
 """Distance in m of the first position from the root; the last position is the tip."""
 
 
@@ -47,16 +47,16 @@ class LaplaceLine:
         at the others.
     """
 
-    __slots__ = ("_grown", "n", "s", "step_s")
+    __slots__ = ("_growth", "n", "s", "step_s")
 
     def __init__(self, n: int, step_s: float, band: float = 1.0) -> None:
         self.n, self.step_s = n, step_s
-        shift = WRAPPED / (n * step_s)
-        used = round(band * (n // 2)) + 1
-        self.s = shift + 2j * np.pi * np.arange(used) / (n * step_s)
-        self._grown = np.exp(shift * step_s * np.arange(n))
+        shift = WRAP_AROUND_EXPONENT / (n * step_s)
+        used_frequencies = round(band * (n // 2)) + 1
+        self.s = shift + 2j * np.pi * np.arange(used_frequencies) / (n * step_s)
+        self._growth = np.exp(shift * step_s * np.arange(n))
 
-    def transformed(self, samples: Real) -> Complex:
+    def to_laplace(self, samples: Real) -> Complex:
         """Return the Laplace transform of a function of time, along the last axis.
 
         Parameters
@@ -67,11 +67,11 @@ class LaplaceLine:
         """
         from scipy.fft import rfft
 
-        damped = samples / self._grown[: samples.shape[-1]]
+        damped = samples / self._growth[: samples.shape[-1]]
         spectrum: Complex = rfft(damped, self.n, axis=-1)[..., : self.s.size]
         return spectrum
 
-    def in_time(self, transform: Complex, steps: int) -> Real:
+    def to_time(self, transform: Complex, steps: int) -> Real:
         """Return a function of time from its Laplace transform, along the last axis.
 
         Parameters
@@ -86,11 +86,11 @@ class LaplaceLine:
         if transform.shape[-1] == self.n // 2 + 1:
             transform = transform.copy()
             transform[..., -1] = transform[..., -1].real
-        samples: Real = irfft(transform, self.n, axis=-1)[..., :steps] * self._grown[:steps]
+        samples: Real = irfft(transform, self.n, axis=-1)[..., :steps] * self._growth[:steps]
         return samples
 
 
-class Hat:
+class ForcePulse:
     """Triangular pulse of force, with which responses in the Laplace domain become kernels.
 
     Parameters
@@ -101,18 +101,18 @@ class Hat:
         Number of values of a kernel.
     """
 
-    __slots__ = ("_late", "_steps", "line")
+    __slots__ = ("_delayed_pulse", "_steps", "line")
 
     def __init__(self, step_s: float, steps: int) -> None:
         from scipy.fft import next_fast_len
 
         self._steps = steps
-        fine = step_s / _OVERSAMPLED
-        self.line = LaplaceLine(next_fast_len(2 * _OVERSAMPLED * steps, real=True), fine)
+        fine_step_s = step_s / _OVERSAMPLING
+        self.line = LaplaceLine(next_fast_len(2 * _OVERSAMPLING * steps, real=True), fine_step_s)
         s = self.line.s
-        hat = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine
+        pulse = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine_step_s
         # Two steps later than the force, so that the hat begins within the period.
-        self._late = hat * np.exp(-s * step_s)
+        self._delayed_pulse = pulse * np.exp(-s * step_s)
 
     def kernels(self, response: Complex) -> Real:
         """Return the kernels of responses: their values over time for one hat, shape (k, steps).
@@ -122,8 +122,10 @@ class Hat:
         response
             Transfer functions from a force, at the frequencies of the line, shape (k, frequencies).
         """
-        values = self.line.in_time(self._late * response, _OVERSAMPLED * (self._steps + 1))
-        return values[:, _OVERSAMPLED::_OVERSAMPLED][:, : self._steps]
+        values = self.line.to_time(
+            self._delayed_pulse * response, _OVERSAMPLING * (self._steps + 1)
+        )
+        return values[:, _OVERSAMPLING::_OVERSAMPLING][:, : self._steps]
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,9 +159,11 @@ class ContactKernels:
         steps
             Number of time steps of the result.
         """
-        first, weights = lagrange(x_m, self.x_m)
+        first, weights = cubic_weights(x_m, self.x_m)
         tables = (self.displacement[:, :steps], self.torque[:, :steps], self.shear[:, :steps])
-        return ContactKernels(x_m, self.step_s, *(mixed(t, first, weights) for t in tables))
+        return ContactKernels(
+            x_m, self.step_s, *(interpolate_rows(t, first, weights) for t in tables)
+        )
 
     def coarser(self, factor: int, steps: int) -> "ContactKernels":
         """Return the kernels of wider triangular pulses, with longer time steps.
@@ -171,17 +175,17 @@ class ContactKernels:
         steps
             Number of time steps of the result.
         """
-        hat = 1 - np.abs(np.arange(1 - factor, factor)) / factor
+        pulse = 1 - np.abs(np.arange(1 - factor, factor)) / factor
         tables = []
         for table in (self.displacement, self.torque, self.shear):
             padded = np.pad(table, ((0, 0), (factor - 1, factor - 1)))
             # A wide hat with its peak at 0 is a sum of narrow ones from 1 - factor to factor - 1.
-            wide = sum(
+            wide_response = sum(
                 weight
                 * padded[:, factor - 1 - i : factor - 1 - i + (steps - 1) * factor + 1 : factor]
-                for i, weight in zip(range(1 - factor, factor), hat, strict=True)
+                for i, weight in zip(range(1 - factor, factor), pulse, strict=True)
             )
-            tables.append(np.ascontiguousarray(wide))
+            tables.append(np.ascontiguousarray(wide_response))
         return ContactKernels(self.x_m, factor * self.step_s, *tables)
 
 
@@ -208,21 +212,21 @@ def contact_kernels(
     sensor_filter
         Filters of torque and shear.
     """
-    hat = Hat(step_s, steps)
-    s = hat.line.s
+    pulse = ForcePulse(step_s, steps)
+    s = pulse.line.s
     grid = PointForceGrid(s, beam, damping)
-    seen = sensor_filter.response(s)
+    filter_response = sensor_filter.response(s)
     stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
     tables = np.empty((3, x_m.size, steps))
-    for i in range(0, x_m.size, _AT_ONCE):
-        x = x_m[i : i + _AT_ONCE]
+    for i in range(0, x_m.size, _POSITIONS_AT_ONCE):
+        x = x_m[i : i + _POSITIONS_AT_ONCE]
         responses = (
             grid.per_force(x, x).T,
-            -seen * grid.per_angle(x).T,
-            seen * stiffness * grid.per_force(np.zeros_like(x), x, 3).T,
+            -filter_response * grid.per_angle(x).T,
+            filter_response * stiffness * grid.per_force(np.zeros_like(x), x, 3).T,
         )
         for table, response in zip(tables, responses, strict=True):
-            table[i : i + _AT_ONCE] = hat.kernels(response)
+            table[i : i + _POSITIONS_AT_ONCE] = pulse.kernels(response)
     return ContactKernels(x_m, step_s, *tables)
 
 
@@ -251,9 +255,11 @@ class CrossKernels:
         steps
             Number of time steps of the result.
         """
-        one, other = (mixed(self.shapes, *lagrange(x, self.x_m)) for x in (x_m, other_m))
-        crossing: Real = (one * other) @ self.kernels[:, :steps]
-        return crossing
+        first_shapes, second_shapes = (
+            interpolate_rows(self.shapes, *cubic_weights(x, self.x_m)) for x in (x_m, other_m)
+        )
+        cross_kernels_of_pairs: Real = (first_shapes * second_shapes) @ self.kernels[:, :steps]
+        return cross_kernels_of_pairs
 
 
 def cross_kernels(
@@ -263,18 +269,20 @@ def cross_kernels(
 
     The arguments are those of `contact_kernels`.
     """
-    hat = Hat(step_s, steps)
-    s = hat.line.s
+    pulse = ForcePulse(step_s, steps)
+    s = pulse.line.s
     inertial = beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
     internal = 1 + damping.zeta * s**damping.alpha
-    wave = clamped_free_eigenvalues(_MODES) / beam.length_m
+    wave = clamped_free_eigenvalues(_CROSS_MODE_COUNT) / beam.length_m
     stiffness = beam.bending_stiffness_n_m2 * beam.length_m
     per_force = 1 / (stiffness * (inertial + internal * wave[:, None] ** 4))
-    shapes = np.stack([mode_shape(i + 1, x_m / beam.length_m) for i in range(_MODES)], axis=1)
-    return CrossKernels(x_m, shapes, hat.kernels(per_force))
+    shapes = np.stack(
+        [mode_shape(i + 1, x_m / beam.length_m) for i in range(_CROSS_MODE_COUNT)], axis=1
+    )
+    return CrossKernels(x_m, shapes, pulse.kernels(per_force))
 
 
-_AT_ONCE = 8
+_POSITIONS_AT_ONCE = 8
 """Number of positions that are evaluated at once, so that temporary arrays stay in the cache."""
 
 
@@ -288,8 +296,8 @@ def positions(length_m: float, spacing_m: float) -> Real:
     spacing_m
         Largest distance between two neighbouring positions.
     """
-    n = int(np.ceil((length_m - _EDGE_M) / spacing_m)) + 1
-    return np.linspace(_EDGE_M, length_m, n)
+    n = int(np.ceil((length_m - _FIRST_POSITION_M) / spacing_m)) + 1
+    return np.linspace(_FIRST_POSITION_M, length_m, n)
 
 
 def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
@@ -318,7 +326,7 @@ def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
     return x_m[0] + (x_m[-1] - x_m[0]) * (nodes + 1) / 2, between
 
 
-def lagrange(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
+def cubic_weights(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
     """Return the indices and weights of a cubic interpolation on an equally spaced grid.
 
     Parameters
@@ -350,8 +358,8 @@ def lagrange(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
     return first, weights
 
 
-def mixed(table: Real, first: NDArray[np.intp], weights: Real) -> Real:
-    """Interpolate between the rows of a table (m, n) with the result of `lagrange`: (k, n)."""
+def interpolate_rows(table: Real, first: NDArray[np.intp], weights: Real) -> Real:
+    """Interpolate between the rows of a table (m, n) with the result of `cubic_weights`: (k, n)."""
     total = weights[:, 0, None] * table[first]
     for i in range(1, 4):
         total += weights[:, i, None] * table[first + i]

@@ -21,7 +21,7 @@ UNCERTAIN: Final = (
 )
 """Names of the model's parameters whose uncertainty is taken into account."""
 
-_ASSUMED: Final = {
+_ASSUMED_RELATIVE_STD: Final = {
     "bending_stiffness_n_m2": 0.01,
     "density_over_stiffness": 0.01,
     "zeta": 0.2,
@@ -134,7 +134,7 @@ class TouchModel:
             angle_delay_s,
             torque_delay_s,
             sensor_filter,
-            std={name: factor * values[name] for name, factor in _ASSUMED.items()},
+            std={name: factor * values[name] for name, factor in _ASSUMED_RELATIVE_STD.items()},
         )
 
     @classmethod

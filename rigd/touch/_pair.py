@@ -8,28 +8,28 @@ them. Every touch that one obstacle explains is therefore tested for a second ob
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.touch._contact import march_two
+from rigd.touch._contact import integrate_two_contacts
 from rigd.touch._kernels import ContactKernels, CrossKernels
-from rigd.touch._physical import SOFTEST, Space, Touching, WhitenedWindow
+from rigd.touch._physical import MIN_LN_STIFFNESS, ObstacleContact, ParameterRanges, WhitenedWindow
 
 Real = NDArray[np.float64]
 
-_AFTER_S = np.array([0.0, 0.008, 0.025, 0.06])
+_SECOND_TOUCH_DELAYS_S = np.array([0.0, 0.008, 0.025, 0.06])
 """Times in s from the first touch to that of the second obstacle by a free beam, with which the
 search starts."""
-_POSITIONS = 12
+_POSITION_COUNT = 12
 """Number of positions of the second obstacle with which the search starts."""
-_TRIED_N_PER_M = 100.0
+_TRIAL_STIFFNESS_N_PER_M = 100.0
 """Stiffness of the second obstacle whose effect is computed; the effect of other soft obstacles is
 proportional to their stiffness."""
-_SHARED = np.array([[0.6, 1.6], [0.8, 1.3], [0.6, 2.5]])
+_EQUIVALENT_POSITIONS = np.array([[0.6, 1.6], [0.8, 1.3], [0.6, 2.5]])
 """Positions of two obstacles that are equivalent to one obstacle, over its position. Each of the
 two has half of the moment."""
-_FARTHEST_M = 0.3
+_MAX_DISTANCE_M = 0.3
 """Largest distance in m of the free beam from the second obstacle at the first touch."""
 
 
-class Pairing:
+class TwoObstacleContact:
     """Integration in time of the contact with two obstacles, for the record of one touch.
 
     Candidates have six columns: position, instant and logarithm of the stiffness of the first
@@ -48,7 +48,9 @@ class Pairing:
 
     __slots__ = ("_crossing", "_kernels", "_touching")
 
-    def __init__(self, touching: Touching, kernels: ContactKernels, crossing: CrossKernels) -> None:
+    def __init__(
+        self, touching: ObstacleContact, kernels: ContactKernels, crossing: CrossKernels
+    ) -> None:
         self._touching, self._kernels, self._crossing = touching, kernels, crossing
 
     def predicted(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
@@ -76,7 +78,7 @@ class Pairing:
             touching.approach(x, instant, steps) for x in positions
         )
         cross = self._crossing.between(*positions, steps) * (side * side_other)[:, None]
-        pressing = march_two(
+        pressing = integrate_two_contacts(
             (kernels[0].displacement, kernels[1].displacement),
             cross,
             (beyond, beyond_other - parameters[:, 4:5]),
@@ -97,7 +99,9 @@ class Pairing:
         """
         return self.predicted(parameters, window)[0]
 
-    def starts(self, one: Real, window: WhitenedWindow, space: Space, count: int) -> Real:
+    def starts(
+        self, single_obstacle: Real, window: WhitenedWindow, space: ParameterRanges, count: int
+    ) -> Real:
         """Return pairs of obstacles from which the search starts, shape (k, 6).
 
         Some have a similar effect as one obstacle, others have a second obstacle in addition to it.
@@ -115,48 +119,58 @@ class Pairing:
             Number of positions of a second obstacle: those with the largest reduction of the
             residuals, by first-order effects.
         """
-        shared = np.tile(np.concatenate([one, one]), (len(_SHARED), 1))
-        shared[:, [0, 3]] *= _SHARED
-        shared[:, [2, 5]] -= np.log(2 * _SHARED**2)
-        shared[:, 4] = 0.0
-        return np.vstack([shared, self._with_another(one, window, space, count)])
+        equivalent_pairs = np.tile(
+            np.concatenate([single_obstacle, single_obstacle]), (len(_EQUIVALENT_POSITIONS), 1)
+        )
+        equivalent_pairs[:, [0, 3]] *= _EQUIVALENT_POSITIONS
+        equivalent_pairs[:, [2, 5]] -= np.log(2 * _EQUIVALENT_POSITIONS**2)
+        equivalent_pairs[:, 4] = 0.0
+        return np.vstack(
+            [equivalent_pairs, self._with_second_obstacle(single_obstacle, window, space, count)]
+        )
 
-    def _with_another(self, one: Real, window: WhitenedWindow, space: Space, count: int) -> Real:
+    def _with_second_obstacle(
+        self, single_obstacle: Real, window: WhitenedWindow, space: ParameterRanges, count: int
+    ) -> Real:
         """Return one obstacle with each of the likeliest second obstacles, shape (count, 6).
 
         Their likelihood is computed from the first-order effect of the second obstacle.
         """
-        x_m = np.linspace(space.low[3], space.high[3], _POSITIONS)
-        instants = np.full(_POSITIONS, one[1])
+        x_m = np.linspace(space.low[3], space.high[3], _POSITION_COUNT)
+        instants = np.full(_POSITION_COUNT, single_obstacle[1])
         steps = self._touching.steps(instants, window)
-        after = np.round(_AFTER_S / self._kernels.step_s).astype(np.intp)
+        delay_steps = np.round(_SECOND_TOUCH_DELAYS_S / self._kernels.step_s).astype(np.intp)
         beyond, _ = self._touching.approach(x_m, instants, steps)
-        away_m = np.maximum(beyond[:, np.minimum(after, steps - 1)], 0.0)
-        pair = np.concatenate([one, [0.0, 0.0, np.log(_TRIED_N_PER_M)]])
-        second = np.tile(pair, (_POSITIONS * after.size, 1))
-        second[:, 3], second[:, 4] = np.repeat(x_m, after.size), away_m.ravel()
-        alone = np.concatenate([one, [x_m[-1], space.high[4], SOFTEST]])
-        changed = alone + np.diag(space.difference)[:3]
-        rows = np.vstack([alone, changed, second])
+        distances_m = np.maximum(beyond[:, np.minimum(delay_steps, steps - 1)], 0.0)
+        pair = np.concatenate([single_obstacle, [0.0, 0.0, np.log(_TRIAL_STIFFNESS_N_PER_M)]])
+        with_second = np.tile(pair, (_POSITION_COUNT * delay_steps.size, 1))
+        with_second[:, 3], with_second[:, 4] = np.repeat(x_m, delay_steps.size), distances_m.ravel()
+        without_second = np.concatenate(
+            [single_obstacle, [x_m[-1], space.high[4], MIN_LN_STIFFNESS]]
+        )
+        changed_first = without_second + np.diag(space.difference)[:3]
+        rows = np.vstack([without_second, changed_first, with_second])
         residual = window.residuals(self.channels(rows, window))
-        now, effect = residual[0], residual[4:] - residual[0]
+        residual_without_second, effect = residual[0], residual[4:] - residual[0]
         # Effects that changes of the first could have are projected out of both.
-        q, triangle = np.linalg.qr(((residual[1:4] - now) / space.difference[:3, None]).T)
-        own = effect - (effect @ q) @ q.T
-        power = np.einsum("kn,kn->k", own, own) + 1e-300
-        factor = np.maximum(-(own @ now) / power, 0.0)
-        gain = (factor**2 * power).reshape(_POSITIONS, -1)
-        likely = np.argsort(-gain.max(axis=1))[:count]
-        chosen = likely * after.size + gain[likely].argmax(axis=1)
-        starts: Real = second[chosen]
+        q, triangle = np.linalg.qr(
+            ((residual[1:4] - residual_without_second) / space.difference[:3, None]).T
+        )
+        projected_effect = effect - (effect @ q) @ q.T
+        power = np.einsum("kn,kn->k", projected_effect, projected_effect) + 1e-300
+        factor = np.maximum(-(projected_effect @ residual_without_second) / power, 0.0)
+        gain = (factor**2 * power).reshape(_POSITION_COUNT, -1)
+        likeliest = np.argsort(-gain.max(axis=1))[:count]
+        chosen = likeliest * delay_steps.size + gain[likeliest].argmax(axis=1)
+        starts: Real = with_second[chosen]
         starts[:, 5] += np.log(np.clip(factor[chosen], 0.1, 100.0))
-        follows = (now + factor[chosen, None] * effect[chosen]) @ q
+        follows = (residual_without_second + factor[chosen, None] * effect[chosen]) @ q
         moves = -np.linalg.solve(triangle, follows.T).T
         starts[:, :3] += np.clip(moves, -4 * space.scale[:3], 4 * space.scale[:3])
         return starts
 
     @staticmethod
-    def exchanged(parameters: Real) -> Real:
+    def in_reverse_order(parameters: Real) -> Real:
         """Return pairs in which the second obstacle is touched first, the other right after it.
 
         Parameters
@@ -164,12 +178,12 @@ class Pairing:
         parameters
             Candidates, shape (k, 6).
         """
-        others: Real = parameters[:, [3, 1, 5, 0, 4, 2]]
-        others[:, 4] = 0.0
-        return others
+        reversed_pairs: Real = parameters[:, [3, 1, 5, 0, 4, 2]]
+        reversed_pairs[:, 4] = 0.0
+        return reversed_pairs
 
     @staticmethod
-    def space(one: Space) -> Space:
+    def space(single_obstacle: ParameterRanges) -> ParameterRanges:
         """Return the ranges of the six parameters of two obstacles.
 
         Parameters
@@ -177,11 +191,18 @@ class Pairing:
         one
             Ranges of the parameters of one obstacle at rest.
         """
-        return Space(
-            low=np.concatenate([one.low, [one.low[0], 0.0, one.low[2]]]),
-            high=np.concatenate([one.high, [one.high[0], _FARTHEST_M, one.high[2]]]),
-            difference=np.concatenate([one.difference, [2e-4, 2e-5, 2e-2]]),
+        return ParameterRanges(
+            low=np.concatenate(
+                [single_obstacle.low, [single_obstacle.low[0], 0.0, single_obstacle.low[2]]]
+            ),
+            high=np.concatenate(
+                [
+                    single_obstacle.high,
+                    [single_obstacle.high[0], _MAX_DISTANCE_M, single_obstacle.high[2]],
+                ]
+            ),
+            difference=np.concatenate([single_obstacle.difference, [2e-4, 2e-5, 2e-2]]),
             scale=np.array([6e-3, 1e-3, 1.0, 6e-3, 1e-3, 1.0]),
-            smallest=np.concatenate([one.smallest, [1e-3, 2e-5, 2e-2]]),
-            loose=np.array([0.05, 5e-3, 1.0, 0.2, 0.05, 2.0]),
+            smallest_std=np.concatenate([single_obstacle.smallest_std, [1e-3, 2e-5, 2e-2]]),
+            largest_std=np.array([0.05, 5e-3, 1.0, 0.2, 0.05, 2.0]),
         )

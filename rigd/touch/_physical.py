@@ -14,19 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.touch._contact import march, responses, shifted
+from rigd.touch._contact import contact_responses, integrate_contact, shift_rows
 from rigd.touch._free_motion import FreeMotion
-from rigd.touch._kernels import ContactKernels, lagrange, mixed
+from rigd.touch._kernels import ContactKernels, cubic_weights, interpolate_rows
 
 Real = NDArray[np.float64]
 
-PARAMETERS = ("x_m", "time_s", "ln_stiffness", "rate_m_per_s", "mobility_m_per_n_s")
+OBSTACLE_PARAMETERS = ("x_m", "time_s", "ln_stiffness", "rate_m_per_s", "mobility_m_per_n_s")
 """Names of the parameters of an obstacle, in the order of a candidate's columns; the last two are
 omitted for an obstacle at rest."""
 
-STIFFEST = log(1e6)
+MAX_LN_STIFFNESS = log(1e6)
 """Logarithm of the largest stiffness of an obstacle in N/m."""
-SOFTEST = log(10.0)
+MIN_LN_STIFFNESS = log(10.0)
 """Logarithm of the smallest stiffness of an obstacle in N/m."""
 
 Prediction = Callable[[Real, "WhitenedWindow"], Real]
@@ -35,7 +35,7 @@ window of samples, shape (k, c, samples)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Space:
+class ParameterRanges:
     """Ranges and step sizes of the p parameters of one kind of obstacle; arrays of shape (p,)."""
 
     low: Real
@@ -46,9 +46,9 @@ class Space:
     """Change of each parameter for a numerical derivative."""
     scale: Real
     """Significant change of each parameter; an iteration changes it by at most eight times this."""
-    smallest: Real
+    smallest_std: Real
     """Smallest standard deviation of each parameter for drawing samples."""
-    loose: Real
+    largest_std: Real
     """Largest standard deviation of each parameter for drawing samples."""
 
 
@@ -88,8 +88,8 @@ class WhitenedWindow:
             deviations = motion.design[:, first:end] @ motion.spread
         noise = motion.noise[:, None, None]
         columns = (deviations[:, : end - first] / noise).reshape(-1, deviations.shape[2])
-        whole = np.eye(columns.shape[0]) + columns @ columns.T
-        whitening = np.linalg.inv(np.linalg.cholesky(whole))
+        covariance = np.eye(columns.shape[0]) + columns @ columns.T
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
         raw = (motion.innovations[:, first:end] / motion.noise[:, None]).ravel()
         return cls(motion, first, end, whitening, whitening @ raw)
 
@@ -111,7 +111,7 @@ class WhitenedWindow:
         return data - scaled @ whitening.T
 
 
-class Touching:
+class ObstacleContact:
     """Integration in time of the contact with obstacles, for the record of one touch.
 
     Parameters
@@ -141,7 +141,8 @@ class Touching:
         Parameters
         ----------
         parameters
-            Candidates with the columns of `PARAMETERS`, at least the first three, shape (k, p).
+            Candidates with the columns of `OBSTACLE_PARAMETERS`, at least the first three; shape
+            (k, p).
         window
             Samples for which the effect is predicted.
         side
@@ -160,11 +161,11 @@ class Touching:
         x, instant = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
         steps = self.steps(instant, window)
-        local = self._kernels.at(x, steps) if kernels is None else kernels
+        local_kernels = self._kernels.at(x, steps) if kernels is None else kernels
         approach, sides = self.approach(x, instant, steps, side)
         extra = parameters[:, 3:].T
-        pressing = march(
-            np.broadcast_to(local.displacement[:, :steps], approach.shape),
+        pressing = integrate_contact(
+            np.broadcast_to(local_kernels.displacement[:, :steps], approach.shape),
             approach,
             np.exp(parameters[:, 2]),
             step_s,
@@ -172,10 +173,12 @@ class Touching:
             *extra[1:2],
         )
         force = -sides[:, None] * pressing
-        tables = (local.torque, local.shear)[: motion.innovations.shape[0]]
+        tables = (local_kernels.torque, local_kernels.shear)[: motion.innovations.shape[0]]
         return self.effects(tables, force, instant, window), force
 
-    def passed_on(self, parameters: Real, window: WhitenedWindow, moved_m: Real) -> Real:
+    def effect_of_changed_motion(
+        self, parameters: Real, window: WhitenedWindow, moved_m: Real
+    ) -> Real:
         """Return how changes of the free motion act on torque and shear through the contact.
 
         Another free motion meets the obstacle at another instant, which changes the contact force.
@@ -193,14 +196,16 @@ class Touching:
         """
         x, instant = parameters[:1], parameters[1:2]
         steps = self.steps(instant, window)
-        local = self._kernels.at(x, steps)
+        local_kernels = self._kernels.at(x, steps)
         approach, side = self.approach(x, instant, steps)
         instants = np.repeat(instant, len(moved_m))
         further = side * self._on_steps(moved_m, instants, steps)
         every = np.vstack([approach, approach + further - further[:, :1]])
         stiffness = np.full((1, len(every)), np.exp(parameters[2]))
-        pressing = march(local.displacement, every[None], stiffness, self._kernels.step_s)[0]
-        tables = (local.torque, local.shear)[: self._motion.innovations.shape[0]]
+        pressing = integrate_contact(
+            local_kernels.displacement, every[None], stiffness, self._kernels.step_s
+        )[0]
+        tables = (local_kernels.torque, local_kernels.shear)[: self._motion.innovations.shape[0]]
         return self.effects(tables, -side * (pressing[1:] - pressing[0]), instants, window)
 
     def steps(self, instant: Real, window: WhitenedWindow) -> int:
@@ -249,8 +254,8 @@ class Touching:
         samples = window.end - window.first
         begin = (motion.t[window.first] - instant) / step_s
         # Convolution and shift commute: shifting first puts the steps of all at the samples.
-        aligned = shifted(force, begin, (samples - 1) * every + 1)
-        return responses(tables, aligned, every, samples)
+        aligned = shift_rows(force, begin, (samples - 1) * every + 1)
+        return contact_responses(tables, aligned, every, samples)
 
     def approach(
         self, x: Real, instant: Real, steps: int, given: float | None = None
@@ -275,53 +280,53 @@ class Touching:
             Direction of the motion, 1 or -1.
         """
         motion = self._motion
-        first, weights = lagrange(x, self._x_m)
-        moved = mixed(motion.displacement_m, first, weights)
-        free = self._on_steps(moved, instant, steps)
+        first, weights = cubic_weights(x, self._x_m)
+        displacement_m = interpolate_rows(motion.displacement_m, first, weights)
+        free = self._on_steps(displacement_m, instant, steps)
         if given is None:
-            before = shifted(moved, (instant - motion.first_s) / motion.step_s - 1.0, 1)
+            before = shift_rows(displacement_m, (instant - motion.first_s) / motion.step_s - 1.0, 1)
             side = np.where(free[:, 0] >= before[:, 0], 1.0, -1.0)
         else:
             side = np.full(x.size, given)
         return side[:, None] * (free - free[:, :1]), side
 
-    def _on_steps(self, moved: Real, instant: Real, steps: int) -> Real:
+    def _on_steps(self, displacement_m: Real, instant: Real, steps: int) -> Real:
         """Interpolate displacements to the kernels' time steps, each row from its instant on."""
         motion = self._motion
         begin = (instant - motion.first_s) / motion.step_s
-        between = max(1, round(motion.step_s / self._kernels.step_s))
-        finer = np.empty((begin.size, between * -(-steps // between)))
-        for i in range(between):
-            part = finer[:, i::between]
-            part[:] = shifted(moved, begin + i / between, part.shape[1])
-        return finer[:, :steps]
+        substeps = max(1, round(motion.step_s / self._kernels.step_s))
+        interpolated = np.empty((begin.size, substeps * -(-steps // substeps)))
+        for i in range(substeps):
+            part = interpolated[:, i::substeps]
+            part[:] = shift_rows(displacement_m, begin + i / substeps, part.shape[1])
+        return interpolated[:, :steps]
 
 
 @dataclass(frozen=True, slots=True)
-class Descended:
+class Minima:
     """Local minima of the sum of squared residuals that least squares found."""
 
     parameters: Real
-    """Parameters of each minimum, with the columns of `PARAMETERS`; shape (k, p)."""
+    """Parameters of each minimum, with the columns of `OBSTACLE_PARAMETERS`; shape (k, p)."""
     chi2: Real
     """Sum of squared residuals at each minimum, shape (k,)."""
     jacobian: Real
     """Derivatives of the residuals by the parameters, shape (k, n, p)."""
 
 
-_SETTLED = 0.1
+_MIN_CHI2_REDUCTION = 0.1
 """Reduction of the sum of squared residuals below which a step of least squares is the last. For a
 step that fails, the predicted reduction counts."""
 
 
-def descend(
+def find_minima(
     predict: Prediction,
     window: WhitenedWindow,
     starts: Real,
-    space: Space,
+    space: ParameterRanges,
     rounds: int = 12,
     free: NDArray[np.bool_] | None = None,
-) -> Descended:
+) -> Minima:
     """Minimise the sum of squared residuals from each start by least squares; return the minima.
 
     Parameters
@@ -339,12 +344,12 @@ def descend(
     free
         Whether each parameter of each start is free, shape (k, p); None: all are free.
     """
-    at = np.clip(starts, space.low, space.high)
-    damping = np.full(len(at), 1e-2)
-    residual, jacobian = _linearised(predict, window, at, space)
+    current = np.clip(starts, space.low, space.high)
+    damping = np.full(len(current), 1e-2)
+    residual, jacobian = _linearise(predict, window, current, space)
     chi2 = np.einsum("kn,kn->k", residual, residual)
-    active = np.ones(len(at), dtype=bool)
-    loose = 1e-6 / space.scale**2
+    active = np.ones(len(current), dtype=bool)
+    largest_std = 1e-6 / space.scale**2
     for _ in range(rounds):
         rows = np.flatnonzero(active)
         j, r = jacobian[rows], residual[rows]
@@ -352,41 +357,44 @@ def descend(
             j = j * free[rows, None]
         normal = np.einsum("knp,knq->kpq", j, j)
         gradient = np.einsum("knp,kn->kp", j, r)
-        diagonal = np.einsum("kpp->kp", normal) * damping[rows, None] + loose
-        normal += diagonal[:, :, None] * np.eye(at.shape[1])
-        move = -np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
-        move = np.clip(move, -8 * space.scale, 8 * space.scale)
-        trial = np.clip(at[rows] + move, space.low, space.high)
-        linear = r + np.einsum("knp,kp->kn", j, trial - at[rows])
-        predicted_gain = chi2[rows] - np.einsum("kn,kn->k", linear, linear)
-        new_residual, new_jacobian = _linearised(predict, window, trial, space)
-        new = np.einsum("kn,kn->k", new_residual, new_residual)
-        gain = chi2[rows] - new
-        better = gain > 0
-        taken = rows[better]
-        at[taken], chi2[taken] = trial[better], new[better]
-        residual[taken], jacobian[taken] = new_residual[better], new_jacobian[better]
-        damping[rows] = np.where(better, damping[rows] / 6, damping[rows] * 8)
+        diagonal = np.einsum("kpp->kp", normal) * damping[rows, None] + largest_std
+        normal += diagonal[:, :, None] * np.eye(current.shape[1])
+        step = -np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
+        step = np.clip(step, -8 * space.scale, 8 * space.scale)
+        trial = np.clip(current[rows] + step, space.low, space.high)
+        predicted_residual = r + np.einsum("knp,kp->kn", j, trial - current[rows])
+        predicted_gain = chi2[rows] - np.einsum("kn,kn->k", predicted_residual, predicted_residual)
+        new_residual, new_jacobian = _linearise(predict, window, trial, space)
+        new_chi2 = np.einsum("kn,kn->k", new_residual, new_residual)
+        gain = chi2[rows] - new_chi2
+        is_improved = gain > 0
+        accepted_rows = rows[is_improved]
+        current[accepted_rows], chi2[accepted_rows] = trial[is_improved], new_chi2[is_improved]
+        residual[accepted_rows], jacobian[accepted_rows] = (
+            new_residual[is_improved],
+            new_jacobian[is_improved],
+        )
+        damping[rows] = np.where(is_improved, damping[rows] / 6, damping[rows] * 8)
         # Residuals have kinks where contacts begin and end: short steps may fail to reduce them.
-        active[rows[np.where(better, gain, predicted_gain) < _SETTLED]] = False
+        active[rows[np.where(is_improved, gain, predicted_gain) < _MIN_CHI2_REDUCTION]] = False
         if not active.any():
             break
-    return Descended(at, chi2, jacobian)
+    return Minima(current, chi2, jacobian)
 
 
-def _linearised(
-    predict: Prediction, window: WhitenedWindow, at: Real, space: Space
+def _linearise(
+    predict: Prediction, window: WhitenedWindow, current: Real, space: ParameterRanges
 ) -> tuple[Real, Real]:
     """Return the residuals of candidates, (k, n), and derivatives by the parameters, (k, n, p)."""
-    width = at.shape[1]
-    shifts = np.where(at + space.difference > space.high, -space.difference, space.difference)
-    rows = np.concatenate([at, *(at + np.eye(width)[i] * shifts for i in range(width))])
-    residuals = window.residuals(predict(rows, window)).reshape(width + 1, len(at), -1)
+    width = current.shape[1]
+    shifts = np.where(current + space.difference > space.high, -space.difference, space.difference)
+    rows = np.concatenate([current, *(current + np.eye(width)[i] * shifts for i in range(width))])
+    residuals = window.residuals(predict(rows, window)).reshape(width + 1, len(current), -1)
     derivatives = (residuals[1:] - residuals[0]) / shifts.T[:, :, None]
     return residuals[0], np.moveaxis(derivatives, 0, -1)
 
 
-class Starts:
+class CandidateGrid:
     """Grid of candidates over position, instant and stiffness, from which the search starts.
 
     All candidates are integrated together in coarse time steps.
@@ -420,7 +428,9 @@ class Starts:
             for table in (kernels.torque, kernels.shear)
         ]  # (positions, steps, samples)
 
-    def marched(self, motion: FreeMotion, window: WhitenedWindow, latest: int) -> tuple[Real, Real]:
+    def integrate(
+        self, motion: FreeMotion, window: WhitenedWindow, latest: int
+    ) -> tuple[Real, Real]:
         """Return all candidates of the grid, and their sums of squared residuals.
 
         Parameters
@@ -434,9 +444,11 @@ class Starts:
             of the window.
         """
         samples = np.arange(window.first + 1, latest + 1)
-        batches = np.array_split(samples, -(-samples.size // _INSTANTS))
+        batches = np.array_split(samples, -(-samples.size // _INSTANTS_AT_ONCE))
         chi2 = [self._chi2(motion, window, batch) for batch in batches]
-        starts = np.meshgrid(self._x_m, motion.t[samples], np.log(STIFFNESSES), indexing="ij")
+        starts = np.meshgrid(
+            self._x_m, motion.t[samples], np.log(GRID_STIFFNESSES_N_PER_M), indexing="ij"
+        )
         return np.stack(starts, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
     def _chi2(self, motion: FreeMotion, window: WhitenedWindow, samples: NDArray[np.intp]) -> Real:
@@ -444,20 +456,24 @@ class Starts:
 
         The shape is (positions, instants, stiffnesses).
         """
-        positions, kinds = self._x_m.size, STIFFNESSES.size
+        positions, kinds = self._x_m.size, GRID_STIFFNESSES_N_PER_M.size
         length = window.end - int(samples[0])
         steps = self._ratio * length
         begins = np.round((motion.t[samples] - motion.first_s) / motion.step_s).astype(np.intp)
         columns = begins[:, None] + np.arange(-1, steps)
         last = motion.displacement_m.shape[1] - 1
-        moved = motion.displacement_m[:: self._every][:, np.minimum(columns, last)]
+        displacement_m = motion.displacement_m[:: self._every][:, np.minimum(columns, last)]
         # Axes: position, instant, step.
-        side = np.where(moved[:, :, 1] >= moved[:, :, 0], 1, -1)[:, :, None].astype(np.float32)
-        approach = (side * (moved[:, :, 1:] - moved[:, :, 1:2])).astype(np.float32)
-        pressing = march(
+        side = np.where(displacement_m[:, :, 1] >= displacement_m[:, :, 0], 1, -1)[
+            :, :, None
+        ].astype(np.float32)
+        approach = (side * (displacement_m[:, :, 1:] - displacement_m[:, :, 1:2])).astype(
+            np.float32
+        )
+        pressing = integrate_contact(
             self._kernel[:, :steps],
             np.repeat(approach, kinds, axis=1),
-            np.tile(STIFFNESSES.astype(np.float32), (positions, samples.size)),
+            np.tile(GRID_STIFFNESSES_N_PER_M.astype(np.float32), (positions, samples.size)),
             self._step_s,
         )
         force = -np.repeat(side, kinds, axis=1) * pressing
@@ -476,9 +492,9 @@ class Starts:
         return chi2.reshape(positions, samples.size, kinds)
 
 
-_INSTANTS = 16
+_INSTANTS_AT_ONCE = 16
 """Number of instants of touch in the grid that are integrated at once."""
-STIFFNESSES = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 100000.0])
+GRID_STIFFNESSES_N_PER_M = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 100000.0])
 """Stiffnesses of the grid's candidates in N/m."""
 
 

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 Real = NDArray[np.float64]
 
-_FREEDOM = 4.0
+_STUDENT_DEGREES = 4.0
 """Degrees of freedom of the Student distributions from which samples are drawn; they have heavy
 tails."""
-_CENTRES = 16
+_MAX_CENTRES = 16
 """Largest number of Student distributions in a round, centred at the best samples."""
 
 
@@ -37,7 +37,7 @@ class Posterior:
     """Sum of squared residuals of each sample, shape (n,)."""
 
     @property
-    def effective(self) -> float:
+    def effective_samples(self) -> float:
         """Effective number of samples: number of equal weights with the same precision."""
         return float(1 / np.sum(self.weights**2))
 
@@ -78,7 +78,7 @@ class Posterior:
         return float(np.sqrt(self.weights @ deviation**2))
 
 
-def sampled(
+def sample_posterior(
     chi2_of: Callable[[Real], Real],
     centres: Real,
     covariances: Real,
@@ -126,35 +126,37 @@ def sampled(
         chosen = rng.choice(len(centres), count, p=mixture)
         factors = np.linalg.cholesky(covariances)
         normal = rng.standard_normal((count, width))
-        spread = np.sqrt(_FREEDOM / rng.chisquare(_FREEDOM, count))
-        drawn = centres[chosen] + spread[:, None] * np.einsum("kpq,kq->kp", factors[chosen], normal)
-        inside = np.all((drawn >= low) & (drawn <= high), axis=1)
-        found = np.full(count, np.inf)
-        if inside.any():
-            found[inside] = chi2_of(drawn[inside])
+        student_scale = np.sqrt(_STUDENT_DEGREES / rng.chisquare(_STUDENT_DEGREES, count))
+        drawn = centres[chosen] + student_scale[:, None] * np.einsum(
+            "kpq,kq->kp", factors[chosen], normal
+        )
+        in_bounds = np.all((drawn >= low) & (drawn <= high), axis=1)
+        drawn_chi2 = np.full(count, np.inf)
+        if in_bounds.any():
+            drawn_chi2[in_bounds] = chi2_of(drawn[in_bounds])
         proposals.append((centres, covariances, mixture))
         density = density + _density(samples, *proposals[-1]) if samples.size else density
-        own = sum(_density(drawn, *each) for each in proposals)
+        own_density = sum(_density(drawn, *each) for each in proposals)
         samples = np.concatenate([samples, drawn])
-        chi2 = np.concatenate([chi2, found])
-        density = np.concatenate([density, own])
-        logged = -0.5 * (chi2 - chi2.min()) / scale - np.log(density)
-        weights = np.exp(logged - logged.max())
+        chi2 = np.concatenate([chi2, drawn_chi2])
+        density = np.concatenate([density, own_density])
+        log_weights = -0.5 * (chi2 - chi2.min()) / scale - np.log(density)
+        weights = np.exp(log_weights - log_weights.max())
         weights /= weights.sum()
         posterior = Posterior(samples, weights, chi2)
-        if posterior.effective > enough and len(proposals) > 1:
+        if posterior.effective_samples > enough and len(proposals) > 1:
             break
         # Tempered weights choose the next centres, so that one lucky sample does not dominate.
         tempered = weights**0.5
         tempered /= tempered.sum()
-        best = np.argsort(-tempered)[:_CENTRES]
+        best = np.argsort(-tempered)[:_MAX_CENTRES]
         centres, mixture = samples[best], tempered[best] / tempered[best].sum()
         mean = tempered @ samples
         deviation = samples - mean
-        local = np.minimum(
+        clipped_deviation = np.minimum(
             np.abs(deviation), 6 * np.sqrt(weights @ (samples - weights @ samples) ** 2) + smallest
         ) * np.sign(deviation)
-        covariance = (local * tempered[:, None]).T @ local
+        covariance = (clipped_deviation * tempered[:, None]).T @ clipped_deviation
         shrink = max(len(best), 2) ** (-2 / (width + 4))
         covariances = np.broadcast_to(
             shrink * covariance + np.diag(smallest**2), (len(best), width, width)
@@ -174,6 +176,8 @@ def _density(samples: Real, centres: Real, covariances: Real, mixture: Real) -> 
         factor = np.linalg.cholesky(covariance)
         scaled = np.linalg.solve(factor, (samples - centre).T)
         distance = np.sum(scaled**2, axis=0)
-        height = weight / np.prod(np.diag(factor))
-        total += height * (1 + distance / _FREEDOM) ** (-(_FREEDOM + width) / 2)
+        peak_density = weight / np.prod(np.diag(factor))
+        total += peak_density * (1 + distance / _STUDENT_DEGREES) ** (
+            -(_STUDENT_DEGREES + width) / 2
+        )
     return total

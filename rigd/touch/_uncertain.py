@@ -7,15 +7,17 @@ motion and the encoder's steps, with their effects on the instant of touch.
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.touch._free_motion import BEFORE, FINER, TouchRecord
+from rigd.touch._free_motion import SPLINE_FADE_SAMPLES, STEPS_PER_SAMPLE, TouchRecord
 from rigd.touch._kernels import contact_kernels
-from rigd.touch._physical import Touching, WhitenedWindow
-from rigd.touch._tables import Tables
+from rigd.touch._physical import ObstacleContact, WhitenedWindow
+from rigd.touch._tables import TouchTables
 
 Real = NDArray[np.float64]
 
 
-def deviations(tables: Tables, record: TouchRecord, best: Real, whole: WhitenedWindow) -> Real:
+def uncertainty_effects(
+    tables: TouchTables, record: TouchRecord, best: Real, whole: WhitenedWindow
+) -> Real:
     """Return the effects of r uncertainties on the innovations, for one standard deviation each.
 
     The shape is (c, n, r), with c = 1 for torque alone and 2 for torque and base shear.
@@ -32,20 +34,20 @@ def deviations(tables: Tables, record: TouchRecord, best: Real, whole: WhitenedW
         Innovations from a sample that is certainly before the touch to the end.
     """
     motion, quiet = whole.motion, whole.first
-    fine = Touching(tables.finest, tables.x_m, motion).predicted(best, whole)[0][0]
-    touching = Touching(tables.middle, tables.x_m, motion)
-    middle = touching.predicted(best, whole)[0][0]
-    columns = [
-        fine - middle,
+    finest_effect = ObstacleContact(tables.finest, tables.x_m, motion).predicted(best, whole)[0][0]
+    touching = ObstacleContact(tables.middle, tables.x_m, motion)
+    middle_effect = touching.predicted(best, whole)[0][0]
+    effects = [
+        finest_effect - middle_effect,
         *_ringing(tables, touching, best[0], whole),
         *_angle_noise(tables, touching, best[0], whole),
     ]
     span = slice(whole.first, whole.end)
-    left = motion.innovations[:, span] - middle
+    residual = motion.innovations[:, span] - middle_effect
     x = float(best[0, 0])
-    near = min(x, tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
+    nearby_m = min(x, tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
     for free in tables.changed:
-        changed = free.at(near).motion(record, quiet, quiet - 4, motion.turned)
+        changed = free.at(nearby_m).motion(record, quiet, quiet - 4, motion.angle_transform)
         kernels = contact_kernels(
             free.model.beam,
             free.model.damping,
@@ -54,12 +56,16 @@ def deviations(tables: Tables, record: TouchRecord, best: Real, whole: WhitenedW
             round((motion.t[-1] - best[0, 1]) / tables.middle.step_s) + 4,
             free.model.sensor_filter,
         )
-        effect, _ = Touching(kernels, near, changed).predicted(best, whole, kernels=kernels)
-        columns.append(changed.innovations[:, span] - effect[0] - left)
-    return np.stack(columns, axis=-1)
+        effect, _ = ObstacleContact(kernels, nearby_m, changed).predicted(
+            best, whole, kernels=kernels
+        )
+        effects.append(changed.innovations[:, span] - effect[0] - residual)
+    return np.stack(effects, axis=-1)
 
 
-def _ringing(tables: Tables, touching: Touching, best: Real, whole: WhitenedWindow) -> Real:
+def _ringing(
+    tables: TouchTables, touching: ObstacleContact, best: Real, whole: WhitenedWindow
+) -> Real:
     """Return the effects of the free motion's uncertainty on the innovations, (q, c, n).
 
     They include the effects through the contact, such as another instant of touch.
@@ -67,16 +73,20 @@ def _ringing(tables: Tables, touching: Touching, best: Real, whole: WhitenedWind
     motion = whole.motion
     spread = motion.spread
     count = motion.ringing.poles.size * 2
-    there = best[:1] / tables.model.beam.length_m
-    columns = motion.displacement_m.shape[1]
+    position_fraction = best[:1] / tables.model.beam.length_m
+    steps = motion.displacement_m.shape[1]
     # Times from the record's beginning, as for the amplitudes.
-    t = motion.first_s + tables.model.angle_delay_s + motion.step_s * np.arange(columns)
-    moved = motion.ringing.at(there).displacement(t, spread[:count])[0]
+    t = motion.first_s + tables.model.angle_delay_s + motion.step_s * np.arange(steps)
+    displacement_m = motion.ringing.at(position_fraction).displacement(t, spread[:count])[0]
     direct = motion.design[:, whole.first : whole.end] @ spread
-    return direct.transpose(2, 0, 1) + touching.passed_on(best, whole, moved.T)
+    return direct.transpose(2, 0, 1) + touching.effect_of_changed_motion(
+        best, whole, displacement_m.T
+    )
 
 
-def _angle_noise(tables: Tables, touching: Touching, best: Real, whole: WhitenedWindow) -> Real:
+def _angle_noise(
+    tables: TouchTables, touching: ObstacleContact, best: Real, whole: WhitenedWindow
+) -> Real:
     """Return the effects of the encoder's noise through the contact on the innovations.
 
     There is one for each sample of the angle; the shape is (samples, c, n).
@@ -84,9 +94,16 @@ def _angle_noise(tables: Tables, touching: Touching, best: Real, whole: Whitened
     motion = whole.motion
     samples = np.arange(whole.first, whole.end)
     nearest = int(np.argmin(np.abs(tables.x_m - best[0])))
-    one = tables.free.per_sample(nearest, samples.size + 8)
+    sample_displacement = tables.free.per_sample(nearest, samples.size + 8)
     # Columns begin four samples before the window.
-    late = np.arange(motion.displacement_m.shape[1]) - 4 * FINER
-    index = late[None, :] - FINER * (samples - whole.first - BEFORE)[:, None]
-    moved = np.where((index >= 0) & (index < one.size), one[np.clip(index, 0, one.size - 1)], 0.0)
-    return touching.passed_on(best, whole, motion.angle_noise_rad * moved)
+    window_steps = np.arange(motion.displacement_m.shape[1]) - 4 * STEPS_PER_SAMPLE
+    index = (
+        window_steps[None, :]
+        - STEPS_PER_SAMPLE * (samples - whole.first - SPLINE_FADE_SAMPLES)[:, None]
+    )
+    displacement_m = np.where(
+        (index >= 0) & (index < sample_displacement.size),
+        sample_displacement[np.clip(index, 0, sample_displacement.size - 1)],
+        0.0,
+    )
+    return touching.effect_of_changed_motion(best, whole, motion.angle_noise_rad * displacement_m)

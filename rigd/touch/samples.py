@@ -63,16 +63,16 @@ def touch_record(
         Coefficients of the base shear, shear = projection · wrench; None: it is not measured.
     """
     ticks = samples["tick"].astype(np.int64)
-    every = np.arange(ticks[0], ticks[-1] + 1)
+    all_ticks = np.arange(ticks[0], ticks[-1] + 1)
 
-    def filled(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.interp(every, ticks, values)
+    def interpolated(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.interp(all_ticks, ticks, values)
 
     return TouchRecord(
         rate_hz,
-        filled(samples["angle_rad"]),
-        filled(samples["coupling_torque_nm"]),
-        None if shear_projection is None else filled(base_shear_n(samples, shear_projection)),
+        interpolated(samples["angle_rad"]),
+        interpolated(samples["coupling_torque_nm"]),
+        None if shear_projection is None else interpolated(base_shear_n(samples, shear_projection)),
         int(tick - ticks[0]),
     )
 

@@ -9,12 +9,12 @@ from touch_records import DAMPED, LINK
 from rigd.beam import Damping, PointForceGrid, clamped_free_eigenvalues, mode_shape
 from rigd.touch import SensorFilter
 from rigd.touch._kernels import (
-    Hat,
+    ForcePulse,
     LaplaceLine,
     chebyshev_nodes,
     contact_kernels,
     cross_kernels,
-    lagrange,
+    cubic_weights,
     positions,
 )
 
@@ -61,7 +61,7 @@ def test_kernels_between_places_are_those_of_the_exact_model():
     x, other = np.array([0.1, 0.3, 0.8]), np.array([0.25, 0.62, 0.7])
     crossing = cross_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), 2 * STEP_S, 400)
     told = crossing.between(x, other, 300)
-    hat = Hat(2 * STEP_S, 400)
+    hat = ForcePulse(2 * STEP_S, 400)
     exact = hat.kernels(PointForceGrid(hat.line.s, LINK, DAMPED).per_force(x, other).T)
     assert told == pytest.approx(exact[:, :300], abs=1e-3 * np.abs(exact).max())
     assert crossing.between(other, x, 300) == pytest.approx(told)
@@ -96,13 +96,13 @@ def test_a_line_gives_back_what_it_was_given():
     line = LaplaceLine(4096, 1e-3)
     t = np.arange(1000) * 1e-3
     wave = np.exp(-((t - 0.5) ** 2) / 2e-3)
-    assert line.in_time(line.transformed(wave), 1000) == pytest.approx(wave, abs=1e-6)
+    assert line.to_time(line.to_laplace(wave), 1000) == pytest.approx(wave, abs=1e-6)
 
 
 def test_cubic_interpolation_is_exact_for_cubics():
     grid = np.linspace(0.1, 0.9, 9)
     at = np.array([0.1, 0.23, 0.5, 0.88, 0.9])
-    first, weights = lagrange(at, grid)
+    first, weights = cubic_weights(at, grid)
     values = sum(weights[:, i] * (grid[first + i] ** 3 - grid[first + i]) for i in range(4))
     assert values == pytest.approx(at**3 - at)
 
