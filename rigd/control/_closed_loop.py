@@ -317,10 +317,10 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     n = plant.a.shape[0]
 
     # States: plant, integral, derivative, two low-pass filters of the reference.
-    integral, derivative, fast, slow = range(n, n + 4)
+    integral, derivative, filter_once, filter_twice = range(n, n + 4)
     period_s = 1.0 / model.rate_hz
-    ki_t = gains.ki_nm_per_rad_s * period_s
-    decay_d, gain_d = derivative_coefficients(gains, model.rate_hz)
+    integral_gain = gains.ki_nm_per_rad_s * period_s
+    derivative_decay, derivative_gain = derivative_coefficients(gains, model.rate_hz)
     b_p, b_d, kp = gains.setpoint_weight_p, gains.setpoint_weight_d, gains.kp_nm_per_rad
 
     a = np.zeros((n + 4, n + 4))
@@ -331,14 +331,14 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     command[:n] = plant.b
 
     # The integral carries Ki T/2 of the last error, the derivative its decayed last step.
-    torque_from_angle = -(kp + 0.5 * ki_t + gain_d)
-    torque_from_reference = kp * b_p + 0.5 * ki_t + gain_d * b_d
+    torque_from_angle = -(kp + 0.5 * integral_gain + derivative_gain)
+    torque_from_reference = kp * b_p + 0.5 * integral_gain + derivative_gain * b_d
     torque = torque_from_angle * measured_angle + settings.feedforward_gain * measured_torque
     torque[[integral, derivative]] = 1.0
 
     from_angle = torque_from_angle * command
-    from_angle[integral] = -ki_t
-    from_angle[derivative] = -(decay_d - 1.0) * gain_d
+    from_angle[integral] = -integral_gain
+    from_angle[derivative] = -(derivative_decay - 1.0) * derivative_gain
     cuts = (
         CutSignal("torque command", command, torque),
         CutSignal("angle reading", from_angle, measured_angle),
@@ -348,22 +348,25 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     a[:n, :n] = plant.a
     a[:n] += np.outer(plant.b, torque)
     b[:n] = plant.b * torque_from_reference
-    a[integral] = -ki_t * measured_angle
+    a[integral] = -integral_gain * measured_angle
     a[integral, integral] += 1.0
-    b[integral] = ki_t
-    a[derivative] = -(decay_d - 1.0) * gain_d * measured_angle
-    a[derivative, derivative] += decay_d
-    b[derivative] = (decay_d - 1.0) * gain_d * b_d
+    b[integral] = integral_gain
+    a[derivative] = -(derivative_decay - 1.0) * derivative_gain * measured_angle
+    a[derivative, derivative] += derivative_decay
+    b[derivative] = (derivative_decay - 1.0) * derivative_gain * b_d
 
     # Low-pass filters: output = state + gain · input, next state = decay · output + gain · input.
     decay, gain = lowpass_coefficients(settings, model.rate_hz)
-    a[fast, fast] = decay
-    b[fast] = gain * (decay + 1.0)
-    a[slow, slow] = decay
-    a[slow, fast] = gain * (decay + 1.0)
-    b[slow] = gain * gain * (decay + 1.0)
+    a[filter_once, filter_once] = decay
+    b[filter_once] = gain * (decay + 1.0)
+    a[filter_twice, filter_twice] = decay
+    a[filter_twice, filter_once] = gain * (decay + 1.0)
+    b[filter_twice] = gain * gain * (decay + 1.0)
     speed = np.zeros(n + 4)
-    speed[fast], speed[slow] = settings.pole_rad_s * (1.0 - gain), -settings.pole_rad_s
+    speed[filter_once], speed[filter_twice] = (
+        settings.pole_rad_s * (1.0 - gain),
+        -settings.pole_rad_s,
+    )
     speed_from_reference = settings.pole_rad_s * (gain - gain * gain)
 
     c = np.zeros((_OUTPUT_ROWS, n + 4))
@@ -417,12 +420,12 @@ def check_stability(loop: ClosedLoop) -> str | None:
     """
     remedy = _remedy(loop.model.settings)
     growth = loop.growth_per_s
-    finding = (
+    instability = (
         "The closed loop of motor, beam and delays is unstable (spectral radius "
         f"{loop.spectral_radius:.7f}): {_describe(loop.poles_rad_s[0])} grows at {growth:.2g} /s"
     )
     if growth > MAX_GROWTH_PER_S:
-        raise ControlDesignError(f"{finding}; {remedy}.")
+        raise ControlDesignError(f"{instability}; {remedy}.")
     if loop.model.beam is not None:
         lightly_damped_loop = close_loop(light_beam(loop.model, loop.model.beam))
         pole = lightly_damped_loop.least_damped()
@@ -435,7 +438,7 @@ def check_stability(loop: ClosedLoop) -> str | None:
     if growth <= 0.0:
         return None
     return (
-        f"{finding}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
+        f"{instability}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
         "damping does that, so keep sessions short."
     )
 
@@ -586,12 +589,12 @@ class _Plant:
 
         measured_rows = []
         first = n + commands
-        for (_, fraction), length, quantity, undelayed in (
+        for (_, fraction), length, quantity, undelayed_row in (
             (angle_chain, lengths[0], angle, self.angle),
             (torque_chain, lengths[1], sensor_torque, self.sensor_torque),
         ):
             if length == 0:
-                measured_rows.append(undelayed)
+                measured_rows.append(undelayed_row)
                 continue
             # The chain's first link: the reading of the last tick, or one from the period since.
             periods_since_tick = 1.0 - fraction if fraction > 0.0 else 0.0

@@ -133,12 +133,12 @@ def open_loop_gain(loop: ClosedLoop, cut: CutSignal, phase_rad: Real) -> Complex
         Complex gain, shape (m,).
     """
     n = cut.action.size
-    opened = loop.a - np.outer(cut.action, cut.reading)
+    open_loop_matrix = loop.a - np.outer(cut.action, cut.reading)
     gain = np.empty(phase_rad.shape, complex)
     for first in range(0, phase_rad.size, _FREQUENCIES_AT_ONCE):
         z = np.exp(1j * phase_rad[first : first + _FREQUENCIES_AT_ONCE])[:, np.newaxis, np.newaxis]
         action = np.broadcast_to(cut.action[:, np.newaxis], (z.size, n, 1))
-        states = np.linalg.solve(z * np.eye(n) - opened, action)
+        states = np.linalg.solve(z * np.eye(n) - open_loop_matrix, action)
         gain[first : first + _FREQUENCIES_AT_ONCE] = -(states[:, :, 0] @ cut.reading)
     return gain
 
@@ -195,8 +195,8 @@ def _frequencies(loop: ClosedLoop, cut: CutSignal) -> Real:
 
     They are dense around the resonances of the open and the closed loop.
     """
-    opened = loop.a - np.outer(cut.action, cut.reading)
-    poles = np.concatenate([np.linalg.eigvals(matrix) for matrix in (opened, loop.a)])
+    open_loop_matrix = loop.a - np.outer(cut.action, cut.reading)
+    poles = np.concatenate([np.linalg.eigvals(matrix) for matrix in (open_loop_matrix, loop.a)])
     poles = np.log(poles[np.abs(poles) > _MAX_DELAY_EIGENVALUE].astype(complex))
     poles = poles[(poles.imag > 0.0) & (poles.imag < pi)]
     half_width = np.maximum(np.abs(poles.real), _MIN_HALF_WIDTH * poles.imag)
@@ -217,21 +217,21 @@ def _negative_real_crossings(curve: Curve, frequencies: Real, gain: Complex) -> 
         end for end in (0, -1) if abs(gain[end].imag) < _MAX_IMAGINARY_RATIO * abs(gain[end].real)
     ]
     at = np.concatenate([crossings, frequencies[end_indices]])
-    real = np.concatenate([curve(crossings).real, gain[end_indices].real])
-    return at[real < 0.0], real[real < 0.0]
+    real_gains = np.concatenate([curve(crossings).real, gain[end_indices].real])
+    return at[real_gains < 0.0], real_gains[real_gains < 0.0]
 
 
 def _sign_changes(
     function: Callable[[Complex], Real], curve: Curve, frequencies: Real, gain: Complex
 ) -> Real:
     """Return the frequencies at which a real function of the open loop's gain changes its sign."""
-    negative = np.signbit(function(gain))
-    first = np.flatnonzero(negative[:-1] != negative[1:])
+    is_negative = np.signbit(function(gain))
+    first = np.flatnonzero(is_negative[:-1] != is_negative[1:])
     low, high = frequencies[first], frequencies[first + 1]
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        before = np.signbit(function(curve(middle))) == negative[first]
-        low, high = np.where(before, middle, low), np.where(before, high, middle)
+        is_before_zero = np.signbit(function(curve(middle))) == is_negative[first]
+        low, high = np.where(is_before_zero, middle, low), np.where(is_before_zero, high, middle)
     zeros: Real = 0.5 * (low + high)
     return zeros
 

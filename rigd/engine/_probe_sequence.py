@@ -72,10 +72,10 @@ class ProbeSequence(SessionSequence):
         cycle.encoder_watch = None  # the move itself compares angle and torques
         cycle.start(self._rest_spread_nm)
         cycle.controller = cast("PidController", move)  # the cycle only steps it
-        self._tick(start_rad, excused=True)  # enabling takes its time
+        self._run_tick(start_rad, excused=True)  # enabling takes its time
         self._move, self._last_tick = move, self._scheduler.tick
         while move.end is None:
-            self._tick(cycle.angle_rad)
+            self._run_tick(cycle.angle_rad)
         cycle.torque_off()
         return {"end": move.end.name} | estimate_probe(self._rig, move).as_dict()
 

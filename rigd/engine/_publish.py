@@ -73,13 +73,13 @@ class Display:
         if self._last_bits is None:
             self._shared_state[StateField.BUS_LOAD_PPM] = UNKNOWN
         else:
-            then_ns, before = self._last_bits
-            if now_ns <= then_ns:
+            previous_ns, previous_bits = self._last_bits
+            if now_ns <= previous_ns:
                 return  # virtual time has not advanced
-            ppm_s = 1e-15 * (now_ns - then_ns)  # 1e-9 s, 1e-6
+            ppm_s = 1e-15 * (now_ns - previous_ns)  # 1e-9 s, 1e-6
             loads_ppm = [
                 (now - then) / (line.bit_rate_bit_s * ppm_s)
-                for line, now, then in zip(lines, bits, before, strict=True)
+                for line, now, then in zip(lines, bits, previous_bits, strict=True)
                 if line.bit_rate_bit_s
             ]
             self._shared_state[StateField.BUS_LOAD_PPM] = (
@@ -95,7 +95,7 @@ _AFTER_LOST = int(Status.AFTER_LOST)
 _LATE = int(Status.LATE)
 _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
-_STALE = _ANGLE_STALE | _WRENCH_STALE
+_STALE_FLAGS = _ANGLE_STALE | _WRENCH_STALE
 
 _TERMS_PERIOD_TICKS = CONTROL.every
 """Number of ticks from one record of the controller's terms to the next."""
@@ -193,7 +193,7 @@ class SampleLog:
             flags |= _LATE
             self.counts.late += 1
             self._shared_state[StateField.LATE] = self.counts.late
-        if flags & _STALE:
+        if flags & _STALE_FLAGS:
             self._count_stale(flags)
         t_ns = scheduler.t_ns
         fx, fy, fz, tx, ty, tz = cycle.wrench

@@ -113,14 +113,16 @@ class Ring:
 
     # Consumer
 
-    def take(self, most: int) -> bytes:
-        """Remove up to ``most`` of the oldest records from the ring and return their bytes.
+    def take(self, max_records: int) -> bytes:
+        """Remove up to ``max_records`` of the oldest records from the ring and return their bytes.
 
         Only records that are contiguous in memory are returned.
         """
         first = self._counters[_READ_COUNTER]
         count = min(
-            most, self._counters[_WRITTEN_COUNTER] - first, self.capacity - first % self.capacity
+            max_records,
+            self._counters[_WRITTEN_COUNTER] - first,
+            self.capacity - first % self.capacity,
         )
         start = HEADER_SIZE + first % self.capacity * self.record_size
         block = bytes(self.buffer[start : start + count * self.record_size])
@@ -165,8 +167,8 @@ class Observer:
         """Index of the record that the observer reads next, counted since the ring's creation."""
         return self._next_index
 
-    def take(self, most: int) -> bytes:
-        """Return the bytes of up to ``most`` records that this observer has not read yet.
+    def take(self, max_records: int) -> bytes:
+        """Return the bytes of up to ``max_records`` records that this observer has not read yet.
 
         The oldest record comes first.
         """
@@ -176,7 +178,7 @@ class Observer:
             self.dropped += oldest - self._next_index
             self._next_index = oldest
         index = self._next_index % ring.capacity
-        count = min(most, ring.written - self._next_index, ring.capacity - index)
+        count = min(max_records, ring.written - self._next_index, ring.capacity - index)
         start = HEADER_SIZE + index * ring.record_size
         block = bytes(ring.buffer[start : start + count * ring.record_size])
         self._next_index += count

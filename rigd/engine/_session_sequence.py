@@ -240,23 +240,23 @@ class SessionSequence:
         """
         settings = self._profile.session
         self._shared_state[StateField.PHASE] = Phase.TARING
-        patience_s = settings.rest_timeout_s
+        remaining_s = settings.rest_timeout_s
         while True:
             self._cycle.sensor_watch.learn()
             rest = self._read_rest(settings.tare_s)
-            moving = self._motion_reason(rest)
-            if not moving:
+            motion = self._motion_reason(rest)
+            if not motion:
                 return rest
-            patience_s -= rest.duration_s
-            if patience_s <= 0.0:
+            remaining_s -= rest.duration_s
+            if remaining_s <= 0.0:
                 raise SessionEnd(
                     "fault",
-                    f"{moving} It did not come to rest within session.rest_timeout_s = "
+                    f"{motion} It did not come to rest within session.rest_timeout_s = "
                     f"{settings.rest_timeout_s:g} s; wait until it is at rest and start again.",
                 )
             if self._shared_state[StateField.PHASE] != Phase.WAITING:
                 self._shared_state[StateField.PHASE] = Phase.WAITING
-                self._log_event("info", f"Waiting until the rig is at rest. {moving}")
+                self._log_event("info", f"Waiting until the rig is at rest. {motion}")
 
     def _motion_reason(self, rest: Rest) -> str:
         """Return a sentence that says how motor or beam moves, or an empty text if both rest."""
@@ -283,7 +283,7 @@ class SessionSequence:
         self._cycle.start(self._rest_spread_nm)
         for number in range(round(_SETTLING_S * self._rate_hz)):
             # Enabling the drive before the first tick takes longer than a tick.
-            self._tick(self._start_angle_rad, excused=number == 0)
+            self._run_tick(self._start_angle_rad, excused=number == 0)
 
     def wait_for_go(self) -> None:
         """Hold the motor until the supervisor reports that the recorder is ready.
@@ -309,7 +309,7 @@ class SessionSequence:
                 self._switch_off_if_stopped()
                 time.sleep(_VIRTUAL_POLL_S)
             else:
-                self._tick(self._start_angle_rad)
+                self._run_tick(self._start_angle_rad)
 
     def record(self) -> None:
         """Run the excitation and log a sample of every tick.
@@ -323,7 +323,7 @@ class SessionSequence:
             in missed or lost ticks.
         """
         reference, start_rad = self._relative_reference, self._start_angle_rad
-        total = len(reference)
+        total_ticks = len(reference)
         scheduler, cycle, log, shared_state = (
             self._scheduler,
             self._cycle,
@@ -344,12 +344,12 @@ class SessionSequence:
         ahead_ns = 0 if virtual else scheduler.start_ns - before_ns
         shared_state[StateField.START_UTC_NS] = wall_ns + ahead_ns
         shared_state[StateField.PHASE] = Phase.RUNNING
-        self._log_event("info", f"Record starts: {total} ticks at {self._rate_hz:g} Hz.")
+        self._log_event("info", f"Record starts: {total_ticks} ticks at {self._rate_hz:g} Hz.")
         last = -1
         first_ns = last_ns = 0
         reference_rad = start_rad
         end: SessionEnd | None = None
-        while end is None and last < total - 1:
+        while end is None and last < total_ticks - 1:
             if reader is not None:
                 if virtual:
                     self._await_segment(reader, last + 1)
@@ -358,12 +358,12 @@ class SessionSequence:
             missed = scheduler.wait()
             tick = scheduler.tick
             if missed:
-                missed = min(tick, total) - last - 1
+                missed = min(tick, total_ticks) - last - 1
                 counts.missed += missed
                 shared_state[StateField.MISSED] = counts.missed
-                end = self._check_missed_ticks(missed, min(tick, total))
-                if tick >= total:
-                    last, reference_rad = total - 1, start_rad + reference[-1]
+                end = self._check_missed_ticks(missed, min(tick, total_ticks))
+                if tick >= total_ticks:
+                    last, reference_rad = total_ticks - 1, start_rad + reference[-1]
                     break
             if end is None and cycle.stale:  # in the tick before
                 end = self._check_stale_readings(tick)
@@ -407,9 +407,9 @@ class SessionSequence:
         and shows the devices that their host still runs.
         """
         on_lines = self._cycle.devices.on_lines
-        begun_s = time.monotonic()
+        wait_start_s = time.monotonic()
         while reader.must_wait(tick) and self._stop_reason() is None:
-            if on_lines and time.monotonic() - begun_s > SIGN_OF_LIFE_S:
+            if on_lines and time.monotonic() - wait_start_s > SIGN_OF_LIFE_S:
                 return
             self._display.show(self._cycle, self._scheduler.due_ns)
             time.sleep(_VIRTUAL_POLL_S)
@@ -440,13 +440,15 @@ class SessionSequence:
         cycle = self._cycle
         # The record may have ended at the limit of the angle.
         limit_rad = self._profile.limits.angle_rad
-        least_rad = min(0.0, max(-_MAX_DAMPING_ANGLE_RAD, -limit_rad - end_rad))
-        most_rad = max(0.0, min(_MAX_DAMPING_ANGLE_RAD, limit_rad - end_rad))
+        min_displacement_rad = min(0.0, max(-_MAX_DAMPING_ANGLE_RAD, -limit_rad - end_rad))
+        max_displacement_rad = max(0.0, min(_MAX_DAMPING_ANGLE_RAD, limit_rad - end_rad))
         torques_nm = np.zeros(round(_SPREAD_WINDOW_S * self._rate_hz))
         for tick in range(round(_LONGEST_DAMPING_S * self._rate_hz)):
             damping_angle_rad = damper.step(cycle.coupling_torque_nm)
-            self._end_angle_rad = end_rad + min(max(damping_angle_rad, least_rad), most_rad)
-            self._tick(self._end_angle_rad)
+            self._end_angle_rad = end_rad + min(
+                max(damping_angle_rad, min_displacement_rad), max_displacement_rad
+            )
+            self._run_tick(self._end_angle_rad)
             torques_nm[tick % torques_nm.size] = cycle.coupling_torque_nm
             if (
                 tick % _SPREAD_CHECK_TICKS == 0
@@ -465,7 +467,7 @@ class SessionSequence:
             goal_rad += self._relative_reference[-1]
         distance_rad = goal_rad - self._end_angle_rad
         for fraction in self._return_path:
-            self._tick(self._end_angle_rad + distance_rad * fraction)
+            self._run_tick(self._end_angle_rad + distance_rad * fraction)
 
     def check_tare(self) -> None:
         """Average the sensor again with the drive disabled, and check the drift of its zero.
@@ -490,7 +492,7 @@ class SessionSequence:
         if violation is not None:
             raise SessionEnd("fault", str(violation))
 
-    def _tick(self, reference_rad: float, *, excused: bool = False) -> None:
+    def _run_tick(self, reference_rad: float, *, excused: bool = False) -> None:
         """Run one tick outside the record, where missed ticks are limited but not counted.
 
         Set `excused` for a tick that other work, such as enabling the drive, may delay.

@@ -338,13 +338,16 @@ class Cycle:
             speed_change_rad
         ) < _MIN_SPEED_CHANGE * abs(now_rad):
             return False
-        half = _SPEED_TICKS // 2
+        half_window = _SPEED_TICKS // 2
         torques_nm = [sent_nm - coupling_nm for _, coupling_nm, sent_nm in recent]
-        impulse_nm_s = sum(torques_nm[half : -1 - half]) / rate_hz
+        impulse_nm_s = sum(torques_nm[half_window : -1 - half_window]) / rate_hz
         expected_rad = impulse_nm_s / inertia_kg_m2 * _SPEED_TICKS / rate_hz
-        least, most = _OPPOSITE_ACCELERATION_RATIOS
+        min_ratio, max_ratio = _OPPOSITE_ACCELERATION_RATIOS
         opposition = -speed_change_rad * expected_rad
-        return least * expected_rad**2 <= opposition <= most * expected_rad**2 and opposition > 0.0
+        return (
+            min_ratio * expected_rad**2 <= opposition <= max_ratio * expected_rad**2
+            and opposition > 0.0
+        )
 
     @property
     def stale(self) -> bool:
@@ -503,8 +506,8 @@ class Rest:
     def as_metadata(self) -> dict[str, str]:
         """Return duration, mean and standard deviation as metadata of the session file."""
         return {"tare_s": repr(self.duration_s)} | {
-            f"tare_{what}_{axis}": repr(value)
-            for what, values in (("mean", self.mean), ("std", self.spread))
+            f"tare_{statistic}_{axis}": repr(value)
+            for statistic, values in (("mean", self.mean), ("std", self.spread))
             for axis, value in zip(WRENCH_FIELDS, values, strict=True)
         }
 
@@ -603,14 +606,14 @@ def make_observers(profile: Profile, devices: Devices) -> ReadingMonitors:
         scales=ScaleWatch(rig.motor.inertia_kg_m2, profile.limits.torque_ratio),
     )
     simulation = rig.simulation
-    noisy = [True] * 6
+    is_noisy = [True] * 6
     if simulation is not None:
-        noisy = [simulation.force_noise_n > 0.0] * 3 + [simulation.torque_noise_nm > 0.0] * 3
+        is_noisy = [simulation.force_noise_n > 0.0] * 3 + [simulation.torque_noise_nm > 0.0] * 3
     channels: Sequence[str] = WRENCH_FIELDS
     if isinstance(devices.sensor, GaugeSensor):
         # Each gauge shows the noise of all axes.
-        channels, noisy = [f"gauge {number}" for number in range(6)], [all(noisy)] * 6
-    return ReadingMonitors(encoder, SensorWatch(channels, noisy, rig.rate_hz))
+        channels, is_noisy = [f"gauge {number}" for number in range(6)], [all(is_noisy)] * 6
+    return ReadingMonitors(encoder, SensorWatch(channels, is_noisy, rig.rate_hz))
 
 
 def remember_heat(profile: Profile, heat_nm2: float) -> None:

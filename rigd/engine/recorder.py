@@ -57,7 +57,7 @@ def main() -> None:
     except SessionError as error:
         parent.send(Failed(str(error), taken=isinstance(error, SessionExistsError)))
         raise SystemExit(1) from None
-    _show_free_space(channels.shared_state, job.path.parent)
+    _publish_free_space(channels.shared_state, job.path.parent)
     parent.send(Opened(granted))
     try:
         _record(parent, channels, writer, job.path.parent)
@@ -95,7 +95,7 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
         transferred = recorder.transfer()
         if time.monotonic() - polled_s > _DISK_POLL_S:
             polled_s = time.monotonic()
-            _show_free_space(channels.shared_state, folder)
+            _publish_free_space(channels.shared_state, folder)
         try:
             message = parent.poll(0.0 if transferred else _IDLE_PAUSE_S)
         except EOFError:
@@ -116,7 +116,7 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
                 return
 
 
-def _show_free_space(shared_state: SharedState, folder: Path) -> None:
+def _publish_free_space(shared_state: SharedState, folder: Path) -> None:
     """Publish the free space on the disk of a folder, in MB, in the shared state."""
     with contextlib.suppress(OSError):
         shared_state[StateField.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))

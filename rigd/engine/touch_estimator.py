@@ -122,8 +122,10 @@ class TouchFollower:
 
     def take(self, samples: NDArray[np.void]) -> None:
         """Add the next samples of the record, shape (n,), and register the touches in them."""
-        earlier = self._samples
-        self._samples = samples if earlier is None else np.concatenate([earlier, samples])
+        earlier_samples = self._samples
+        self._samples = (
+            samples if earlier_samples is None else np.concatenate([earlier_samples, samples])
+        )
         for tick in samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist():
             self._count += 1
             estimate = self._estimator.follow()
@@ -144,30 +146,30 @@ class TouchFollower:
             return []
         touch = self._pending_touches[0]
         available_ticks = int(self._samples["tick"][-1]) - touch.tick + 1
-        final = self._record_ended or available_ticks >= self._final_ticks
+        is_final = self._record_ended or available_ticks >= self._final_ticks
         # In real time the operator waits for the first estimate, even if the record is complete.
-        first = self._job.realtime is not None or not final
-        if available_ticks >= self._first_ticks and first and not touch.reported:
+        is_first = self._job.realtime is not None or not is_final
+        if available_ticks >= self._first_ticks and is_first and not touch.reported:
             touch.reported = True
-            return [self._estimate(touch, self._first_ticks, final=False)]
-        if final:
+            return [self._estimate(touch, self._first_ticks, is_final=False)]
+        if is_final:
             self._pending_touches.popleft()
-            return [self._estimate(touch, self._final_ticks, final=True)]
+            return [self._estimate(touch, self._final_ticks, is_final=True)]
         if available_ticks >= self._preview_ticks and not touch.previewed:
             touch.previewed = True
             record, _ = self._record(touch, self._preview_ticks)
             touch.estimate.preview(record)
         return []
 
-    def _estimate(self, touch: _PendingTouch, after: int, *, final: bool) -> TouchReport:
-        """Return the estimate of a touch from the record up to `after` ticks from the detection."""
-        record, start_s = self._record(touch, after)
-        touch_estimate = touch.estimate.update(record, scan=False, first=not final)
+    def _estimate(self, touch: _PendingTouch, after_ticks: int, *, is_final: bool) -> TouchReport:
+        """Return the estimate of a touch from the record until `after_ticks` past its detection."""
+        record, start_s = self._record(touch, after_ticks)
+        touch_estimate = touch.estimate.update(record, scan=False, first=not is_final)
         document = touch_estimate.as_dict(start_s)
-        return TouchReport(touch.number, touch.tick, final, document)
+        return TouchReport(touch.number, touch.tick, is_final, document)
 
-    def _record(self, touch: _PendingTouch, after: int) -> tuple[TouchRecord, float]:
-        """Return the record around a touch up to `after` ticks from its detection, and its start.
+    def _record(self, touch: _PendingTouch, after_ticks: int) -> tuple[TouchRecord, float]:
+        """Return the record around a touch until `after_ticks` past its detection, and its start.
 
         The start is the time in s since the start of the session's record.
         """
@@ -177,7 +179,7 @@ class TouchFollower:
         free_from = min(touch.free_from, touch.tick)
         samples = around_touch(self._samples, touch.tick, job.rate_hz, free_from)
         record = touch_record(samples, touch.tick, job.rate_hz, job.shear_projection)
-        return record.until(record.detected + after), int(samples["tick"][0]) / job.rate_hz
+        return record.until(record.detected + after_ticks), int(samples["tick"][0]) / job.rate_hz
 
 
 if __name__ == "__main__":

@@ -99,10 +99,10 @@ class TorqueModel:
         """
         factor = ticks_per_sample(rate_hz)
         # Twice the length, and one of which a transform is quick.
-        half = -(-ticks // factor)
-        half = _fast_transform_length(half)
-        ticks = half * factor
-        samples = 2 * half
+        half_samples = -(-ticks // factor)
+        half_samples = _fast_transform_length(half_samples)
+        ticks = half_samples * factor
+        samples = 2 * half_samples
         sample_hz = rate_hz / factor
         sigma = _WRAP_AROUND_DECAY * sample_hz / samples
         frequency_hz = np.fft.rfftfreq(samples, 1.0 / sample_hz)
@@ -452,6 +452,6 @@ def _nuisance_terms(estimate: BeamEstimate, samples: int, sample_hz: float) -> R
     poles = np.array([mode.pole_rad_s for mode in estimate.modes()])
     decays = np.exp(np.outer(poles, time_s))
     weight = _whitening_weights(estimate, poles.imag / (2 * pi), sample_hz)[:, None]
-    slow = _whitening_weights(estimate, np.zeros(1), sample_hz)[0]
-    level = np.stack([np.ones(samples), time_s]) * slow
-    return np.concatenate([decays.real * weight, decays.imag * weight, level])
+    constant_weight = _whitening_weights(estimate, np.zeros(1), sample_hz)[0]
+    offset_and_drift = np.stack([np.ones(samples), time_s]) * constant_weight
+    return np.concatenate([decays.real * weight, decays.imag * weight, offset_and_drift])

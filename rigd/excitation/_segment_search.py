@@ -332,7 +332,7 @@ class SegmentSearch:
         The best band comes first; bands of further modes are added if they give more information.
         """
         sweep_pairs = [(band, self.sweep_pair(band, duration_s)) for band in self.bands()]
-        nothing = _Candidate(
+        empty_candidate = _Candidate(
             duration_s,
             (),
             (),
@@ -349,31 +349,32 @@ class SegmentSearch:
             band.number: band for band, _ in sweep_pairs if band.at_mode and band.number in through
         }
         candidates_at_rest = {
-            number: self.with_modes_at_rest(nothing, number, mode_sweeps) for number in mode_sweeps
+            number: self.with_modes_at_rest(empty_candidate, number, mode_sweeps)
+            for number in mode_sweeps
         }
         found = max(
             (
                 self.with_band(start, 1.0, band, sweep_pair, phase_index)
                 for band, sweep_pair in sweep_pairs
                 if band.at_mode and (not through or band is resonance_bands.get(band.number))
-                for start in (nothing, candidates_at_rest[band.number])
+                for start in (empty_candidate, candidates_at_rest[band.number])
                 for phase_index in range(_PHASE_COUNT)
             ),
             key=lambda each: each.value,
         )
         for _ in range(2):
             driven_modes = {band.number for band, _ in found.parts}
-            more = [
+            extended_candidates = [
                 self.with_band(found, fraction, band, sweep_pair, phase_index)
                 for band, sweep_pair in sweep_pairs
                 if band.number not in driven_modes
                 for fraction in _BASE_AMPLITUDE_FACTORS
                 for phase_index in range(0, _PHASE_COUNT, 2)
             ]
-            better = max(more, key=lambda each: each.value, default=found)
-            if better.value <= found.value:
+            better_candidate = max(extended_candidates, key=lambda each: each.value, default=found)
+            if better_candidate.value <= found.value:
                 break
-            found = better
+            found = better_candidate
         return found
 
     def ticks(self, time_s: float) -> int:
@@ -516,14 +517,14 @@ class SegmentSearch:
         The motor then holds the amplitude that the mode has at the end of the segment.
         """
         first = self.model_samples(duration_s)
-        rest = self.samples - first
+        remaining_samples = self.samples - first
         continued_drive = self.continued_drive(band)
         amplitudes = self.decays @ tip_slope[first : first + self.decays.shape[1]]
         index = 2 * [mode.number for mode in self.modes].index(band.number)
         factors = continued_drive.per_amplitude @ amplitudes[index : index + 2]
         before = weighted[:, :first]
         after = weighted[:, first:] + np.tensordot(
-            factors, continued_drive.weighted[:, :, :rest], axes=1
+            factors, continued_drive.weighted[:, :, :remaining_samples], axes=1
         )
         return float(np.vdot(before, before) + np.vdot(after, after))
 

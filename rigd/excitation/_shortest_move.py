@@ -360,29 +360,41 @@ class _MoveSearch:
         plant = self._plant
         end = n + round(plant.settling_s * plant.rate_hz)
         # The ends of all intervals and the ticks between them: the solution exploits every gap.
-        middles = np.round((edges[:-1] + edges[1:]) / 2).astype(int)
-        tail = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MAX_INTERVALS // 2]
-        fine = np.unique(np.concatenate([edges, middles if n > 2 * len(edges) else [], tail]))
-        fine = fine.astype(int)
-        coarse = fine[::2]
+        interval_middles = np.round((edges[:-1] + edges[1:]) / 2).astype(int)
+        settling_ticks = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MAX_INTERVALS // 2]
+        checked_ticks = np.unique(
+            np.concatenate([edges, interval_middles if n > 2 * len(edges) else [], settling_ticks])
+        )
+        checked_ticks = checked_ticks.astype(int)
+        every_second_tick = checked_ticks[::2]
         unit_responses = self._unit_response.for_ticks(end)
         rows = [
-            _interval_responses(unit_responses[name], edges, coarse if name == "coupling" else fine)
+            _interval_responses(
+                unit_responses[name],
+                edges,
+                every_second_tick if name == "coupling" else checked_ticks,
+            )
             * (scale / self._limits[name])
             for name in self._limits
         ]
         if self._order > 1 and self._ringing is None:
-            forward = np.copysign(scale, self._distance_rad)
-            backward = -forward * _interval_responses(unit_responses["velocity"], edges, coarse)
+            forward_scale = np.copysign(scale, self._distance_rad)
+            backward_speed = -forward_scale * _interval_responses(
+                unit_responses["velocity"], edges, every_second_tick
+            )
             mean_rad_s = abs(self._distance_rad) * plant.rate_hz / n
             return (
                 np.concatenate(rows),
-                backward,
-                np.full(len(coarse), _MAX_BACKWARD_SPEED_FRACTION * mean_rad_s),
+                backward_speed,
+                np.full(len(every_second_tick), _MAX_BACKWARD_SPEED_FRACTION * mean_rad_s),
             )
-        angle = scale * _interval_responses(unit_responses["angle"], edges, coarse)
+        angle = scale * _interval_responses(unit_responses["angle"], edges, every_second_tick)
         free_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
-        return np.concatenate(rows), np.vstack([angle, -angle]), np.repeat(free_rad, len(coarse))
+        return (
+            np.concatenate(rows),
+            np.vstack([angle, -angle]),
+            np.repeat(free_rad, len(every_second_tick)),
+        )
 
     def limit_fraction(self, reference: Real) -> float:
         """Return the largest fraction of a limit that the response to a reference reaches."""
@@ -460,9 +472,11 @@ def _interval_responses(
     The shape is (ticks, intervals). `unit_responses` is the response to a constant acceleration of
     1, and `edges` are the ticks at which the intervals begin and end.
     """
-    since = ticks[:, None] - edges
-    begun: Real = np.where(since >= 0, unit_responses[np.maximum(since, 0)], 0.0)
-    return begun[:, :-1] - begun[:, 1:]
+    ticks_since_edge = ticks[:, None] - edges
+    step_response: Real = np.where(
+        ticks_since_edge >= 0, unit_responses[np.maximum(ticks_since_edge, 0)], 0.0
+    )
+    return step_response[:, :-1] - step_response[:, 1:]
 
 
 # Braking

@@ -211,14 +211,14 @@ def check_ticks(what: str, ticks: float, rate_hz: float, around_s: float = 0.0) 
     """
     if ticks > MAX_SAMPLES:
         longest_s = MAX_SAMPLES / rate_hz
-        between = (
+        limit_text = (
             f" ({longest_s - around_s:g} s between rest and ring-down)"
             if 0.0 < around_s < longest_s
             else ""
         )
         raise ExcitationError(
             f"{what} would take {ticks / rate_hz:g} s; {longest_s:g} s is the most at {rate_hz:g} "
-            f"Hz{between}, because no more than {MAX_SAMPLES} samples can be analysed, exported "
+            f"Hz{limit_text}, because no more than {MAX_SAMPLES} samples can be analysed, exported "
             "or replayed: shorten it or run several sessions."
         )
 
@@ -308,9 +308,13 @@ def chirp(
         segments |= {"there": there_ticks, "back": back_ticks}
     t = _sweep_time(segments, rate_hz)
     # Time on the way there and on the way back, where the phase goes on from the turn.
-    there, back = np.minimum(t, duration_s), np.maximum(t - duration_s, 0.0)
-    phase = 2.0 * pi * (start_hz * there + (stop_hz - start_hz) * there**2 / (2.0 * duration_s))
-    phase += 2.0 * pi * (stop_hz * back - (stop_hz - start_hz) * back**2 / (2.0 * duration_s))
+    outward_s, return_s = np.minimum(t, duration_s), np.maximum(t - duration_s, 0.0)
+    phase = (
+        2.0 * pi * (start_hz * outward_s + (stop_hz - start_hz) * outward_s**2 / (2.0 * duration_s))
+    )
+    phase += (
+        2.0 * pi * (stop_hz * return_s - (stop_hz - start_hz) * return_s**2 / (2.0 * duration_s))
+    )
     sweep = amplitude_rad * np.sin(phase) * _taper(t, (1 + there_and_back) * duration_s, taper_s)
     parameters = {
         "amplitude_rad": amplitude_rad,
@@ -499,10 +503,10 @@ def _random_phase_period(
     """Return one period of the multisine with peak 1, shape (ticks,), which starts near zero."""
     frequency_hz = np.arange(1, ticks // 2) / period_s
     tolerance_hz = 1e-9 * band_hz[1]
-    inside = (frequency_hz >= band_hz[0] - tolerance_hz) & (
+    in_band = (frequency_hz >= band_hz[0] - tolerance_hz) & (
         frequency_hz <= band_hz[1] + tolerance_hz
     )
-    harmonics = 1 + np.flatnonzero(inside)
+    harmonics = 1 + np.flatnonzero(in_band)
     if harmonics.size == 0:
         raise ExcitationError(
             f"No harmonic of period_s = {period_s:g} s lies between start_hz = {band_hz[0]:g} Hz "

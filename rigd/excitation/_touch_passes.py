@@ -134,14 +134,14 @@ def touch(
     at_least_s = settle_s + abs(by_rad) / speed_rad_s + hold_s
     check_ticks("The session", passes * at_least_s * rate_hz, rate_hz)
     plant = rig.move_plant(path, TOUCH)
-    out = slew(
+    way_out_rad = slew(
         by_rad,
         speed_rad_s=speed_rad_s,
         acceleration_rad_s2=acceleration_rad_s2,
         rate_hz=rate_hz,
         poles_rad_s=plant.poles_rad_s,
     )
-    braking = shortest_braking(plant, np.concatenate([[0.0, 0.0], out]))
+    braking = shortest_braking(plant, np.concatenate([[0.0, 0.0], way_out_rad]))
     hold_ticks = ceil(hold_s * rate_hz)
     if hold_s < braking.duration_s:
         raise ExcitationError(
@@ -154,15 +154,17 @@ def touch(
         _PEAK_OVER_MEAN_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s
     )
     back = still_path(return_duration_s, rate_hz, plant.poles_rad_s)
-    settle = np.zeros(ceil(settle_s * rate_hz))
-    single_pass = np.concatenate([settle, out, np.full(hold_ticks, by_rad), by_rad * (1.0 - back)])
+    rest_rad = np.zeros(ceil(settle_s * rate_hz))
+    single_pass = np.concatenate(
+        [rest_rad, way_out_rad, np.full(hold_ticks, by_rad), by_rad * (1.0 - back)]
+    )
     check_ticks("The session", passes * single_pass.size, rate_hz)
     segments = lay_out_segments(rate_hz, rest_s, passes * single_pass.size / rate_hz, ring_down_s)
     first = segments["sweep"][0]
     approach = Approach(
         passes=tuple(
             TouchPass(
-                begins=start + settle.size,
+                begins=start + rest_rad.size,
                 returns=start + single_pass.size - back.size,
                 ends=start + single_pass.size,
             )
@@ -222,11 +224,11 @@ def after_touch(
         Reference angles in rad at the ticks after `tick`.
     """
     braking, back = approach.braking, approach.back
-    before, last, now = recent_rad
-    acceleration = (now - 2 * last + before) * braking.rate_hz**2
-    speed = (now - last) * braking.rate_hz + acceleration / (2 * braking.rate_hz)
+    second_last, last_angle, present_angle = recent_rad
+    acceleration = (present_angle - 2 * last_angle + second_last) * braking.rate_hz**2
+    speed = (present_angle - last_angle) * braking.rate_hz + acceleration / (2 * braking.rate_hz)
     reference = np.full(ends - tick - 1, start_rad)
-    braking_rad = braking.path(now, speed, acceleration)
+    braking_rad = braking.path(present_angle, speed, acceleration)
     return_index = reference.size - back.size
     hold = min(approach.hold_ticks, return_index)
     held_rad = braking_rad[-1]

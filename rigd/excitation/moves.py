@@ -287,8 +287,10 @@ class Braking:
             Reference angle, speed and acceleration at the start of braking.
         """
         return [
-            angle_rad + speed_rad_s * way_s + acceleration_rad_s2 * way_s2
-            for way_s, way_s2 in zip(self.per_speed_s, self.per_acceleration_s2, strict=True)
+            angle_rad + speed_rad_s * speed_factor_s + acceleration_rad_s2 * acceleration_factor_s2
+            for speed_factor_s, acceleration_factor_s2 in zip(
+                self.per_speed_s, self.per_acceleration_s2, strict=True
+            )
         ]
 
 
@@ -345,8 +347,12 @@ def braked_reference(reference_rad: Sequence[float] | Real, tick: int, braking: 
         Angles of the reference and of the m ticks of the braking path. The last angle is that at
         standstill.
     """
-    before, last, now = (float(value) for value in reference_rad[tick - 2 : tick + 1])
+    second_last, last_angle, present_angle = (
+        float(value) for value in reference_rad[tick - 2 : tick + 1]
+    )
     rate_hz = braking.rate_hz
-    acceleration = (now - 2 * last + before) * rate_hz**2
-    speed = (now - last) * rate_hz + acceleration / (2 * rate_hz)
-    return np.concatenate([reference_rad[: tick + 1], braking.path(now, speed, acceleration)])
+    acceleration = (present_angle - 2 * last_angle + second_last) * rate_hz**2
+    speed = (present_angle - last_angle) * rate_hz + acceleration / (2 * rate_hz)
+    return np.concatenate(
+        [reference_rad[: tick + 1], braking.path(present_angle, speed, acceleration)]
+    )

@@ -242,15 +242,19 @@ def _linearise(
     if name in MODE_QUANTITIES:
         mode = next((each for each in modes if each.number == target.mode), None)
         if mode is None:
-            seen = ", ".join(str(each.number) for each in modes) or "none"
-            return 0.0, gradient, f"mode {target.mode} is not below {BAND_HZ:g} Hz (seen: {seen})"
+            mode_numbers = ", ".join(str(each.number) for each in modes) or "none"
+            return (
+                0.0,
+                gradient,
+                f"mode {target.mode} is not below {BAND_HZ:g} Hz (seen: {mode_numbers})",
+            )
         if name == "damping":
             return mode.damping_ratio, mode.damping_gradient, ""
         return mode.frequency_hz, mode.frequency_gradient_hz, ""
     value = estimate.values[name]
     coefficient = _COEFFICIENT_OF_ORDER.get(name, name)
     if estimate.values[coefficient] == 0.0 or name not in estimate.names:
-        obstacle = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
-        return value, gradient, f"{_DAMPING_KIND[name]} damping {obstacle} in the estimate so far"
+        reason = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
+        return value, gradient, f"{_DAMPING_KIND[name]} damping {reason} in the estimate so far"
     gradient[estimate.names.index(name)] = value if name in LOGARITHMIC_PARAMETERS else 1.0
     return value, gradient, ""

@@ -349,7 +349,7 @@ def find_minima(
     residual, jacobian = _linearise(predict, window, current, space)
     chi2 = np.einsum("kn,kn->k", residual, residual)
     active = np.ones(len(current), dtype=bool)
-    largest_std = 1e-6 / space.scale**2
+    regularisation = 1e-6 / space.scale**2
     for _ in range(rounds):
         rows = np.flatnonzero(active)
         j, r = jacobian[rows], residual[rows]
@@ -357,7 +357,7 @@ def find_minima(
             j = j * free[rows, None]
         normal = np.einsum("knp,knq->kpq", j, j)
         gradient = np.einsum("knp,kn->kp", j, r)
-        diagonal = np.einsum("kpp->kp", normal) * damping[rows, None] + largest_std
+        diagonal = np.einsum("kpp->kp", normal) * damping[rows, None] + regularisation
         normal += diagonal[:, :, None] * np.eye(current.shape[1])
         step = -np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
         step = np.clip(step, -8 * space.scale, 8 * space.scale)
