@@ -87,7 +87,7 @@ def estimate_from_explanations(
         if kind == "rigid":
             stiffness = _stiffness_estimate(at_rest.posterior)
     elif (
-        explainer.blind.chi2 < explainer.most(explainer.blind.degrees)
+        explainer.blind.chi2 < explainer.max_chi2(explainer.blind.degrees)
         and not explainer.begins_too_late
     ):
         x_m = _unexplained_position(explainer)
@@ -174,14 +174,14 @@ def _force_estimate(
         force = peaks[:1, None] * np.sin(np.pi * np.minimum(phase, 1.0))
     elif best.kind == "two":
         step_s = explainer.tables.coarse.step_s
-        force = np.abs(explainer.pairing().predicted(candidates, window)[1])
+        force = np.abs(explainer.pairing().predict(candidates, window)[1])
         peaks = force.max(axis=1)
     else:
         touching = ObstacleContact(explainer.tables.middle, explainer.tables.x_m, explainer.motion)
-        side = None if best.kind == "rigid" else explainer.side()
+        side = None if best.kind == "rigid" else explainer.pressing_direction()
         if best.kind == "yielding":
             candidates = np.insert(candidates, 3, 0.0, axis=1)
-        force = np.abs(touching.predicted(candidates, window, side)[1])
+        force = np.abs(touching.predict(candidates, window, side)[1])
         peaks = force.max(axis=1)
     low, high = np.quantile(peaks[1:], (0.025, 0.975))
     estimate = Estimated(float(peaks[1:].mean()), float(peaks[1:].std()), (float(low), float(high)))

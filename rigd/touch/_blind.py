@@ -71,7 +71,7 @@ class AnyForceEstimator:
     ----------
     kernels
         Contact kernels with two time steps a sample.
-    every
+    stride
         Number of the kernels' positions from one scanned position to the next.
     samples
         Largest number of samples.
@@ -79,11 +79,11 @@ class AnyForceEstimator:
 
     __slots__ = ("_effects", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, every: int, samples: int) -> None:
-        self._x_m = kernels.x_m[::every]
+    def __init__(self, kernels: ContactKernels, stride: int, samples: int) -> None:
+        self._x_m = kernels.x_m[::stride]
         lag = 2 * np.arange(samples)[:, None] - np.arange(2 * samples)
         self._effects = [
-            np.where(lag >= 0, table[::every][:, np.clip(lag, 0, table.shape[1] - 1)], 0.0)
+            np.where(lag >= 0, table[::stride][:, np.clip(lag, 0, table.shape[1] - 1)], 0.0)
             for table in (kernels.torque, kernels.shear)
         ]  # (positions, samples, forces)
 

@@ -247,7 +247,9 @@ class Explainer:
         for seconds in stages:
             self._include_uncertainties(starts, seconds)
             window = self.window(seconds)
-            at_rest = self.explained("rigid", self.predictor(starts), window, starts, self.space(3))
+            at_rest = self.explain_by_kind(
+                "rigid", self.predictor(starts), window, starts, self.space(3)
+            )
             if previous_stage is not None and self._later_is_worse(
                 at_rest, window, *previous_stage
             ):
@@ -329,7 +331,7 @@ class Explainer:
         tip = bool(np.median(rows[:, 0]) > NEAR_TIP_FRACTION * tables.model.beam.length_m)
         kernels = tables.finest if tip else tables.coarse if first else tables.middle
         touching = ObstacleContact(kernels, tables.x_m, self.motion)
-        return lambda candidates, window: touching.predicted(candidates, window)[0]
+        return lambda candidates, window: touching.predict(candidates, window)[0]
 
     # Springy obstacle at rest
 
@@ -356,7 +358,7 @@ class Explainer:
         """The 12 likeliest candidates of the grid, compared over more samples."""
         coarse = ObstacleContact(self.tables.coarse, self.tables.x_m, self.motion)
         chi2 = chi2_of(
-            lambda rows, window: coarse.predicted(rows, window)[0],
+            lambda rows, window: coarse.predict(rows, window)[0],
             self._first_samples,
             self._grid_candidates,
         )
@@ -392,7 +394,7 @@ class Explainer:
             chosen + 0.5 * spread * rng.standard_normal(chosen.shape), space.low, space.high
         )
 
-    def explained(
+    def explain_by_kind(
         self,
         kind: str,
         predict: Prediction,
@@ -439,7 +441,7 @@ class Explainer:
             scale=variance_factor * max(_MIN_RESIDUAL_VARIANCE, found.chi2.min() / degrees),
             count=120,
             rounds=5,
-            enough=150.0,
+            enough_samples=150.0,
             smallest_std=space.smallest_std,
         )
         best = int(np.argmin(posterior.chi2))
@@ -454,9 +456,9 @@ class Explainer:
 
         `max_stds` is the number of standard deviations by which they may exceed their expectation.
         """
-        return bool(explanation.chi2 < self.most(window.data.size, max_stds))
+        return bool(explanation.chi2 < self.max_chi2(window.data.size, max_stds))
 
-    def most(self, degrees: int, max_stds: float = _MAX_MISFIT_STDS) -> float:
+    def max_chi2(self, degrees: int, max_stds: float = _MAX_MISFIT_STDS) -> float:
         """Return the largest sum of squared residuals that noise explains.
 
         `degrees` is its expectation, and `max_stds` the allowed number of standard deviations.
@@ -474,7 +476,7 @@ class Explainer:
         """Return whether a shorter window is explained, but not the samples of a longer one."""
         added_samples = longer_window.data.size - shorter_window.data.size
         added_chi2 = longer_explanation.chi2 - shorter_explanation.chi2
-        return self.fits(shorter_explanation, shorter_window) and added_chi2 > self.most(
+        return self.fits(shorter_explanation, shorter_window) and added_chi2 > self.max_chi2(
             added_samples, _MAX_LATER_MISFIT_STDS
         )
 
@@ -484,9 +486,9 @@ class Explainer:
         starts = np.hstack([np.tile(at_rest.parameters, (len(extra), 1)), extra])
         free = np.hstack([np.ones((len(extra), at_rest.parameters.size), dtype=bool), extra != 0])
         touching = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
-        side = touching.side(at_rest.parameters)
+        side = touching.pressing_direction(at_rest.parameters)
         found = find_minima(
-            lambda candidates, window: touching.predicted(candidates, window, side)[0],
+            lambda candidates, window: touching.predict(candidates, window, side)[0],
             window,
             starts,
             self.space(5),
@@ -497,7 +499,7 @@ class Explainer:
 
     def _explain_by_other_kinds(self, window: WhitenedWindow) -> list[Explanation]:
         """Return the explanations of the window by a moving or yielding obstacle, and a knock."""
-        blind, side = self.blind, self.side()
+        blind, side = self.blind, self.pressing_direction()
         likeliest_positions = blind.x_m[np.argsort(-blind.log_likelihood)[:24]]
         instants = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
         found = []
@@ -517,13 +519,13 @@ class Explainer:
             if window.end > self.end(FIRST_S):
                 early_minima = find_minima(predict, self.window(FIRST_S), starts, space, rounds=6)
                 starts = early_minima.parameters
-            found.append(self.explained(kind, predict, window, starts, space))
+            found.append(self.explain_by_kind(kind, predict, window, starts, space))
         touching = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
         knocking = KnockResponse(touching, self.tables.middle, 2)
         starts = knocking.starts(self.window(FIRST_S), self.detected, 10)
         ranges = self.space(3)
         space = knocking.space(self.edges, (ranges.low[1], ranges.high[1]))
-        found.append(self.explained("knock", knocking.predicted, window, starts, space))
+        found.append(self.explain_by_kind("knock", knocking.predict, window, starts, space))
         return found
 
     def pairing(self) -> TwoObstacleContact:
@@ -539,7 +541,7 @@ class Explainer:
         # The first samples show in less time whether more iterations are worthwhile.
         early = self.window(_UNCERTAINTIES_S) if window.end > self.end(_UNCERTAINTIES_S) else window
         starts = pairing.starts(at_rest.parameters, early, space, 2)
-        found = find_minima(pairing.channels, early, starts, space, rounds=4)
+        found = find_minima(pairing.predict_channels, early, starts, space, rounds=4)
         single_obstacle = at_rest.parameters[None]
         if (
             found.chi2.min()
@@ -548,16 +550,16 @@ class Explainer:
             return None
         likeliest = found.parameters[np.argsort(found.chi2)[:3]]
         starts = np.vstack([likeliest, pairing.in_reverse_order(likeliest[:1])])
-        found = find_minima(pairing.channels, window, starts, space, rounds=8)
+        found = find_minima(pairing.predict_channels, window, starts, space, rounds=8)
         gain = at_rest.chi2 - found.chi2.min()
         if gain < _MIN_TWO_OBSTACLES_GAIN:
             return None
         variance_factor = _TWO_OBSTACLES_VARIANCE if gain > DECISIVE_CHI2_DIFFERENCE else 1.0
         return self._explain_from_minima(
-            "two", pairing.channels, window, found, space, variance_factor
+            "two", pairing.predict_channels, window, found, space, variance_factor
         )
 
-    def side(self) -> float:
+    def pressing_direction(self) -> float:
         """Return the direction in which the beam presses on the obstacle, 1 or -1.
 
         It is opposite to the direction of the likeliest force on the beam.
@@ -571,12 +573,12 @@ class Explainer:
         """
         touching = ObstacleContact(kernels, self.tables.x_m, self.motion)
 
-        def predicted(candidates: Real, window: WhitenedWindow) -> Real:
+        def predict(candidates: Real, window: WhitenedWindow) -> Real:
             if kind == "yielding":
                 candidates = np.insert(candidates, 3, 0.0, axis=1)
-            return touching.predicted(candidates, window, side)[0]
+            return touching.predict(candidates, window, side)[0]
 
-        return predicted
+        return predict
 
     def _moving_space(self, kind: str) -> ParameterRanges:
         """Return the ranges of the four parameters of a moving or yielding obstacle."""

@@ -23,16 +23,16 @@ class KnockResponse:
         Integration of the contact for the record.
     kernels
         Contact kernels on the time steps of the integration.
-    every
+    stride
         Number of the kernels' positions from one starting position of the search to the next.
     """
 
-    __slots__ = ("_every", "_kernels", "_touching")
+    __slots__ = ("_kernels", "_stride", "_touching")
 
-    def __init__(self, touching: ObstacleContact, kernels: ContactKernels, every: int) -> None:
-        self._touching, self._kernels, self._every = touching, kernels, every
+    def __init__(self, touching: ObstacleContact, kernels: ContactKernels, stride: int) -> None:
+        self._touching, self._kernels, self._stride = touching, kernels, stride
 
-    def predicted(self, parameters: Real, window: WhitenedWindow) -> Real:
+    def predict(self, parameters: Real, window: WhitenedWindow) -> Real:
         """Return the effect of knocks on torque and base shear, shape (k, c, samples).
 
         Parameters
@@ -64,7 +64,7 @@ class KnockResponse:
         count
             Number of knocks that are returned.
         """
-        positions = self._kernels.x_m[:: self._every]
+        positions = self._kernels.x_m[:: self._stride]
         grid = np.stack(
             [
                 each.ravel()
@@ -73,7 +73,7 @@ class KnockResponse:
             axis=1,
         )
         first = window.motion.t[window.first]
-        unit = self.predicted(np.insert(grid, 1, first, axis=1), window)
+        unit = self.predict(np.insert(grid, 1, first, axis=1), window)
         candidates = []
         for sample in range(window.first, latest + 1):
             delay_samples = sample - window.first

@@ -53,7 +53,7 @@ class TwoObstacleContact:
     ) -> None:
         self._touching, self._kernels, self._crossing = touching, kernels, crossing
 
-    def predicted(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
+    def predict(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
         """Return the effect of two obstacles on torque and shear, and the force of the first.
 
         Parameters
@@ -71,7 +71,7 @@ class TwoObstacleContact:
             Force of the first obstacle on the beam in N, at the steps from the touch on.
         """
         touching, instant = self._touching, parameters[:, 1]
-        steps = touching.steps(instant, window)
+        steps = touching.step_count(instant, window)
         positions = parameters[:, 0], parameters[:, 3]
         kernels = [self._kernels.at(x, steps) for x in positions]
         (beyond, side), (beyond_other, side_other) = (
@@ -92,12 +92,12 @@ class TwoObstacleContact:
         )
         return first + second, forces[0]
 
-    def channels(self, parameters: Real, window: WhitenedWindow) -> Real:
+    def predict_channels(self, parameters: Real, window: WhitenedWindow) -> Real:
         """Return the effect of two obstacles on torque and shear, shape (k, c, samples).
 
-        The arguments are those of `predicted`.
+        The arguments are those of `predict`.
         """
-        return self.predicted(parameters, window)[0]
+        return self.predict(parameters, window)[0]
 
     def starts(
         self, single_obstacle: Real, window: WhitenedWindow, space: ParameterRanges, count: int
@@ -138,7 +138,7 @@ class TwoObstacleContact:
         """
         x_m = np.linspace(space.low[3], space.high[3], _POSITION_COUNT)
         instants = np.full(_POSITION_COUNT, single_obstacle[1])
-        steps = self._touching.steps(instants, window)
+        steps = self._touching.step_count(instants, window)
         delay_steps = np.round(_SECOND_TOUCH_DELAYS_S / self._kernels.step_s).astype(np.intp)
         beyond, _ = self._touching.approach(x_m, instants, steps)
         distances_m = np.maximum(beyond[:, np.minimum(delay_steps, steps - 1)], 0.0)
@@ -150,7 +150,7 @@ class TwoObstacleContact:
         )
         changed_first = without_second + np.diag(space.difference)[:3]
         rows = np.vstack([without_second, changed_first, with_second])
-        residual = window.residuals(self.channels(rows, window))
+        residual = window.residuals(self.predict_channels(rows, window))
         residual_without_second, effect = residual[0], residual[4:] - residual[0]
         # Effects that changes of the first could have are projected out of both.
         q, triangle = np.linalg.qr(

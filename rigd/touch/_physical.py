@@ -129,7 +129,7 @@ class ObstacleContact:
     def __init__(self, kernels: ContactKernels, x_m: Real, motion: FreeMotion) -> None:
         self._kernels, self._x_m, self._motion = kernels, x_m, motion
 
-    def predicted(
+    def predict(
         self,
         parameters: Real,
         window: WhitenedWindow,
@@ -160,24 +160,24 @@ class ObstacleContact:
         motion = self._motion
         x, instant = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
-        steps = self.steps(instant, window)
+        steps = self.step_count(instant, window)
         local_kernels = self._kernels.at(x, steps) if kernels is None else kernels
         approach, sides = self.approach(x, instant, steps, side)
-        extra = parameters[:, 3:].T
-        pressing = integrate_contact(
+        motion_parameters = parameters[:, 3:].T
+        pressing_force_n = integrate_contact(
             np.broadcast_to(local_kernels.displacement[:, :steps], approach.shape),
             approach,
             np.exp(parameters[:, 2]),
             step_s,
-            *(sides * extra[0],) if len(extra) else (),
-            *extra[1:2],
+            *(sides * motion_parameters[0],) if len(motion_parameters) else (),
+            *motion_parameters[1:2],
         )
-        force = -sides[:, None] * pressing
+        force = -sides[:, None] * pressing_force_n
         tables = (local_kernels.torque, local_kernels.shear)[: motion.innovations.shape[0]]
         return self.effects(tables, force, instant, window), force
 
     def effect_of_changed_motion(
-        self, parameters: Real, window: WhitenedWindow, moved_m: Real
+        self, parameters: Real, window: WhitenedWindow, displacement_changes_m: Real
     ) -> Real:
         """Return how changes of the free motion act on torque and shear through the contact.
 
@@ -195,20 +195,24 @@ class ObstacleContact:
             its first step on, shape (r, columns).
         """
         x, instant = parameters[:1], parameters[1:2]
-        steps = self.steps(instant, window)
+        steps = self.step_count(instant, window)
         local_kernels = self._kernels.at(x, steps)
         approach, side = self.approach(x, instant, steps)
-        instants = np.repeat(instant, len(moved_m))
-        further = side * self._on_steps(moved_m, instants, steps)
-        every = np.vstack([approach, approach + further - further[:, :1]])
-        stiffness = np.full((1, len(every)), np.exp(parameters[2]))
-        pressing = integrate_contact(
-            local_kernels.displacement, every[None], stiffness, self._kernels.step_s
+        instants = np.repeat(instant, len(displacement_changes_m))
+        added_approach_m = side * self._on_steps(displacement_changes_m, instants, steps)
+        all_approaches = np.vstack(
+            [approach, approach + added_approach_m - added_approach_m[:, :1]]
+        )
+        stiffness = np.full((1, len(all_approaches)), np.exp(parameters[2]))
+        pressing_force_n = integrate_contact(
+            local_kernels.displacement, all_approaches[None], stiffness, self._kernels.step_s
         )[0]
         tables = (local_kernels.torque, local_kernels.shear)[: self._motion.innovations.shape[0]]
-        return self.effects(tables, -side * (pressing[1:] - pressing[0]), instants, window)
+        return self.effects(
+            tables, -side * (pressing_force_n[1:] - pressing_force_n[0]), instants, window
+        )
 
-    def steps(self, instant: Real, window: WhitenedWindow) -> int:
+    def step_count(self, instant: Real, window: WhitenedWindow) -> int:
         """Return the number of time steps from the earliest touch to the end of the window.
 
         Parameters
@@ -222,7 +226,7 @@ class ObstacleContact:
         steps = int(np.ceil((self._motion.t[window.end - 1] - instant.min()) / step_s)) + 3
         return min(max(steps, 4), self._kernels.steps)
 
-    def side(self, parameters: Real) -> float:
+    def pressing_direction(self, parameters: Real) -> float:
         """Return the direction of the beam's motion at a touch, 1 or -1.
 
         Parameters
@@ -250,15 +254,15 @@ class ObstacleContact:
         """
         motion = self._motion
         step_s = self._kernels.step_s
-        every = round((motion.t[1] - motion.t[0]) / step_s)
+        stride = round((motion.t[1] - motion.t[0]) / step_s)
         samples = window.end - window.first
         begin = (motion.t[window.first] - instant) / step_s
         # Convolution and shift commute: shifting first puts the steps of all at the samples.
-        aligned = shift_rows(force, begin, (samples - 1) * every + 1)
-        return contact_responses(tables, aligned, every, samples)
+        aligned = shift_rows(force, begin, (samples - 1) * stride + 1)
+        return contact_responses(tables, aligned, stride, samples)
 
     def approach(
-        self, x: Real, instant: Real, steps: int, given: float | None = None
+        self, x: Real, instant: Real, steps: int, given_direction: float | None = None
     ) -> tuple[Real, Real]:
         """Return how far the free beam would move beyond the obstacle, and in which direction.
 
@@ -283,11 +287,11 @@ class ObstacleContact:
         first, weights = cubic_weights(x, self._x_m)
         displacement_m = interpolate_rows(motion.displacement_m, first, weights)
         free = self._on_steps(displacement_m, instant, steps)
-        if given is None:
+        if given_direction is None:
             before = shift_rows(displacement_m, (instant - motion.first_s) / motion.step_s - 1.0, 1)
             side = np.where(free[:, 0] >= before[:, 0], 1.0, -1.0)
         else:
-            side = np.full(x.size, given)
+            side = np.full(x.size, given_direction)
         return side[:, None] * (free - free[:, :1]), side
 
     def _on_steps(self, displacement_m: Real, instant: Real, steps: int) -> Real:
@@ -403,7 +407,7 @@ class CandidateGrid:
     ----------
     kernels
         Contact kernels whose step divides the sampling period.
-    every
+    stride
         Number of the kernels' positions from one position of the grid to the next.
     rate_hz
         Samples a second.
@@ -411,18 +415,18 @@ class CandidateGrid:
         Number of samples that are compared.
     """
 
-    __slots__ = ("_channels", "_every", "_kernel", "_ratio", "_samples", "_step_s", "_x_m")
+    __slots__ = ("_channels", "_kernel", "_ratio", "_samples", "_step_s", "_stride", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, every: int, rate_hz: float, samples: int) -> None:
+    def __init__(self, kernels: ContactKernels, stride: int, rate_hz: float, samples: int) -> None:
         self._ratio = round(1 / (rate_hz * kernels.step_s))
-        self._samples, self._every, self._step_s = samples, every, kernels.step_s
+        self._samples, self._stride, self._step_s = samples, stride, kernels.step_s
         steps = self._ratio * samples
-        self._x_m = kernels.x_m[::every]
+        self._x_m = kernels.x_m[::stride]
         # Single precision suffices for choosing starts, and is twice as fast.
-        self._kernel = kernels.displacement[::every, :steps].astype(np.float32)
+        self._kernel = kernels.displacement[::stride, :steps].astype(np.float32)
         lag = self._ratio * np.arange(samples)[:, None] - np.arange(steps)
         self._channels = [
-            np.where(lag >= 0, table[::every][:, np.maximum(lag, 0)], 0.0)
+            np.where(lag >= 0, table[::stride][:, np.maximum(lag, 0)], 0.0)
             .transpose(0, 2, 1)
             .astype(np.float32)
             for table in (kernels.torque, kernels.shear)
@@ -456,13 +460,13 @@ class CandidateGrid:
 
         The shape is (positions, instants, stiffnesses).
         """
-        positions, kinds = self._x_m.size, GRID_STIFFNESSES_N_PER_M.size
+        positions, stiffness_count = self._x_m.size, GRID_STIFFNESSES_N_PER_M.size
         length = window.end - int(samples[0])
         steps = self._ratio * length
         begins = np.round((motion.t[samples] - motion.first_s) / motion.step_s).astype(np.intp)
         columns = begins[:, None] + np.arange(-1, steps)
         last = motion.displacement_m.shape[1] - 1
-        displacement_m = motion.displacement_m[:: self._every][:, np.minimum(columns, last)]
+        displacement_m = motion.displacement_m[:: self._stride][:, np.minimum(columns, last)]
         # Axes: position, instant, step.
         side = np.where(displacement_m[:, :, 1] >= displacement_m[:, :, 0], 1, -1)[
             :, :, None
@@ -470,26 +474,32 @@ class CandidateGrid:
         approach = (side * (displacement_m[:, :, 1:] - displacement_m[:, :, 1:2])).astype(
             np.float32
         )
-        pressing = integrate_contact(
+        pressing_force_n = integrate_contact(
             self._kernel[:, :steps],
-            np.repeat(approach, kinds, axis=1),
+            np.repeat(approach, stiffness_count, axis=1),
             np.tile(GRID_STIFFNESSES_N_PER_M.astype(np.float32), (positions, samples.size)),
             self._step_s,
         )
-        force = -np.repeat(side, kinds, axis=1) * pressing
+        force = -np.repeat(side, stiffness_count, axis=1) * pressing_force_n
         predicted = np.zeros(
-            (positions, samples.size, kinds, motion.noise.size, window.end - window.first),
+            (
+                positions,
+                samples.size,
+                stiffness_count,
+                motion.noise.size,
+                window.end - window.first,
+            ),
             dtype=np.float32,
         )
         for channel in range(motion.noise.size):
             effect = force @ self._channels[channel][:, :steps, :length]
-            effect = effect.reshape(positions, samples.size, kinds, length)
+            effect = effect.reshape(positions, samples.size, stiffness_count, length)
             for i, sample in enumerate(samples):
                 count = window.end - sample
                 predicted[:, i, :, channel, -count:] = effect[:, i, :, :count]
         residual = window.residuals(predicted.reshape(-1, *predicted.shape[3:]))
         chi2: Real = np.einsum("kn,kn->k", residual, residual)
-        return chi2.reshape(positions, samples.size, kinds)
+        return chi2.reshape(positions, samples.size, stiffness_count)
 
 
 _INSTANTS_AT_ONCE = 16

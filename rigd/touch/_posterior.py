@@ -87,8 +87,8 @@ def sample_posterior(
     scale: float,
     count: int,
     rounds: int,
-    enough: float,
-    smallest: Real,
+    enough_samples: float,
+    smallest_std: Real,
 ) -> Posterior:
     """Draw weighted samples of the posterior, with a uniform prior within the bounds.
 
@@ -144,7 +144,7 @@ def sample_posterior(
         weights = np.exp(log_weights - log_weights.max())
         weights /= weights.sum()
         posterior = Posterior(samples, weights, chi2)
-        if posterior.effective_samples > enough and len(proposals) > 1:
+        if posterior.effective_samples > enough_samples and len(proposals) > 1:
             break
         # Tempered weights choose the next centres, so that one lucky sample does not dominate.
         tempered = weights**0.5
@@ -154,12 +154,13 @@ def sample_posterior(
         mean = tempered @ samples
         deviation = samples - mean
         clipped_deviation = np.minimum(
-            np.abs(deviation), 6 * np.sqrt(weights @ (samples - weights @ samples) ** 2) + smallest
+            np.abs(deviation),
+            6 * np.sqrt(weights @ (samples - weights @ samples) ** 2) + smallest_std,
         ) * np.sign(deviation)
         covariance = (clipped_deviation * tempered[:, None]).T @ clipped_deviation
         shrink = max(len(best), 2) ** (-2 / (width + 4))
         covariances = np.broadcast_to(
-            shrink * covariance + np.diag(smallest**2), (len(best), width, width)
+            shrink * covariance + np.diag(smallest_std**2), (len(best), width, width)
         )
     assert posterior is not None
     return posterior

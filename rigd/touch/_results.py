@@ -83,13 +83,13 @@ class TouchEstimate:
             time = replace(
                 time, value=time.value + start_s, interval_95=(low + start_s, high + start_s)
             )
-        named = {
+        quantities = {
             "x_m": self.x_m,
             "time_s": time,
             "force_n": self.force_n,
             "stiffness_n_per_m": self.stiffness_n_per_m,
         }
-        return {name: each and each.as_dict() for name, each in named.items()} | {
+        return {name: each and each.as_dict() for name, each in quantities.items()} | {
             "kind": self.kind,
             "model": self.model,
         }

@@ -47,13 +47,13 @@ class TouchTables:
         self.blind = AnyForceEstimator(
             half_sample_kernels, 2, round((FIRST_S + DETECTION_DELAYS_S[-1]) * rate_hz) + 1
         )
-        self.most = round((HISTORY_S + FINAL_S) * rate_hz) + 1
-        self.free = FreeBeam(model, self.x_m, rate_hz, self.most)
+        self.max_samples = round((HISTORY_S + FINAL_S) * rate_hz) + 1
+        self.free = FreeBeam(model, self.x_m, rate_hz, self.max_samples)
         self._grids: dict[int, CandidateGrid] = {}
         self.starts(round(DETECTION_DELAYS_S[0] * rate_hz) + round(GRID_COMPARISON_S * rate_hz))
         no_positions = np.empty(0)
         self.changed = [
-            FreeBeam(model.changed(name, std), no_positions, rate_hz, self.most)
+            FreeBeam(model.changed(name, std), no_positions, rate_hz, self.max_samples)
             for name, std in model.std.items()
             if std > 0
         ]

@@ -16,7 +16,7 @@ Real = NDArray[np.float64]
 
 
 def uncertainty_effects(
-    tables: TouchTables, record: TouchRecord, best: Real, whole: WhitenedWindow
+    tables: TouchTables, record: TouchRecord, likeliest: Real, window: WhitenedWindow
 ) -> Real:
     """Return the effects of r uncertainties on the innovations, for one standard deviation each.
 
@@ -33,18 +33,20 @@ def uncertainty_effects(
     whole
         Innovations from a sample that is certainly before the touch to the end.
     """
-    motion, quiet = whole.motion, whole.first
-    finest_effect = ObstacleContact(tables.finest, tables.x_m, motion).predicted(best, whole)[0][0]
+    motion, quiet = window.motion, window.first
+    finest_effect = ObstacleContact(tables.finest, tables.x_m, motion).predict(likeliest, window)[
+        0
+    ][0]
     touching = ObstacleContact(tables.middle, tables.x_m, motion)
-    middle_effect = touching.predicted(best, whole)[0][0]
+    middle_effect = touching.predict(likeliest, window)[0][0]
     effects = [
         finest_effect - middle_effect,
-        *_ringing(tables, touching, best[0], whole),
-        *_angle_noise(tables, touching, best[0], whole),
+        *_ringing(tables, touching, likeliest[0], window),
+        *_angle_noise(tables, touching, likeliest[0], window),
     ]
-    span = slice(whole.first, whole.end)
+    span = slice(window.first, window.end)
     residual = motion.innovations[:, span] - middle_effect
-    x = float(best[0, 0])
+    x = float(likeliest[0, 0])
     nearby_m = min(x, tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
     for free in tables.changed:
         changed = free.at(nearby_m).motion(record, quiet, quiet - 4, motion.angle_transform)
@@ -53,57 +55,59 @@ def uncertainty_effects(
             free.model.damping,
             np.array([x]),
             tables.middle.step_s,
-            round((motion.t[-1] - best[0, 1]) / tables.middle.step_s) + 4,
+            round((motion.t[-1] - likeliest[0, 1]) / tables.middle.step_s) + 4,
             free.model.sensor_filter,
         )
-        effect, _ = ObstacleContact(kernels, nearby_m, changed).predicted(
-            best, whole, kernels=kernels
+        effect, _ = ObstacleContact(kernels, nearby_m, changed).predict(
+            likeliest, window, kernels=kernels
         )
         effects.append(changed.innovations[:, span] - effect[0] - residual)
     return np.stack(effects, axis=-1)
 
 
 def _ringing(
-    tables: TouchTables, touching: ObstacleContact, best: Real, whole: WhitenedWindow
+    tables: TouchTables, touching: ObstacleContact, likeliest: Real, window: WhitenedWindow
 ) -> Real:
     """Return the effects of the free motion's uncertainty on the innovations, (q, c, n).
 
     They include the effects through the contact, such as another instant of touch.
     """
-    motion = whole.motion
+    motion = window.motion
     spread = motion.spread
     count = motion.ringing.poles.size * 2
-    position_fraction = best[:1] / tables.model.beam.length_m
+    position_fraction = likeliest[:1] / tables.model.beam.length_m
     steps = motion.displacement_m.shape[1]
     # Times from the record's beginning, as for the amplitudes.
     t = motion.first_s + tables.model.angle_delay_s + motion.step_s * np.arange(steps)
     displacement_m = motion.ringing.at(position_fraction).displacement(t, spread[:count])[0]
-    direct = motion.design[:, whole.first : whole.end] @ spread
+    direct = motion.design[:, window.first : window.end] @ spread
     return direct.transpose(2, 0, 1) + touching.effect_of_changed_motion(
-        best, whole, displacement_m.T
+        likeliest, window, displacement_m.T
     )
 
 
 def _angle_noise(
-    tables: TouchTables, touching: ObstacleContact, best: Real, whole: WhitenedWindow
+    tables: TouchTables, touching: ObstacleContact, likeliest: Real, window: WhitenedWindow
 ) -> Real:
     """Return the effects of the encoder's noise through the contact on the innovations.
 
     There is one for each sample of the angle; the shape is (samples, c, n).
     """
-    motion = whole.motion
-    samples = np.arange(whole.first, whole.end)
-    nearest = int(np.argmin(np.abs(tables.x_m - best[0])))
+    motion = window.motion
+    samples = np.arange(window.first, window.end)
+    nearest = int(np.argmin(np.abs(tables.x_m - likeliest[0])))
     sample_displacement = tables.free.per_sample(nearest, samples.size + 8)
     # Columns begin four samples before the window.
     window_steps = np.arange(motion.displacement_m.shape[1]) - 4 * STEPS_PER_SAMPLE
     index = (
         window_steps[None, :]
-        - STEPS_PER_SAMPLE * (samples - whole.first - SPLINE_FADE_SAMPLES)[:, None]
+        - STEPS_PER_SAMPLE * (samples - window.first - SPLINE_FADE_SAMPLES)[:, None]
     )
     displacement_m = np.where(
         (index >= 0) & (index < sample_displacement.size),
         sample_displacement[np.clip(index, 0, sample_displacement.size - 1)],
         0.0,
     )
-    return touching.effect_of_changed_motion(best, whole, motion.angle_noise_rad * displacement_m)
+    return touching.effect_of_changed_motion(
+        likeliest, window, motion.angle_noise_rad * displacement_m
+    )

@@ -17,8 +17,8 @@ def drawn(chi2_of, centres, width):
         scale=1.0,
         count=400,
         rounds=6,
-        enough=1500.0,
-        smallest=np.array([0.01, 0.01]),
+        enough_samples=1500.0,
+        smallest_std=np.array([0.01, 0.01]),
     )
 
 
