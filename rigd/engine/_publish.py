@@ -129,7 +129,7 @@ class SampleLog:
 
     Parameters
     ----------
-    cycle, metronome, clock
+    cycle, scheduler, clock
         Cycle, schedule and clock, whose values a sample contains.
     channels
         Channels to write to.

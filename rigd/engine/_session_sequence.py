@@ -105,7 +105,7 @@ class SessionSequence:
         Profile of the rig.
     reference_rad
         Angle per tick, relative to the start angle.
-    cycle, clock, metronome
+    cycle, clock, scheduler
         Cycle that runs each tick, clock, and schedule of the ticks.
     standstill
         Check of the angles that are read without torque.

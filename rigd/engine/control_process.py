@@ -101,7 +101,7 @@ def run_control(
         Devices, not yet connected.
     clock, channels, parent, stop
         As for :class:`rigd.engine._session_sequence.SessionSequence`.
-    obtained
+    granted
         Real-time settings that were granted, for the file.
     """
     failure = ""

@@ -525,7 +525,7 @@ def observe_rest(
 
     Parameters
     ----------
-    cycle, metronome
+    cycle, scheduler
         Cycle that reads the devices, and the schedule of its ticks.
     rate_hz, duration_s
         Rate and duration of the readings.

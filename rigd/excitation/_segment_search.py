@@ -658,7 +658,7 @@ def best_mixture(
         The q target quantities.
     frequency_hz, angle_rad
         Frequencies of the sines and amplitudes of the angle, each of shape (m,).
-    missed
+    relaxation
         Factor by which all standard deviations may exceed their targets.
     """
     rates = _information_rates(estimate, frequency_hz, angle_rad)

@@ -131,9 +131,9 @@ def integrate_two_contacts(
 
     Parameters
     ----------
-    own
+    own_kernels
         Displacement at each obstacle's position per hat of force there, shape (k, n).
-    cross
+    cross_kernel
         Displacement at one position per hat of force at the other, in the directions of the forces;
         shape (k, n).
     approach

@@ -129,7 +129,7 @@ class Explainer:
         Precomputed tables of the model at the record's rate.
     record
         Samples from 0.3 s or more before the touch.
-    noticed_s
+    detection_delay_s
         Longest time in s from the touch to its detection.
     previous_explainer
         Search with the beginning of the same record, from whose results this search starts; None:

@@ -179,7 +179,7 @@ class FreeBeam:
             Number of samples that are certainly before the touch.
         first
             Index of the sample from which the displacement is computed.
-        turned
+        angle_transform
             Transform of the record's angle, if it is known from another beam; None: it is computed.
         """
         n = record.angle_rad.size

@@ -108,7 +108,7 @@ class TwoObstacleContact:
 
         Parameters
         ----------
-        one
+        single_obstacle
             Position, instant and logarithm of the stiffness of the single obstacle that explains
             the record best.
         window
@@ -188,7 +188,7 @@ class TwoObstacleContact:
 
         Parameters
         ----------
-        one
+        single_obstacle
             Ranges of the parameters of one obstacle at rest.
         """
         return ParameterRanges(

@@ -190,7 +190,7 @@ class ObstacleContact:
             Position, instant and logarithm of the stiffness of an obstacle at rest.
         window
             Samples for which the effect is predicted.
-        moved_m
+        displacement_changes_m
             Changes of the displacement at the obstacle's position, on the free motion's steps from
             its first step on, shape (r, columns).
         """
@@ -272,7 +272,7 @@ class ObstacleContact:
             Positions and instants of touches, shape (k,).
         steps
             Number of time steps from the instants on.
-        given
+        given_direction
             Direction of the motion, 1 or -1; None: the direction at the instant of touch.
 
         Returns

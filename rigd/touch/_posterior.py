@@ -108,9 +108,9 @@ def sample_posterior(
         Number of samples in a round.
     rounds
         Largest number of rounds.
-    enough
+    enough_samples
         Effective number of samples that ends the rounds.
-    smallest
+    smallest_std
         Smallest standard deviation for drawing samples, shape (p,).
     """
     rng = np.random.default_rng(0)  # the same record gives the same answer

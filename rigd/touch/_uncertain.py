@@ -28,9 +28,9 @@ def uncertainty_effects(
         Precomputed quantities of the model at the record's rate.
     record
         Samples around the touch.
-    best
+    likeliest
         Position, instant and logarithm of the stiffness of the likeliest obstacle, shape (1, 3).
-    whole
+    window
         Innovations from a sample that is certainly before the touch to the end.
     """
     motion, quiet = window.motion, window.first
