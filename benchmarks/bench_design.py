@@ -47,7 +47,7 @@ Real = NDArray[np.float64]
 def precisions(angle_rad: Real, targets: list[Target]) -> tuple[Precision, ...]:
     """Return what is expected after a record."""
     covariance = covariance_of(information(angle_rad, ESTIMATE, RATE_HZ), ESTIMATE)
-    return Quantities.of(targets, ESTIMATE).precisions(covariance)
+    return Quantities.linearised(targets, ESTIMATE).precisions(covariance)
 
 
 def designed(
@@ -73,9 +73,9 @@ def designed(
 
 def steady_s(rig: RigPreview, targets: list[Target], tip_slope_rad: float) -> float:
     """Time of the best steady sines from nothing: below it no session can be."""
-    record = RecordSoFar.of(np.zeros(8), ESTIMATE, RATE_HZ, 8.0)
+    record = RecordSoFar.from_angle(np.zeros(8), ESTIMATE, RATE_HZ, 8.0)
     plant = rig.plant_with(LINK, DAMPING)
-    quantities = Quantities.of(targets, ESTIMATE)
+    quantities = Quantities.linearised(targets, ESTIMATE)
     return float(
         SegmentSearch(ESTIMATE, quantities, plant, 0.0, record, tip_slope_rad).mixture.times_s.sum()
     )

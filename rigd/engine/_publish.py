@@ -184,7 +184,7 @@ class SampleLog:
             flags |= _AFTER_MISSED
         if self.counts.lost:
             flags |= _AFTER_LOST
-        offset = ring.slot()
+        offset = ring.next_slot()
         if offset < 0 and (not wait or (offset := self._wait_for_free_slot()) < 0):
             self.counts.lost += 1
             self._shared_state[StateField.LOST] = self.counts.lost
@@ -234,7 +234,7 @@ class SampleLog:
 
     def _write_ages(self, ring: Ring, tick: int, t_ns: int) -> None:
         """Write the ages of a tick's readings to a ring, or nothing if the ring is full."""
-        offset = ring.slot()
+        offset = ring.next_slot()
         if offset < 0:
             return  # dropped, like the terms
         due_ns, devices = self._scheduler.due_ns, self._cycle.devices
@@ -251,7 +251,7 @@ class SampleLog:
     def _write_terms(self, tick: int, t_ns: int) -> None:
         """Write the controller's terms of a tick to their ring, or nothing if it is full."""
         ring, terms = self._terms_ring, self._cycle.controller
-        offset = ring.slot()
+        offset = ring.next_slot()
         if offset < 0:
             return  # dropped: the terms explain a record, but no analysis needs them
         pack_control_into(
@@ -274,7 +274,7 @@ class SampleLog:
         Return -1 if the recorder has stopped reading.
         """
         ring, recorder = self._ring, Heartbeat()
-        while (offset := ring.slot()) < 0:
+        while (offset := ring.next_slot()) < 0:
             if recorder.stalled_for(ring.read, time.monotonic()) > _FREE_SLOT_TIMEOUT_S:
                 break
             time.sleep(_FREE_SLOT_POLL_S)

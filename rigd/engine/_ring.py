@@ -97,7 +97,7 @@ class Ring:
 
     # Producer
 
-    def slot(self) -> int:
+    def next_slot(self) -> int:
         """Return the byte offset in :attr:`buffer` for the next record, or -1 if the ring is full.
 
         The producer writes the record there and then calls :meth:`publish`.
@@ -107,7 +107,7 @@ class Ring:
         return HEADER_SIZE + self._next_record % self.capacity * self.record_size
 
     def publish(self) -> None:
-        """Make the record just written at :meth:`slot` visible to the readers of the ring."""
+        """Make the record just written at :meth:`next_slot` visible to the readers of the ring."""
         self._next_record += 1
         self._counters[_WRITTEN_COUNTER] = self._next_record
 

@@ -252,7 +252,7 @@ def write_event(ring: Ring, event: LogEvent) -> None:
     event
         Event; its text is cut to the size of a record.
     """
-    offset = ring.slot()
+    offset = ring.next_slot()
     if offset < 0:
         return
     text = event.message.encode()[:_TEXT_SIZE]

@@ -85,8 +85,8 @@ class TorqueModel:
     """Responses from angle to torque in N·m/rad and to the slope of the tip, shape (2, K)."""
 
     @classmethod
-    def of(cls, estimate: BeamEstimate, rate_hz: float, ticks: int) -> "TorqueModel":
-        """Return the model for records of at least a given number of ticks.
+    def for_records(cls, estimate: BeamEstimate, rate_hz: float, ticks: int) -> "TorqueModel":
+        """Return the torque model of a beam for records of at least a given number of ticks.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ class TorqueModel:
         spectrum: Complex = np.fft.rfft(decaying_angle_rad, 2 * self.ticks)[: self.kernels.shape[1]]
         return spectrum
 
-    def rows(self, spectrum: Complex) -> Real:
+    def whitened_derivatives(self, spectrum: Complex) -> Real:
         """Return whitened derivatives of the torque by the parameters at each sample.
 
         `spectrum` is the transform of the angle. The shape is (k, ticks / factor).
@@ -138,7 +138,7 @@ class TorqueModel:
             self.kernels * (spectrum / self.factor), self.ticks // self.factor, 1
         )
 
-    def motion(self, spectrum: Complex) -> Real:
+    def torque_and_slope(self, spectrum: Complex) -> Real:
         """Return torque in N·m and slope of the tip in rad at every tick, shape (2, ticks).
 
         `spectrum` is the transform of the angle.
@@ -293,7 +293,7 @@ class RecordSoFar:
     (2, ticks)."""
 
     @classmethod
-    def of(
+    def from_angle(
         cls, angle_rad: Real, estimate: BeamEstimate, rate_hz: float, ahead_s: float = 0.0
     ) -> "RecordSoFar":
         """Return the information of a record of the motor's angle.
@@ -315,28 +315,28 @@ class RecordSoFar:
         angle_rad = np.concatenate([np.zeros(-angle_rad.size % factor), angle_rad - angle_rad[0]])
         ahead = -(-round(ahead_s * rate_hz) // factor)
         samples = angle_rad.size // factor
-        model = TorqueModel.of(estimate, rate_hz, angle_rad.size + ahead * factor)
+        model = TorqueModel.for_records(estimate, rate_hz, angle_rad.size + ahead * factor)
         spectrum = model.spectrum(angle_rad)
         rows = np.concatenate(
             [
-                model.rows(spectrum)[:, : samples + ahead],
+                model.whitened_derivatives(spectrum)[:, : samples + ahead],
                 _nuisance_terms(estimate, samples + ahead, model.sample_hz),
             ]
         )
         ringing = np.zeros((2, 0))
         if ahead:
             first = angle_rad.size
-            ringing = model.motion(spectrum)[:, first : first + ahead * factor]
+            ringing = model.torque_and_slope(spectrum)[:, first : first + ahead * factor]
         before = rows[:, :samples]
         return cls(estimate, before @ before.T, rows[:, samples:], ringing)
 
     @property
-    def through(self) -> Real:
+    def nuisance_projection(self) -> Real:
         """Matrix that projects the nuisance terms out of the derivatives, shape (k, k + m)."""
         k = len(self.estimate.names)
         return np.concatenate([np.eye(k), -_regression_coefficients(self.before, k)], axis=1)
 
-    def after(self, more: Real | None, samples: int) -> Real:
+    def information_after(self, more: Real | None, samples: int) -> Real:
         """Return the information on the parameters after further samples, shape (k, k).
 
         Parameters
@@ -388,7 +388,7 @@ def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real
     >>> print(f"zeta {std[0]:.1%}, gamma {std[1]:.1%}")
     zeta 0.4%, gamma 1.4%
     """
-    return RecordSoFar.of(angle_rad, estimate, rate_hz).after(None, 0)
+    return RecordSoFar.from_angle(angle_rad, estimate, rate_hz).information_after(None, 0)
 
 
 def projected_information(gram: Real, k: int) -> Real:

@@ -209,7 +209,7 @@ class SegmentSearch:
             raise ExcitationError(
                 f"The estimated beam has no mode below {BAND_HZ:g} Hz that could be driven."
             )
-        self.model = TorqueModel.of(estimate, plant.rate_hz, record.ringing.shape[1])
+        self.model = TorqueModel.for_records(estimate, plant.rate_hz, record.ringing.shape[1])
         self.samples = record.ahead.shape[1]
         self.limits = LIMIT_FRACTION * np.array(
             [
@@ -227,7 +227,7 @@ class SegmentSearch:
         ringing = np.stack([zeros, zeros, zeros, torque_nm, torque_nm, slope_rad])
         self.ringing = ringing / self.limits[:, None]
         self.line_hz, line_rad = self.steady_sines()
-        known = record.after(None, 0)
+        known = record.information_after(None, 0)
         self.mixture = best_mixture(known, estimate, quantities, self.line_hz, line_rad)
         self.needed_s = self.time_with_ring_up() / _MIXTURE_EFFICIENCY
         # With too little time all targets are missed by one factor, not the last mode alone.
@@ -240,7 +240,7 @@ class SegmentSearch:
                 known, estimate, quantities, self.line_hz, line_rad, relaxation
             )
             needed_s = self.time_with_ring_up() / _MIXTURE_EFFICIENCY
-        self.held = self.mixture.weights @ record.through @ record.ahead
+        self.held = self.mixture.weights @ record.nuisance_projection @ record.ahead
         self._continued_drives: dict[float, _ContinuedDrive] = {}
         self.tip_slope = self.ringing[-1, :: self.model.factor][: self.samples]
 
@@ -447,8 +447,8 @@ class SegmentSearch:
         )
         response = self.plant.respond(extended_reference_rad)
         spectrum = self.model.spectrum(response.angle_rad)
-        rows = self.model.rows(spectrum)[:, : self.samples]
-        slope_rad = self.model.motion(spectrum)[1]
+        rows = self.model.whitened_derivatives(spectrum)[:, : self.samples]
+        slope_rad = self.model.torque_and_slope(spectrum)[1]
         channels = np.stack(
             [
                 response.angle_rad,
@@ -568,9 +568,9 @@ class SegmentSearch:
         ringing = self.ringing[:, : channels.shape[1]]
         # Between the checked ticks a peak is a little higher.
         fraction = min(1.0, largest_factor(ringing, channels))
-        now = covariance_of(self.record.after(None, 0), estimate)
+        now = covariance_of(self.record.information_after(None, 0), estimate)
         after = covariance_of(
-            self.record.after(fraction * chosen.weighted_sum("rows"), samples), estimate
+            self.record.information_after(fraction * chosen.weighted_sum("rows"), samples), estimate
         )
         return Segment(
             name=_describe_candidate(chosen),

@@ -118,11 +118,11 @@ def next_segment(
         If there is no target, or no segment fits into the time or drives a mode.
     """
     driven = [mode.number for mode in estimate.modes() if mode.number in through]
-    quantities = Quantities.of(targets, estimate)
+    quantities = Quantities.linearised(targets, estimate)
     if not quantities.items:
         raise ExcitationError("No precision is requested; give for example --damping 1%.")
     plant = rig.plant_with(estimate.loaded_beam)
-    record = RecordSoFar.of(angle_rad_so_far, estimate, plant.rate_hz, HORIZON_S)
+    record = RecordSoFar.from_angle(angle_rad_so_far, estimate, plant.rate_hz, HORIZON_S)
     search = SegmentSearch(
         estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
     )
@@ -187,8 +187,8 @@ def geometry_floors(
     if not targets or not uniformity:
         return ()
     plant = rig.plant_with(estimate.loaded_beam)
-    resting_record = RecordSoFar.of(np.zeros(1), estimate, plant.rate_hz, SHORTEST_S)
-    quantities = Quantities.of(targets, estimate)
+    resting_record = RecordSoFar.from_angle(np.zeros(1), estimate, plant.rate_hz, SHORTEST_S)
+    quantities = Quantities.linearised(targets, estimate)
     search = SegmentSearch(
         estimate, quantities, plant, rig.start_rad, resting_record, tip_slope_rad
     )
@@ -197,7 +197,7 @@ def geometry_floors(
         least_deviations(
             np.zeros((len(each.names), len(each.names))),
             each,
-            Quantities.of(targets, each),
+            Quantities.linearised(targets, each),
             *search.steady_sines(),
             duration_s,
         )
@@ -229,7 +229,7 @@ def expected_precisions(
         Rate of the angle.
     """
     covariance = covariance_of(information(angle_rad, estimate, rate_hz), estimate)
-    return Quantities.of(targets, estimate).precisions(covariance)
+    return Quantities.linearised(targets, estimate).precisions(covariance)
 
 
 def design_excitation(

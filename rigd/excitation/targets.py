@@ -176,7 +176,7 @@ class Quantities:
     """Derivatives of the quantities by the free parameters, shape (q, k)."""
 
     @classmethod
-    def of(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
+    def linearised(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
         """Return the target quantities, linearised at an estimate of the beam.
 
         Parameters

@@ -284,7 +284,9 @@ class Explainer:
         """
         if self._uncertainties_s < seconds:
             self._uncertainties_s = min(max(seconds, _UNCERTAINTIES_S), self.available / self.rate)
-            whole = WhitenedWindow.of(self.motion, self.quiet, self.end(self._uncertainties_s))
+            whole = WhitenedWindow.from_motion(
+                self.motion, self.quiet, self.end(self._uncertainties_s)
+            )
             self.deviations = uncertainty_effects(self.tables, self.record, likeliest[:1], whole)
 
     def _next_candidates(self, at_rest: Explanation) -> Real:
@@ -303,7 +305,9 @@ class Explainer:
 
     def window(self, seconds: float) -> WhitenedWindow:
         """Return the whitened innovations from before the touch to a time after the detection."""
-        return WhitenedWindow.of(self.motion, self.quiet, self.end(seconds), self.deviations)
+        return WhitenedWindow.from_motion(
+            self.motion, self.quiet, self.end(seconds), self.deviations
+        )
 
     def end(self, seconds: float) -> int:
         """Return the index of the sample at a time after the detection, or the record's end."""
@@ -351,7 +355,7 @@ class Explainer:
 
         The effects of uncertainties through the contact are not included yet.
         """
-        return WhitenedWindow.of(self.motion, self.quiet, self.end(FIRST_S))
+        return WhitenedWindow.from_motion(self.motion, self.quiet, self.end(FIRST_S))
 
     @cached_property
     def starts(self) -> Real:

@@ -113,13 +113,13 @@ class FreeBeam:
         inertia = model.tool_inertia_kg_m2 * s * s
         self._torque: Complex = filter_response * (grid.torque_per_angle() + inertia)
         self._shear: Complex = filter_response * grid.shear_per_angle()
-        self.modes = FreeVibration.of(model, np.empty(0))
+        self.modes = FreeVibration.from_model(model, np.empty(0))
         self._set_positions(x_m)
         unit = np.zeros(3 * SPLINE_FADE_SAMPLES)
         unit[SPLINE_FADE_SAMPLES] = 1.0
         self._sample = self.line.to_laplace(_interpolate_angle(unit, rate_hz, self.line)[0])
 
-    def at(self, x_m: Real) -> "FreeBeam":
+    def at_positions(self, x_m: Real) -> "FreeBeam":
         """Return the free beam with other positions of the displacement.
 
         Parameters
@@ -141,7 +141,7 @@ class FreeBeam:
         if x_m.size > _NODE_COUNT:
             nodes_m, self._between = chebyshev_nodes(x_m, _NODE_COUNT)
         self._displacement: Complex = self._grid.per_angle(nodes_m).T
-        self.modes = self.modes.at(x_m / self.model.beam.length_m)
+        self.modes = self.modes.at_positions(x_m / self.model.beam.length_m)
 
     def per_sample(self, index: int, samples: int) -> Real:
         """Return the displacement at a position that one sample of the angle causes, in m/rad.
@@ -184,7 +184,9 @@ class FreeBeam:
         """
         n = record.angle_rad.size
         rate = self.rate_hz
-        angle_transform = angle_transform or AngleTransform.of(record.angle_rad, rate, self.line)
+        angle_transform = angle_transform or AngleTransform.from_samples(
+            record.angle_rad, rate, self.line
+        )
         spectrum, start, speed = (
             angle_transform.spectrum,
             angle_transform.start_rad,
@@ -206,7 +208,7 @@ class FreeBeam:
             drift[:, 2 * i] = 1.0
             drift[:, 2 * i + 1] = t - t[quiet // 2]
             designs.append(np.hstack([vibration_columns[i], drift]))
-        fitted = _FreeMotionFit.to(innovations, designs, quiet)
+        fitted = _FreeMotionFit.fit(innovations, designs, quiet)
         steps = STEPS_PER_SAMPLE * n
         at_nodes = self.line.to_time(self._displacement * spectrum, steps)
         displacement_m = self._between @ at_nodes[:, STEPS_PER_SAMPLE * first :]
@@ -278,7 +280,7 @@ class AngleTransform:
     """Speed at the record's beginning."""
 
     @classmethod
-    def of(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "AngleTransform":
+    def from_samples(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "AngleTransform":
         """Return the transform of an angle's samples at the frequencies of a Laplace line."""
         rest, start_rad, speed_rad_s = _interpolate_angle(angle_rad, rate_hz, line)
         return cls(line.to_laplace(rest), start_rad, speed_rad_s)
@@ -320,7 +322,7 @@ class FreeVibration:
     """Displacement at the positions per amplitude of each mode, shape (modes, positions)."""
 
     @classmethod
-    def of(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
+    def from_model(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
         """Return the free vibrations of a model, with the displacement at positions `x_m`."""
         beam, damping = model.beam, model.damping
         candidate_modes = 12
@@ -336,9 +338,9 @@ class FreeVibration:
         # Units of the amplitudes that give about the same torque in each mode.
         scale = 1 / np.abs(root[0])
         unplaced = cls(mode_poles.astype(np.complex128), root * scale, scale, np.empty((count, 0)))
-        return unplaced.at(x_m / beam.length_m)
+        return unplaced.at_positions(x_m / beam.length_m)
 
-    def at(self, fractions: Real) -> "FreeVibration":
+    def at_positions(self, fractions: Real) -> "FreeVibration":
         """Return the free vibrations with the displacement at other positions.
 
         Parameters
@@ -396,7 +398,7 @@ class _FreeMotionFit:
     """Torque and shear minus the fit at all samples."""
 
     @classmethod
-    def to(cls, innovations: list[Real], designs: list[Real], quiet: int) -> "_FreeMotionFit":
+    def fit(cls, innovations: list[Real], designs: list[Real], quiet: int) -> "_FreeMotionFit":
         """Fit the first `quiet` samples by weighted least squares.
 
         Repeated fits estimate the noise of torque and shear, which gives the weights.

@@ -149,7 +149,7 @@ class ContactKernels:
         """Number of time steps of the kernels."""
         return int(self.displacement.shape[1])
 
-    def at(self, x_m: Real, steps: int) -> "ContactKernels":
+    def at_positions(self, x_m: Real, steps: int) -> "ContactKernels":
         """Return the kernels at other positions, by cubic interpolation of four positions.
 
         Parameters
@@ -245,7 +245,7 @@ class CrossKernels:
     """Displacement over time of each mode for a pulse of force, where its shape is 1; shape
     (modes, n)."""
 
-    def between(self, x_m: Real, other_m: Real, steps: int) -> Real:
+    def between_positions(self, x_m: Real, other_m: Real, steps: int) -> Real:
         """Return the kernels between pairs of positions, by interpolation of the mode shapes.
 
         Parameters

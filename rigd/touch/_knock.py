@@ -46,7 +46,7 @@ class KnockResponse:
         last = motion.t[window.end - 1]
         steps = int(np.ceil((last - parameters[:, 1].min()) / self._kernels.step_s)) + 3
         steps = min(steps, self._kernels.steps)
-        local_kernels = self._kernels.at(parameters[:, 0], steps)
+        local_kernels = self._kernels.at_positions(parameters[:, 0], steps)
         phase = np.arange(steps) * self._kernels.step_s / np.exp(parameters[:, 2:3])
         force = parameters[:, 3:4] * np.sin(np.pi * np.minimum(phase, 1.0))
         tables = (local_kernels.torque, local_kernels.shear)[: motion.noise.size]

@@ -73,11 +73,11 @@ class TwoObstacleContact:
         touching, instant = self._touching, parameters[:, 1]
         steps = touching.step_count(instant, window)
         positions = parameters[:, 0], parameters[:, 3]
-        kernels = [self._kernels.at(x, steps) for x in positions]
+        kernels = [self._kernels.at_positions(x, steps) for x in positions]
         (beyond, side), (beyond_other, side_other) = (
             touching.approach(x, instant, steps) for x in positions
         )
-        cross = self._crossing.between(*positions, steps) * (side * side_other)[:, None]
+        cross = self._crossing.between_positions(*positions, steps) * (side * side_other)[:, None]
         pressing = integrate_two_contacts(
             (kernels[0].displacement, kernels[1].displacement),
             cross,

@@ -68,7 +68,7 @@ class WhitenedWindow:
     """Whitened innovations of torque and base shear, shape (n,)."""
 
     @classmethod
-    def of(
+    def from_motion(
         cls, motion: FreeMotion, first: int, end: int, deviations: Real | None = None
     ) -> "WhitenedWindow":
         """Return the whitened innovations of the samples from `first` to `end`.
@@ -161,7 +161,7 @@ class ObstacleContact:
         x, instant = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
         steps = self.step_count(instant, window)
-        local_kernels = self._kernels.at(x, steps) if kernels is None else kernels
+        local_kernels = self._kernels.at_positions(x, steps) if kernels is None else kernels
         approach, sides = self.approach(x, instant, steps, side)
         motion_parameters = parameters[:, 3:].T
         pressing_force_n = integrate_contact(
@@ -196,7 +196,7 @@ class ObstacleContact:
         """
         x, instant = parameters[:1], parameters[1:2]
         steps = self.step_count(instant, window)
-        local_kernels = self._kernels.at(x, steps)
+        local_kernels = self._kernels.at_positions(x, steps)
         approach, side = self.approach(x, instant, steps)
         instants = np.repeat(instant, len(displacement_changes_m))
         added_approach_m = side * self._on_steps(displacement_changes_m, instants, steps)

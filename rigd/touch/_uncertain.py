@@ -49,7 +49,9 @@ def uncertainty_effects(
     x = float(likeliest[0, 0])
     nearby_m = min(x, tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
     for free in tables.changed:
-        changed = free.at(nearby_m).motion(record, quiet, quiet - 4, motion.angle_transform)
+        changed = free.at_positions(nearby_m).motion(
+            record, quiet, quiet - 4, motion.angle_transform
+        )
         kernels = contact_kernels(
             free.model.beam,
             free.model.damping,
@@ -79,7 +81,9 @@ def _ringing(
     steps = motion.displacement_m.shape[1]
     # Times from the record's beginning, as for the amplitudes.
     t = motion.first_s + tables.model.angle_delay_s + motion.step_s * np.arange(steps)
-    displacement_m = motion.ringing.at(position_fraction).displacement(t, spread[:count])[0]
+    displacement_m = motion.ringing.at_positions(position_fraction).displacement(t, spread[:count])[
+        0
+    ]
     direct = motion.design[:, window.first : window.end] @ spread
     return direct.transpose(2, 0, 1) + touching.effect_of_changed_motion(
         likeliest, window, displacement_m.T

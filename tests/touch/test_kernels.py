@@ -60,11 +60,11 @@ def test_displacement_is_the_sum_of_the_modes(at_point):
 def test_kernels_between_places_are_those_of_the_exact_model():
     x, other = np.array([0.1, 0.3, 0.8]), np.array([0.25, 0.62, 0.7])
     crossing = cross_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), 2 * STEP_S, 400)
-    told = crossing.between(x, other, 300)
+    told = crossing.between_positions(x, other, 300)
     hat = ForcePulse(2 * STEP_S, 400)
     exact = hat.kernels(PointForceGrid(hat.line.s, LINK, DAMPED).per_force(x, other).T)
     assert told == pytest.approx(exact[:, :300], abs=1e-3 * np.abs(exact).max())
-    assert crossing.between(other, x, 300) == pytest.approx(told)
+    assert crossing.between_positions(other, x, 300) == pytest.approx(told)
 
 
 def test_a_force_that_stays_is_carried_by_the_root_at_last():
@@ -78,7 +78,7 @@ def test_a_force_that_stays_is_carried_by_the_root_at_last():
 
 
 def test_between_places_kernels_are_interpolated(kernels, at_point):
-    between = kernels.at(np.array([0.62]), 400)
+    between = kernels.at_positions(np.array([0.62]), 400)
     for name in ("displacement", "torque", "shear"):
         exact = getattr(at_point, name)
         assert np.abs(getattr(between, name) - exact).max() < 1e-4 * np.abs(exact).max()
