@@ -97,7 +97,10 @@ class _DampingLaw:
     def advance(
         self, state: tuple[_Signal, _Signal, _Signal], torque: _Signal
     ) -> tuple[tuple[_Signal, _Signal, _Signal], _Signal]:
-        """Return the next state (both filters, leaky integral) and the reference's displacement."""
+        """Compute one tick: return the next state, and the displacement of the reference.
+
+        The state consists of both filters and the leaky integral.
+        """
         fast, slow, leaky_integral = state
         fast = fast + self._fast_coefficient * (torque - fast)
         slow = slow + self._slow_coefficient * (fast - slow)

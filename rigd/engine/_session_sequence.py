@@ -417,7 +417,7 @@ class SessionSequence:
     def _watch_touch(self, touch: "TouchWatch", tick: int, missed: int) -> SessionEnd | None:
         """Check the last tick for a touch, to which the touch watch reacts.
 
-        Return the end of the session if the touch requires it, otherwise None.
+        Return an error that ends the session if the touch requires that, otherwise None.
         """
         contact = touch.step(tick, missed)
         if contact is None:
@@ -512,7 +512,7 @@ class SessionSequence:
             raise end
 
     def _step(self, reference_rad: float) -> SessionEnd | None:
-        """Run one tick of control; return the end of the session, or None if it continues.
+        """Run one tick of control; return an error that ends the session, or None.
 
         If the session ends, the torque is off.
         """
@@ -570,7 +570,7 @@ class SessionSequence:
             raise SessionEnd("fault", str(self._cycle.with_cause(failed)))
 
     def _check_missed_ticks(self, missed: int, tick: int) -> SessionEnd | None:
-        """Return the end of the session if too many ticks were missed, otherwise None."""
+        """Return an error that ends the session if too many ticks were missed, else None."""
         if not missed:
             return None
         self._cycle.skip_encoder(missed)
@@ -582,7 +582,7 @@ class SessionSequence:
         return self._stop_reason() is not None
 
     def _check_stale_readings(self, scheduled: int) -> SessionEnd | None:
-        """Return the end of the session if too many readings were stale, otherwise None."""
+        """Return an error that ends the session if too many readings were stale, else None."""
         counts = self.counts
         reason = self._cycle.watch.check_stale_fraction(
             counts.stale_angles, counts.stale_wrenches, scheduled
@@ -590,7 +590,7 @@ class SessionSequence:
         return None if reason is None else SessionEnd("fault", str(self._cycle.with_cause(reason)))
 
     def _stop_reason(self) -> SessionEnd | None:
-        """Return the end of the session if a stop is requested or a process died, or None."""
+        """Return an error that ends the session if a stop is requested or a process died."""
         stop = self._shared_state[StateField.STOP]
         if self._stop.requested or stop == Stop.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")
@@ -606,8 +606,8 @@ class SessionSequence:
     def _poll(self) -> SessionEnd | None:
         """Publish heartbeat and readings, and check slow limits, supervisor and stop requests.
 
-        Return the end of the session, or None if it continues. The supervisor requests a stop when
-        the recorder has died (`rigd.runner`).
+        Return an error that ends the session, or None. The supervisor requests a stop when the
+        recorder has died (`rigd.runner`).
         """
         self._publish_readings()
         violation = self._cycle.check_slow_limits(
@@ -644,7 +644,7 @@ class SessionSequence:
         return self._stop_reason()
 
     def _switch_off_if_stopped(self) -> None:
-        """Switch the torque off and raise the end of the session if one is due."""
+        """Switch the torque off and raise `SessionEnd` if a stop is requested or a check fails."""
         poll_due = self._scheduler.tick % SLOW_CHECK_TICKS == 0
         end = self._poll() if poll_due else self._stop_reason()
         if end is not None:

@@ -311,7 +311,7 @@ class BeamEstimate:
                 np.array([*poles_in_band.values()], dtype=np.complex128), names
             )
         scales = parameter_scales(self)
-        found = []
+        estimated_modes = []
         for (number, pole), row in zip(poles_in_band.items(), pole_gradients_by_mode, strict=True):
             gradient = np.zeros(len(self.names), dtype=np.complex128)
             gradient[: len(parameters)] = row * scales

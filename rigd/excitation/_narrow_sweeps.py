@@ -491,11 +491,11 @@ def modes(
 
 def _read_bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Band]:
     """Read modes from a document and return their bands, that of the slowest decay first."""
-    found = read_modes(path)
-    modes_in_band = [mode for mode in found if mode.frequency_hz <= stop_hz]
+    read = read_modes(path)
+    modes_in_band = [mode for mode in read if mode.frequency_hz <= stop_hz]
     if not modes_in_band:
         raise ExcitationError(
-            f"{path}: the lowest mode, frequency_hz = {found[0].frequency_hz:g} Hz, lies above "
+            f"{path}: the lowest mode, frequency_hz = {read[0].frequency_hz:g} Hz, lies above "
             f"stop_hz = {stop_hz:g} Hz; raise stop_hz."
         )
     bands = sorted(

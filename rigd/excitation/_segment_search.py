@@ -246,7 +246,7 @@ class SegmentSearch:
 
     def bands(self) -> list[_Band]:
         """Return the bands that candidate sweeps cover: through every mode, and on either side."""
-        found = []
+        bands = []
         for mode in self.modes:
             hz = mode.frequency_hz
             # A sine, a narrow sweep, and one over the whole resonance where that is wider.
@@ -263,9 +263,9 @@ class SegmentSearch:
                     else []
                 ),
             ]
-            found += [_Band(mode.number, hz, each, _FADE_S) for each in widths_hz]
+            bands += [_Band(mode.number, hz, each, _FADE_S) for each in widths_hz]
             # Fades as long as the beat with the mode: a shorter one excites the mode as well.
-            found += [
+            bands += [
                 _Band(
                     mode.number,
                     (1.0 + step) * hz,
@@ -276,7 +276,7 @@ class SegmentSearch:
                 for step in (-_SIDE_OFFSET, _SIDE_OFFSET)
                 if (1.0 + step) * hz < BAND_HZ
             ]
-        return found
+        return bands
 
     def steady_sines(self) -> tuple[Real, Real]:
         """Return the steady sines of the forecast, at the largest amplitudes that limits allow.
@@ -352,7 +352,7 @@ class SegmentSearch:
             number: self.with_modes_at_rest(empty_candidate, number, mode_sweeps)
             for number in mode_sweeps
         }
-        found = max(
+        best = max(
             (
                 self.with_band(start, 1.0, band, sweep_pair, phase_index)
                 for band, sweep_pair in sweep_pairs
@@ -363,19 +363,19 @@ class SegmentSearch:
             key=lambda each: each.value,
         )
         for _ in range(2):
-            driven_modes = {band.number for band, _ in found.parts}
+            driven_modes = {band.number for band, _ in best.parts}
             extended_candidates = [
-                self.with_band(found, fraction, band, sweep_pair, phase_index)
+                self.with_band(best, fraction, band, sweep_pair, phase_index)
                 for band, sweep_pair in sweep_pairs
                 if band.number not in driven_modes
                 for fraction in _BASE_AMPLITUDE_FACTORS
                 for phase_index in range(0, _PHASE_COUNT, 2)
             ]
-            better_candidate = max(extended_candidates, key=lambda each: each.value, default=found)
-            if better_candidate.value <= found.value:
+            better_candidate = max(extended_candidates, key=lambda each: each.value, default=best)
+            if better_candidate.value <= best.value:
                 break
-            found = better_candidate
-        return found
+            best = better_candidate
+        return best
 
     def ticks(self, time_s: float) -> int:
         """Return a time in s as a number of ticks of the rig."""
@@ -720,16 +720,16 @@ def least_deviations(
         Lower bound of each standard deviation for a record of this duration.
     """
     rates = _information_rates(estimate, frequency_hz, angle_rad)
-    found = np.empty(len(quantities.gradients))
+    deviations = np.empty(len(quantities.gradients))
     for row, gradient in enumerate(quantities.gradients):
         times_s = np.full(frequency_hz.size, duration_s / frequency_hz.size)
         for _ in range(_MIXTURE_STEPS):
             total = information + np.tensordot(times_s, rates, axes=1)
             line = gradient @ covariance_of(total, estimate)
-            found[row] = np.sqrt(max(float(line @ gradient), 0.0))
+            deviations[row] = np.sqrt(max(float(line @ gradient), 0.0))
             times_s = times_s * np.sqrt(np.einsum("i,fij,j->f", line, rates, line))
             times_s *= duration_s / max(float(times_s.sum()), 1e-300)
-    return found
+    return deviations
 
 
 def largest_factor(before: Real, unit: Real) -> float:

@@ -254,22 +254,22 @@ class _MoveSearch:
         longest_ticks = round(LONGEST_MOVE_S * rate_hz)
         slowest_rad_s = float(np.abs(self._plant.poles_rad_s).min())
         n = round((1.0 if self._order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
-        too_short, found, fraction_short, fraction_found = 8, longest_ticks + 1, inf, 0.0
+        too_short, sufficient, fraction_short, fraction_sufficient = 8, longest_ticks + 1, inf, 0.0
         best: Real | None = None
         for _ in range(_MAX_ROUNDS):
             fraction, acceleration = self._least_limit_fraction(n)
             if fraction <= 1.0:
-                found, fraction_found, best = n, fraction, acceleration
+                sufficient, fraction_sufficient, best = n, fraction, acceleration
             else:
                 too_short, fraction_short = n, fraction
-            if fraction_found >= _CONVERGED_LIMIT_FRACTION or found <= max(
+            if fraction_sufficient >= _CONVERGED_LIMIT_FRACTION or sufficient <= max(
                 _CONVERGED_DURATION_RATIO * too_short, too_short + 1
             ):
                 break
             if too_short >= longest_ticks:
                 break
             n = _next_duration_ticks(
-                too_short, found, fraction_short, fraction_found, n, fraction, self._order
+                too_short, sufficient, fraction_short, fraction_sufficient, n, fraction, self._order
             )
             n = min(n, longest_ticks)
         if best is None:
@@ -316,7 +316,7 @@ class _MoveSearch:
             [[limited, fraction_column], [-limited, fraction_column], [bounded, zero_column]]
         )
         upper_bounds = np.concatenate([np.zeros(2 * len(limited)), bounds])
-        found = linprog(
+        solution = linprog(
             np.append(np.zeros(intervals), 1.0),
             A_ub=inequality_matrix,
             b_ub=upper_bounds,
@@ -325,9 +325,9 @@ class _MoveSearch:
             bounds=[(None, None)] * intervals + [(0.0, None)],
             method="highs-ds",
         )
-        if found.x is None or found.status != 0:
+        if solution.x is None or solution.status != 0:
             return inf, None
-        return float(found.fun), np.repeat(found.x[:-1] * scale, np.diff(edges))
+        return float(solution.fun), np.repeat(solution.x[:-1] * scale, np.diff(edges))
 
     def _ringing_rows(self, n: int) -> list[float]:
         """Return the state at the end of the move that the initial vibration decays to.
@@ -414,29 +414,29 @@ class _MoveSearch:
 
 def _next_duration_ticks(
     too_short: int,
-    found: int,
+    sufficient: int,
     fraction_short: float,
-    fraction_found: float,
+    fraction_sufficient: float,
     n: int,
     fraction: float,
     order: int,
 ) -> int:
     """Return the duration in ticks that the search for the shortest move tries next.
 
-    `too_short` and `found` are the longest insufficient and the shortest sufficient duration, with
+    `too_short` and `sufficient` are the longest insufficient and the shortest sufficient duration, with
     the fractions of the limits that they use. The fraction falls with a power of the duration:
     about the third, and more if the modes, not the distance, determine the duration.
     """
-    if fraction_found == 0.0:  # none has sufficed yet
+    if fraction_sufficient == 0.0:  # none has sufficed yet
         return int(max(n + 2, round(1.03 * n * min(fraction, 4.0) ** 0.3)))
-    if fraction_short == inf and n == found:
+    if fraction_short == inf and n == sufficient:
         guess = round(n * max(fraction, 0.02) ** (0.08 if order > 1 else 0.22))
     elif fraction_short == inf:
-        guess = round((too_short * found) ** 0.5)
+        guess = round((too_short * sufficient) ** 0.5)
     else:
-        power = np.log(fraction_short / fraction_found) / np.log(found / too_short)
-        guess = round(1.004 * found * fraction_found ** (1.0 / power))
-    return int(min(max(guess, too_short + 1), found - 1))
+        power = np.log(fraction_short / fraction_sufficient) / np.log(sufficient / too_short)
+        guess = round(1.004 * sufficient * fraction_sufficient ** (1.0 / power))
+    return int(min(max(guess, too_short + 1), sufficient - 1))
 
 
 class _UnitResponse:

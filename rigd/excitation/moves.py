@@ -148,9 +148,9 @@ def slew(
 
 
 def _speed_change_pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | None:
-    """Return accelerations (n,) of least norm that change the speed by 1 and leave modes at rest.
+    """Return the accelerations (n,) of least norm that change the speed by 1 rad/s.
 
-    Return None if `n` ticks are too few.
+    They leave all modes at rest. Return None if `n` ticks are too few.
     """
     rows = np.concatenate(
         [_motion_map(n, rate_hz)[:1], residual_vibration_map(n, rate_hz, poles_rad_s, 1)]

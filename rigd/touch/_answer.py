@@ -177,11 +177,11 @@ def _force_estimate(
         force = np.abs(explainer.pairing().predict(candidates, window)[1])
         peaks = force.max(axis=1)
     else:
-        touching = ObstacleContact(explainer.tables.middle, explainer.tables.x_m, explainer.motion)
+        contact = ObstacleContact(explainer.tables.middle, explainer.tables.x_m, explainer.motion)
         side = None if best.kind == "rigid" else explainer.pressing_direction()
         if best.kind == "yielding":
             candidates = np.insert(candidates, 3, 0.0, axis=1)
-        force = np.abs(touching.predict(candidates, window, side)[1])
+        force = np.abs(contact.predict(candidates, window, side)[1])
         peaks = force.max(axis=1)
     low, high = np.quantile(peaks[1:], (0.025, 0.975))
     estimate = Estimated(float(peaks[1:].mean()), float(peaks[1:].std()), (float(low), float(high)))

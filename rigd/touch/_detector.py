@@ -46,7 +46,7 @@ class DetectorSettings:
     """Assumed error of the model, as a fraction of the predicted torque and shear."""
 
     def threshold(self, rate_hz: float, signatures: int) -> float:
-        """Return the threshold, in standard deviations, above which a comparison shows a touch.
+        """Return the detection threshold in standard deviations, for the stated false alarms.
 
         Parameters
         ----------

@@ -334,8 +334,8 @@ class Explainer:
         tables = self.tables
         tip = bool(np.median(rows[:, 0]) > NEAR_TIP_FRACTION * tables.model.beam.length_m)
         kernels = tables.finest if tip else tables.coarse if first else tables.middle
-        touching = ObstacleContact(kernels, tables.x_m, self.motion)
-        return lambda candidates, window: touching.predict(candidates, window)[0]
+        contact = ObstacleContact(kernels, tables.x_m, self.motion)
+        return lambda candidates, window: contact.predict(candidates, window)[0]
 
     # Springy obstacle at rest
 
@@ -409,28 +409,28 @@ class Explainer:
         """Return the explanation by one kind of obstacle: search for minima, and sample around."""
         if starts.shape[0] > 12:
             starts = starts[np.argsort(chi2_of(predict, window, starts))[:12]]
-        found = find_minima(predict, window, starts, space, rounds=9)
-        return self._explain_from_minima(kind, predict, window, found, space)
+        minima = find_minima(predict, window, starts, space, rounds=9)
+        return self._explain_from_minima(kind, predict, window, minima, space)
 
     def _explain_from_minima(
         self,
         kind: str,
         predict: Prediction,
         window: WhitenedWindow,
-        found: Minima,
+        minima: Minima,
         space: ParameterRanges,
         variance_factor: float = 1.0,
     ) -> Explanation:
-        """Return an explanation with samples of the posterior around the minima in `found`.
+        """Return an explanation with samples of the posterior around the minima in `minima`.
 
         `variance_factor` is a factor on the variance of the residuals.
         """
-        width = found.parameters.shape[1]
-        near_best = np.flatnonzero(found.chi2 < found.chi2.min() + 30)
+        width = minima.parameters.shape[1]
+        near_best = np.flatnonzero(minima.chi2 < minima.chi2.min() + 30)
         covariances = np.array(
             [
                 np.linalg.inv(
-                    found.jacobian[k].T @ found.jacobian[k] + np.diag(1 / space.largest_std**2)
+                    minima.jacobian[k].T @ minima.jacobian[k] + np.diag(1 / space.largest_std**2)
                 )
                 + np.diag(space.smallest_std**2)
                 for k in near_best
@@ -439,10 +439,10 @@ class Explainer:
         degrees = max(window.data.size - width, 1)
         posterior = sample_posterior(
             lambda rows: chi2_of(predict, window, rows),
-            found.parameters[near_best],
+            minima.parameters[near_best],
             covariances,
             (space.low, space.high),
-            scale=variance_factor * max(_MIN_RESIDUAL_VARIANCE, found.chi2.min() / degrees),
+            scale=variance_factor * max(_MIN_RESIDUAL_VARIANCE, minima.chi2.min() / degrees),
             count=120,
             rounds=5,
             enough_samples=150.0,
@@ -489,24 +489,24 @@ class Explainer:
         extra = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
         starts = np.hstack([np.tile(at_rest.parameters, (len(extra), 1)), extra])
         free = np.hstack([np.ones((len(extra), at_rest.parameters.size), dtype=bool), extra != 0])
-        touching = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
-        side = touching.pressing_direction(at_rest.parameters)
-        found = find_minima(
-            lambda candidates, window: touching.predict(candidates, window, side)[0],
+        contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
+        side = contact.pressing_direction(at_rest.parameters)
+        minima = find_minima(
+            lambda candidates, window: contact.predict(candidates, window, side)[0],
             window,
             starts,
             self.space(5),
             rounds=5,
             free=free,
         )
-        return bool(found.chi2.min() < at_rest.chi2 - CHANCE_CHI2_REDUCTION)
+        return bool(minima.chi2.min() < at_rest.chi2 - CHANCE_CHI2_REDUCTION)
 
     def _explain_by_other_kinds(self, window: WhitenedWindow) -> list[Explanation]:
         """Return the explanations of the window by a moving or yielding obstacle, and a knock."""
         blind, side = self.blind, self.pressing_direction()
         likeliest_positions = blind.x_m[np.argsort(-blind.log_likelihood)[:24]]
         instants = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
-        found = []
+        explanations = []
         for kind, extra in (("moving", _RATES_M_PER_S), ("yielding", _MOBILITIES)):
             grid = np.meshgrid(
                 likeliest_positions, instants, np.log(_STIFFNESSES), extra, indexing="ij"
@@ -523,20 +523,20 @@ class Explainer:
             if window.end > self.end(FIRST_S):
                 early_minima = find_minima(predict, self.window(FIRST_S), starts, space, rounds=6)
                 starts = early_minima.parameters
-            found.append(self.explain_by_kind(kind, predict, window, starts, space))
-        touching = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
-        knocking = KnockResponse(touching, self.tables.middle, 2)
-        starts = knocking.starts(self.window(FIRST_S), self.detected, 10)
+            explanations.append(self.explain_by_kind(kind, predict, window, starts, space))
+        contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
+        knock = KnockResponse(contact, self.tables.middle, 2)
+        starts = knock.starts(self.window(FIRST_S), self.detected, 10)
         ranges = self.space(3)
-        space = knocking.space(self.edges, (ranges.low[1], ranges.high[1]))
-        found.append(self.explain_by_kind("knock", knocking.predict, window, starts, space))
-        return found
+        space = knock.space(self.edges, (ranges.low[1], ranges.high[1]))
+        explanations.append(self.explain_by_kind("knock", knock.predict, window, starts, space))
+        return explanations
 
     def pairing(self) -> TwoObstacleContact:
         """Return the integration of the contact with two obstacles for this record."""
         tables = self.tables
-        touching = ObstacleContact(tables.coarse, tables.x_m, self.motion)
-        return TwoObstacleContact(touching, tables.coarse, tables.crossing)
+        contact = ObstacleContact(tables.coarse, tables.x_m, self.motion)
+        return TwoObstacleContact(contact, tables.coarse, tables.crossing)
 
     def _explain_by_two(self, at_rest: Explanation, window: WhitenedWindow) -> Explanation | None:
         """Return the explanation by two obstacles, or None if one obstacle explains as much."""
@@ -545,22 +545,22 @@ class Explainer:
         # The first samples show in less time whether more iterations are worthwhile.
         early = self.window(_UNCERTAINTIES_S) if window.end > self.end(_UNCERTAINTIES_S) else window
         starts = pairing.starts(at_rest.parameters, early, space, 2)
-        found = find_minima(pairing.predict_channels, early, starts, space, rounds=4)
+        minima = find_minima(pairing.predict_channels, early, starts, space, rounds=4)
         single_obstacle = at_rest.parameters[None]
         if (
-            found.chi2.min()
+            minima.chi2.min()
             > chi2_of(self.predictor(single_obstacle), early, single_obstacle)[0] - _MIN_EARLY_GAIN
         ):
             return None
-        likeliest = found.parameters[np.argsort(found.chi2)[:3]]
+        likeliest = minima.parameters[np.argsort(minima.chi2)[:3]]
         starts = np.vstack([likeliest, pairing.in_reverse_order(likeliest[:1])])
-        found = find_minima(pairing.predict_channels, window, starts, space, rounds=8)
-        gain = at_rest.chi2 - found.chi2.min()
+        minima = find_minima(pairing.predict_channels, window, starts, space, rounds=8)
+        gain = at_rest.chi2 - minima.chi2.min()
         if gain < _MIN_TWO_OBSTACLES_GAIN:
             return None
         variance_factor = _TWO_OBSTACLES_VARIANCE if gain > DECISIVE_CHI2_DIFFERENCE else 1.0
         return self._explain_from_minima(
-            "two", pairing.predict_channels, window, found, space, variance_factor
+            "two", pairing.predict_channels, window, minima, space, variance_factor
         )
 
     def pressing_direction(self) -> float:
@@ -575,12 +575,12 @@ class Explainer:
 
         Their fourth parameter is the speed or the mobility.
         """
-        touching = ObstacleContact(kernels, self.tables.x_m, self.motion)
+        contact = ObstacleContact(kernels, self.tables.x_m, self.motion)
 
         def predict(candidates: Real, window: WhitenedWindow) -> Real:
             if kind == "yielding":
                 candidates = np.insert(candidates, 3, 0.0, axis=1)
-            return touching.predict(candidates, window, side)[0]
+            return contact.predict(candidates, window, side)[0]
 
         return predict
 
@@ -598,11 +598,11 @@ class Explainer:
         )
 
 
-def _distinct_minima(found: Minima) -> Real:
+def _distinct_minima(minima: Minima) -> Real:
     """Return the parameters of minima that are not close to a better minimum, the best first."""
-    order = np.argsort(found.chi2)
+    order = np.argsort(minima.chi2)
     distinct: list[Real] = []
-    for row in found.parameters[order[found.chi2[order] < 2 * found.chi2.min() + 60]]:
+    for row in minima.parameters[order[minima.chi2[order] < 2 * minima.chi2.min() + 60]]:
         if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in distinct):
             distinct.append(row)
     return np.array(distinct)

@@ -27,10 +27,10 @@ class KnockResponse:
         Number of the kernels' positions from one starting position of the search to the next.
     """
 
-    __slots__ = ("_kernels", "_stride", "_touching")
+    __slots__ = ("_contact", "_kernels", "_stride")
 
-    def __init__(self, touching: ObstacleContact, kernels: ContactKernels, stride: int) -> None:
-        self._touching, self._kernels, self._stride = touching, kernels, stride
+    def __init__(self, contact: ObstacleContact, kernels: ContactKernels, stride: int) -> None:
+        self._contact, self._kernels, self._stride = contact, kernels, stride
 
     def predict(self, parameters: Real, window: WhitenedWindow) -> Real:
         """Return the effect of knocks on torque and base shear, shape (k, c, samples).
@@ -50,7 +50,7 @@ class KnockResponse:
         phase = np.arange(steps) * self._kernels.step_s / np.exp(parameters[:, 2:3])
         force = parameters[:, 3:4] * np.sin(np.pi * np.minimum(phase, 1.0))
         tables = (local_kernels.torque, local_kernels.shear)[: motion.noise.size]
-        return self._touching.effects(tables, force, parameters[:, 1], window)
+        return self._contact.effects(tables, force, parameters[:, 1], window)
 
     def starts(self, window: WhitenedWindow, latest: int, count: int) -> Real:
         """Return the likeliest knocks of a grid, each with its best peak, shape (count, 4).

@@ -9,7 +9,7 @@ from rigd.beam import Beam, Damping
 from rigd.identified_beam import TOUCH, read_identified_beam
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
-UNCERTAIN: Final = (
+UNCERTAIN_PARAMETERS: Final = (
     "bending_stiffness_n_m2",
     "density_over_stiffness",
     "zeta",
@@ -51,7 +51,7 @@ class TouchModel:
     source: str = "profile"
     """Source of the model, for the operator."""
     std: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviation of each uncertain parameter of `UNCERTAIN` in its unit, by name. The mass
+    """Standard deviation of each uncertain parameter of `UNCERTAIN_PARAMETERS` in its unit, by name. The mass
     per length is the product of bending stiffness and density over stiffness."""
 
     @property
@@ -65,7 +65,7 @@ class TouchModel:
         Parameters
         ----------
         name
-            Name of the parameter, one of `UNCERTAIN`.
+            Name of the parameter, one of `UNCERTAIN_PARAMETERS`.
         by
             Difference in the unit of the parameter.
         """
@@ -92,7 +92,7 @@ class TouchModel:
             case "delay_s":
                 return replace(self, torque_delay_s=self.torque_delay_s + by)
             case _:
-                raise ValueError(f"{name!r} is not one of {UNCERTAIN}.")
+                raise ValueError(f"{name!r} is not one of {UNCERTAIN_PARAMETERS}.")
         return replace(self, beam=beam, damping=damping)
 
     @classmethod
@@ -167,15 +167,15 @@ class TouchModel:
             If the file cannot be read, lacks the beam's stiffness or density, has an effect that a
             uniform beam on a rigid clamp does not have, or flags a required number.
         """
-        found = read_identified_beam(path, length_m, TOUCH)
-        tool = found.tool_inertia_kg_m2
+        identified = read_identified_beam(path, length_m, TOUCH)
+        tool = identified.tool_inertia_kg_m2
         return cls(
-            found.beam,
-            found.damping,
+            identified.beam,
+            identified.damping,
             tool_inertia_kg_m2 if tool is None else tool,
             angle_delay_s,
-            torque_delay_s if found.delay_s is None else found.delay_s + angle_delay_s,
+            torque_delay_s if identified.delay_s is None else identified.delay_s + angle_delay_s,
             sensor_filter,
             source=str(path),
-            std=found.std,
+            std=identified.std,
         )

@@ -46,12 +46,12 @@ class TwoObstacleContact:
         Kernels from a force at one position to the displacement at another, on the same steps.
     """
 
-    __slots__ = ("_crossing", "_kernels", "_touching")
+    __slots__ = ("_contact", "_crossing", "_kernels")
 
     def __init__(
-        self, touching: ObstacleContact, kernels: ContactKernels, crossing: CrossKernels
+        self, contact: ObstacleContact, kernels: ContactKernels, crossing: CrossKernels
     ) -> None:
-        self._touching, self._kernels, self._crossing = touching, kernels, crossing
+        self._contact, self._kernels, self._crossing = contact, kernels, crossing
 
     def predict(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
         """Return the effect of two obstacles on torque and shear, and the force of the first.
@@ -70,12 +70,12 @@ class TwoObstacleContact:
         force : ndarray, shape (k, n)
             Force of the first obstacle on the beam in N, at the steps from the touch on.
         """
-        touching, instant = self._touching, parameters[:, 1]
-        steps = touching.step_count(instant, window)
+        contact, instant = self._contact, parameters[:, 1]
+        steps = contact.step_count(instant, window)
         positions = parameters[:, 0], parameters[:, 3]
         kernels = [self._kernels.at_positions(x, steps) for x in positions]
         (beyond, side), (beyond_other, side_other) = (
-            touching.approach(x, instant, steps) for x in positions
+            contact.approach(x, instant, steps) for x in positions
         )
         cross = self._crossing.between_positions(*positions, steps) * (side * side_other)[:, None]
         pressing = integrate_two_contacts(
@@ -87,7 +87,7 @@ class TwoObstacleContact:
         forces = -side[:, None] * pressing[0], -side_other[:, None] * pressing[1]
         channels = window.motion.noise.size
         first, second = (
-            touching.effects((local.torque, local.shear)[:channels], force, instant, window)
+            contact.effects((local.torque, local.shear)[:channels], force, instant, window)
             for local, force in zip(kernels, forces, strict=True)
         )
         return first + second, forces[0]
@@ -138,9 +138,9 @@ class TwoObstacleContact:
         """
         x_m = np.linspace(space.low[3], space.high[3], _POSITION_COUNT)
         instants = np.full(_POSITION_COUNT, single_obstacle[1])
-        steps = self._touching.step_count(instants, window)
+        steps = self._contact.step_count(instants, window)
         delay_steps = np.round(_SECOND_TOUCH_DELAYS_S / self._kernels.step_s).astype(np.intp)
-        beyond, _ = self._touching.approach(x_m, instants, steps)
+        beyond, _ = self._contact.approach(x_m, instants, steps)
         distances_m = np.maximum(beyond[:, np.minimum(delay_steps, steps - 1)], 0.0)
         pair = np.concatenate([single_obstacle, [0.0, 0.0, np.log(_TRIAL_STIFFNESS_N_PER_M)]])
         with_second = np.tile(pair, (_POSITION_COUNT * delay_steps.size, 1))

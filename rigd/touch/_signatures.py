@@ -113,7 +113,7 @@ def signatures(
     approach = positions[:, None] * step_s * np.arange(kernels.steps)
     per_tick = _impulse_responses(model, ticks)
 
-    found = []
+    signature_blocks = []
     for stiffness in _STIFFNESSES_N_PER_M:
         force = integrate_contact(
             kernels.displacement, approach, np.full(positions.size, stiffness), step_s
@@ -132,8 +132,8 @@ def signatures(
             for age in ages:
                 rows = np.zeros_like(innovations)
                 rows[:, 2 * (ticks - age) :] = innovations[:, : 2 * age]
-                found.append(rows)
-    all_signatures = np.concatenate(found)
+                signature_blocks.append(rows)
+    all_signatures = np.concatenate(signature_blocks)
     norms = np.linalg.norm(all_signatures, axis=1)
     return _select_dissimilar(all_signatures[norms > 0] / norms[norms > 0, None])
 

@@ -37,12 +37,12 @@ def uncertainty_effects(
     finest_effect = ObstacleContact(tables.finest, tables.x_m, motion).predict(likeliest, window)[
         0
     ][0]
-    touching = ObstacleContact(tables.middle, tables.x_m, motion)
-    middle_effect = touching.predict(likeliest, window)[0][0]
+    contact = ObstacleContact(tables.middle, tables.x_m, motion)
+    middle_effect = contact.predict(likeliest, window)[0][0]
     effects = [
         finest_effect - middle_effect,
-        *_ringing(tables, touching, likeliest[0], window),
-        *_angle_noise(tables, touching, likeliest[0], window),
+        *_ringing(tables, contact, likeliest[0], window),
+        *_angle_noise(tables, contact, likeliest[0], window),
     ]
     span = slice(window.first, window.end)
     residual = motion.innovations[:, span] - middle_effect
@@ -68,7 +68,7 @@ def uncertainty_effects(
 
 
 def _ringing(
-    tables: TouchTables, touching: ObstacleContact, likeliest: Real, window: WhitenedWindow
+    tables: TouchTables, contact: ObstacleContact, likeliest: Real, window: WhitenedWindow
 ) -> Real:
     """Return the effects of the free motion's uncertainty on the innovations, (q, c, n).
 
@@ -85,13 +85,13 @@ def _ringing(
         0
     ]
     direct = motion.design[:, window.first : window.end] @ spread
-    return direct.transpose(2, 0, 1) + touching.effect_of_changed_motion(
+    return direct.transpose(2, 0, 1) + contact.effect_of_changed_motion(
         likeliest, window, displacement_m.T
     )
 
 
 def _angle_noise(
-    tables: TouchTables, touching: ObstacleContact, likeliest: Real, window: WhitenedWindow
+    tables: TouchTables, contact: ObstacleContact, likeliest: Real, window: WhitenedWindow
 ) -> Real:
     """Return the effects of the encoder's noise through the contact on the innovations.
 
@@ -112,6 +112,6 @@ def _angle_noise(
         sample_displacement[np.clip(index, 0, sample_displacement.size - 1)],
         0.0,
     )
-    return touching.effect_of_changed_motion(
+    return contact.effect_of_changed_motion(
         likeliest, window, motion.angle_noise_rad * displacement_m
     )
