@@ -320,8 +320,8 @@ class BeamEstimate:
                     gradient[index] = POLE_AND_RESIDUE_DERIVATIVES[name.rpartition("_")[0]](
                         pole, 0j
                     )[0]
-            found.append(EstimatedMode(number, pole, gradient))
-        return tuple(found)
+            estimated_modes.append(EstimatedMode(number, pole, gradient))
+        return tuple(estimated_modes)
 
 
 POLE_AND_RESIDUE_DERIVATIVES: Final[

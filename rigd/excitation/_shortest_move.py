@@ -423,8 +423,8 @@ def _next_duration_ticks(
 ) -> int:
     """Return the duration in ticks that the search for the shortest move tries next.
 
-    `too_short` and `sufficient` are the longest insufficient and the shortest sufficient duration, with
-    the fractions of the limits that they use. The fraction falls with a power of the duration:
+    `too_short` and `sufficient` are the longest insufficient and the shortest sufficient duration,
+    with the fractions of the limits that they use. The fraction falls with a power of the duration:
     about the third, and more if the modes, not the distance, determine the duration.
     """
     if fraction_sufficient == 0.0:  # none has sufficed yet

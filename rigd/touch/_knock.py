@@ -19,7 +19,7 @@ class KnockResponse:
 
     Parameters
     ----------
-    touching
+    contact
         Integration of the contact for the record.
     kernels
         Contact kernels on the time steps of the integration.

@@ -51,8 +51,8 @@ class TouchModel:
     source: str = "profile"
     """Source of the model, for the operator."""
     std: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviation of each uncertain parameter of `UNCERTAIN_PARAMETERS` in its unit, by name. The mass
-    per length is the product of bending stiffness and density over stiffness."""
+    """Standard deviation of each uncertain parameter of `UNCERTAIN_PARAMETERS` in its unit, by
+    name. The mass per length is the product of bending stiffness and density over stiffness."""
 
     @property
     def wrench_delay_s(self) -> float:

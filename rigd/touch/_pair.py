@@ -38,7 +38,7 @@ class TwoObstacleContact:
 
     Parameters
     ----------
-    touching
+    contact
         Integration of the contact with one obstacle.
     kernels
         Contact kernels on the time steps of the integration.
