@@ -53,6 +53,7 @@ _WRONG_SIGN_REMEDY = (
     "Check the drive's polarity (object 607E), cia402.direction and the wiring of motor and "
     "encoder; a lower amplitude does not help."
 )
+"""Advice for the operator if the sign of angle or torque is wrong."""
 _ENCODER_TESTED_MESSAGE = (
     "The beam pulled at a shaft that stood still, so the encoder was tested: it works."
 )
@@ -688,6 +689,7 @@ class SessionSequence:
             self._encoder_tests = tests
 
     def _log_event(self, level: Level, message: str) -> None:
+        """Write a line of the session's log for the operator and the file."""
         # Events before tick 0 have no time in the file yet.
         t_ns = self._clock.now_ns() - self._scheduler.start_ns if self._recording else 0
         write_event(self._channels.events, LogEvent(t_ns, level, message))

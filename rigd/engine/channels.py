@@ -58,9 +58,13 @@ class Topic:
 
 
 EVENT = Topic("/rig/event", EVENT_SIZE, every=0, logged=True, live=True)
+"""Topic of the log events."""
 CONTROL = Topic("/rig/control", CONTROL_SIZE, every=10, logged=True, live=False)
+"""Topic of the controller's terms."""
 TIMING = Topic("/rig/timing", TIMING_SIZE, every=1, logged=True, live=True)
+"""Topic of the ages of the readings."""
 SAMPLE = Topic("/rig/sample", SAMPLE_SIZE, every=1, logged=True, live=True)
+"""Topic of the samples."""
 
 TOPICS = (EVENT, CONTROL, TIMING, SAMPLE)
 """Topics in the order in which the recorder writes them. Samples come last, so that the events that
@@ -155,5 +159,6 @@ def attach_channels(specs: ChannelSpecs) -> Channels:
 def _make_channels(
     rings: Sequence[Ring], shared_state: SharedState, reference_fd: int = -1
 ) -> Channels:
+    """Return channels from rings in the order of `TOPICS`, and the shared state."""
     events, controls, timings, samples = rings
     return Channels(events, controls, timings, samples, shared_state, reference_fd)

@@ -99,7 +99,7 @@ class Standstill:
         return self._last_movements_rad is not None
 
     def check(self, angle_rad: float, due_ns: int) -> None:
-        """Raise if an angle cannot follow from the angles before it.
+        """Raise `DeviceError` if the motor cannot have turned to an angle since the last tick.
 
         Parameters
         ----------

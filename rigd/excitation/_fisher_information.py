@@ -146,7 +146,7 @@ class TorqueModel:
         return self._inverse_transform(self.channels * spectrum, self.ticks, self.factor)
 
     def _inverse_transform(self, spectra: Complex, samples: int, values_per_sample: int) -> Real:
-        """Return Laplace transforms as functions of time, with some values per sample."""
+        """Return functions of time, with some values per sample, from their Laplace transforms."""
         time_s = np.arange(samples) * (self.factor / values_per_sample / self.rate_hz)
         values = np.fft.irfft(spectra, 2 * samples)[:, :samples]
         values *= np.exp(self.sigma_per_s * time_s)

@@ -359,7 +359,7 @@ class Explainer:
 
     @cached_property
     def starts(self) -> Real:
-        """The 12 likeliest candidates of the grid, compared over more samples."""
+        """The 12 likeliest obstacles at rest of the grid, compared over more samples."""
         coarse = ObstacleContact(self.tables.coarse, self.tables.x_m, self.motion)
         chi2 = chi2_of(
             lambda rows, window: coarse.predict(rows, window)[0],
