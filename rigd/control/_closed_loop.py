@@ -313,7 +313,7 @@ def close_loop(model: LoopModel) -> ClosedLoop:
             stiffness_offsets=model.stiffness_offsets,
         )
     )
-    plant = _Plant(model, realisation)
+    plant = _DiscretePlant(model, realisation)
     n = plant.a.shape[0]
 
     # States: plant, integral, derivative, two low-pass filters of the reference.
@@ -418,22 +418,23 @@ def check_stability(loop: ClosedLoop) -> str | None:
         If an oscillation of the loop grows faster than `MAX_GROWTH_PER_S`, or would do so without
         the beam's own damping (`MAX_DAMPING_TAKEN`).
     """
-    remedy = _remedy(loop.model.settings)
+    remedy = _stability_remedy(loop.model.settings)
     growth = loop.growth_per_s
     instability = (
         "The closed loop of motor, beam and delays is unstable (spectral radius "
-        f"{loop.spectral_radius:.7f}): {_describe(loop.poles_rad_s[0])} grows at {growth:.2g} /s"
+        f"{loop.spectral_radius:.7f}): {_describe_pole(loop.poles_rad_s[0])} grows at "
+        f"{growth:.2g} /s"
     )
     if growth > MAX_GROWTH_PER_S:
         raise ControlDesignError(f"{instability}; {remedy}.")
     if loop.model.beam is not None:
-        lightly_damped_loop = close_loop(light_beam(loop.model, loop.model.beam))
+        lightly_damped_loop = close_loop(lightly_damped_model(loop.model, loop.model.beam))
         pole = lightly_damped_loop.least_damped()
         if _damping_ratio(pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_TAKEN:
             raise ControlDesignError(
                 "The closed loop is stable only by the beam's own damping: without it (spectral "
-                f"radius {lightly_damped_loop.spectral_radius:.7f}), {_describe(pole)} grows at "
-                f"{pole.real:.2g} /s; {remedy}."
+                f"radius {lightly_damped_loop.spectral_radius:.7f}), {_describe_pole(pole)} grows "
+                f"at {pole.real:.2g} /s; {remedy}."
             )
     if growth <= 0.0:
         return None
@@ -478,7 +479,7 @@ def _stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
     return loop, check_stability(loop)
 
 
-def _remedy(settings: ControlSettings) -> str:
+def _stability_remedy(settings: ControlSettings) -> str:
     """Return the end of a message: how to change the settings of an unstable controller."""
     if settings.feedforward_gain < 0.5:
         return (
@@ -492,7 +493,7 @@ def _remedy(settings: ControlSettings) -> str:
     )
 
 
-def light_beam(model: LoopModel, beam: Beam) -> LoopModel:
+def lightly_damped_model(model: LoopModel, beam: Beam) -> LoopModel:
     """Return a loop's model in which the beam has almost no damping.
 
     Parameters
@@ -513,13 +514,13 @@ def _damping_ratio(pole_rad_s: complex) -> float:
     return -pole_rad_s.real / abs(pole_rad_s)
 
 
-def _describe(pole_rad_s: complex) -> str:
+def _describe_pole(pole_rad_s: complex) -> str:
     """Return frequency and damping ratio of a pole as text."""
     frequency_hz = abs(pole_rad_s.imag) / (2.0 * pi)
     return f"a mode at {frequency_hz:.3g} Hz with damping ratio {_damping_ratio(pole_rad_s):.2g}"
 
 
-class _Plant:
+class _DiscretePlant:
     """State space of motor, beam and delays in discrete time: ``z[k+1] = a z[k] + b u[k]``.
 
     The state z contains the state of motor and beam, the last commands (newest first), and past

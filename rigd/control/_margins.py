@@ -112,7 +112,7 @@ def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
     angle reading: modulus margin 0.47
     torque reading: modulus margin 0.25
     """
-    return tuple(_margins(loop, cut) for cut in loop.cuts)
+    return tuple(_margins_at_cut(loop, cut) for cut in loop.cuts)
 
 
 def open_loop_gain(loop: ClosedLoop, cut: CutSignal, phase_rad: Real) -> Complex:
@@ -143,14 +143,14 @@ def open_loop_gain(loop: ClosedLoop, cut: CutSignal, phase_rad: Real) -> Complex
     return gain
 
 
-def _margins(loop: ClosedLoop, cut: CutSignal) -> Margins:
+def _margins_at_cut(loop: ClosedLoop, cut: CutSignal) -> Margins:
     """Return the stability margins of a loop at one signal."""
 
     def curve(phase_rad: Real) -> Complex:
         return open_loop_gain(loop, cut, phase_rad)
 
     rate_hz = loop.model.rate_hz
-    frequencies = _frequencies(loop, cut)
+    frequencies = _examined_frequencies(loop, cut)
     gain = curve(frequencies)
 
     crossing_phase, real_gain = _negative_real_crossings(curve, frequencies, gain)
@@ -190,7 +190,7 @@ Curve = Callable[[Real], Complex]
 """Function that returns the open loop's gain at angular frequencies times the period."""
 
 
-def _frequencies(loop: ClosedLoop, cut: CutSignal) -> Real:
+def _examined_frequencies(loop: ClosedLoop, cut: CutSignal) -> Real:
     """Return the examined angular frequencies times the period, in increasing order.
 
     They are dense around the resonances of the open and the closed loop.

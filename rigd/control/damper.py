@@ -132,7 +132,7 @@ def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     """
     # Imported here: the control process uses a finished design, and starts sooner without these.
     from rigd.beam import undamped_frequencies_rad_s
-    from rigd.control._closed_loop import MAX_GROWTH_PER_S, close_loop, light_beam
+    from rigd.control._closed_loop import MAX_GROWTH_PER_S, close_loop, lightly_damped_model
 
     model = loop.model
     if model.beam is None:
@@ -148,7 +148,7 @@ def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     beams = [
         replace(model.beam, bending_stiffness_n_m2=ratio * stiffness) for ratio in _STIFFNESS_RATIOS
     ]
-    loops = [close_loop(light_beam(model, beam)) for beam in beams]
+    loops = [close_loop(lightly_damped_model(model, beam)) for beam in beams]
     for _ in range(_MAX_HALVINGS):
         growth_rates_per_s = [damped_poles(each, settings).real.max() for each in loops]
         # The same growth as without it is allowed, on beams with almost no damping of their own.

@@ -7,10 +7,10 @@ and records nothing.
 from typing import TYPE_CHECKING, Any, cast
 
 from rigd.engine._probed_rig import probed_rig
-from rigd.engine._publish import Display
+from rigd.engine._publish import ReadingPublisher
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine.channels import Channels
-from rigd.engine.cycle import Cycle, Standstill
+from rigd.engine.cycle import Cycle, StandstillMonitor
 from rigd.engine.messages import Ending
 from rigd.engine.processes import Parent
 from rigd.engine.shared_state import Phase, StateField
@@ -36,9 +36,9 @@ class ProbeSequence(SessionSequence):
         cycle: Cycle,
         clock: Clock,
         scheduler: TickScheduler,
-        standstill: Standstill,
+        standstill: StandstillMonitor,
         channels: Channels,
-        display: Display,
+        display: ReadingPublisher,
         parent: Parent,
         stop: StopRequest,
     ) -> None:
@@ -65,7 +65,7 @@ class ProbeSequence(SessionSequence):
             If the operator or an interlock ends the move.
         """
         self._shared_state[StateField.PHASE] = Phase.PROBING
-        self._standstill.forget()
+        self._standstill.reset()
         cycle = self._cycle
         start_rad = cycle.angle_rad
         move = ProbingMove(self._rig, plan_probe(self._rig), start_rad, self._rest_spread_nm)
@@ -79,9 +79,9 @@ class ProbeSequence(SessionSequence):
         cycle.torque_off()
         return {"end": move.end.name} | estimate_probe(self._rig, move).as_dict()
 
-    def _step(self, reference_rad: float) -> SessionEnd | None:
+    def _control_tick(self, reference_rad: float) -> SessionEnd | None:
         """Run one tick of the probing move, and report missed ticks to it."""
         if self._move is not None:
             self._move.missed = max(0, self._scheduler.tick - self._last_tick - 1)
             self._last_tick = self._scheduler.tick
-        return super()._step(reference_rad)
+        return super()._control_tick(reference_rad)

@@ -1,4 +1,4 @@
-"""Publication of a tick's results to the shared state (`Display`), the recorder and live view."""
+"""Publication of a tick's results to the shared state, the recorder and the live view."""
 
 import time
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from rigd.engine.timing import Clock, TickScheduler
 from rigd.session.layout import Status, pack_control_into, pack_sample_into, pack_timing_into
 
 
-class Display:
+class ReadingPublisher:
     """Publisher of the control process's readings in the shared state, several times a second.
 
     Parameters
@@ -28,7 +28,7 @@ class Display:
     ----------
     doubts
         Sentences for the operator that explain why the age of a reading is doubtful, as of the last
-        call of `show`.
+        call of `publish`.
     doubt_counts
         Sentences with the number of doubtful readings since the devices were connected.
     """
@@ -40,7 +40,7 @@ class Display:
         self.doubt_counts: list[str] = []
         self._last_bits: tuple[int, tuple[int, ...]] | None = None
 
-    def show(self, cycle: Cycle, now_ns: int) -> None:
+    def publish(self, cycle: Cycle, now_ns: int) -> None:
         """Publish the control process's heartbeat and last readings in the shared state.
 
         Parameters
@@ -65,9 +65,9 @@ class Display:
         error_counts = [line.errors for line in (drive, sensor) if line.errors is not None]
         shared_state[StateField.BUS_ERRORS] = sum(error_counts) if error_counts else UNKNOWN
         shared_state[StateField.SENSOR_STATUS] = UNKNOWN if sensor.status is None else sensor.status
-        self._show_load((drive, sensor), now_ns)
+        self._publish_load((drive, sensor), now_ns)
 
-    def _show_load(self, lines: tuple[LineHealth, ...], now_ns: int) -> None:
+    def _publish_load(self, lines: tuple[LineHealth, ...], now_ns: int) -> None:
         """Publish the load of the busiest bus or serial line since the last call."""
         bits = tuple(line.bits or 0 for line in lines)
         if self._last_bits is None:

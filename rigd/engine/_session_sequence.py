@@ -14,9 +14,9 @@ import numpy as np
 
 from rigd.control.damper import VibrationDamper
 from rigd.devices.contracts import DeviceError
-from rigd.engine._publish import Display, SampleLog
+from rigd.engine._publish import ReadingPublisher, SampleLog
 from rigd.engine.channels import Channels
-from rigd.engine.cycle import Cycle, Rest, Standstill, observe_rest
+from rigd.engine.cycle import Cycle, RestReadings, StandstillMonitor, observe_rest
 from rigd.engine.messages import Ending
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import page_faults
@@ -133,9 +133,9 @@ class SessionSequence:
         cycle: Cycle,
         clock: Clock,
         scheduler: TickScheduler,
-        standstill: Standstill,
+        standstill: StandstillMonitor,
         channels: Channels,
-        display: Display,
+        display: ReadingPublisher,
         parent: Parent,
         stop: StopRequest,
         ending: Ending,
@@ -234,7 +234,7 @@ class SessionSequence:
                 )
         watch.tared_nm = zero_nm
 
-    def _wait_for_rest(self) -> Rest:
+    def _wait_for_rest(self) -> RestReadings:
         """Return the readings of the first interval in which neither the motor nor the beam moves.
 
         Raise `SessionEnd` if the rig does not come to rest within ``session.rest_timeout_s``.
@@ -245,7 +245,7 @@ class SessionSequence:
         while True:
             self._cycle.sensor_watch.learn()
             rest = self._read_rest(settings.tare_s)
-            motion = self._motion_reason(rest)
+            motion = self._describe_motion(rest)
             if not motion:
                 return rest
             remaining_s -= rest.duration_s
@@ -259,7 +259,7 @@ class SessionSequence:
                 self._shared_state[StateField.PHASE] = Phase.WAITING
                 self._log_event("info", f"Waiting until the rig is at rest. {motion}")
 
-    def _motion_reason(self, rest: Rest) -> str:
+    def _describe_motion(self, rest: RestReadings) -> str:
         """Return a sentence that says how motor or beam moves, or an empty text if both rest."""
         settings = self._profile.session
         if rest.speed_rad_s > settings.rest_velocity_rad_s:
@@ -278,7 +278,7 @@ class SessionSequence:
     def hold(self) -> None:
         """Hold the motor at its present angle for 0.5 s after the drive has been enabled."""
         self._shared_state[StateField.PHASE] = Phase.SETTLING
-        self._standstill.forget()
+        self._standstill.reset()
         # The last reading, not the mean: the controller must start without a step.
         self._start_angle_rad = self._cycle.angle_rad
         self._cycle.start(self._rest_spread_nm)
@@ -306,7 +306,7 @@ class SessionSequence:
                     "Check CPU load.",
                 )
             if self._clock.virtual:
-                self._display.show(self._cycle, self._scheduler.due_ns)
+                self._display.publish(self._cycle, self._scheduler.due_ns)
                 self._switch_off_if_stopped()
                 time.sleep(_VIRTUAL_POLL_S)
             else:
@@ -376,7 +376,7 @@ class SessionSequence:
                 reference[tick] if reader is None else reader.reference_at(tick)
             )
             if end is None:
-                end = self._step(reference_rad)
+                end = self._control_tick(reference_rad)
                 if touch is not None and end is None:
                     end = self._watch_touch(touch, tick, missed)
             else:
@@ -412,7 +412,7 @@ class SessionSequence:
         while reader.must_wait(tick) and self._stop_reason() is None:
             if on_lines and time.monotonic() - wait_start_s > SIGN_OF_LIFE_S:
                 return
-            self._display.show(self._cycle, self._scheduler.due_ns)
+            self._display.publish(self._cycle, self._scheduler.due_ns)
             time.sleep(_VIRTUAL_POLL_S)
 
     def _watch_touch(self, touch: "TouchWatch", tick: int, missed: int) -> SessionEnd | None:
@@ -458,7 +458,7 @@ class SessionSequence:
             ):
                 return
 
-    def go_back(self) -> None:
+    def return_to_start(self) -> None:
         """Move the motor back to the start angle without exciting a vibration.
 
         If the session is a move (``ending.stays``), go to the last angle of the reference instead.
@@ -508,11 +508,11 @@ class SessionSequence:
                 f"{self._profile.limits.missed_ticks_in_a_row}. {OVERLOADED}",
             )
         self._switch_off_if_stopped()
-        end = self._step(reference_rad)
+        end = self._control_tick(reference_rad)
         if end is not None:
             raise end
 
-    def _step(self, reference_rad: float) -> SessionEnd | None:
+    def _control_tick(self, reference_rad: float) -> SessionEnd | None:
         """Run one tick of control; return an error that ends the session, or None.
 
         If the session ends, the torque is off.
@@ -528,7 +528,7 @@ class SessionSequence:
             return None
         if violation.channel in _MOTION_CHANNELS and self._accelerates_against_torque():
             violation = replace(violation, remedy=_WRONG_SIGN_REMEDY)
-        violation = self._cycle.with_cause(violation)
+        violation = self._cycle.with_reported_cause(violation)
         # The zero is then invalid, and with it the limits of all further sessions.
         failed = violation.channel in _ENCODER_CHANNELS
         return SessionEnd("fault", str(violation), device_failed=failed)
@@ -551,7 +551,7 @@ class SessionSequence:
         except (DeviceError, OSError):
             self._cycle.mark_readings_stale()
 
-    def _read_rest(self, duration_s: float) -> Rest:
+    def _read_rest(self, duration_s: float) -> RestReadings:
         """Return the sensor and encoder readings of `duration_s` seconds without torque."""
         return observe_rest(
             self._cycle,
@@ -568,7 +568,7 @@ class SessionSequence:
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
         failed = self._cycle.check_stale() or self._cycle.check_sensor()
         if failed is not None:
-            raise SessionEnd("fault", str(self._cycle.with_cause(failed)))
+            raise SessionEnd("fault", str(self._cycle.with_reported_cause(failed)))
 
     def _check_missed_ticks(self, missed: int, tick: int) -> SessionEnd | None:
         """Return an error that ends the session if too many ticks were missed, else None."""
@@ -588,7 +588,11 @@ class SessionSequence:
         reason = self._cycle.watch.check_stale_fraction(
             counts.stale_angles, counts.stale_wrenches, scheduled
         )
-        return None if reason is None else SessionEnd("fault", str(self._cycle.with_cause(reason)))
+        return (
+            None
+            if reason is None
+            else SessionEnd("fault", str(self._cycle.with_reported_cause(reason)))
+        )
 
     def _stop_reason(self) -> SessionEnd | None:
         """Return an error that ends the session if a stop is requested or a process died."""
@@ -670,7 +674,7 @@ class SessionSequence:
 
     def _publish_readings(self) -> None:
         """Publish the readings for the operator, and log each doubt about their age once."""
-        self._display.show(self._cycle, self._scheduler.due_ns)
+        self._display.publish(self._cycle, self._scheduler.due_ns)
         for doubt in self._display.doubts:
             if doubt not in self._doubts_reported:
                 self._doubts_reported.add(doubt)

@@ -14,13 +14,13 @@ from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
 from rigd.devices.contracts import DeviceError, Devices, StatedDrive
 from rigd.engine._control_names import CONNECTING_NAME, IDLE_NAME, SESSION_NAME
-from rigd.engine._publish import Display
+from rigd.engine._publish import ReadingPublisher
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.cycle import (
     Cycle,
-    Rest,
-    Standstill,
+    RestReadings,
+    StandstillMonitor,
     make_observers,
     make_watch,
     observe_rest,
@@ -162,8 +162,8 @@ class _ControlServer:
         # A simulated motor starts cold.
         real_motor = not devices.simulated
         self._watch = make_watch(profile, recalled_heat_nm2(profile) if real_motor else 0.0)
-        self._standstill = Standstill(profile)
-        self._display = Display(channels.shared_state, devices)
+        self._standstill = StandstillMonitor(profile)
+        self._display = ReadingPublisher(channels.shared_state, devices)
         self._cycle = self._make_cycle(profile)
 
     def store_heat(self) -> None:
@@ -182,7 +182,7 @@ class _ControlServer:
             If a device failed.
         """
         for _ in range(_STANDSTILL_TICKS):
-            if not self._standstill.begun:
+            if not self._standstill.has_speed:
                 self._scheduler.wait()
                 self._read_at_rest()
         self._publish_readings()
@@ -316,7 +316,7 @@ class _ControlServer:
             sequence.record()
             recorded = True
             sequence.damp()
-            sequence.go_back()
+            sequence.return_to_start()
             cycle.torque_off()
             sequence.check_tare()
         except SessionEnd as end:
@@ -456,9 +456,9 @@ class _ControlServer:
 
     def _publish_readings(self) -> None:
         """Publish the last readings in the shared state."""
-        self._display.show(self._cycle, self._scheduler.due_ns)
+        self._display.publish(self._cycle, self._scheduler.due_ns)
 
-    def _read_rest(self, duration_s: float) -> Rest:
+    def _read_rest(self, duration_s: float) -> RestReadings:
         """Return the sensor and encoder readings of `duration_s` seconds without torque."""
         rig = self._profile.rig
         return observe_rest(
@@ -479,7 +479,7 @@ class _ControlServer:
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
         failed = self._cycle.check_stale() or self._cycle.check_sensor()
         if failed is not None:
-            raise SessionEnd("fault", str(self._cycle.with_cause(failed)))
+            raise SessionEnd("fault", str(self._cycle.with_reported_cause(failed)))
 
     def _make_cycle(self, profile: Profile) -> Cycle:
         """Return a new cycle with the controller and monitors of a profile."""

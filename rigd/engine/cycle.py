@@ -2,8 +2,8 @@
 
 `Cycle` runs a tick. The tare is the mean of readings without torque (`observe_rest`). The zero of
 the angle, and with it the limits, depend on the encoder's count. `LimitWatch` checks every reading
-during a session, and `Standstill` before, between and after sessions. While the torque is off, a
-person may turn the motor by hand, but its angle cannot jump.
+during a session, and `StandstillMonitor` before, between and after sessions. While the torque is
+off, a person may turn the motor by hand, but its angle cannot jump.
 """
 
 import json
@@ -65,7 +65,7 @@ sign. The range allows for friction and for an inertia that is only assumed."""
 # The encoder without torque
 
 
-class Standstill:
+class StandstillMonitor:
     """Check that the motor's angle does not jump while the torque is off.
 
     Each angle is compared with the angles before it. From one tick to the next the speed may change
@@ -85,16 +85,16 @@ class Standstill:
         self._resolution_rad = 2.0 * profile.rig.encoder.resolution_rad
         self._per_tick2_rad = limits.acceleration_rad_s2 / rate_hz**2
         self._per_tick_rad = limits.velocity_rad_s / rate_hz
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Forget the angles checked so far, because the drive has moved the motor meanwhile."""
         self._angle_rad: float | None = None
         self._due_ns = 0
         self._last_movements_rad: tuple[float, float] | None = None
 
     @property
-    def begun(self) -> bool:
+    def has_speed(self) -> bool:
         """Whether angle and speed are known, with which the next angle can be compared."""
         return self._last_movements_rad is not None
 
@@ -360,7 +360,7 @@ class Cycle:
         names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
         return " and ".join(name for flag, name in names if self.flags & flag).capitalize()
 
-    def check_encoder(self, standstill: Standstill, due_ns: int) -> None:
+    def check_encoder(self, standstill: StandstillMonitor, due_ns: int) -> None:
         """Check the angle just read against those before it, while the torque is off.
 
         Parameters
@@ -400,7 +400,7 @@ class Cycle:
             bool(flags & _WRENCH_SATURATED),
         )
 
-    def with_cause(self, violation: Violation) -> Violation:
+    def with_reported_cause(self, violation: Violation) -> Violation:
         """Return a violation with the cause that the device reports as its remedy.
 
         Return the violation unchanged if the device reports no cause.
@@ -461,7 +461,7 @@ class Cycle:
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
+class RestReadings:
     """Readings of angle and wrench at rest, without torque.
 
     Attributes
@@ -520,7 +520,7 @@ def observe_rest(
     duration_s: float,
     projection: Wrench,
     check: Callable[[], None],
-) -> Rest:
+) -> RestReadings:
     """Read angle and wrench for `duration_s` without changing the torque, return the readings.
 
     Parameters
@@ -543,7 +543,7 @@ def observe_rest(
         wrenches.append(cycle.raw_wrench)
         angles.append(cycle.angle_rad)
     readings = np.array(wrenches)
-    return Rest(duration_s, readings, np.array(angles), readings @ np.array(projection))
+    return RestReadings(duration_s, readings, np.array(angles), readings @ np.array(projection))
 
 
 # The limits' watch, and the motor's heat

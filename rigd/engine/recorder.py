@@ -60,7 +60,7 @@ def main() -> None:
     _publish_free_space(channels.shared_state, job.path.parent)
     parent.send(Opened(granted))
     try:
-        _record(parent, channels, writer, job.path.parent)
+        _record_until_closed(parent, channels, writer, job.path.parent)
     except SessionError as error:
         text, saved_path = _abandon_recording(writer)
         parent.send(Failed(f"{error}{text}", saved_path=saved_path))
@@ -87,7 +87,9 @@ def _abandon_recording(writer: SessionWriter) -> tuple[str, Path | None]:
     )
 
 
-def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: Path) -> None:
+def _record_until_closed(
+    parent: Parent, channels: Channels, writer: SessionWriter, folder: Path
+) -> None:
     """Write the records of the rings until the supervisor orders to close the file, or ends."""
     recorder = Recorder(channels, writer)
     polled_s = time.monotonic()
@@ -142,7 +144,7 @@ class Recorder:
         self._channels = channels
         self._writer = writer
         writers: dict[Topic, Callable[[bytes], None]] = {
-            EVENT: self._log,
+            EVENT: self._write_events,
             CONTROL: writer.write_controls,
             TIMING: writer.write_timings,
             SAMPLE: self._write_samples,
@@ -179,7 +181,7 @@ class Recorder:
                 transferred = True
         return transferred
 
-    def _log(self, block: bytes) -> None:
+    def _write_events(self, block: bytes) -> None:
         """Write a block of log events to the file."""
         for event in read_events(block):
             self._writer.log(event.t_ns, event.level, event.message)

@@ -111,7 +111,7 @@ class Segment:
 
 
 @dataclass(frozen=True, slots=True)
-class _Band:
+class _SweepBand:
     """Band of frequencies that a candidate sweep covers, and the mode that it excites."""
 
     number: int
@@ -147,12 +147,12 @@ class _UnitSweep:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
+class _SegmentCandidate:
     """Candidate for the next segment, at the largest amplitude that the limits allow."""
 
     duration_s: float
     """Duration of the segment in s."""
-    parts: tuple[tuple[_Band, float], ...]
+    parts: tuple[tuple[_SweepBand, float], ...]
     """Bands of the segment, and their amplitudes in rad."""
     terms: tuple[tuple[float, _UnitSweep], ...]
     """Amplitudes in rad and unit sweeps, whose sum of products is the segment."""
@@ -240,11 +240,11 @@ class SegmentSearch:
                 known, estimate, quantities, self.line_hz, line_rad, relaxation
             )
             needed_s = self.time_with_ring_up() / _MIXTURE_EFFICIENCY
-        self.held = self.mixture.weights @ record.nuisance_projection @ record.ahead
+        self.weighted_if_held = self.mixture.weights @ record.nuisance_projection @ record.ahead
         self._continued_drives: dict[float, _ContinuedDrive] = {}
         self.tip_slope = self.ringing[-1, :: self.model.factor][: self.samples]
 
-    def bands(self) -> list[_Band]:
+    def candidate_bands(self) -> list[_SweepBand]:
         """Return the bands that candidate sweeps cover: through every mode, and on either side."""
         bands = []
         for mode in self.modes:
@@ -263,10 +263,10 @@ class SegmentSearch:
                     else []
                 ),
             ]
-            bands += [_Band(mode.number, hz, each, _FADE_S) for each in widths_hz]
+            bands += [_SweepBand(mode.number, hz, each, _FADE_S) for each in widths_hz]
             # Fades as long as the beat with the mode: a shorter one excites the mode as well.
             bands += [
-                _Band(
+                _SweepBand(
                     mode.number,
                     (1.0 + step) * hz,
                     0.0,
@@ -311,7 +311,9 @@ class SegmentSearch:
         fractions = np.abs([np.ones_like(s), s, lag, motor_torque + response, response, slope])
         return frequency_hz, 1.0 / (fractions / self.limits[:, None]).max(axis=0)
 
-    def best_candidate(self, time_left_s: float, through: Collection[int] = ()) -> _Candidate:
+    def best_candidate(
+        self, time_left_s: float, through: Collection[int] = ()
+    ) -> _SegmentCandidate:
         """Return the most informative candidate that fits into `time_left_s`.
 
         It drives one of the modes in `through`, or any mode if `through` is empty.
@@ -326,18 +328,18 @@ class SegmentSearch:
             (self.best_of_duration(d, through) for d in durations_s), key=lambda each: each.value
         )
 
-    def best_of_duration(self, duration_s: float, through: Collection[int]) -> _Candidate:
+    def best_of_duration(self, duration_s: float, through: Collection[int]) -> _SegmentCandidate:
         """Return the most informative candidate of a given duration.
 
         The best band comes first; bands of further modes are added if they give more information.
         """
-        sweep_pairs = [(band, self.sweep_pair(band, duration_s)) for band in self.bands()]
-        empty_candidate = _Candidate(
+        sweep_pairs = [(band, self.sweep_pair(band, duration_s)) for band in self.candidate_bands()]
+        empty_candidate = _SegmentCandidate(
             duration_s,
             (),
             (),
             self.ringing[:, : self.ticks(duration_s + _SETTLING_S) : _LIMIT_CHECK_TICKS],
-            self.held,
+            self.weighted_if_held,
             self.tip_slope,
             0.0,
         )
@@ -386,8 +388,11 @@ class SegmentSearch:
         return round(time_s * self.model.sample_hz)
 
     def with_modes_at_rest(
-        self, start: _Candidate, number: int, mode_sweeps: dict[int, tuple[_UnitSweep, _UnitSweep]]
-    ) -> _Candidate:
+        self,
+        start: _SegmentCandidate,
+        number: int,
+        mode_sweeps: dict[int, tuple[_UnitSweep, _UnitSweep]],
+    ) -> _SegmentCandidate:
         """Return a candidate that also brings all modes but one to rest by the segment's end.
 
         If the limits do not allow that, the modes' vibration is reduced as far as they allow.
@@ -412,7 +417,7 @@ class SegmentSearch:
         )
         fraction = min(1.0, largest_factor(start.channels, unit))
         weighted = sum(f * sweep.weighted for f, sweep in zip(factors, sweeps, strict=True))
-        return _Candidate(
+        return _SegmentCandidate(
             start.duration_s,
             (),
             tuple((fraction * f, sweep) for f, sweep in zip(factors, sweeps, strict=True)),
@@ -423,7 +428,7 @@ class SegmentSearch:
             0.0,
         )
 
-    def sweep_pair(self, band: _Band, duration_s: float) -> tuple[_UnitSweep, _UnitSweep]:
+    def sweep_pair(self, band: _SweepBand, duration_s: float) -> tuple[_UnitSweep, _UnitSweep]:
         """Return two unit sweeps through a band, whose phases differ by a quarter of a period."""
         rate_hz = self.plant.rate_hz
         n = self.ticks(duration_s)
@@ -437,9 +442,9 @@ class SegmentSearch:
         window[:last] = 1.0
         window[: fade.size] = fade
         window[last - fade.size : last] = np.minimum(window[last - fade.size : last], 1.0 - fade)
-        return self.sweep(window * np.sin(phase)), self.sweep(window * np.cos(phase))
+        return self.unit_sweep(window * np.sin(phase)), self.sweep(window * np.cos(phase))
 
-    def sweep(self, reference_rad: Real) -> _UnitSweep:
+    def unit_sweep(self, reference_rad: Real) -> _UnitSweep:
         """Return the predicted response to a reference of amplitude 1 rad from rest, shape (n,)."""
         n = reference_rad.size
         extended_reference_rad = np.concatenate(
@@ -470,12 +475,12 @@ class SegmentSearch:
 
     def with_band(
         self,
-        base: _Candidate,
+        base: _SegmentCandidate,
         fraction: float,
-        band: _Band,
+        band: _SweepBand,
         sweep_pair: tuple[_UnitSweep, _UnitSweep],
         phase_index: int,
-    ) -> _Candidate:
+    ) -> _SegmentCandidate:
         """Return a candidate with a further band, at the largest amplitude that limits allow.
 
         The amplitudes of the candidate `base` are multiplied by `fraction`. The phase of the new
@@ -493,11 +498,11 @@ class SegmentSearch:
         amplitude_rad = largest_factor(before, unit)
         tip_slope = self.tip_slope + fraction * (base.tip_slope - self.tip_slope)
         tip_slope += amplitude_rad * (sine * first.slope + cosine * second.slope)
-        weighted = self.held + fraction * (base.weighted - self.held)
+        weighted = self.weighted_if_held + fraction * (base.weighted - self.weighted_if_held)
         weighted += amplitude_rad * (sine * first.weighted + cosine * second.weighted)
         leading = base.parts[0][0] if base.parts else band
-        value = self.value(leading, weighted, tip_slope, base.duration_s)
-        return _Candidate(
+        value = self.information_to_horizon(leading, weighted, tip_slope, base.duration_s)
+        return _SegmentCandidate(
             base.duration_s,
             (*((other, fraction * size) for other, size in base.parts), (band, amplitude_rad)),
             (
@@ -511,7 +516,9 @@ class SegmentSearch:
             value,
         )
 
-    def value(self, band: _Band, weighted: Real, tip_slope: Real, duration_s: float) -> float:
+    def information_to_horizon(
+        self, band: _SweepBand, weighted: Real, tip_slope: Real, duration_s: float
+    ) -> float:
         """Return the information up to the planning horizon if a mode is driven after a segment.
 
         The motor then holds the amplitude that the mode has at the end of the segment.
@@ -519,7 +526,9 @@ class SegmentSearch:
         first = self.model_samples(duration_s)
         remaining_samples = self.samples - first
         continued_drive = self.continued_drive(band)
-        amplitudes = self.decays @ tip_slope[first : first + self.decays.shape[1]]
+        amplitudes = (
+            self.amplitude_matrix @ tip_slope[first : first + self.amplitude_matrix.shape[1]]
+        )
         index = 2 * [mode.number for mode in self.modes].index(band.number)
         factors = continued_drive.per_amplitude @ amplitudes[index : index + 2]
         before = weighted[:, :first]
@@ -529,7 +538,7 @@ class SegmentSearch:
         return float(np.vdot(before, before) + np.vdot(after, after))
 
     @cached_property
-    def decays(self) -> Real:
+    def amplitude_matrix(self) -> Real:
         """Matrix from one second of the tip's slope to the modes' complex amplitudes.
 
         The shape is (2 m, n), with a row each for real and imaginary part of the m amplitudes.
@@ -539,7 +548,7 @@ class SegmentSearch:
         columns = np.stack([free.real, -free.imag], axis=1).reshape(-1, time_s.size)
         return np.linalg.pinv(columns.T)
 
-    def continued_drive(self, band: _Band) -> _ContinuedDrive:
+    def continued_drive(self, band: _SweepBand) -> _ContinuedDrive:
         """Return the response to driving the mode of a band by a sine up to the horizon."""
         if band.middle_hz not in self._continued_drives:
             duration_s = HORIZON_S - DURATIONS_S[0]
@@ -560,7 +569,7 @@ class SegmentSearch:
             self._continued_drives[band.middle_hz] = _ContinuedDrive(weighted, per_amplitude)
         return self._continued_drives[band.middle_hz]
 
-    def segment(self, chosen: _Candidate, time_left_s: float) -> Segment:
+    def segment(self, chosen: _SegmentCandidate, time_left_s: float) -> Segment:
         """Return the chosen candidate as a segment, with the precisions expected from it."""
         estimate, quantities = self.estimate, self.quantities
         samples = self.model_samples(chosen.duration_s)
@@ -623,7 +632,7 @@ class SegmentSearch:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mixture:
+class SineMixture:
     """Mixture of steady sines that reaches all targets in the shortest time, without ring-up."""
 
     times_s: Real
@@ -640,7 +649,7 @@ def best_mixture(
     frequency_hz: Real,
     angle_rad: Real,
     relaxation: float = 1.0,
-) -> Mixture:
+) -> SineMixture:
     """Return the times of steady sines that together reach all targets soonest.
 
     Uses multiplicative steps, as `time_fractions`, with a multiplier for each quantity. By the
@@ -667,7 +676,7 @@ def best_mixture(
     )
     scaled_gradients = quantities.gradients / (relaxation * target_stds[:, None])
     if not scaled_gradients.any():
-        return Mixture(np.zeros(frequency_hz.size), scaled_gradients)
+        return SineMixture(np.zeros(frequency_hz.size), scaled_gradients)
     multipliers = np.ones(len(scaled_gradients))
     times_s = np.full(frequency_hz.size, 1.0 / frequency_hz.size)
     for _ in range(_MIXTURE_STEPS):
@@ -685,7 +694,7 @@ def best_mixture(
         if times_s.sum() > _UNREACHABLE_S:
             break
     scale = np.sqrt(multipliers / max(float(times_s @ gain_rates / times_s.sum()), 1e-300))
-    return Mixture(times_s, scale[:, None] * lines)
+    return SineMixture(times_s, scale[:, None] * lines)
 
 
 def _information_rates(estimate: BeamEstimate, frequency_hz: Real, angle_rad: Real) -> Real:
@@ -750,7 +759,7 @@ def largest_factor(before: Real, unit: Real) -> float:
     return max(float(factor.min()), 0.0)
 
 
-def _describe_candidate(chosen: _Candidate) -> str:
+def _describe_candidate(chosen: _SegmentCandidate) -> str:
     """Return a text for the operator with modes, bands, duration and amplitudes of a segment."""
     parts = sorted(chosen.parts, key=lambda part: part[0].middle_hz)
     bands = [

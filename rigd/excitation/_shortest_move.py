@@ -192,12 +192,12 @@ def shortest_move(
         reference_rad=reference,
         duration_s=n / plant.rate_hz,
         limit_fraction=search.limit_fraction(reference),
-        residual_nm=_residual_nm(plant, reference, ringing),
-        quintic_residual_nm=_residual_nm(plant, quintic_rad, ringing),
+        residual_nm=_residual_torque_nm(plant, reference, ringing),
+        quintic_residual_nm=_residual_torque_nm(plant, quintic_rad, ringing),
     )
 
 
-def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> float:
+def _residual_torque_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> float:
     """Return the coupling torque in N·m of the vibration after a move.
 
     It is the sum of the modes' amplitudes, each for a frequency wrong by its uncertainty.

@@ -306,7 +306,7 @@ def chirp(
         segments = lay_out_segments(rate_hz, rest_s, 2.0 * duration_s, ring_down_s)
         back_ticks = there_ticks[1], segments["sweep"][1]
         segments |= {"there": there_ticks, "back": back_ticks}
-    t = _sweep_time(segments, rate_hz)
+    t = _sweep_times_s(segments, rate_hz)
     # Time on the way there and on the way back, where the phase goes on from the turn.
     outward_s, return_s = np.minimum(t, duration_s), np.maximum(t - duration_s, 0.0)
     phase = (
@@ -315,7 +315,11 @@ def chirp(
     phase += (
         2.0 * pi * (stop_hz * return_s - (stop_hz - start_hz) * return_s**2 / (2.0 * duration_s))
     )
-    sweep = amplitude_rad * np.sin(phase) * _taper(t, (1 + there_and_back) * duration_s, taper_s)
+    sweep = (
+        amplitude_rad
+        * np.sin(phase)
+        * _taper_factors(t, (1 + there_and_back) * duration_s, taper_s)
+    )
     parameters = {
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,
@@ -480,8 +484,8 @@ def multisine(
         )
     period = amplitude_rad * _random_phase_period(ticks, period_s, (start_hz, stop_hz), seed)
     crest_factor = amplitude_rad / float(np.sqrt(np.mean(period**2)))
-    t = _sweep_time(segments, rate_hz)
-    sweep = np.tile(period, periods) * _taper(t, duration_s, taper_s)
+    t = _sweep_times_s(segments, rate_hz)
+    sweep = np.tile(period, periods) * _taper_factors(t, duration_s, taper_s)
     parameters = {
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,
@@ -521,13 +525,13 @@ def _random_phase_period(
     return period
 
 
-def _sweep_time(segments: Mapping[str, tuple[int, int]], rate_hz: float) -> FloatArray:
+def _sweep_times_s(segments: Mapping[str, tuple[int, int]], rate_hz: float) -> FloatArray:
     """Return the time in s of each tick of the sweep, from its first tick on."""
     first, end = segments["sweep"]
     return np.arange(end - first) / rate_hz
 
 
-def _taper(t: FloatArray, duration_s: float, taper_s: float) -> FloatArray | float:
+def _taper_factors(t: FloatArray, duration_s: float, taper_s: float) -> FloatArray | float:
     """Return the factors at times `t` that fade a sweep in and out, each within `taper_s`."""
     require_not_negative("taper_s", taper_s)
     if taper_s == 0.0:

@@ -242,7 +242,7 @@ def _require_reachable_targets(
     floors = geometry_floors(
         rig.stated_estimate, rig, targets, uniformity, at_most_s, tip_slope_rad
     )
-    unreachable_floors = [each for each in floors if each.below]
+    unreachable_floors = [each for each in floors if each.makes_unreachable]
     if not unreachable_floors:
         return
     floors_text = "; ".join(

@@ -143,7 +143,7 @@ class GeometryFloor:
     """Smallest standard deviation if the beam were exactly uniform."""
 
     @property
-    def below(self) -> bool:
+    def makes_unreachable(self) -> bool:
         """Whether the tolerance of the geometry makes the target unreachable."""
         target_std = self.target.std * (abs(self.value) if self.target.relative else 1.0)
         return target_std < self.std and self.std > _GEOMETRY_DOMINANCE_RATIO * self.exact_std

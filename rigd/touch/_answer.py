@@ -87,8 +87,8 @@ def estimate_from_explanations(
         if kind == "rigid":
             stiffness = _stiffness_estimate(at_rest.posterior)
     elif (
-        explainer.blind.chi2 < explainer.max_chi2(explainer.blind.degrees)
-        and not explainer.begins_too_late
+        explainer.any_force.chi2 < explainer.max_chi2(explainer.any_force.degrees)
+        and not explainer.begins_before_window
     ):
         x_m = _unexplained_position(explainer)
     return TouchEstimate(
@@ -101,8 +101,8 @@ def estimate_from_explanations(
         channels=explainer.motion.noise.size,
         samples=window.end - explainer.detected,
         chi2_per_degree=best.chi2 / (window.data.size - best.parameters.size),
-        positions_m=explainer.blind.x_m if scan else np.zeros(0),
-        log_likelihood=explainer.blind.log_likelihood if scan else np.zeros(0),
+        positions_m=explainer.any_force.x_m if scan else np.zeros(0),
+        log_likelihood=explainer.any_force.log_likelihood if scan else np.zeros(0),
         innovations=explainer.motion.innovations / explainer.motion.noise[:, None],
         innovation_times_s=explainer.motion.t + offset,
         force_history_n=force_history_n,
@@ -116,19 +116,21 @@ def _unexplained_position(explainer: Explainer) -> Estimated:
     The interval contains all positions at which any force could cause the first samples, or the
     first and later samples. Later more than one point may be touched.
     """
-    early = [explainer.tables.blind.scan(explainer.window(seconds)) for seconds in _EARLY_TIMES_S]
+    early = [
+        explainer.tables.any_force.scan(explainer.window(seconds)) for seconds in _EARLY_TIMES_S
+    ]
     interval_ends = np.array(
-        [scan.interval(_WIDE_LIKELIHOOD_DROP)[2:] for scan in (explainer.blind, *early)]
+        [scan.interval(_WIDE_LIKELIHOOD_DROP)[2:] for scan in (explainer.any_force, *early)]
     )
     low, high = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
     return Estimated(
-        explainer.blind.interval(_WIDE_LIKELIHOOD_DROP)[0], (high - low) / 4, (low, high)
+        explainer.any_force.interval(_WIDE_LIKELIHOOD_DROP)[0], (high - low) / 4, (low, high)
     )
 
 
 def _with_wide_interval(explainer: Explainer, estimate: Estimated) -> Estimated:
     """Return the estimate of a position with an interval that contains those for any force."""
-    *_, low, high = explainer.blind.interval()
+    *_, low, high = explainer.any_force.interval()
     low, high = min(low, estimate.interval_95[0]), max(high, estimate.interval_95[1])
     return Estimated(estimate.value, max(estimate.std, (high - low) / 4), (low, high))
 

@@ -101,7 +101,7 @@ class GrowingEstimate:
         ]:  # the last one takes long, and is hardly ever needed
             if not self._has_enough_samples(record, detection_delay_s):
                 return
-            if not self._explainer(record, detection_delay_s).begins_too_late:
+            if not self._explainer(record, detection_delay_s).begins_before_window:
                 return
 
     def update(
@@ -130,7 +130,7 @@ class GrowingEstimate:
             explainer = self._explainer(record, detection_delay_s)
             if detection_delay_s != self._explaining_delay_s and (
                 # After an unexplained one, only if the touch may have begun before.
-                explainer.seems_to_begin >= searched_from
+                explainer.likely_first_sample >= searched_from
                 or self._began_earlier(record, detection_delay_s)
             ):
                 continue
@@ -169,14 +169,14 @@ class GrowingEstimate:
         if detection_delay_s == DETECTION_DELAYS_S[-1]:
             return False
         explainer = self._explainer(record, detection_delay_s)
-        if explainer.begins_too_late:
+        if explainer.begins_before_window:
             return True
         longer_delay_s = DETECTION_DELAYS_S[DETECTION_DELAYS_S.index(detection_delay_s) + 1]
         if explainer.misfit < _POOR_MISFIT or not self._has_enough_samples(record, longer_delay_s):
             return False
         longer_explainer = self._explainer(record, longer_delay_s)
         return (
-            longer_explainer.seems_to_begin < explainer.first
+            longer_explainer.likely_first_sample < explainer.first
             and longer_explainer.misfit < 0.5 * explainer.misfit
         )
 

@@ -178,12 +178,12 @@ class Explainer:
         return self.begin + self.quiet
 
     @property
-    def begins_too_late(self) -> bool:
+    def begins_before_window(self) -> bool:
         """Whether the likeliest touch begins before the samples that may contain it."""
         return bool(self.starts[0, 1] < self.motion.t[self.quiet] + 2.5 / self.rate)
 
     @property
-    def seems_to_begin(self) -> int:
+    def likely_first_sample(self) -> int:
         """Index of the sample before which the likeliest touch of the grid search begins."""
         after_s = float(self.starts[0, 1] - self.motion.t[self.quiet])
         return self.first + round(after_s * self.rate)
@@ -294,12 +294,12 @@ class Explainer:
         return np.vstack([at_rest.parameters, self._draw_candidates(at_rest.posterior)])
 
     @cached_property
-    def blind(self) -> AnyForceLikelihood:
+    def any_force(self) -> AnyForceLikelihood:
         """Likelihood of a touch by any force at each position, from the first samples.
 
         Its computation takes as long as the remaining estimate.
         """
-        return self.tables.blind.scan(self.window(FIRST_S))
+        return self.tables.any_force.scan(self.window(FIRST_S))
 
     # Data for the comparison of candidates
 
@@ -503,8 +503,8 @@ class Explainer:
 
     def _explain_by_other_kinds(self, window: WhitenedWindow) -> list[Explanation]:
         """Return the explanations of the window by a moving or yielding obstacle, and a knock."""
-        blind, side = self.blind, self.pressing_direction()
-        likeliest_positions = blind.x_m[np.argsort(-blind.log_likelihood)[:24]]
+        any_force, side = self.any_force, self.pressing_direction()
+        likeliest_positions = any_force.x_m[np.argsort(-any_force.log_likelihood)[:24]]
         instants = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
         explanations = []
         for kind, extra in (("moving", _RATES_M_PER_S), ("yielding", _MOBILITIES)):
@@ -568,7 +568,7 @@ class Explainer:
 
         It is opposite to the direction of the likeliest force on the beam.
         """
-        return -1.0 if self.blind.force_n.sum() > 0 else 1.0
+        return -1.0 if self.any_force.force_n.sum() > 0 else 1.0
 
     def _moving_predictor(self, kind: str, kernels: ContactKernels, side: float) -> Prediction:
         """Return the function that predicts the effect of moving or yielding obstacles.

@@ -134,7 +134,7 @@ def observed_beam(
         beam, damping, rate_hz, tool_inertia_kg_m2, torque_after_angle_s, sensor_filter
     )
     has_shear = noise.shear_n is not None
-    observer = _observer(beam, damping, rate_hz, noise, filter_.noise_gain)
+    observer = _design_observer(beam, damping, rate_hz, noise, filter_.noise_gain)
     f, o = filter_.a.shape[0], observer.a.shape[0]
     n = f + o
     matrix = np.zeros((n + 4, n + 3))
@@ -422,7 +422,7 @@ class _Observer:
     """Matrix from innovations to whitened innovations, shape (2, 2)."""
 
 
-def _observer(
+def _design_observer(
     beam: Beam, damping: Damping, rate_hz: float, noise: ChannelNoise, noise_gain: Real
 ) -> _Observer:
     """Return the stationary Kalman filter that follows vibrating modes and drifting zeros."""

@@ -75,7 +75,7 @@ class TwoObstacleContact:
         positions = parameters[:, 0], parameters[:, 3]
         kernels = [self._kernels.at_positions(x, steps) for x in positions]
         (beyond, side), (beyond_other, side_other) = (
-            contact.approach(x, instant, steps) for x in positions
+            contact.motion_beyond_obstacle(x, instant, steps) for x in positions
         )
         cross = self._crossing.between_positions(*positions, steps) * (side * side_other)[:, None]
         pressing = integrate_two_contacts(
@@ -140,7 +140,7 @@ class TwoObstacleContact:
         instants = np.full(_POSITION_COUNT, single_obstacle[1])
         steps = self._contact.step_count(instants, window)
         delay_steps = np.round(_SECOND_TOUCH_DELAYS_S / self._kernels.step_s).astype(np.intp)
-        beyond, _ = self._contact.approach(x_m, instants, steps)
+        beyond, _ = self._contact.motion_beyond_obstacle(x_m, instants, steps)
         distances_m = np.maximum(beyond[:, np.minimum(delay_steps, steps - 1)], 0.0)
         pair = np.concatenate([single_obstacle, [0.0, 0.0, np.log(_TRIAL_STIFFNESS_N_PER_M)]])
         with_second = np.tile(pair, (_POSITION_COUNT * delay_steps.size, 1))

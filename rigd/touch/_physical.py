@@ -162,7 +162,7 @@ class ObstacleContact:
         step_s = self._kernels.step_s
         steps = self.step_count(instant, window)
         local_kernels = self._kernels.at_positions(x, steps) if kernels is None else kernels
-        approach, sides = self.approach(x, instant, steps, side)
+        approach, sides = self.motion_beyond_obstacle(x, instant, steps, side)
         motion_parameters = parameters[:, 3:].T
         pressing_force_n = integrate_contact(
             np.broadcast_to(local_kernels.displacement[:, :steps], approach.shape),
@@ -197,9 +197,9 @@ class ObstacleContact:
         x, instant = parameters[:1], parameters[1:2]
         steps = self.step_count(instant, window)
         local_kernels = self._kernels.at_positions(x, steps)
-        approach, side = self.approach(x, instant, steps)
+        approach, side = self.motion_beyond_obstacle(x, instant, steps)
         instants = np.repeat(instant, len(displacement_changes_m))
-        added_approach_m = side * self._on_steps(displacement_changes_m, instants, steps)
+        added_approach_m = side * self._on_kernel_steps(displacement_changes_m, instants, steps)
         all_approaches = np.vstack(
             [approach, approach + added_approach_m - added_approach_m[:, :1]]
         )
@@ -234,7 +234,7 @@ class ObstacleContact:
         parameters
             One candidate with at least position and instant.
         """
-        return float(self.approach(parameters[:1], parameters[1:2], 1)[1][0])
+        return float(self.motion_beyond_obstacle(parameters[:1], parameters[1:2], 1)[1][0])
 
     def effects(
         self, tables: tuple[Real, ...], force: Real, instant: Real, window: WhitenedWindow
@@ -261,7 +261,7 @@ class ObstacleContact:
         aligned = shift_rows(force, begin, (samples - 1) * stride + 1)
         return contact_responses(tables, aligned, stride, samples)
 
-    def approach(
+    def motion_beyond_obstacle(
         self, x: Real, instant: Real, steps: int, given_direction: float | None = None
     ) -> tuple[Real, Real]:
         """Return how far the free beam would move beyond the obstacle, and in which direction.
@@ -286,7 +286,7 @@ class ObstacleContact:
         motion = self._motion
         first, weights = cubic_weights(x, self._x_m)
         displacement_m = interpolate_rows(motion.displacement_m, first, weights)
-        free = self._on_steps(displacement_m, instant, steps)
+        free = self._on_kernel_steps(displacement_m, instant, steps)
         if given_direction is None:
             before = shift_rows(displacement_m, (instant - motion.first_s) / motion.step_s - 1.0, 1)
             side = np.where(free[:, 0] >= before[:, 0], 1.0, -1.0)
@@ -294,7 +294,7 @@ class ObstacleContact:
             side = np.full(x.size, given_direction)
         return side[:, None] * (free - free[:, :1]), side
 
-    def _on_steps(self, displacement_m: Real, instant: Real, steps: int) -> Real:
+    def _on_kernel_steps(self, displacement_m: Real, instant: Real, steps: int) -> Real:
         """Interpolate displacements to the kernels' time steps, each row from its instant on."""
         motion = self._motion
         begin = (instant - motion.first_s) / motion.step_s
@@ -449,13 +449,15 @@ class CandidateGrid:
         """
         samples = np.arange(window.first + 1, latest + 1)
         batches = np.array_split(samples, -(-samples.size // _INSTANTS_AT_ONCE))
-        chi2 = [self._chi2(motion, window, batch) for batch in batches]
+        chi2 = [self._sums_of_squares(motion, window, batch) for batch in batches]
         starts = np.meshgrid(
             self._x_m, motion.t[samples], np.log(GRID_STIFFNESSES_N_PER_M), indexing="ij"
         )
         return np.stack(starts, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
-    def _chi2(self, motion: FreeMotion, window: WhitenedWindow, samples: NDArray[np.intp]) -> Real:
+    def _sums_of_squares(
+        self, motion: FreeMotion, window: WhitenedWindow, samples: NDArray[np.intp]
+    ) -> Real:
         """Return sums of squared residuals for touches at some samples.
 
         The shape is (positions, instants, stiffnesses).

@@ -44,7 +44,7 @@ class TouchTables:
         self.crossing = cross_kernels(
             model.beam, model.damping, self.x_m, self.coarse.step_s, self.coarse.steps
         )
-        self.blind = AnyForceEstimator(
+        self.any_force = AnyForceEstimator(
             half_sample_kernels, 2, round((FIRST_S + DETECTION_DELAYS_S[-1]) * rate_hz) + 1
         )
         self.max_samples = round((HISTORY_S + FINAL_S) * rate_hz) + 1

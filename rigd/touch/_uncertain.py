@@ -41,8 +41,8 @@ def uncertainty_effects(
     middle_effect = contact.predict(likeliest, window)[0][0]
     effects = [
         finest_effect - middle_effect,
-        *_ringing(tables, contact, likeliest[0], window),
-        *_angle_noise(tables, contact, likeliest[0], window),
+        *_free_motion_effects(tables, contact, likeliest[0], window),
+        *_encoder_noise_effects(tables, contact, likeliest[0], window),
     ]
     span = slice(window.first, window.end)
     residual = motion.innovations[:, span] - middle_effect
@@ -67,7 +67,7 @@ def uncertainty_effects(
     return np.stack(effects, axis=-1)
 
 
-def _ringing(
+def _free_motion_effects(
     tables: TouchTables, contact: ObstacleContact, likeliest: Real, window: WhitenedWindow
 ) -> Real:
     """Return the effects of the free motion's uncertainty on the innovations, (q, c, n).
@@ -90,7 +90,7 @@ def _ringing(
     )
 
 
-def _angle_noise(
+def _encoder_noise_effects(
     tables: TouchTables, contact: ObstacleContact, likeliest: Real, window: WhitenedWindow
 ) -> Real:
     """Return the effects of the encoder's noise through the contact on the innovations.
