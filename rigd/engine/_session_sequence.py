@@ -41,7 +41,9 @@ _START_TIMEOUT_S = 10.0
 _SUPERVISOR_TIMEOUT_S = 2.0
 """Longest time in s without a heartbeat of the supervisor. Only time in which this process ran
 counts, because a stalled computer is not the supervisor's fault."""
-_MOTION_CHANNELS = tuple(BY_NAME[name].channel for name in ("angle", "velocity", "tracking error"))
+_WRONG_SIGN_CHANNELS = tuple(
+    BY_NAME[name].channel for name in ("angle", "velocity", "tracking error")
+)
 """Channels of the limits that a wrong sign of angle or torque violates."""
 _ENCODER_CHANNELS = tuple(
     BY_NAME[name].channel
@@ -526,7 +528,7 @@ class SessionSequence:
             return SessionEnd("fault", reason, device_failed=True)
         if violation is None:
             return None
-        if violation.channel in _MOTION_CHANNELS and self._accelerates_against_torque():
+        if violation.channel in _WRONG_SIGN_CHANNELS and self._accelerates_against_torque():
             violation = replace(violation, remedy=_WRONG_SIGN_REMEDY)
         violation = self._cycle.with_reported_cause(violation)
         # The zero is then invalid, and with it the limits of all further sessions.

@@ -114,7 +114,7 @@ class Segment:
 class _SweepBand:
     """Band of frequencies that a candidate sweep covers, and the mode that it excites."""
 
-    number: int
+    mode_number: int
     """Number of the mode, from 1."""
     middle_hz: float
     """Centre of the band in Hz."""
@@ -344,32 +344,36 @@ class SegmentSearch:
             0.0,
         )
         mode_sweeps = {
-            band.number: sweep_pair for band, sweep_pair in reversed(sweep_pairs) if band.at_mode
+            band.mode_number: sweep_pair
+            for band, sweep_pair in reversed(sweep_pairs)
+            if band.at_mode
         }
         # A single line does not show a mode: any smooth response could produce it.
         resonance_bands = {
-            band.number: band for band, _ in sweep_pairs if band.at_mode and band.number in through
+            band.mode_number: band
+            for band, _ in sweep_pairs
+            if band.at_mode and band.mode_number in through
         }
         candidates_at_rest = {
-            number: self.with_modes_at_rest(empty_candidate, number, mode_sweeps)
-            for number in mode_sweeps
+            mode_number: self.with_modes_at_rest(empty_candidate, mode_number, mode_sweeps)
+            for mode_number in mode_sweeps
         }
         best = max(
             (
                 self.with_band(start, 1.0, band, sweep_pair, phase_index)
                 for band, sweep_pair in sweep_pairs
-                if band.at_mode and (not through or band is resonance_bands.get(band.number))
-                for start in (empty_candidate, candidates_at_rest[band.number])
+                if band.at_mode and (not through or band is resonance_bands.get(band.mode_number))
+                for start in (empty_candidate, candidates_at_rest[band.mode_number])
                 for phase_index in range(_PHASE_COUNT)
             ),
             key=lambda each: each.value,
         )
         for _ in range(2):
-            driven_modes = {band.number for band, _ in best.parts}
+            driven_modes = {band.mode_number for band, _ in best.parts}
             extended_candidates = [
                 self.with_band(best, fraction, band, sweep_pair, phase_index)
                 for band, sweep_pair in sweep_pairs
-                if band.number not in driven_modes
+                if band.mode_number not in driven_modes
                 for fraction in _BASE_AMPLITUDE_FACTORS
                 for phase_index in range(0, _PHASE_COUNT, 2)
             ]
@@ -390,7 +394,7 @@ class SegmentSearch:
     def with_modes_at_rest(
         self,
         start: _SegmentCandidate,
-        number: int,
+        mode_number: int,
         mode_sweeps: dict[int, tuple[_UnitSweep, _UnitSweep]],
     ) -> _SegmentCandidate:
         """Return a candidate that also brings all modes but one to rest by the segment's end.
@@ -400,7 +404,7 @@ class SegmentSearch:
         sweeps = [
             sweep
             for other, sweep_pair in mode_sweeps.items()
-            if other != number
+            if other != mode_number
             for sweep in sweep_pair
         ]
         if not sweeps:
@@ -529,7 +533,7 @@ class SegmentSearch:
         amplitudes = (
             self.amplitude_matrix @ tip_slope[first : first + self.amplitude_matrix.shape[1]]
         )
-        index = 2 * [mode.number for mode in self.modes].index(band.number)
+        index = 2 * [mode.number for mode in self.modes].index(band.mode_number)
         factors = continued_drive.per_amplitude @ amplitudes[index : index + 2]
         before = weighted[:, :first]
         after = weighted[:, first:] + np.tensordot(
@@ -554,7 +558,7 @@ class SegmentSearch:
             duration_s = HORIZON_S - DURATIONS_S[0]
             sweeps = self.sweep_pair(replace(band, half_width_hz=0.0), duration_s)
             weighted = np.stack([sweep.weighted for sweep in sweeps])
-            mode = next(each for each in self.modes if each.number == band.number)
+            mode = next(each for each in self.modes if each.number == band.mode_number)
             last = self.model_samples(duration_s - _FADE_S)
             window = slice(last - self.model_samples(_TAIL_S), last)
             time_s = np.arange(window.start, window.stop) / self.model.sample_hz
@@ -769,7 +773,8 @@ def _describe_candidate(chosen: _SegmentCandidate) -> str:
         for band, _ in parts
     ]
     return (
-        f"mode{'s' if len(parts) > 1 else ''} {' + '.join(str(band.number) for band, _ in parts)}, "
+        f"mode{'s' if len(parts) > 1 else ''} "
+        f"{' + '.join(str(band.mode_number) for band, _ in parts)}, "
         f"{' + '.join(bands)} Hz, {chosen.duration_s:g} s, "
         f"{' + '.join(f'{size:.2g}' for _, size in parts)} rad"
     )

@@ -153,10 +153,10 @@ def touch(
     return_duration_s = max(
         _PEAK_OVER_MEAN_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s
     )
-    back = still_path(return_duration_s, rate_hz, plant.poles_rad_s)
+    return_path = still_path(return_duration_s, rate_hz, plant.poles_rad_s)
     rest_rad = np.zeros(ceil(settle_s * rate_hz))
     single_pass = np.concatenate(
-        [rest_rad, way_out_rad, np.full(hold_ticks, by_rad), by_rad * (1.0 - back)]
+        [rest_rad, way_out_rad, np.full(hold_ticks, by_rad), by_rad * (1.0 - return_path)]
     )
     check_ticks("The session", passes * single_pass.size, rate_hz)
     segments = lay_out_segments(rate_hz, rest_s, passes * single_pass.size / rate_hz, ring_down_s)
@@ -165,14 +165,14 @@ def touch(
         passes=tuple(
             TouchPass(
                 begins=start + rest_rad.size,
-                returns=start + single_pass.size - back.size,
+                returns=start + single_pass.size - return_path.size,
                 ends=start + single_pass.size,
             )
             for start in range(first, first + passes * single_pass.size, single_pass.size)
         ),
         braking=braking,
         hold_ticks=hold_ticks,
-        back=back,
+        back=return_path,
         force_limit_n=force_limit_n,
     )
     parameters: dict[str, float | int | str] = {
@@ -223,17 +223,21 @@ def after_touch(
     ndarray of shape (ends - tick - 1,)
         Reference angles in rad at the ticks after `tick`.
     """
-    braking, back = approach.braking, approach.back
-    second_last, last_angle, present_angle = recent_rad
-    acceleration = (present_angle - 2 * last_angle + second_last) * braking.rate_hz**2
-    speed = (present_angle - last_angle) * braking.rate_hz + acceleration / (2 * braking.rate_hz)
+    braking, return_path = approach.braking, approach.back
+    angle_two_ticks_before, angle_one_tick_before, present_angle = recent_rad
+    acceleration = (
+        present_angle - 2 * angle_one_tick_before + angle_two_ticks_before
+    ) * braking.rate_hz**2
+    speed = (present_angle - angle_one_tick_before) * braking.rate_hz + acceleration / (
+        2 * braking.rate_hz
+    )
     reference = np.full(ends - tick - 1, start_rad)
     braking_rad = braking.path(present_angle, speed, acceleration)
-    return_index = reference.size - back.size
+    return_index = reference.size - return_path.size
     hold = min(approach.hold_ticks, return_index)
     held_rad = braking_rad[-1]
     reference[:hold] = held_rad
     # A touch during the pause needs no braking; the remaining pause follows.
     reference[: min(hold, len(braking_rad))] = braking_rad[:hold]
-    reference[hold : hold + back.size] = held_rad + (start_rad - held_rad) * back
+    reference[hold : hold + return_path.size] = held_rad + (start_rad - held_rad) * return_path
     return reference

@@ -347,12 +347,12 @@ def braked_reference(reference_rad: Sequence[float] | Real, tick: int, braking: 
         Angles of the reference and of the m ticks of the braking path. The last angle is that at
         standstill.
     """
-    second_last, last_angle, present_angle = (
+    angle_two_ticks_before, angle_one_tick_before, present_angle = (
         float(value) for value in reference_rad[tick - 2 : tick + 1]
     )
     rate_hz = braking.rate_hz
-    acceleration = (present_angle - 2 * last_angle + second_last) * rate_hz**2
-    speed = (present_angle - last_angle) * rate_hz + acceleration / (2 * rate_hz)
+    acceleration = (present_angle - 2 * angle_one_tick_before + angle_two_ticks_before) * rate_hz**2
+    speed = (present_angle - angle_one_tick_before) * rate_hz + acceleration / (2 * rate_hz)
     return np.concatenate(
         [reference_rad[: tick + 1], braking.path(present_angle, speed, acceleration)]
     )

@@ -13,8 +13,8 @@ from rigd.touch._explanations import (
     NEAR_TIP_FRACTION,
     POOR_FIT_STDS,
     ExplainedRecord,
-    Explainer,
     Explanation,
+    ExplanationSearch,
 )
 from rigd.touch._physical import MAX_LN_STIFFNESS, MIN_LN_STIFFNESS, ObstacleContact, WhitenedWindow
 from rigd.touch._posterior import Posterior
@@ -39,7 +39,7 @@ _WIDE_LIKELIHOOD_DROP = 8.0
 
 
 def estimate_from_explanations(
-    explainer: Explainer, explained: ExplainedRecord, *, scan: bool
+    search: ExplanationSearch, explained: ExplainedRecord, *, scan: bool
 ) -> TouchEstimate:
     """Return the estimate of a touch from the likeliest explanations of its record.
 
@@ -64,12 +64,12 @@ def estimate_from_explanations(
     is_unambiguous = len(likely_explanations) == 1 and best.kind != "two"
     if best is at_rest:
         likely_explanations += [each for each in explanations if each.kind == "two"]
-    offset = explainer.begin / explainer.rate
+    offset = search.begin / search.rate
     x_m = time_s = force_n = stiffness = None
     force_history_n, instants = np.zeros(0), np.zeros(0)
     kind = "unknown"
-    if explainer.fits(best, window):
-        is_poor_fit = not explainer.fits(best, window, POOR_FIT_STDS)
+    if search.fits(best, window):
+        is_poor_fit = not search.fits(best, window, POOR_FIT_STDS)
         is_doubtful = (
             explained.later_samples_contradict or explained.other_kinds_untried
             if best is at_rest
@@ -78,67 +78,67 @@ def estimate_from_explanations(
         if is_unambiguous and not is_doubtful:
             kind = best.kind
         x_m, time_s = (
-            _position_estimate(explainer, likely_explanations),
+            _position_estimate(search, likely_explanations),
             _common_parameter(likely_explanations, 1, offset),
         )
         if is_poor_fit or explained.other_kinds_untried:
-            x_m = _with_wide_interval(explainer, x_m)
-        force_history_n, instants, force_n = _force_estimate(explainer, best, window)
+            x_m = _with_wide_interval(search, x_m)
+        force_history_n, instants, force_n = _force_estimate(search, best, window)
         if kind == "rigid":
             stiffness = _stiffness_estimate(at_rest.posterior)
     elif (
-        explainer.any_force.chi2 < explainer.max_chi2(explainer.any_force.degrees)
-        and not explainer.begins_before_window
+        search.any_force.chi2 < search.max_chi2(search.any_force.degrees)
+        and not search.begins_before_window
     ):
-        x_m = _unexplained_position(explainer)
+        x_m = _unexplained_position(search)
     return TouchEstimate(
         x_m=x_m,
         time_s=time_s,
         force_n=force_n,
         stiffness_n_per_m=stiffness,
         kind=kind,
-        model=explainer.tables.model.source,
-        channels=explainer.motion.noise.size,
-        samples=window.end - explainer.detected,
+        model=search.tables.model.source,
+        channels=search.motion.noise.size,
+        samples=window.end - search.detected,
         chi2_per_degree=best.chi2 / (window.data.size - best.parameters.size),
-        positions_m=explainer.any_force.x_m if scan else np.zeros(0),
-        log_likelihood=explainer.any_force.log_likelihood if scan else np.zeros(0),
-        innovations=explainer.motion.innovations / explainer.motion.noise[:, None],
-        innovation_times_s=explainer.motion.t + offset,
+        positions_m=search.any_force.x_m if scan else np.zeros(0),
+        log_likelihood=search.any_force.log_likelihood if scan else np.zeros(0),
+        innovations=search.motion.innovations / search.motion.noise[:, None],
+        innovation_times_s=search.motion.t + offset,
         force_history_n=force_history_n,
         force_times_s=instants + offset,
     )
 
 
-def _unexplained_position(explainer: Explainer) -> Estimated:
+def _unexplained_position(search: ExplanationSearch) -> Estimated:
     """Return the position of an unexplained touch in m, with a wide interval.
 
     The interval contains all positions at which any force could cause the first samples, or the
     first and later samples. Later more than one point may be touched.
     """
-    early = [
-        explainer.tables.any_force.scan(explainer.window(seconds)) for seconds in _EARLY_TIMES_S
-    ]
+    early = [search.tables.any_force.scan(search.window(seconds)) for seconds in _EARLY_TIMES_S]
     interval_ends = np.array(
-        [scan.interval(_WIDE_LIKELIHOOD_DROP)[2:] for scan in (explainer.any_force, *early)]
+        [scan.interval(_WIDE_LIKELIHOOD_DROP)[2:] for scan in (search.any_force, *early)]
     )
     low, high = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
     return Estimated(
-        explainer.any_force.interval(_WIDE_LIKELIHOOD_DROP)[0], (high - low) / 4, (low, high)
+        search.any_force.interval(_WIDE_LIKELIHOOD_DROP)[0], (high - low) / 4, (low, high)
     )
 
 
-def _with_wide_interval(explainer: Explainer, estimate: Estimated) -> Estimated:
+def _with_wide_interval(search: ExplanationSearch, estimate: Estimated) -> Estimated:
     """Return the estimate of a position with an interval that contains those for any force."""
-    *_, low, high = explainer.any_force.interval()
+    *_, low, high = search.any_force.interval()
     low, high = min(low, estimate.interval_95[0]), max(high, estimate.interval_95[1])
     return Estimated(estimate.value, max(estimate.std, (high - low) / 4), (low, high))
 
 
-def _position_estimate(explainer: Explainer, likely_explanations: list[Explanation]) -> Estimated:
+def _position_estimate(
+    search: ExplanationSearch, likely_explanations: list[Explanation]
+) -> Estimated:
     """Return the position of the touch in m, with the additional uncertainty from bounces."""
     estimate = _common_parameter(likely_explanations, 0)
-    near_tip = estimate.value > NEAR_TIP_FRACTION * explainer.tables.model.beam.length_m
+    near_tip = estimate.value > NEAR_TIP_FRACTION * search.tables.model.beam.length_m
     additional_std_m = (
         _TWO_OBSTACLES_STD_M
         if likely_explanations[0].kind == "two"
@@ -149,7 +149,7 @@ def _position_estimate(explainer: Explainer, likely_explanations: list[Explanati
         + np.copysign(np.hypot(end - estimate.value, _NORMAL_QUANTILE_95 * additional_std_m), sign)
         for end, sign in zip(estimate.interval_95, (-1.0, 1.0), strict=True)
     )
-    length = explainer.tables.model.beam.length_m
+    length = search.tables.model.beam.length_m
     return Estimated(
         estimate.value,
         float(np.hypot(estimate.std, additional_std_m)),
@@ -158,7 +158,7 @@ def _position_estimate(explainer: Explainer, likely_explanations: list[Explanati
 
 
 def _force_estimate(
-    explainer: Explainer, best: Explanation, window: WhitenedWindow
+    search: ExplanationSearch, best: Explanation, window: WhitenedWindow
 ) -> tuple[Real, Real, Estimated]:
     """Return the contact force over time, its instants, and its peak with an interval.
 
@@ -169,18 +169,18 @@ def _force_estimate(
     posterior = best.posterior
     drawn = rng.choice(posterior.weights.size, 48, p=posterior.weights)
     candidates = np.vstack([best.parameters, posterior.samples[drawn]])
-    step_s = explainer.tables.middle.step_s
+    step_s = search.tables.middle.step_s
     if best.kind == "knock":
         peaks = np.abs(candidates[:, 3])
         phase = np.arange(0.0, np.exp(candidates[0, 2]) + step_s, step_s) / np.exp(candidates[0, 2])
         force = peaks[:1, None] * np.sin(np.pi * np.minimum(phase, 1.0))
     elif best.kind == "two":
-        step_s = explainer.tables.coarse.step_s
-        force = np.abs(explainer.pairing().predict(candidates, window)[1])
+        step_s = search.tables.coarse.step_s
+        force = np.abs(search.pairing().predict(candidates, window)[1])
         peaks = force.max(axis=1)
     else:
-        contact = ObstacleContact(explainer.tables.middle, explainer.tables.x_m, explainer.motion)
-        side = None if best.kind == "rigid" else explainer.pressing_direction()
+        contact = ObstacleContact(search.tables.middle, search.tables.x_m, search.motion)
+        side = None if best.kind == "rigid" else search.pressing_direction()
         if best.kind == "yielding":
             candidates = np.insert(candidates, 3, 0.0, axis=1)
         force = np.abs(contact.predict(candidates, window, side)[1])

@@ -7,7 +7,7 @@ samples before the touch determine the motion of the free beam.
 import numpy as np
 
 from rigd.touch._answer import estimate_from_explanations
-from rigd.touch._explanations import Explainer
+from rigd.touch._explanations import ExplanationSearch
 from rigd.touch._free_motion import TouchRecord
 from rigd.touch._model import TouchModel
 from rigd.touch._results import TouchEstimate
@@ -81,11 +81,11 @@ class GrowingEstimate:
         Precomputed quantities of the model at the record's rate.
     """
 
-    __slots__ = ("_explainers", "_explaining_delay_s", "_tables")
+    __slots__ = ("_explaining_delay_s", "_searches", "_tables")
 
     def __init__(self, tables: TouchTables) -> None:
         self._tables = tables
-        self._explainers: dict[float, Explainer] = {}
+        self._searches: dict[float, ExplanationSearch] = {}
         self._explaining_delay_s: float | None = None
 
     def preview(self, record: TouchRecord) -> None:
@@ -101,7 +101,7 @@ class GrowingEstimate:
         ]:  # the last one takes long, and is hardly ever needed
             if not self._has_enough_samples(record, detection_delay_s):
                 return
-            if not self._explainer(record, detection_delay_s).begins_before_window:
+            if not self._search(record, detection_delay_s).begins_before_window:
                 return
 
     def update(
@@ -127,23 +127,21 @@ class GrowingEstimate:
         ):
             if not self._has_enough_samples(record, detection_delay_s):
                 continue
-            explainer = self._explainer(record, detection_delay_s)
+            search = self._search(record, detection_delay_s)
             if detection_delay_s != self._explaining_delay_s and (
                 # After an unexplained one, only if the touch may have begun before.
-                explainer.likely_first_sample >= searched_from
+                search.likely_first_sample >= searched_from
                 or self._began_earlier(record, detection_delay_s)
             ):
                 continue
-            estimate = estimate_from_explanations(
-                explainer, explainer.explain(first=first), scan=scan
-            )
+            estimate = estimate_from_explanations(search, search.explain(first=first), scan=scan)
             if result is None or estimate.explained:
                 result = estimate
             if estimate.explained:
                 self._explaining_delay_s = detection_delay_s
             if estimate.explained or first:
                 break
-            searched_from = explainer.first
+            searched_from = search.first
         return result or self._empty_estimate(record)
 
     def _has_enough_samples(self, record: TouchRecord, detection_delay_s: float) -> bool:
@@ -152,32 +150,32 @@ class GrowingEstimate:
             record.detected - round(detection_delay_s * self._tables.rate_hz) >= _MIN_SAMPLES_BEFORE
         )
 
-    def _explainer(self, record: TouchRecord, detection_delay_s: float) -> Explainer:
+    def _search(self, record: TouchRecord, detection_delay_s: float) -> ExplanationSearch:
         """Return the search for explanations of a record, for one time from touch to detection.
 
         It starts from the results with the previous, shorter record.
         """
-        previous_explainer = self._explainers.get(detection_delay_s)
-        if previous_explainer is None or previous_explainer.given is not record:
-            self._explainers[detection_delay_s] = Explainer(
-                self._tables, record, detection_delay_s, previous_explainer
+        previous_search = self._searches.get(detection_delay_s)
+        if previous_search is None or previous_search.given is not record:
+            self._searches[detection_delay_s] = ExplanationSearch(
+                self._tables, record, detection_delay_s, previous_search
             )
-        return self._explainers[detection_delay_s]
+        return self._searches[detection_delay_s]
 
     def _began_earlier(self, record: TouchRecord, detection_delay_s: float) -> bool:
         """Return whether the touch seems to begin before the samples that may contain it."""
         if detection_delay_s == DETECTION_DELAYS_S[-1]:
             return False
-        explainer = self._explainer(record, detection_delay_s)
-        if explainer.begins_before_window:
+        search = self._search(record, detection_delay_s)
+        if search.begins_before_window:
             return True
         longer_delay_s = DETECTION_DELAYS_S[DETECTION_DELAYS_S.index(detection_delay_s) + 1]
-        if explainer.misfit < _POOR_MISFIT or not self._has_enough_samples(record, longer_delay_s):
+        if search.misfit < _POOR_MISFIT or not self._has_enough_samples(record, longer_delay_s):
             return False
-        longer_explainer = self._explainer(record, longer_delay_s)
+        longer_search = self._search(record, longer_delay_s)
         return (
-            longer_explainer.likely_first_sample < explainer.first
-            and longer_explainer.misfit < 0.5 * explainer.misfit
+            longer_search.likely_first_sample < search.first
+            and longer_search.misfit < 0.5 * search.misfit
         )
 
     def _empty_estimate(self, record: TouchRecord) -> TouchEstimate:

@@ -120,7 +120,7 @@ class ExplainedRecord:
     """Whether another kind of obstacle may be likelier, but was not tried."""
 
 
-class Explainer:
+class ExplanationSearch:
     """Search for the obstacles that explain the record of one touch.
 
     Parameters
@@ -141,7 +141,7 @@ class Explainer:
         tables: TouchTables,
         record: TouchRecord,
         detection_delay_s: float,
-        previous_explainer: "Explainer | None" = None,
+        previous_search: "ExplanationSearch | None" = None,
     ) -> None:
         rate = tables.rate_hz
         self.tables, self.rate, self.given = tables, rate, record
@@ -161,16 +161,16 @@ class Explainer:
         self.edges = (float(tables.x_m[0]) + 0.002, float(tables.x_m[-1]))
         self.deviations: Real | None = None
         self._uncertainties_s = 0.0
-        whole_grid = previous_explainer is not None and previous_explainer.available >= round(
+        whole_grid = previous_search is not None and previous_search.available >= round(
             GRID_COMPARISON_S * rate
         )
         self._grid_candidates: Real = (
-            previous_explainer._grid_candidates
-            if previous_explainer and whole_grid
+            previous_search._grid_candidates
+            if previous_search and whole_grid
             else self._best_of_grid()
         )
         self._at_rest: tuple[Explanation, float] | None
-        self._at_rest = None if previous_explainer is None else previous_explainer._at_rest
+        self._at_rest = None if previous_search is None else previous_search._at_rest
 
     @property
     def first(self) -> int:
