@@ -35,7 +35,7 @@ a pole of 80 rad/s, at up to 0.003 /s). At the rate allowed here an oscillation 
 the 15 s of a ring-down, and from the noise floor by a factor of 15 in a session of 136 s.
 """
 
-MAX_DAMPING_TAKEN = 0.004
+MAX_DAMPING_REDUCTION = 0.004
 """Largest reduction of a beam mode's damping ratio by the controller.
 
 It is checked on a beam of the same dimensions with almost no damping of its own: a loop that is
@@ -416,7 +416,7 @@ def check_stability(loop: ClosedLoop) -> str | None:
     ------
     ControlDesignError
         If an oscillation of the loop grows faster than `MAX_GROWTH_PER_S`, or would do so without
-        the beam's own damping (`MAX_DAMPING_TAKEN`).
+        the beam's own damping (`MAX_DAMPING_REDUCTION`).
     """
     remedy = _stability_remedy(loop.model.settings)
     growth = loop.growth_per_s
@@ -430,7 +430,7 @@ def check_stability(loop: ClosedLoop) -> str | None:
     if loop.model.beam is not None:
         lightly_damped_loop = close_loop(lightly_damped_model(loop.model, loop.model.beam))
         pole = lightly_damped_loop.least_damped()
-        if _damping_ratio(pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_TAKEN:
+        if _damping_ratio(pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_REDUCTION:
             raise ControlDesignError(
                 "The closed loop is stable only by the beam's own damping: without it (spectral "
                 f"radius {lightly_damped_loop.spectral_radius:.7f}), {_describe_pole(pole)} grows "

@@ -361,7 +361,7 @@ class Cycle:
         return " and ".join(name for flag, name in names if self.flags & flag).capitalize()
 
     def check_encoder(self, standstill: StandstillMonitor, due_ns: int) -> None:
-        """Check the angle just read against those before it, while the torque is off.
+        """Raise `DeviceError` if the angle just read has jumped, while the torque is off.
 
         Parameters
         ----------

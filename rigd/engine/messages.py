@@ -58,7 +58,7 @@ class ControlJob:
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
     fast: bool
-    """Whether to run with the virtual clock."""
+    """Whether sessions run with the virtual clock, faster than real time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +78,9 @@ class TouchOrder:
     """Order to search for an obstacle in a session."""
 
     beam: "WatchedBeam"
-    """Model of the beam for the detector."""
+    """Model of the beam for the touch detector."""
     settings: "DetectorSettings"
-    """Thresholds of the detector."""
+    """Sensitivity of the touch detector."""
     approach: "Approach"
     """Passes of the search, and the reaction to a touch."""
     shear_projection: tuple[float, ...] | None
@@ -285,7 +285,8 @@ class TouchJob:
     shear_projection: tuple[float, ...] | None
     """Coefficients of the base shear force, shear = projection · wrench; None: not measured."""
     realtime: "RealtimeSettings | None" = None
-    """Real-time settings, whose loop core it must avoid; None: not in real time."""
+    """Real-time settings, which name the loop's core that this process must avoid; None: the session is
+    not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,7 +326,8 @@ class FitJob:
     search: "PrecisionSearch | None" = None
     """Target precision, for which segments are planned; None: the reference is fixed."""
     realtime: "RealtimeSettings | None" = None
-    """Real-time settings, whose loop core it must avoid; None: not in real time."""
+    """Real-time settings, which name the loop's core that this process must avoid; None: the session is
+    not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,7 +348,7 @@ class FitReport:
     """Message with the model that the fit process has estimated from the record so far."""
 
     document: Mapping[str, Any]
-    """Modes and parameters with their intervals, as in JSON documents."""
+    """Estimated modes and parameters with their intervals, as in JSON documents."""
     final: bool = False
     """Whether this is the last estimate, which uses the whole record."""
 

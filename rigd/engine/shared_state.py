@@ -230,7 +230,7 @@ _TEXT_SIZE = EVENT_SIZE - _HEADER.size
 
 @dataclass(frozen=True, slots=True)
 class LogEvent:
-    """One line of the session's log."""
+    """Event in the session's log, which is one line of text."""
 
     t_ns: int
     """Time in ns since the session's start."""

@@ -162,7 +162,7 @@ class Precision:
 
     @property
     def reached(self) -> bool:
-        """Whether the target is reached."""
+        """Whether the quantity's standard deviation has reached its target."""
         return self.ratio <= 1.0
 
 

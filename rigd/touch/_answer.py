@@ -45,7 +45,7 @@ def estimate_from_explanations(
 
     Parameters
     ----------
-    explainer
+    search
         Search that found the explanations.
     explained
         Explanations of the record.

@@ -131,7 +131,7 @@ class ExplanationSearch:
         Samples from 0.3 s or more before the touch.
     detection_delay_s
         Longest time in s from the touch to its detection.
-    previous_explainer
+    previous_search
         Search with the beginning of the same record, from whose results this search starts; None:
         it starts from a grid.
     """

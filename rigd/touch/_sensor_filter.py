@@ -25,7 +25,7 @@ class SensorFilter:
     """
 
     corner_hz: float = 0.0
-    """Corner of the sensor's low-pass filter; 0: it has none."""
+    """Corner frequency in Hz of the sensor's low-pass filter; 0: the sensor has no filter."""
     order: int = 1
     """Order of the low-pass filter: 1, or 2 (Butterworth)."""
     weights: tuple[float, ...] = (1.0,)
