@@ -446,7 +446,7 @@ class SegmentSearch:
         window[:last] = 1.0
         window[: fade.size] = fade
         window[last - fade.size : last] = np.minimum(window[last - fade.size : last], 1.0 - fade)
-        return self.unit_sweep(window * np.sin(phase)), self.sweep(window * np.cos(phase))
+        return self.unit_sweep(window * np.sin(phase)), self.unit_sweep(window * np.cos(phase))
 
     def unit_sweep(self, reference_rad: Real) -> _UnitSweep:
         """Return the predicted response to a reference of amplitude 1 rad from rest, shape (n,)."""

@@ -8,7 +8,14 @@ import pytest
 from rigd.beam import participation, transfer
 from rigd.control import close_loop
 from rigd.excitation import ExcitationError, shortest_braking, shortest_move
-from rigd.excitation.moves import braked_reference, braking_path, modal_state, quintic, slew, still_path
+from rigd.excitation.moves import (
+    braked_reference,
+    braking_path,
+    modal_state,
+    quintic,
+    slew,
+    still_path,
+)
 from rigd.identified_beam import MOVE
 
 RATE_HZ = 1000.0
