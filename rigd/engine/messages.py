@@ -285,8 +285,8 @@ class TouchJob:
     shear_projection: tuple[float, ...] | None
     """Coefficients of the base shear force, shear = projection · wrench; None: not measured."""
     realtime: "RealtimeSettings | None" = None
-    """Real-time settings, which name the loop's core that this process must avoid; None: the session
-    is not in real time."""
+    """Real-time settings, which name the loop's core that this process must avoid; None: the
+    session is not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,8 +326,8 @@ class FitJob:
     search: "PrecisionSearch | None" = None
     """Target precision, for which segments are planned; None: the reference is fixed."""
     realtime: "RealtimeSettings | None" = None
-    """Real-time settings, which name the loop's core that this process must avoid; None: the session
-    is not in real time."""
+    """Real-time settings, which name the loop's core that this process must avoid; None: the
+    session is not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
