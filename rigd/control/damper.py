@@ -68,7 +68,7 @@ class VibrationDamper:
         self._state = 0.0, 0.0, 0.0
 
     def step(self, coupling_torque_nm: float) -> float:
-        """Return the angle in rad by which the reference is displaced in this tick.
+        """Return the displacement of the reference from its resting angle in this tick, in rad.
 
         Parameters
         ----------
@@ -97,7 +97,7 @@ class _DampingLaw:
     def advance(
         self, state: tuple[_Signal, _Signal, _Signal], torque: _Signal
     ) -> tuple[tuple[_Signal, _Signal, _Signal], _Signal]:
-        """Compute one tick: return the next state, and the displacement of the reference.
+        """Compute one tick: return the next state, and the displacement of the reference in rad.
 
         The state consists of both filters and the leaky integral.
         """

@@ -226,7 +226,10 @@ class BeamEstimate:
         return replace(self, names=free, uniformity=uniformity)
 
     def modal(self) -> "BeamEstimate":
-        """Return the estimate of a modal model: the parameters are each mode's and a background."""
+        """Return the estimate with the free parameters of a modal model.
+
+        They are the constants of each mode, and those of a background.
+        """
         modes = [mode.number for mode in self.modes()]
         constants = [f"{name}_{number}" for number in modes for name in MODAL_CONSTANTS]
         background = [f"background_{power}" for power in range(_BACKGROUND_TERMS)]

@@ -350,7 +350,8 @@ def _fit_filter(
 def _is_represented_mode(upper_poles: Complex, rate_hz: float) -> NDArray[np.bool_]:
     """Return which of the poles belong to modes that the filter represents, as a mask.
 
-    Such a mode oscillates, at a frequency well below half the tick rate. A pole of NaN does not.
+    Such a mode oscillates at less than `_MAX_FREQUENCY_FRACTION` of the tick rate. A pole of NaN
+    belongs to no mode.
     """
     represented: NDArray[np.bool_] = upper_poles.imag > _MIN_IMAGINARY_FRACTION * np.abs(
         upper_poles
