@@ -278,7 +278,7 @@ class Band:
     """Upper end of the band in Hz."""
 
     @classmethod
-    def of_mode(cls, mode: FoundMode, widths: float) -> "Band":
+    def around_mode(cls, mode: FoundMode, widths: float) -> "Band":
         """Return the band around a mode.
 
         On either side it extends by the uncertainty of the frequency and by `widths` half-power
@@ -499,7 +499,7 @@ def _read_bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> li
             f"stop_hz = {stop_hz:g} Hz; raise stop_hz."
         )
     bands = sorted(
-        (Band.of_mode(mode, widths) for mode in modes_in_band), key=lambda band: -band.decay_s
+        (Band.around_mode(mode, widths) for mode in modes_in_band), key=lambda band: -band.decay_s
     )
     for band in bands:
         require_frequency(f"The upper end of a band of {widths:g} widths", band.stop_hz, rate_hz)

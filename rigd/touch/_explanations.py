@@ -233,7 +233,7 @@ class ExplanationSearch:
         stages.append(available_s)
         previous_stage: tuple[Explanation, WhitenedWindow] | None = None
         if self._at_rest is None:
-            starts = self._with_neighbours(_distinct_minima(self._first_minima))
+            starts = self._add_neighbours(_distinct_minima(self._first_minima))
         else:
             at_rest, explained_s = self._at_rest
             stages = [seconds for seconds in stages if seconds > explained_s]
@@ -250,7 +250,7 @@ class ExplanationSearch:
             at_rest = self.explain_by_kind(
                 "rigid", self.predictor(starts), window, starts, self.space(3)
             )
-            if previous_stage is not None and self._later_is_worse(
+            if previous_stage is not None and self._later_samples_fit_worse(
                 at_rest, window, *previous_stage
             ):
                 two_obstacles = self._explain_by_two(at_rest, window)
@@ -374,7 +374,7 @@ class ExplanationSearch:
         predict = self.predictor(self.starts, first=True)
         return find_minima(predict, self._first_samples, self.starts, self.space(3), rounds=7)
 
-    def _with_neighbours(self, starts: Real) -> Real:
+    def _add_neighbours(self, starts: Real) -> Real:
         """Return candidates, with further ones nearby if they are close to the beam's tip.
 
         Minima are close together there.
@@ -470,7 +470,7 @@ class ExplanationSearch:
         of_noise = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
         return float(degrees + max_stds * np.sqrt(2 * degrees + of_noise))
 
-    def _later_is_worse(
+    def _later_samples_fit_worse(
         self,
         longer_explanation: Explanation,
         longer_window: WhitenedWindow,

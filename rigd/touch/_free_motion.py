@@ -143,7 +143,7 @@ class FreeBeam:
         self._displacement: Complex = self._grid.per_angle(nodes_m).T
         self.modes = self.modes.at_positions(x_m / self.model.beam.length_m)
 
-    def per_sample(self, index: int, samples: int) -> Real:
+    def displacement_per_sample(self, index: int, samples: int) -> Real:
         """Return the displacement at a position that one sample of the angle causes, in m/rad.
 
         Parameters

@@ -165,7 +165,7 @@ class ContactKernels:
             x_m, self.step_s, *(interpolate_rows(t, first, weights) for t in tables)
         )
 
-    def coarser(self, factor: int, steps: int) -> "ContactKernels":
+    def with_wider_pulses(self, factor: int, steps: int) -> "ContactKernels":
         """Return the kernels of wider triangular pulses, with longer time steps.
 
         Parameters

@@ -59,7 +59,7 @@ class TouchModel:
         """Age of torque and shear in s without the delay of the weighted mean of records."""
         return self.torque_delay_s - self.sensor_filter.weights_delay_s
 
-    def changed(self, name: str, by: float) -> "TouchModel":
+    def with_changed_parameter(self, name: str, by: float) -> "TouchModel":
         """Return the model with one parameter changed by a given difference.
 
         Parameters

@@ -36,9 +36,11 @@ class TouchTables:
             steps,
             model.sensor_filter,
         )
-        self.middle = self.finest.coarser(2, steps // 2)
-        self.coarse = self.finest.coarser(steps_per_sample // 4, steps // (steps_per_sample // 4))
-        half_sample_kernels = self.finest.coarser(
+        self.middle = self.finest.with_wider_pulses(2, steps // 2)
+        self.coarse = self.finest.with_wider_pulses(
+            steps_per_sample // 4, steps // (steps_per_sample // 4)
+        )
+        half_sample_kernels = self.finest.with_wider_pulses(
             steps_per_sample // 2, steps // (steps_per_sample // 2)
         )
         self.crossing = cross_kernels(
@@ -53,7 +55,9 @@ class TouchTables:
         self.starts(round(DETECTION_DELAYS_S[0] * rate_hz) + round(GRID_COMPARISON_S * rate_hz))
         no_positions = np.empty(0)
         self.changed = [
-            FreeBeam(model.changed(name, std), no_positions, rate_hz, self.max_samples)
+            FreeBeam(
+                model.with_changed_parameter(name, std), no_positions, rate_hz, self.max_samples
+            )
             for name, std in model.std.items()
             if std > 0
         ]

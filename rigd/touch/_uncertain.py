@@ -100,7 +100,7 @@ def _encoder_noise_effects(
     motion = window.motion
     samples = np.arange(window.first, window.end)
     nearest = int(np.argmin(np.abs(tables.x_m - likeliest[0])))
-    sample_displacement = tables.free.per_sample(nearest, samples.size + 8)
+    sample_displacement = tables.free.displacement_per_sample(nearest, samples.size + 8)
     # Columns begin four samples before the window.
     window_steps = np.arange(motion.displacement_m.shape[1]) - 4 * STEPS_PER_SAMPLE
     index = (

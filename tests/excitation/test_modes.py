@@ -76,10 +76,10 @@ def test_each_sweep_covers_its_band_and_little_else(document):
 
 
 def test_a_band_is_half_power_widths_and_the_uncertainty_to_either_side():
-    band = Band.of_mode(FoundMode(16.0, 0.005, 0.1), widths=2.0)
+    band = Band.around_mode(FoundMode(16.0, 0.005, 0.1), widths=2.0)
     assert (band.start_hz, band.stop_hz) == pytest.approx((16 - 0.42, 16 + 0.42))
     assert band.decay_s == pytest.approx(1 / (2 * np.pi * 16 * 0.005))
-    heavy = Band.of_mode(FoundMode(2.0, 0.6, 0.0), widths=2.0)
+    heavy = Band.around_mode(FoundMode(2.0, 0.6, 0.0), widths=2.0)
     assert 0 < heavy.start_hz < heavy.stop_hz
 
 
@@ -134,7 +134,7 @@ def test_the_split_is_the_best_there_is(rig):
         FoundMode(16.01, 0.0042, 0.0),
         FoundMode(44.8, 0.0099, 0.0),
     ]
-    bands = [Band.of_mode(mode, 1.0) for mode in modes]
+    bands = [Band.around_mode(mode, 1.0) for mode in modes]
     shares = time_fractions(bands, [0.025] * 3, rig)
     assert shares.sum() == pytest.approx(1.0)
     damping = first_order_damping(modes, LINK)

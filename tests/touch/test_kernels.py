@@ -86,7 +86,7 @@ def test_between_places_kernels_are_interpolated(kernels, at_point):
 
 def test_wider_hats_are_sums_of_narrow_ones(at_point):
     wide = contact_kernels(LINK, DAMPED, np.array([0.62]), 4 * STEP_S, 90)
-    summed = at_point.coarser(4, 90)
+    summed = at_point.with_wider_pulses(4, 90)
     for name in ("displacement", "torque", "shear"):
         exact = getattr(wide, name)
         assert np.abs(getattr(summed, name) - exact).max() < 2e-4 * np.abs(exact).max()
