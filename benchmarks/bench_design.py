@@ -26,7 +26,7 @@ from analysis.identify import Measurement, Plant, fit_record
 from analysis.models import STRUCTURES
 from rigd.beam.tip import tip_motion
 from rigd.excitation import BeamEstimate, Segment, chirp, information, modes
-from rigd.excitation._beam_estimate import OF_UNIFORM
+from rigd.excitation._beam_estimate import UNIFORM_BEAM_PARAMETERS
 from rigd.excitation._fisher_information import RecordSoFar, covariance_of
 from rigd.excitation._segment_search import SegmentSearch
 from rigd.excitation.experiment_design import next_segment
@@ -37,7 +37,7 @@ from rigd.runner.planning import RigPreview
 NOISE_NM = 5e-3
 DAMPING = PLANTS["VI"]
 ESTIMATE = BeamEstimate(
-    LINK, DAMPING, OF_UNIFORM, np.array([1.0]), np.array([2.0 * NOISE_NM**2 / RATE_HZ])
+    LINK, DAMPING, UNIFORM_BEAM_PARAMETERS, np.array([1.0]), np.array([2.0 * NOISE_NM**2 / RATE_HZ])
 )
 SCAN = chirp(rate_hz=RATE_HZ, start_hz=0.5, stop_hz=50.0, duration_s=5.0, rest_s=1.0, ring_down_s=0)
 
@@ -47,7 +47,7 @@ Real = NDArray[np.float64]
 def precisions(angle_rad: Real, targets: list[Target]) -> tuple[Precision, ...]:
     """Return what is expected after a record."""
     covariance = covariance_of(information(angle_rad, ESTIMATE, RATE_HZ), ESTIMATE)
-    return Quantities.of(targets, ESTIMATE).precisions(covariance)
+    return Quantities.linearised(targets, ESTIMATE).precisions(covariance)
 
 
 def designed(
@@ -73,9 +73,9 @@ def designed(
 
 def steady_s(rig: RigPreview, targets: list[Target], tip_slope_rad: float) -> float:
     """Time of the best steady sines from nothing: below it no session can be."""
-    record = RecordSoFar.of(np.zeros(8), ESTIMATE, RATE_HZ, 8.0)
+    record = RecordSoFar.from_angle(np.zeros(8), ESTIMATE, RATE_HZ, 8.0)
     plant = rig.plant_with(LINK, DAMPING)
-    quantities = Quantities.of(targets, ESTIMATE)
+    quantities = Quantities.linearised(targets, ESTIMATE)
     return float(
         SegmentSearch(ESTIMATE, quantities, plant, 0.0, record, tip_slope_rad).mixture.times_s.sum()
     )

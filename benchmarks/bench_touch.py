@@ -127,7 +127,7 @@ def model_near(rng: np.random.Generator, *, exact: bool) -> TouchModel:
     std = {name: share * values[name] for name, share in RELATIVE_STD.items()}
     model = replace(model, std=std)
     for name, deviation in std.items():
-        model = model.changed(name, deviation * rng.standard_normal())
+        model = model.with_changed_parameter(name, deviation * rng.standard_normal())
     return model
 
 

@@ -1,9 +1,10 @@
 """The discrete closed loop of motor, beam, delays, feed-forward and PID: linear, exact at ticks.
 
-The plant is propagated exactly under the held torque, with the instant inside a period at which the
-actuation delay passes a command; delayed readings are the exact values of that earlier instant.
-Friction, quantisation, the torque limit and noise are left out. A sensor that is read at the
-instant a new torque takes effect sees the old one.
+The plant is propagated exactly for a torque that is constant between two switches. A switch is at
+the instant inside a period at which a command takes effect after the actuation delay. Delayed
+readings are the exact values of the earlier instant. Friction, quantisation, the torque limit and
+noise are left out. A sensor that is read at the instant when a new torque takes effect shows the
+effect of the old torque.
 """
 
 from dataclasses import dataclass, replace
@@ -27,56 +28,60 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 MAX_GROWTH_PER_S = 0.02
-"""Fastest accepted growth of the loop, with a warning.
+"""Largest growth rate of an oscillation of the loop in 1/s that is accepted, with a warning.
 
 A beam with almost no damping leaves the loop slightly unstable with any controller (below 0.02 % at
 a pole of 80 rad/s, at up to 0.003 /s). At the rate allowed here an oscillation grows by 35 % over
 the 15 s of a ring-down, and from the noise floor by a factor of 15 in a session of 136 s.
 """
 
-MAX_DAMPING_TAKEN = 0.004
-"""Largest damping ratio that the controller may take from a mode of the beam.
+MAX_DAMPING_REDUCTION = 0.004
+"""Largest reduction of a beam mode's damping ratio by the controller.
 
-Checked on a beam of the same dimensions with almost no damping of its own: a loop that is stable
-only through the damping to be measured is not safe, and its record shows little of the beam near
-that mode. With feed-forward of the coupling torque a mode loses 0.0001 to 0.0015 (poles from 40 to
-120 rad/s, gains from 0.8 to 1.2, torque readings up to 10 ms old); without, 0.0045 to 0.013.
+It is checked on a beam of the same dimensions with almost no damping of its own: a loop that is
+stable only through the damping to be measured is not safe, and its record shows little of the beam
+near that mode. With feed-forward of the coupling torque the damping ratio of a mode falls by 0.0001
+to 0.0015 (poles from 40 to 120 rad/s, gains from 0.8 to 1.2, torque readings up to 10 ms old).
+Without feed-forward it falls by 0.0045 to 0.013.
 """
 
 _LIGHT_DAMPING_RATIO = 1e-4
-"""Damping of the beam in that check: rounding may make an undamped realisation unstable."""
+"""Damping ratio of the beam's first mode in this check. It is not 0, because rounding may make the
+realisation of an undamped beam unstable."""
 
 MAX_DELAY_PERIODS = 50
-"""Longest delay in the model: every period of delay is one more state."""
+"""Longest delay in the model in periods: every period of delay adds one state."""
 
-_DEAD = 1e-9
-_BLOCK = 64  # ticks: fewer make the sequential part longer, more the products
+_MAX_DELAY_EIGENVALUE = 1e-9
+"""Magnitude of an eigenvalue below which it belongs to a delay, which decays within a few ticks."""
+_BLOCK_TICKS = 64  # ticks: fewer make the sequential part longer, more the products
 _BLOCKS_AT_ONCE = 4096
-_ROWS = 5  # angle, velocity, torque without friction, reference speed, sensor torque
+"""Number of blocks of ticks whose response is computed at once."""
+_OUTPUT_ROWS = 5  # angle, velocity, torque without friction, reference speed, sensor torque
 
 
 @dataclass(frozen=True, slots=True)
 class LoopModel:
-    """Parameters of the closed loop."""
+    """Parameters of the closed loop of motor, beam and controller."""
 
     rate_hz: float
     """Ticks a second."""
     beam: Beam | None
-    """None: the motor alone."""
+    """Beam on the motor; None: the motor alone."""
     damping: Damping
     """Damping of the beam."""
     motor_inertia_kg_m2: float
-    """At the output shaft."""
+    """Inertia of the motor, at the output shaft."""
     viscous_nm_s_per_rad: float
     """Viscous friction of the motor, at the output shaft."""
     tool_inertia_kg_m2: float
     """Inertia between torque sensor and beam."""
     actuation_delay_s: float
-    """Delay from a tick to the instant its command takes effect; any fraction of a period."""
+    """Delay from a tick to the instant when its command takes effect; any fraction of a period."""
     angle_delay_s: float
-    """Age of the angle at the tick that uses it."""
+    """Age of the angle reading at the tick that uses it."""
     torque_delay_s: float
-    """Age of the coupling torque at the tick that uses it."""
+    """Age of the coupling torque reading at the tick that uses it."""
     settings: ControlSettings
     """Settings of the controller."""
     tip_mass_kg: float = 0.0
@@ -84,11 +89,11 @@ class LoopModel:
     root_compliance_rad_per_nm: float = 0.0
     """Rotation of the clamp per torque on the beam's root."""
     stiffness_offsets: tuple[float, ...] = ()
-    """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
+    """Relative differences of the stiffness of modes 2, 3, … from that of the uniform beam."""
 
     @property
     def loaded_beam(self) -> LoadedBeam:
-        """The beam with tip mass and root compliance; a loop without a beam has none."""
+        """Beam with tip mass, root compliance and stiffness offsets; the model must have a beam."""
         assert self.beam is not None
         return LoadedBeam(
             self.beam,
@@ -101,84 +106,87 @@ class LoopModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopResponse:
-    """Response of the loop, tick by tick; each of shape (n,)."""
+    """Response of the closed loop to a reference, with a value for each tick; arrays (n,)."""
 
     angle_rad: Real
-    """At the output shaft."""
+    """Angle of the output shaft in rad."""
     velocity_rad_s: Real
-    """At the output shaft."""
+    """Speed of the output shaft in rad/s."""
     torque_nm: Real
-    """The command, friction compensation included, not limited."""
+    """Torque command in N·m with friction compensation, without the limit of the motor."""
     coupling_torque_nm: Real
-    """Measured torque (beam and tool inertia), without the sensor's delay."""
+    """Coupling torque in N·m (beam and tool inertia), without the sensor's delay."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cut:
-    """A signal at which the loop can be opened: it is read from the state and acts on the next.
+class CutSignal:
+    """Signal at which the closed loop can be opened, to compute the gain of the open loop.
 
-    ``outer(action, reading)`` is the part of the closed loop's matrix through the cut.
+    The signal depends on the present state and acts on the next state. ``outer(action, reading)``
+    is the part of the closed loop's state matrix that passes through the signal.
     """
 
     name: str
+    """Name of the signal."""
     action: Real
-    """(n,): effect of one unit of the signal on the next state."""
+    """Effect of one unit of the signal on the next state, shape (n,)."""
     reading: Real
-    """(n,): the signal is ``reading · x``."""
+    """Row vector that gives the signal from the state x, ``reading · x``; shape (n,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosedLoop:
-    """``x[k+1] = a x[k] + b r[k]``, ``y[k] = c x[k] + d r[k]`` from the reference.
+    """Closed loop as a discrete state space from the reference r to five quantities y.
 
-    The rows of y are angle (rad), velocity (rad/s), torque without friction compensation (N·m),
-    the speed used by that compensation (rad/s), and the sensor's torque (N·m).
+    The equations are ``x[k+1] = a x[k] + b r[k]`` and ``y[k] = c x[k] + d r[k]``. The rows of y are
+    angle (rad), velocity (rad/s), torque without friction compensation (N·m), the speed used by
+    that compensation (rad/s), and the sensor's torque (N·m).
     """
 
     a: Real
-    """(n, n)."""
+    """State matrix, shape (n, n)."""
     b: Real
-    """(n,)."""
+    """Input vector of the reference, shape (n,)."""
     c: Real
-    """(5, n)."""
+    """Output matrix, shape (5, n)."""
     d: Real
-    """(5,)."""
+    """Direct effect of the reference on the outputs, shape (5,)."""
     model: LoopModel
-    """Model from which it was computed."""
-    cuts: tuple[Cut, ...]
-    """The torque command, the angle and the coupling torque as the controller reads them."""
+    """Model from which the loop was computed."""
+    cuts: tuple[CutSignal, ...]
+    """Signals at which the loop can be opened: torque command, angle reading, torque reading."""
     poles_rad_s: Complex
-    """Its modes as continuous-time poles, the fastest growing (or slowest decaying) first."""
+    """Poles of the loop in continuous time, the fastest growing (or slowest decaying) first."""
     shaft_torque: Real
-    """(n,): effect on the next state of 1 N·m on the shaft, held for a period."""
+    """Effect on the next state of 1 N·m on the shaft for one period, shape (n,)."""
     realisation: Realisation | None
-    """The beam, whose states follow angle and velocity in x; None: the motor alone."""
+    """State space of the beam, whose states follow angle and velocity in x; None: no beam."""
 
     @property
     def spectral_radius(self) -> float:
-        """Largest magnitude of an eigenvalue of `a`: the loop is stable below 1."""
+        """Largest magnitude of an eigenvalue of the state matrix; the loop is stable below 1."""
         return exp(self.growth_per_s / self.model.rate_hz)
 
     @property
     def growth_per_s(self) -> float:
-        """Growth rate of the dominating mode (negative: decays), in 1/s."""
+        """Growth rate of the loop's fastest growing mode in 1/s; negative if all modes decay."""
         return float(self.poles_rad_s[0].real)
 
     def least_damped(self) -> complex:
-        """Return the pole with the lowest damping ratio, in rad/s."""
+        """Return the pole of the closed loop with the lowest damping ratio, in rad/s."""
         return complex(min(self.poles_rad_s, key=_damping_ratio))
 
     def simulate(self, reference_rad: Real) -> LoopResponse:
-        """Return the response to a reference from rest, exact at the ticks.
+        """Return the closed loop's response to a reference from rest, exact at the ticks.
 
-        The record is divided into blocks. Within a block the response is a product of matrices (the
-        block's impulse response with the reference, and its free response with the state at its
-        start); only these states are computed one after the other.
+        The record is divided into blocks of ticks. Within a block the response is a product of
+        matrices: the block's impulse response with the reference, plus its free response with the
+        state at its start. Only these states are computed one after the other.
 
         Parameters
         ----------
         reference_rad
-            Shape (n,), relative to the angle at rest.
+            Reference angle at each tick relative to the angle at rest, shape (n,).
 
         Raises
         ------
@@ -186,30 +194,30 @@ class ClosedLoop:
             If the loop is unstable and the response overflows.
         """
         n = reference_rad.size
-        blocks = -(-n // _BLOCK)
-        padded = np.zeros((blocks, _BLOCK))
-        padded.ravel()[:n] = reference_rad
-        rows = np.empty((_ROWS, blocks * _BLOCK))
-        free, forced, step, drive = self._block_matrices()
+        blocks = -(-n // _BLOCK_TICKS)
+        padded_reference = np.zeros((blocks, _BLOCK_TICKS))
+        padded_reference.ravel()[:n] = reference_rad
+        rows = np.empty((_OUTPUT_ROWS, blocks * _BLOCK_TICKS))
+        free_response, forced_response, state_step, reference_drive = self._block_matrices()
         state = np.zeros(self.b.size)
         for first in range(0, blocks, _BLOCKS_AT_ONCE):
-            part = padded[first : first + _BLOCKS_AT_ONCE]
-            driven = part @ drive
-            states = np.empty_like(driven)
-            for index in range(len(part)):
+            block_references = padded_reference[first : first + _BLOCKS_AT_ONCE]
+            reference_effects = block_references @ reference_drive
+            states = np.empty_like(reference_effects)
+            for index in range(len(block_references)):
                 states[index] = state
-                state = step @ state
-                state += driven[index]
+                state = state_step @ state
+                state += reference_effects[index]
             if not np.isfinite(state).all():
                 raise ControlDesignError(
                     f"The closed loop is unstable and grows at {self.growth_per_s:.3g} /s: its "
                     "response cannot be computed."
                 )
-            for row in range(_ROWS):
-                out = rows[row].reshape(blocks, _BLOCK)[first : first + len(part)]
-                np.matmul(part, forced[row], out=out)
-                out += states @ free[row]
-        del padded
+            for row in range(_OUTPUT_ROWS):
+                out = rows[row].reshape(blocks, _BLOCK_TICKS)[first : first + len(block_references)]
+                np.matmul(block_references, forced_response[row], out=out)
+                out += states @ free_response[row]
+        del padded_reference
         angle, velocity, torque, speed, coupling = rows[:, :n]
         settings = self.model.settings
         # Without a copy: an hour of record takes 30 MB a channel.
@@ -220,7 +228,10 @@ class ClosedLoop:
         return LoopResponse(angle, velocity, torque, coupling)
 
     def response(self, frequency_hz: Real) -> Complex:
-        """Return angle over reference, complex, in the shape of the frequencies."""
+        """Return the complex frequency response from reference to angle at given frequencies.
+
+        The result has the shape of the frequencies.
+        """
         z = np.exp(2j * pi * np.atleast_1d(frequency_hz) / self.model.rate_hz)
         identity = np.eye(self.b.size)
         values = [
@@ -230,39 +241,49 @@ class ClosedLoop:
         return np.array(values).reshape(np.shape(frequency_hz))
 
     def _block_matrices(self) -> tuple[Real, Real, Real, Real]:
-        """Return free (5, n, L) and forced (5, L, L) response, step (n, n) and drive (L, n)."""
+        """Return the matrices that compute the response of a block of L ticks.
+
+        They are free response (5, n, L) from the state, forced response (5, L, L) from the
+        reference, and the effects on the next block's state: of the state (n, n) and of the
+        reference (L, n).
+        """
         n = self.b.size
-        free = np.empty((_BLOCK, _ROWS, n))  # c aⁱ
-        drive = np.empty((_BLOCK, n))  # aⁱ b, turned round at the end
-        free[0], drive[0] = self.c, self.b
-        power, done = self.a, 1
-        while done < _BLOCK:  # doubling: rows i + done from rows i
-            free[done : 2 * done] = free[:done] @ power
-            drive[done : 2 * done] = drive[:done] @ power.T
+        free_response = np.empty((_BLOCK_TICKS, _OUTPUT_ROWS, n))  # c aⁱ
+        reference_drive = np.empty((_BLOCK_TICKS, n))  # aⁱ b, turned round at the end
+        free_response[0], reference_drive[0] = self.c, self.b
+        power, rows_done = self.a, 1
+        while rows_done < _BLOCK_TICKS:  # doubling: rows i + done from rows i
+            free_response[rows_done : 2 * rows_done] = free_response[:rows_done] @ power
+            reference_drive[rows_done : 2 * rows_done] = reference_drive[:rows_done] @ power.T
             power = power @ power
-            done *= 2
-        impulse = np.empty((_ROWS, _BLOCK))
+            rows_done *= 2
+        impulse = np.empty((_OUTPUT_ROWS, _BLOCK_TICKS))
         impulse[:, 0] = self.d
-        impulse[:, 1:] = drive[:-1].dot(self.c.T).T
-        forced = np.zeros((_ROWS, _BLOCK, _BLOCK))
-        for tick in range(_BLOCK):
-            forced[:, tick, tick:] = impulse[:, : _BLOCK - tick]
-        free_by_row = np.ascontiguousarray(free.transpose(1, 2, 0))
-        return free_by_row, forced, np.ascontiguousarray(power), drive[::-1].copy()
+        impulse[:, 1:] = reference_drive[:-1].dot(self.c.T).T
+        forced_response = np.zeros((_OUTPUT_ROWS, _BLOCK_TICKS, _BLOCK_TICKS))
+        for tick in range(_BLOCK_TICKS):
+            forced_response[:, tick, tick:] = impulse[:, : _BLOCK_TICKS - tick]
+        free_by_row = np.ascontiguousarray(free_response.transpose(1, 2, 0))
+        return (
+            free_by_row,
+            forced_response,
+            np.ascontiguousarray(power),
+            reference_drive[::-1].copy(),
+        )
 
 
 def close_loop(model: LoopModel) -> ClosedLoop:
-    """Close the loop of a rig around its designed controller.
+    """Return the closed loop of a rig with the controller designed for it.
 
     Parameters
     ----------
     model
-        From :meth:`rigd.profile.Profile.loop_model`.
+        Parameters of the loop, from :meth:`rigd.profile.Profile.loop_model`.
 
     Returns
     -------
     ClosedLoop
-        Stable or not: see :func:`check_stability`.
+        Closed loop, which may be unstable: see :func:`check_stability`.
 
     Raises
     ------
@@ -292,14 +313,14 @@ def close_loop(model: LoopModel) -> ClosedLoop:
             stiffness_offsets=model.stiffness_offsets,
         )
     )
-    plant = _Plant(model, realisation)
+    plant = _DiscretePlant(model, realisation)
     n = plant.a.shape[0]
 
     # States: plant, integral, derivative, two low-pass filters of the reference.
-    integral, derivative, fast, slow = range(n, n + 4)
+    integral, derivative, filter_once, filter_twice = range(n, n + 4)
     period_s = 1.0 / model.rate_hz
-    ki_t = gains.ki_nm_per_rad_s * period_s
-    decay_d, gain_d = derivative_coefficients(gains, model.rate_hz)
+    integral_gain = gains.ki_nm_per_rad_s * period_s
+    derivative_decay, derivative_gain = derivative_coefficients(gains, model.rate_hz)
     b_p, b_d, kp = gains.setpoint_weight_p, gains.setpoint_weight_d, gains.kp_nm_per_rad
 
     a = np.zeros((n + 4, n + 4))
@@ -310,42 +331,45 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     command[:n] = plant.b
 
     # The integral carries Ki T/2 of the last error, the derivative its decayed last step.
-    torque_from_angle = -(kp + 0.5 * ki_t + gain_d)
-    torque_from_reference = kp * b_p + 0.5 * ki_t + gain_d * b_d
+    torque_from_angle = -(kp + 0.5 * integral_gain + derivative_gain)
+    torque_from_reference = kp * b_p + 0.5 * integral_gain + derivative_gain * b_d
     torque = torque_from_angle * measured_angle + settings.feedforward_gain * measured_torque
     torque[[integral, derivative]] = 1.0
 
     from_angle = torque_from_angle * command
-    from_angle[integral] = -ki_t
-    from_angle[derivative] = -(decay_d - 1.0) * gain_d
+    from_angle[integral] = -integral_gain
+    from_angle[derivative] = -(derivative_decay - 1.0) * derivative_gain
     cuts = (
-        Cut("torque command", command, torque),
-        Cut("angle reading", from_angle, measured_angle),
-        Cut("torque reading", settings.feedforward_gain * command, measured_torque),
+        CutSignal("torque command", command, torque),
+        CutSignal("angle reading", from_angle, measured_angle),
+        CutSignal("torque reading", settings.feedforward_gain * command, measured_torque),
     )
 
     a[:n, :n] = plant.a
     a[:n] += np.outer(plant.b, torque)
     b[:n] = plant.b * torque_from_reference
-    a[integral] = -ki_t * measured_angle
+    a[integral] = -integral_gain * measured_angle
     a[integral, integral] += 1.0
-    b[integral] = ki_t
-    a[derivative] = -(decay_d - 1.0) * gain_d * measured_angle
-    a[derivative, derivative] += decay_d
-    b[derivative] = (decay_d - 1.0) * gain_d * b_d
+    b[integral] = integral_gain
+    a[derivative] = -(derivative_decay - 1.0) * derivative_gain * measured_angle
+    a[derivative, derivative] += derivative_decay
+    b[derivative] = (derivative_decay - 1.0) * derivative_gain * b_d
 
     # Low-pass filters: output = state + gain · input, next state = decay · output + gain · input.
     decay, gain = lowpass_coefficients(settings, model.rate_hz)
-    a[fast, fast] = decay
-    b[fast] = gain * (decay + 1.0)
-    a[slow, slow] = decay
-    a[slow, fast] = gain * (decay + 1.0)
-    b[slow] = gain * gain * (decay + 1.0)
+    a[filter_once, filter_once] = decay
+    b[filter_once] = gain * (decay + 1.0)
+    a[filter_twice, filter_twice] = decay
+    a[filter_twice, filter_once] = gain * (decay + 1.0)
+    b[filter_twice] = gain * gain * (decay + 1.0)
     speed = np.zeros(n + 4)
-    speed[fast], speed[slow] = settings.pole_rad_s * (1.0 - gain), -settings.pole_rad_s
+    speed[filter_once], speed[filter_twice] = (
+        settings.pole_rad_s * (1.0 - gain),
+        -settings.pole_rad_s,
+    )
     speed_from_reference = settings.pole_rad_s * (gain - gain * gain)
 
-    c = np.zeros((_ROWS, n + 4))
+    c = np.zeros((_OUTPUT_ROWS, n + 4))
     c[0, :n], c[1, :n], c[4, :n] = plant.angle, plant.velocity, plant.sensor_torque
     c[2], c[3] = torque, speed
     d = np.array([0.0, 0.0, torque_from_reference, speed_from_reference, 0.0])
@@ -365,23 +389,23 @@ def close_loop(model: LoopModel) -> ClosedLoop:
 
 
 def continuous_poles(a: Real, rate_hz: float) -> Complex:
-    """Return the modes of ``x[k+1] = a x[k]`` as poles in continuous time, in rad/s.
+    """Return the poles in continuous time, in rad/s, of the system ``x[k+1] = a x[k]``.
 
     Parameters
     ----------
     a
-        Shape (n, n).
+        State matrix, shape (n, n).
     rate_hz
         Ticks a second.
     """
     eigenvalues = np.linalg.eigvals(a).astype(complex)
     # Delays have eigenvalues at zero, which decay within a few ticks.
-    poles: Complex = np.log(eigenvalues[np.abs(eigenvalues) > _DEAD]) * rate_hz
+    poles: Complex = np.log(eigenvalues[np.abs(eigenvalues) > _MAX_DELAY_EIGENVALUE]) * rate_hz
     return poles
 
 
 def check_stability(loop: ClosedLoop) -> str | None:
-    """Check the stability of a closed loop before anything moves.
+    """Check the stability of a closed loop before the motor moves.
 
     Returns
     -------
@@ -391,51 +415,52 @@ def check_stability(loop: ClosedLoop) -> str | None:
     Raises
     ------
     ControlDesignError
-        If the loop grows faster than `MAX_GROWTH_PER_S`, or would do so without the beam's own
-        damping (`MAX_DAMPING_TAKEN`).
+        If an oscillation of the loop grows faster than `MAX_GROWTH_PER_S`, or would do so without
+        the beam's own damping (`MAX_DAMPING_REDUCTION`).
     """
-    remedy = _remedy(loop.model.settings)
+    remedy = _stability_remedy(loop.model.settings)
     growth = loop.growth_per_s
-    finding = (
+    instability = (
         "The closed loop of motor, beam and delays is unstable (spectral radius "
-        f"{loop.spectral_radius:.7f}): {_describe(loop.poles_rad_s[0])} grows at {growth:.2g} /s"
+        f"{loop.spectral_radius:.7f}): {_describe_pole(loop.poles_rad_s[0])} grows at "
+        f"{growth:.2g} /s"
     )
     if growth > MAX_GROWTH_PER_S:
-        raise ControlDesignError(f"{finding}; {remedy}.")
+        raise ControlDesignError(f"{instability}; {remedy}.")
     if loop.model.beam is not None:
-        light = close_loop(light_beam(loop.model, loop.model.beam))
-        pole = light.least_damped()
-        if _damping_ratio(pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_TAKEN:
+        lightly_damped_loop = close_loop(lightly_damped_model(loop.model, loop.model.beam))
+        pole = lightly_damped_loop.least_damped()
+        if _damping_ratio(pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_REDUCTION:
             raise ControlDesignError(
                 "The closed loop is stable only by the beam's own damping: without it (spectral "
-                f"radius {light.spectral_radius:.7f}), {_describe(pole)} grows at "
-                f"{pole.real:.2g} /s; {remedy}."
+                f"radius {lightly_damped_loop.spectral_radius:.7f}), {_describe_pole(pole)} grows "
+                f"at {pole.real:.2g} /s; {remedy}."
             )
     if growth <= 0.0:
         return None
     return (
-        f"{finding}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
+        f"{instability}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
         "damping does that, so keep sessions short."
     )
 
 
 def stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
-    """Close the loop of a rig, and raise if it is unstable.
+    """Return the closed loop of a rig with a warning, and raise if the loop is unstable.
 
-    The results for the last few models are cached: the check of a rig and the planning of a session
-    need the same one.
+    The results for the last few models are cached, because the check of a rig and the planning of a
+    session need the same loop.
 
     Parameters
     ----------
     model
-        From :meth:`rigd.profile.Profile.loop_model`.
+        Parameters of the loop, from :meth:`rigd.profile.Profile.loop_model`.
 
     Returns
     -------
     loop : ClosedLoop
-        The loop.
+        Closed loop.
     warning : str or None
-        From `check_stability`.
+        Warning of `check_stability`.
 
     Raises
     ------
@@ -449,11 +474,13 @@ def stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
 
 @lru_cache(maxsize=4)
 def _stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
+    """Return the closed loop and its warning, cached by model."""
     loop = close_loop(model)
     return loop, check_stability(loop)
 
 
-def _remedy(settings: ControlSettings) -> str:
+def _stability_remedy(settings: ControlSettings) -> str:
+    """Return the end of a message: how to change the settings of an unstable controller."""
     if settings.feedforward_gain < 0.5:
         return (
             f"control.feedforward_gain = {settings.feedforward_gain:g} leaves the beam to the "
@@ -466,15 +493,15 @@ def _remedy(settings: ControlSettings) -> str:
     )
 
 
-def light_beam(model: LoopModel, beam: Beam) -> LoopModel:
-    """Return a loop's model with a beam that has almost no damping.
+def lightly_damped_model(model: LoopModel, beam: Beam) -> LoopModel:
+    """Return a loop's model in which the beam has almost no damping.
 
     Parameters
     ----------
     model
-        The loop.
+        Model of the loop.
     beam
-        The beam.
+        Beam of the returned model.
     """
     first_mode_rad_s = float(undamped_frequencies_rad_s(beam, 1)[0])
     return replace(
@@ -483,19 +510,21 @@ def light_beam(model: LoopModel, beam: Beam) -> LoopModel:
 
 
 def _damping_ratio(pole_rad_s: complex) -> float:
+    """Return the damping ratio of a pole."""
     return -pole_rad_s.real / abs(pole_rad_s)
 
 
-def _describe(pole_rad_s: complex) -> str:
+def _describe_pole(pole_rad_s: complex) -> str:
+    """Return frequency and damping ratio of a pole as text."""
     frequency_hz = abs(pole_rad_s.imag) / (2.0 * pi)
     return f"a mode at {frequency_hz:.3g} Hz with damping ratio {_damping_ratio(pole_rad_s):.2g}"
 
 
-class _Plant:
-    """Motor, beam and delays in discrete time: ``z[k+1] = a z[k] + b u[k]``.
+class _DiscretePlant:
+    """State space of motor, beam and delays in discrete time: ``z[k+1] = a z[k] + b u[k]``.
 
-    The state is that of the coupled model, the last commands (newest first), and chains of past
-    readings. No reading depends on the command of its own tick.
+    The state z contains the state of motor and beam, the last commands (newest first), and past
+    readings that are delayed. No reading depends on the command u of its own tick.
     """
 
     def __init__(self, model: LoopModel, realisation: Realisation | None) -> None:
@@ -506,83 +535,91 @@ class _Plant:
             tool_inertia_kg_m2=model.tool_inertia_kg_m2,
         )
         period_s = 1.0 / model.rate_hz
-        whole, part = _split(model.actuation_delay_s, period_s, "actuation.delay_s")
-        angle_chain = _split(model.angle_delay_s, period_s, "encoder.delay_s")
-        torque_chain = _split(model.torque_delay_s, period_s, "sensor.delay_s")
+        whole_periods, remainder = _split_delay(
+            model.actuation_delay_s, period_s, "actuation.delay_s"
+        )
+        angle_chain = _split_delay(model.angle_delay_s, period_s, "encoder.delay_s")
+        torque_chain = _split_delay(model.torque_delay_s, period_s, "sensor.delay_s")
         n = coupled.b.size
-        commands = whole + 1
+        commands = whole_periods + 1
         lengths = [w + (1 if f > 0.0 else 0) for w, f in (angle_chain, torque_chain)]
         size = n + commands + sum(lengths)
 
         # Columns of the torque before and after the switch within a period. Without a whole period
         # of delay the command after it is the tick's own: the input column, last.
-        before = n + whole
-        after = before - 1 if whole else size
-        switch_s = part * period_s
-        extended = np.zeros((size, size + 1))
+        column_before = n + whole_periods
+        column_after = column_before - 1 if whole_periods else size
+        switch_s = remainder * period_s
+        extended_matrix = np.zeros((size, size + 1))
 
-        def advance(duration_s: float) -> tuple[Real, int]:
-            """Return the state (n, size + 1) a time after a tick, and the torque's column then."""
-            state, column = np.eye(n, size + 1), before
+        def state_map_after(duration_s: float) -> tuple[Real, int]:
+            """Return the linear map to the state at a time after a tick, shape (n, size + 1).
+
+            The second result is the column of the torque that acts at that time.
+            """
+            state, column = np.eye(n, size + 1), column_before
             for interval_s, acting in (
-                (min(duration_s, switch_s), before),
-                (duration_s - switch_s, after),
+                (min(duration_s, switch_s), column_before),
+                (duration_s - switch_s, column_after),
             ):
                 if interval_s > 0.0:
-                    phi, gamma = propagator(coupled, interval_s)
-                    state = phi @ state
-                    state[:, acting] += gamma
+                    transition, torque_effect = propagator(coupled, interval_s)
+                    state = transition @ state
+                    state[:, acting] += torque_effect
                     column = acting
             return state, column
 
-        def read(row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
-            """Return the row (size + 1,) of a sensor's reading a time after a tick."""
-            state, column = advance(since_tick_s)
+        def reading_row(row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
+            """Return the row vector of a sensor's reading at a time after a tick, (size + 1,)."""
+            state, column = state_map_after(since_tick_s)
             reading: Real = row @ state
             reading[column] += per_torque
             return reading
 
-        extended[:n] = advance(period_s)[0]
+        extended_matrix[:n] = state_map_after(period_s)[0]
         self.shaft_torque = np.append(propagator(coupled, period_s)[1], np.zeros(size - n))
-        extended[n, size] = 1.0
+        extended_matrix[n, size] = 1.0
         for command in range(1, commands):
-            extended[n + command, n + command - 1] = 1.0
+            extended_matrix[n + command, n + command - 1] = 1.0
 
         angle = (coupled.angle, 0.0)
         sensor_torque = (coupled.sensor_torque, coupled.sensor_torque_per_torque)
-        self.angle = read(*angle)[:size]
-        self.velocity = read(coupled.velocity, 0.0)[:size]
-        self.sensor_torque = read(*sensor_torque)[:size]
+        self.angle = reading_row(*angle)[:size]
+        self.velocity = reading_row(coupled.velocity, 0.0)[:size]
+        self.sensor_torque = reading_row(*sensor_torque)[:size]
 
-        measured = []
+        measured_rows = []
         first = n + commands
-        for (_, fraction), length, quantity, undelayed in (
+        for (_, fraction), length, quantity, undelayed_row in (
             (angle_chain, lengths[0], angle, self.angle),
             (torque_chain, lengths[1], sensor_torque, self.sensor_torque),
         ):
             if length == 0:
-                measured.append(undelayed)
+                measured_rows.append(undelayed_row)
                 continue
             # The chain's first link: the reading of the last tick, or one from the period since.
-            since_tick = 1.0 - fraction if fraction > 0.0 else 0.0
-            extended[first] = read(*quantity, since_tick * period_s)
+            periods_since_tick = 1.0 - fraction if fraction > 0.0 else 0.0
+            extended_matrix[first] = reading_row(*quantity, periods_since_tick * period_s)
             for link in range(first + 1, first + length):
-                extended[link, link - 1] = 1.0
-            measured.append(np.eye(size)[first + length - 1])
+                extended_matrix[link, link - 1] = 1.0
+            measured_rows.append(np.eye(size)[first + length - 1])
             first += length
-        self.measured_angle, self.measured_torque = measured
-        self.a = extended[:, :size]
-        self.b = extended[:, size]
+        self.measured_angle, self.measured_torque = measured_rows
+        self.a = extended_matrix[:, :size]
+        self.b = extended_matrix[:, size]
 
 
-def _split(delay_s: float, period_s: float, key: str) -> tuple[int, float]:
-    """Return the whole periods of a delay, and the remainder as a fraction of a period."""
+def _split_delay(delay_s: float, period_s: float, key: str) -> tuple[int, float]:
+    """Return the whole periods of a delay, and the remainder as a fraction of a period.
+
+    `key` is the delay's name in the message of the `ControlDesignError` for too long a delay.
+    """
     periods = delay_s / period_s
     if periods > MAX_DELAY_PERIODS:
         raise ControlDesignError(
             f"{key} = {delay_s:g} s is {periods:.4g} periods; at most {MAX_DELAY_PERIODS} can be "
             "controlled over."
         )
-    whole = floor(periods + 1e-9)
-    part = periods - whole
-    return whole, part if part > 1e-9 else 0.0
+    whole_periods = floor(periods + 1e-9)
+    remainder = periods - whole_periods
+    return whole_periods, remainder if remainder > 1e-9 else 0.0

@@ -1,7 +1,7 @@
 """Gain, phase, delay and modulus margin of the discrete closed loop at each of its cuts.
 
 A margin states how wrong one signal may be before the loop becomes unstable. There are three such
-signals, and they answer different questions:
+signals, each with a meaning of its own:
 
 torque command
     Motor and drive: torque constant, gear, delay of the command. It contains the whole loop, the
@@ -14,10 +14,10 @@ torque reading
 
 The feed-forward is positive feedback that cancels the beam. Where the clamped beam resonates, its
 loop gain is -1 by design. The curve therefore passes close to the critical point at the first and
-the third signal with any controller: a command that is `k` times too strong leaves ``1 - k`` times
-the beam in the loop. A gain margin of 2 is impossible there; it would mean a motor that feels the
-inverted beam. There the tolerances of drive and sensor have to fit into the margin. The rules of
-thumb for a feedback loop apply to the angle only.
+the third signal with any controller: with a command that is `k` times too strong, ``1 - k`` times
+the beam's torque remains in the loop. A gain margin of 2 is impossible there, since it would mean
+that the inverted torque of the beam acts on the motor. There the tolerances of drive and sensor
+have to fit into the margin. The rules of thumb for a feedback loop apply to the angle only.
 """
 
 from collections.abc import Callable
@@ -27,59 +27,68 @@ from math import inf, nan, pi
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.control._closed_loop import ClosedLoop, Cut
+from rigd.control._closed_loop import ClosedLoop, CutSignal
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-_LOWEST = 1e-6
+_LOWEST_FREQUENCY = 1e-6
 """Lowest examined frequency, as a fraction of the sampling rate."""
-_PER_DECADE = 60
-_OFFSETS = np.geomspace(0.03, 100.0, 16)
-"""Offsets of frequencies on both sides of a resonance, in its half-widths."""
-_SHARPEST = 1e-6
-"""Half-width assumed for a resonance without damping, as a fraction of its frequency."""
-_DEAD = 1e-3
+_FREQUENCIES_PER_DECADE = 60
+"""Number of examined frequencies in a decade, in addition to those near resonances."""
+_RESONANCE_OFFSETS = np.geomspace(0.03, 100.0, 16)
+"""Offsets of examined frequencies from a resonance to either side, in its half-widths."""
+_MIN_HALF_WIDTH = 1e-6
+"""Smallest half-width of a resonance, over its frequency, for modes without damping."""
+_MAX_DELAY_EIGENVALUE = 1e-3
 """Magnitude of an eigenvalue below which it belongs to a delay, not to a resonance."""
-_ALMOST_REAL = 1e-3
-_AT_ONCE = 128
-_HALVINGS = 45
-_ZOOMS = 3
+_MAX_IMAGINARY_RATIO = 1e-3
+"""Largest ratio of imaginary to real part with which the gain at either end of the frequencies
+counts as real."""
+_FREQUENCIES_AT_ONCE = 128
+"""Number of frequencies at which the gain is computed at once."""
+_BISECTIONS = 45
+"""Number of bisections by which the zero of a function of frequency is found."""
+_REFINEMENTS = 3
+"""Number of times that the frequencies around the smallest distance are refined."""
 
 
 @dataclass(frozen=True, slots=True)
 class Margins:
     """Stability margins at one signal of a stable loop, each with its frequency.
 
-    A frequency is NaN if there is no limit.
+    A frequency is NaN if the margin is unlimited.
     """
 
     cut: str
-    """The signal."""
+    """Name of the signal."""
     gain_up: float
-    """Factor (above 1) on the signal at which the loop becomes unstable; infinite if none does."""
+    """Smallest factor above 1 on the signal with which the loop becomes unstable; infinite if
+    none."""
     gain_up_hz: float
-    """Frequency of that limit."""
+    """Frequency in Hz at which the loop becomes unstable with the factor `gain_up`."""
     gain_down: float
-    """Factor (below 1) at which it becomes unstable; 0 if none does."""
+    """Largest factor below 1 on the signal with which the loop becomes unstable; 0 if none."""
     gain_down_hz: float
-    """Frequency of that limit."""
+    """Frequency in Hz at which the loop becomes unstable with the factor `gain_down`."""
     phase_rad: float
-    """Smallest phase shift in either direction that makes it unstable, up to π."""
+    """Smallest phase shift of the signal in either direction that makes the loop unstable, up to
+    π."""
     phase_hz: float
-    """Frequency of that limit."""
+    """Frequency in Hz at which the loop becomes unstable with this phase shift."""
     delay_s: float
-    """Smallest additional delay at which it becomes unstable; infinite if none does."""
+    """Smallest additional delay of the signal that makes the loop unstable; infinite if none."""
     delay_hz: float
-    """Frequency of that limit."""
+    """Frequency in Hz at which the loop becomes unstable with this delay."""
     modulus: float
-    """Smallest distance of the loop's gain from -1, the inverse of the largest sensitivity."""
+    """Modulus margin: smallest distance of the open loop's gain from -1, the inverse of the largest
+    sensitivity."""
     modulus_hz: float
-    """Frequency of that distance."""
+    """Frequency in Hz of the smallest distance."""
 
 
 def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
-    """Return the margins at each of the loop's cuts.
+    """Return the stability margins at each signal at which the loop can be opened.
 
     An additional delay counts as a phase shift. That is exact for whole periods, and otherwise to
     0.1 % at the frequencies of the beam.
@@ -87,7 +96,7 @@ def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
     Parameters
     ----------
     loop
-        A stable loop: the margins of an unstable one are meaningless.
+        Stable loop; the margins of an unstable loop are meaningless.
 
     References
     ----------
@@ -103,61 +112,71 @@ def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
     angle reading: modulus margin 0.47
     torque reading: modulus margin 0.25
     """
-    return tuple(_margins(loop, cut) for cut in loop.cuts)
+    return tuple(_margins_at_cut(loop, cut) for cut in loop.cuts)
 
 
-def open_loop_gain(loop: ClosedLoop, cut: Cut, phase_rad: Real) -> Complex:
-    """Return the loop's gain L at a cut; the loop closes as ``1/(1 + L)``.
+def open_loop_gain(loop: ClosedLoop, cut: CutSignal, phase_rad: Real) -> Complex:
+    """Return the complex gain L of the loop opened at one signal, at some frequencies.
+
+    The sensitivity of the closed loop is ``1/(1 + L)``.
 
     Parameters
     ----------
     loop, cut
-        One of the loop's cuts.
+        Closed loop, and one of its cuts.
     phase_rad
-        Frequency times period, shape (m,): π is half the sampling rate.
+        Angular frequencies times the period, shape (m,); π is half the sampling rate.
 
     Returns
     -------
     ndarray
-        Complex, shape (m,).
+        Complex gain, shape (m,).
     """
     n = cut.action.size
-    opened = loop.a - np.outer(cut.action, cut.reading)
+    open_loop_matrix = loop.a - np.outer(cut.action, cut.reading)
     gain = np.empty(phase_rad.shape, complex)
-    for first in range(0, phase_rad.size, _AT_ONCE):
-        z = np.exp(1j * phase_rad[first : first + _AT_ONCE])[:, np.newaxis, np.newaxis]
+    for first in range(0, phase_rad.size, _FREQUENCIES_AT_ONCE):
+        z = np.exp(1j * phase_rad[first : first + _FREQUENCIES_AT_ONCE])[:, np.newaxis, np.newaxis]
         action = np.broadcast_to(cut.action[:, np.newaxis], (z.size, n, 1))
-        states = np.linalg.solve(z * np.eye(n) - opened, action)
-        gain[first : first + _AT_ONCE] = -(states[:, :, 0] @ cut.reading)
+        states = np.linalg.solve(z * np.eye(n) - open_loop_matrix, action)
+        gain[first : first + _FREQUENCIES_AT_ONCE] = -(states[:, :, 0] @ cut.reading)
     return gain
 
 
-def _margins(loop: ClosedLoop, cut: Cut) -> Margins:
+def _margins_at_cut(loop: ClosedLoop, cut: CutSignal) -> Margins:
+    """Return the stability margins of a loop at one signal."""
+
     def curve(phase_rad: Real) -> Complex:
         return open_loop_gain(loop, cut, phase_rad)
 
     rate_hz = loop.model.rate_hz
-    frequencies = _frequencies(loop, cut)
+    frequencies = _examined_frequencies(loop, cut)
     gain = curve(frequencies)
 
-    real_at, real_gain = _where_real(curve, frequencies, gain)
+    crossing_phase, real_gain = _negative_real_crossings(curve, frequencies, gain)
     factor = -1.0 / real_gain
-    up_at, up = _smallest(real_at, np.where(factor > 1.0, factor, inf))
-    down_at, down = _smallest(real_at, np.where(factor <= 1.0, -factor, inf))
+    gain_up_at, gain_up = _smallest_with_frequency(
+        crossing_phase, np.where(factor > 1.0, factor, inf)
+    )
+    gain_down_at, gain_down = _smallest_with_frequency(
+        crossing_phase, np.where(factor <= 1.0, -factor, inf)
+    )
 
-    unity_at = _zeros(lambda value: np.abs(value) - 1.0, curve, frequencies, gain)
+    unity_at = _sign_changes(lambda value: np.abs(value) - 1.0, curve, frequencies, gain)
     lag_rad = (np.angle(curve(unity_at)) + pi) % (2.0 * pi)
-    phase_at, phase_rad = _smallest(unity_at, np.minimum(lag_rad, 2.0 * pi - lag_rad))
-    delay_at, delay_s = _smallest(unity_at, lag_rad / unity_at / rate_hz)
+    phase_at, phase_rad = _smallest_with_frequency(
+        unity_at, np.minimum(lag_rad, 2.0 * pi - lag_rad)
+    )
+    delay_at, delay_s = _smallest_with_frequency(unity_at, lag_rad / unity_at / rate_hz)
 
-    modulus_at, modulus = _smallest_distance(curve, frequencies, gain)
+    modulus_at, modulus = _distance_to_critical_point(curve, frequencies, gain)
     to_hz = rate_hz / (2.0 * pi)
     return Margins(
         cut=cut.name,
-        gain_up=up,
-        gain_up_hz=up_at * to_hz,
-        gain_down=0.0 if down == inf else -down,
-        gain_down_hz=down_at * to_hz,
+        gain_up=gain_up,
+        gain_up_hz=gain_up_at * to_hz,
+        gain_down=0.0 if gain_down == inf else -gain_down,
+        gain_down_hz=gain_down_at * to_hz,
         phase_rad=min(phase_rad, pi),
         phase_hz=phase_at * to_hz,
         delay_s=delay_s,
@@ -168,59 +187,71 @@ def _margins(loop: ClosedLoop, cut: Cut) -> Margins:
 
 
 Curve = Callable[[Real], Complex]
-"""The loop's gain over frequency times period."""
+"""Function that returns the open loop's gain at angular frequencies times the period."""
 
 
-def _frequencies(loop: ClosedLoop, cut: Cut) -> Real:
-    """Return frequencies times period, dense around the resonances of open and closed loop."""
-    opened = loop.a - np.outer(cut.action, cut.reading)
-    poles = np.concatenate([np.linalg.eigvals(matrix) for matrix in (opened, loop.a)])
-    poles = np.log(poles[np.abs(poles) > _DEAD].astype(complex))
+def _examined_frequencies(loop: ClosedLoop, cut: CutSignal) -> Real:
+    """Return the examined angular frequencies times the period, in increasing order.
+
+    They are dense around the resonances of the open and the closed loop.
+    """
+    open_loop_matrix = loop.a - np.outer(cut.action, cut.reading)
+    poles = np.concatenate([np.linalg.eigvals(matrix) for matrix in (open_loop_matrix, loop.a)])
+    poles = np.log(poles[np.abs(poles) > _MAX_DELAY_EIGENVALUE].astype(complex))
     poles = poles[(poles.imag > 0.0) & (poles.imag < pi)]
-    half_width = np.maximum(np.abs(poles.real), _SHARPEST * poles.imag)
-    offsets = half_width[:, np.newaxis] * np.concatenate([-_OFFSETS, [0.0], _OFFSETS])
-    lowest = 2.0 * pi * _LOWEST
-    spread = np.geomspace(lowest, pi, round(_PER_DECADE * np.log10(pi / lowest)))
-    frequencies = np.concatenate([spread, (poles.imag[:, np.newaxis] + offsets).ravel()])
+    half_width = np.maximum(np.abs(poles.real), _MIN_HALF_WIDTH * poles.imag)
+    offsets = half_width[:, np.newaxis] * np.concatenate(
+        [-_RESONANCE_OFFSETS, [0.0], _RESONANCE_OFFSETS]
+    )
+    lowest = 2.0 * pi * _LOWEST_FREQUENCY
+    decade_grid = np.geomspace(lowest, pi, round(_FREQUENCIES_PER_DECADE * np.log10(pi / lowest)))
+    frequencies = np.concatenate([decade_grid, (poles.imag[:, np.newaxis] + offsets).ravel()])
     return np.unique(frequencies[(frequencies >= lowest) & (frequencies <= pi)])
 
 
-def _where_real(curve: Curve, frequencies: Real, gain: Complex) -> tuple[Real, Real]:
-    """Return frequencies at which the gain is real and negative, and its values there."""
-    inner = _zeros(np.imag, curve, frequencies, gain)
+def _negative_real_crossings(curve: Curve, frequencies: Real, gain: Complex) -> tuple[Real, Real]:
+    """Return the frequencies at which the open loop's gain is real and negative, and the gains."""
+    crossings = _sign_changes(np.imag, curve, frequencies, gain)
     # The curve ends at frequency 0 and half the sampling rate, where the gain is always real.
-    ends = [end for end in (0, -1) if abs(gain[end].imag) < _ALMOST_REAL * abs(gain[end].real)]
-    at = np.concatenate([inner, frequencies[ends]])
-    real = np.concatenate([curve(inner).real, gain[ends].real])
-    return at[real < 0.0], real[real < 0.0]
+    end_indices = [
+        end for end in (0, -1) if abs(gain[end].imag) < _MAX_IMAGINARY_RATIO * abs(gain[end].real)
+    ]
+    at = np.concatenate([crossings, frequencies[end_indices]])
+    real_gains = np.concatenate([curve(crossings).real, gain[end_indices].real])
+    return at[real_gains < 0.0], real_gains[real_gains < 0.0]
 
 
-def _zeros(
+def _sign_changes(
     function: Callable[[Complex], Real], curve: Curve, frequencies: Real, gain: Complex
 ) -> Real:
-    """Return where a real function of the gain changes its sign."""
-    negative = np.signbit(function(gain))
-    first = np.flatnonzero(negative[:-1] != negative[1:])
+    """Return the frequencies at which a real function of the open loop's gain changes its sign."""
+    is_negative = np.signbit(function(gain))
+    first = np.flatnonzero(is_negative[:-1] != is_negative[1:])
     low, high = frequencies[first], frequencies[first + 1]
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        before = np.signbit(function(curve(middle))) == negative[first]
-        low, high = np.where(before, middle, low), np.where(before, high, middle)
+        is_before_zero = np.signbit(function(curve(middle))) == is_negative[first]
+        low, high = np.where(is_before_zero, middle, low), np.where(is_before_zero, high, middle)
     zeros: Real = 0.5 * (low + high)
     return zeros
 
 
-def _smallest(at: Real, values: Real) -> tuple[float, float]:
-    """Return position and size of the smallest value; NaN and infinity if there is none."""
+def _smallest_with_frequency(at: Real, values: Real) -> tuple[float, float]:
+    """Return the frequency of the smallest value, and the value; NaN and infinity if all are inf.
+
+    `at` contains the frequency of each value.
+    """
     if values.size == 0 or values.min() == inf:
         return nan, inf
     index = int(values.argmin())
     return float(at[index]), float(values[index])
 
 
-def _smallest_distance(curve: Curve, frequencies: Real, gain: Complex) -> tuple[float, float]:
-    """Return where the gain is closest to -1, and the distance."""
-    for _ in range(_ZOOMS):
+def _distance_to_critical_point(
+    curve: Curve, frequencies: Real, gain: Complex
+) -> tuple[float, float]:
+    """Return the frequency at which the open loop's gain is closest to -1, and the distance."""
+    for _ in range(_REFINEMENTS):
         nearest = int(np.abs(1.0 + gain).argmin())
         low, high = (
             frequencies[max(nearest - 1, 0)],
@@ -228,4 +259,4 @@ def _smallest_distance(curve: Curve, frequencies: Real, gain: Complex) -> tuple[
         )
         frequencies = np.linspace(low, high, 21)
         gain = curve(frequencies)
-    return _smallest(frequencies, np.abs(1.0 + gain))
+    return _smallest_with_frequency(frequencies, np.abs(1.0 + gain))

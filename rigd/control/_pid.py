@@ -19,33 +19,37 @@ from rigd.errors import UserError
 
 
 class ControlDesignError(UserError, ValueError):
-    """The requested controller cannot be designed, or its closed loop is unstable."""
+    """Error of a controller that cannot be designed, or whose closed loop is unstable."""
 
 
 @dataclass(frozen=True, slots=True)
 class ControlSettings:
-    """Controller settings of a profile."""
+    """Settings of the angle controller in a profile."""
 
     pole_rad_s: Annotated[float, Gt(0)]
-    """All four poles of the nominal closed loop lie at minus this."""
+    """Distance of the nominal closed loop's four poles from the origin; they are real."""
     feedforward_gain: Annotated[float, Ge(0), Le(2)]
     """Fraction of the measured coupling torque that is added to the command; 1 cancels the beam."""
     friction_compensation_nm: Annotated[float, Ge(0)]
-    """Coulomb friction assumed by the controller; 0 switches the compensation off."""
+    """Coulomb friction that the controller compensates; 0 switches the compensation off."""
     friction_velocity_rad_s: Annotated[float, Gt(0)]
-    """Reference speed over which the compensation changes sign."""
+    """Speed at which the compensation reaches 76 % of its largest torque (the tanh of 1)."""
 
 
 @dataclass(frozen=True, slots=True)
 class PidGains:
-    """2DOF PID ``u = Kp (b r - y) + Ki/s (r - y) + Kd s/(1 + Tf s) (c r - y)``."""
+    """Gains of a PID controller with two degrees of freedom.
+
+    The torque is ``u = Kp (b r - y) + Ki/s (r - y) + Kd s/(1 + Tf s) (c r - y)`` for the reference
+    r and the angle y.
+    """
 
     kp_nm_per_rad: float
-    """Kp."""
+    """Proportional gain Kp."""
     ki_nm_per_rad_s: float
-    """Ki."""
+    """Integral gain Ki."""
     kd_nm_s_per_rad: float
-    """Kd."""
+    """Derivative gain Kd."""
     filter_s: float
     """Time constant Tf of the derivative's filter."""
     setpoint_weight_p: float
@@ -55,7 +59,7 @@ class PidGains:
 
     @property
     def tracking_s(self) -> float:
-        """Time constant of the anti-windup's back-calculation: the integral time ``Kp/Ki``."""
+        """Time constant in s of the anti-windup's back-calculation: the integral time ``Kp/Ki``."""
         return self.kp_nm_per_rad / self.ki_nm_per_rad_s
 
 
@@ -71,7 +75,7 @@ def design_pid(
     Parameters
     ----------
     motor_inertia_kg_m2, viscous_nm_s_per_rad
-        The motor alone, at the output shaft.
+        Inertia and viscous friction of the motor alone, at the output shaft.
     pole_rad_s
         Distance p of the poles from the origin.
 
@@ -131,17 +135,18 @@ def design_pid(
 
 
 class PidController:
-    """2DOF PID with feed-forward of the coupling torque and compensation of Coulomb friction.
+    """PID controller of the motor's angle, with feed-forward and friction compensation.
 
-    After each step its terms are in the attributes ``proportional_nm``, ``integral_nm``,
-    ``derivative_nm``, ``feedforward_nm`` and ``friction_nm``, their sum in
-    ``unlimited_torque_nm``, and ``saturated`` states whether the sum was limited; the integral then
-    already contains the anti-windup's correction for the next step.
+    It has two degrees of freedom. The measured coupling torque is fed forward, and Coulomb friction
+    is compensated. After each step its terms are in the attributes ``proportional_nm``,
+    ``integral_nm``, ``derivative_nm``, ``feedforward_nm`` and ``friction_nm``, and their sum in
+    ``unlimited_torque_nm``. The attribute ``saturated`` states whether the sum was limited. The
+    integral then already contains the anti-windup's correction for the next step.
 
     Parameters
     ----------
     gains
-        From :func:`rigd.control.design_pid`.
+        Gains from :func:`rigd.control.design_pid`.
     settings
         Feed-forward gain, friction compensation and nominal pole.
     rate_hz
@@ -163,24 +168,24 @@ class PidController:
     """
 
     __slots__ = (
-        "_b_d",
-        "_b_p",
-        "_coulomb_nm",
-        "_decay_d",
-        "_error",
-        "_fast_rad",
+        "_derivative_decay",
+        "_derivative_gain",
         "_feedforward_gain",
-        "_gain_d",
-        "_half_ki_t",
-        "_inverse_v0",
-        "_kp",
+        "_filtered_once_rad",
+        "_filtered_twice_rad",
+        "_friction_compensation_nm",
+        "_half_integral_gain",
+        "_inverse_friction_velocity",
+        "_last_error",
+        "_last_reference_rad",
+        "_last_weighted_error",
         "_lowpass_decay",
         "_lowpass_gain",
         "_pole_rad_s",
-        "_reference_rad",
-        "_slow_rad",
+        "_proportional_gain",
+        "_setpoint_weight_d",
+        "_setpoint_weight_p",
         "_tracking_gain",
-        "_weighted_error",
         "derivative_nm",
         "feedforward_nm",
         "friction_nm",
@@ -196,61 +201,69 @@ class PidController:
     ) -> None:
         period_s = 1.0 / rate_hz
         self.torque_limit_nm = torque_limit_nm
-        self._kp = gains.kp_nm_per_rad
-        self._b_p = gains.setpoint_weight_p
-        self._b_d = gains.setpoint_weight_d
-        self._half_ki_t = 0.5 * gains.ki_nm_per_rad_s * period_s
-        self._decay_d, self._gain_d = derivative_coefficients(gains, rate_hz)
+        self._proportional_gain = gains.kp_nm_per_rad
+        self._setpoint_weight_p = gains.setpoint_weight_p
+        self._setpoint_weight_d = gains.setpoint_weight_d
+        self._half_integral_gain = 0.5 * gains.ki_nm_per_rad_s * period_s
+        self._derivative_decay, self._derivative_gain = derivative_coefficients(gains, rate_hz)
         self._tracking_gain = period_s / gains.tracking_s
         self._feedforward_gain = settings.feedforward_gain
-        self._coulomb_nm = settings.friction_compensation_nm
-        self._inverse_v0 = 1.0 / settings.friction_velocity_rad_s
+        self._friction_compensation_nm = settings.friction_compensation_nm
+        self._inverse_friction_velocity = 1.0 / settings.friction_velocity_rad_s
         self._pole_rad_s = settings.pole_rad_s
         self._lowpass_decay, self._lowpass_gain = lowpass_coefficients(settings, rate_hz)
         self.reset(0.0)
 
     def reset(self, angle_rad: float) -> None:
-        """Initialise the controller at rest at an angle, without a bump.
+        """Set the controller's state to rest at an angle, so that the torque does not jump.
 
-        The next step returns no torque if reference and angle are still equal to it and the
+        The next step returns no torque if reference and angle are still equal to this angle and the
         coupling torque is zero.
         """
-        self.proportional_nm = self._kp * (self._b_p - 1.0) * angle_rad
+        self.proportional_nm = self._proportional_gain * (self._setpoint_weight_p - 1.0) * angle_rad
         self.integral_nm = -self.proportional_nm
         self.derivative_nm = 0.0
         self.feedforward_nm = 0.0
         self.friction_nm = 0.0
         self.unlimited_torque_nm = 0.0
         self.saturated = False
-        self._error = 0.0
-        self._weighted_error = (self._b_d - 1.0) * angle_rad
-        self._reference_rad = angle_rad
-        self._fast_rad = angle_rad
-        self._slow_rad = angle_rad
+        self._last_error = 0.0
+        self._last_weighted_error = (self._setpoint_weight_d - 1.0) * angle_rad
+        self._last_reference_rad = angle_rad
+        self._filtered_once_rad = angle_rad
+        self._filtered_twice_rad = angle_rad
 
     def step(self, reference_rad: float, angle_rad: float, coupling_torque_nm: float) -> float:
-        """Return the torque command of this tick, in N·m.
+        """Compute the terms of the controller for a tick, and return the torque command in N·m.
 
         Parameters
         ----------
         reference_rad, angle_rad
             Reference and measured angle.
         coupling_torque_nm
-            Measured torque, which is fed forward.
+            Measured coupling torque, which is fed forward.
         """
         error = reference_rad - angle_rad
-        weighted_error = self._b_d * reference_rad - angle_rad
-        proportional = self._kp * (self._b_p * reference_rad - angle_rad)
-        integral = self.integral_nm + self._half_ki_t * (error + self._error)
-        derivative = self._decay_d * self.derivative_nm + self._gain_d * (
-            weighted_error - self._weighted_error
+        weighted_error = self._setpoint_weight_d * reference_rad - angle_rad
+        proportional = self._proportional_gain * (
+            self._setpoint_weight_p * reference_rad - angle_rad
+        )
+        integral = self.integral_nm + self._half_integral_gain * (error + self._last_error)
+        derivative = self._derivative_decay * self.derivative_nm + self._derivative_gain * (
+            weighted_error - self._last_weighted_error
         )
         feedforward = self._feedforward_gain * coupling_torque_nm
 
         decay, gain = self._lowpass_decay, self._lowpass_gain
-        fast = decay * self._fast_rad + gain * (reference_rad + self._reference_rad)
-        slow = decay * self._slow_rad + gain * (fast + self._fast_rad)
-        friction = self._coulomb_nm * tanh(self._pole_rad_s * (fast - slow) * self._inverse_v0)
+        filtered_once = decay * self._filtered_once_rad + gain * (
+            reference_rad + self._last_reference_rad
+        )
+        filtered_twice = decay * self._filtered_twice_rad + gain * (
+            filtered_once + self._filtered_once_rad
+        )
+        friction = self._friction_compensation_nm * tanh(
+            self._pole_rad_s * (filtered_once - filtered_twice) * self._inverse_friction_velocity
+        )
 
         unlimited = proportional + integral + derivative + feedforward + friction
         torque = unlimited
@@ -259,11 +272,11 @@ class PidController:
         elif unlimited < -self.torque_limit_nm:
             torque = -self.torque_limit_nm
 
-        self._error = error
-        self._weighted_error = weighted_error
-        self._reference_rad = reference_rad
-        self._fast_rad = fast
-        self._slow_rad = slow
+        self._last_error = error
+        self._last_weighted_error = weighted_error
+        self._last_reference_rad = reference_rad
+        self._filtered_once_rad = filtered_once
+        self._filtered_twice_rad = filtered_twice
         self.proportional_nm = proportional
         self.integral_nm = integral + self._tracking_gain * (torque - unlimited)
         self.derivative_nm = derivative
@@ -275,18 +288,20 @@ class PidController:
 
 
 def derivative_coefficients(gains: PidGains, rate_hz: float) -> tuple[float, float]:
-    """Return decay and gain of ``d[k] = decay d[k-1] + gain (e[k] - e[k-1])``.
+    """Return the coefficients of the discrete derivative term.
 
-    Tustin's rule on ``Kd s/(1 + Tf s)``; d in N·m, gain in N·m/rad.
+    The decay and the gain belong to ``d[k] = decay d[k-1] + gain (e[k] - e[k-1])``, which is
+    ``Kd s/(1 + Tf s)`` by Tustin's rule. The term d is in N·m, the gain in N·m/rad.
     """
     two_tf = 2.0 * gains.filter_s * rate_hz
     return (two_tf - 1.0) / (two_tf + 1.0), 2.0 * gains.kd_nm_s_per_rad * rate_hz / (two_tf + 1.0)
 
 
 def lowpass_coefficients(settings: ControlSettings, rate_hz: float) -> tuple[float, float]:
-    """Return decay and gain of ``x[k] = decay x[k-1] + gain (u[k] + u[k-1])``.
+    """Return the coefficients of the discrete low-pass filter of the reference.
 
-    Tustin's rule on ``1/(1 + s/p)``.
+    The decay and the gain belong to ``x[k] = decay x[k-1] + gain (u[k] + u[k-1])``, which is
+    ``1/(1 + s/p)`` by Tustin's rule.
     """
     step = settings.pole_rad_s / rate_hz
     return (2.0 - step) / (2.0 + step), step / (2.0 + step)

@@ -1,7 +1,7 @@
 """Active damping of the beam: the motor that holds it yields to its torque like a dashpot.
 
 A motor whose speed is proportional to the torque of the beam takes energy out of every mode of any
-beam. The damper moves the reference in this way; a lead compensates the lag of the loop, and slow
+beam. The damper moves the reference in this way. A lead compensates the lag of the loop, and slow
 torques are filtered out, so that the motor stays in position. The stability with loop, delays and
 beam is checked on the closed loop.
 """
@@ -19,37 +19,39 @@ if TYPE_CHECKING:
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-_STRENGTH = 0.25
-"""Speed per torque, times the beam's inertia and the frequency of its first mode: the damping ratio
-becomes about half of that. Twice as much gains little, and is less stable at the third mode."""
-_HALVINGS = 5
-_STIFFNESSES = (0.8, 1.0, 1.25)
-"""Stiffnesses of the beam, over the profile's, for which the loop has to be stable."""
-_SLOW = 0.25
-"""Corner below which torques are filtered out, over the frequency of the first mode."""
+_DAMPING_STRENGTH = 0.25
+"""Speed of the reference per torque, times the beam's inertia and the frequency of its first mode.
+The damping ratio becomes about half of this number. Twice as much gains little, and is less stable
+at the third mode."""
+_MAX_HALVINGS = 5
+"""Largest number of times that the strength of the damping is halved to make the loop stable."""
+_STIFFNESS_RATIOS = (0.8, 1.0, 1.25)
+"""Ratios of the beam's stiffness to the profile's for which the loop must be stable."""
+_SLOW_CORNER_OVER_MODE = 0.25
+"""Frequency below which torques are filtered out, over the frequency of the first mode."""
 
 
 @dataclass(frozen=True, slots=True)
 class DamperSettings:
-    """Settings of the active damping, for one rig."""
+    """Settings of the active damping for one rig."""
 
     yield_rad_per_nm_s: float
     """Speed of the reference per torque of the beam."""
     lead_s: float
-    """Lead that compensates the lag of the loop."""
+    """Lead time that compensates the lag of the loop."""
     slow_rad_s: float
-    """Corner below which torques are filtered out."""
+    """Corner frequency below which torques are filtered out."""
     fast_rad_s: float
-    """Corner above which torques are filtered out."""
+    """Corner frequency above which torques are filtered out."""
 
 
 class VibrationDamper:
-    """Moves a reference so that the beam's vibration decays.
+    """Active damper, which moves the reference angle so that the beam's vibration decays.
 
     Parameters
     ----------
     settings
-        From `design_damper`.
+        Settings from `design_damper`.
     rate_hz
         Ticks a second.
 
@@ -62,47 +64,55 @@ class VibrationDamper:
     """
 
     def __init__(self, settings: DamperSettings, rate_hz: float) -> None:
-        self._law = _Law(settings, rate_hz)
+        self._damping_law = _DampingLaw(settings, rate_hz)
         self._state = 0.0, 0.0, 0.0
 
     def step(self, coupling_torque_nm: float) -> float:
-        """Return the movement of the reference in this tick, in rad.
+        """Return the displacement of the reference from its resting angle in this tick, in rad.
 
         Parameters
         ----------
         coupling_torque_nm
-            Measured torque.
+            Measured coupling torque.
         """
-        self._state, moved_rad = self._law.advance(self._state, coupling_torque_nm)
-        return moved_rad
+        self._state, displacement_rad = self._damping_law.advance(self._state, coupling_torque_nm)
+        return displacement_rad
 
 
 _Signal = TypeVar("_Signal", float, Real)
 
 
-class _Law:
-    """Recursion over numbers in the control loop, or over rows of its states in the design."""
+class _DampingLaw:
+    """Control law of the active damping, applied tick by tick.
+
+    It works with numbers in the control loop, and with row vectors of states in the design.
+    """
 
     def __init__(self, settings: DamperSettings, rate_hz: float) -> None:
         self._gain = settings.yield_rad_per_nm_s / rate_hz
         self._lead = settings.yield_rad_per_nm_s * settings.lead_s
-        self._take = 1.0 - exp(-settings.fast_rad_s / rate_hz)
-        self._leak = 1.0 - exp(-settings.slow_rad_s / rate_hz)
+        self._fast_coefficient = 1.0 - exp(-settings.fast_rad_s / rate_hz)
+        self._slow_coefficient = 1.0 - exp(-settings.slow_rad_s / rate_hz)
 
     def advance(
         self, state: tuple[_Signal, _Signal, _Signal], torque: _Signal
     ) -> tuple[tuple[_Signal, _Signal, _Signal], _Signal]:
-        """Return the next state (both filters, leaky integral) and the movement."""
-        fast, slow, yielded = state
-        fast = fast + self._take * (torque - fast)
-        slow = slow + self._leak * (fast - slow)
-        swing = fast - slow
-        yielded = yielded - self._leak * yielded + self._gain * swing
-        return (fast, slow, yielded), -yielded - self._lead * swing
+        """Compute one tick: return the next state, and the displacement of the reference in rad.
+
+        The state consists of both filters and the leaky integral.
+        """
+        fast, slow, leaky_integral = state
+        fast = fast + self._fast_coefficient * (torque - fast)
+        slow = slow + self._slow_coefficient * (fast - slow)
+        filtered_torque = fast - slow
+        leaky_integral = (
+            leaky_integral - self._slow_coefficient * leaky_integral + self._gain * filtered_torque
+        )
+        return (fast, slow, leaky_integral), -leaky_integral - self._lead * filtered_torque
 
 
 def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
-    """Choose the active damping of a rig.
+    """Return the settings of the active damping for a rig, or None if none is stable.
 
     Parameters
     ----------
@@ -112,8 +122,8 @@ def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     Returns
     -------
     DamperSettings or None
-        The strongest damping that leaves the loop stable on beams of several stiffnesses with
-        almost no damping of their own; None without one, or without a beam.
+        The strongest damping with which the loop is stable on beams of several stiffnesses with
+        almost no damping of their own. None if no such damping is found, or there is no beam.
 
     Raises
     ------
@@ -122,25 +132,27 @@ def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     """
     # Imported here: the control process uses a finished design, and starts sooner without these.
     from rigd.beam import undamped_frequencies_rad_s
-    from rigd.control._closed_loop import MAX_GROWTH_PER_S, close_loop, light_beam
+    from rigd.control._closed_loop import MAX_GROWTH_PER_S, close_loop, lightly_damped_model
 
     model = loop.model
     if model.beam is None:
         return None
     first_rad_s = float(undamped_frequencies_rad_s(model.beam, 1)[0])
     settings = DamperSettings(
-        yield_rad_per_nm_s=_STRENGTH / (model.beam.inertia_kg_m2 * first_rad_s),
+        yield_rad_per_nm_s=_DAMPING_STRENGTH / (model.beam.inertia_kg_m2 * first_rad_s),
         lead_s=2.0 / model.settings.pole_rad_s,
-        slow_rad_s=_SLOW * first_rad_s,
+        slow_rad_s=_SLOW_CORNER_OVER_MODE * first_rad_s,
         fast_rad_s=4.0 * model.settings.pole_rad_s,
     )
     stiffness = model.beam.bending_stiffness_n_m2
-    beams = [replace(model.beam, bending_stiffness_n_m2=part * stiffness) for part in _STIFFNESSES]
-    loops = [close_loop(light_beam(model, beam)) for beam in beams]
-    for _ in range(_HALVINGS):
-        growths = [damped_poles(each, settings).real.max() for each in loops]
+    beams = [
+        replace(model.beam, bending_stiffness_n_m2=ratio * stiffness) for ratio in _STIFFNESS_RATIOS
+    ]
+    loops = [close_loop(lightly_damped_model(model, beam)) for beam in beams]
+    for _ in range(_MAX_HALVINGS):
+        growth_rates_per_s = [damped_poles(each, settings).real.max() for each in loops]
         # The same growth as without it is allowed, on beams with almost no damping of their own.
-        if max(growths) <= MAX_GROWTH_PER_S:
+        if max(growth_rates_per_s) <= MAX_GROWTH_PER_S:
             return settings
         settings = replace(settings, yield_rad_per_nm_s=0.5 * settings.yield_rad_per_nm_s)
     return None
@@ -152,20 +164,20 @@ def damped_poles(loop: "ClosedLoop", settings: DamperSettings) -> Complex:
     Parameters
     ----------
     loop
-        Closed loop without it.
+        Closed loop without active damping.
     settings
-        Active damping.
+        Settings of the active damping.
     """
     from rigd.control._closed_loop import continuous_poles
 
     n, rate_hz = loop.b.size, loop.model.rate_hz
     reading = next(cut.reading for cut in loop.cuts if cut.name == "torque reading")
-    fast, slow, yielded = np.eye(3, n + 3, n)
-    states, moved = _Law(settings, rate_hz).advance(
-        (fast, slow, yielded), np.append(reading, np.zeros(3))
+    fast, slow, leaky_integral = np.eye(3, n + 3, n)
+    states, displacement = _DampingLaw(settings, rate_hz).advance(
+        (fast, slow, leaky_integral), np.append(reading, np.zeros(3))
     )
     a = np.zeros((n + 3, n + 3))
     a[:n, :n] = loop.a
-    a[:n] += np.outer(loop.b, moved)
+    a[:n] += np.outer(loop.b, displacement)
     a[n:] = states
     return continuous_poles(a, rate_hz)

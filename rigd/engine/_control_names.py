@@ -4,23 +4,25 @@ from collections.abc import Sequence
 from typing import Final
 
 CONTROL_MODULE: Final = "rigd.engine.control_process"
-"""Run as ``python -m CONTROL_MODULE PID``, with the process id of its supervisor."""
+"""Module of the control process, run as ``python -m CONTROL_MODULE PID`` with the process id of its
+supervisor."""
 
 CONNECTING_NAME: Final = "rigd connecting"
-"""Short name of the process before its devices are connected."""
+"""Name of the control process in the process table before its devices are connected."""
 IDLE_NAME: Final = "rigd idle"
-"""Short name while the drive is disabled."""
+"""Name of the control process in the process table while the drive is disabled."""
 SESSION_NAME: Final = "rigd session"
-"""Short name from the start of a session until the drive is disabled again."""
+"""Name of the control process in the process table from the start of a session until the drive is
+disabled again."""
 
 
 def supervisor_of_control(command: Sequence[str]) -> int | None:
-    """Return the process id of a control process's supervisor, from its command line.
+    """Return the process id of a control process's supervisor, or None for other processes.
 
     Parameters
     ----------
     command
-        Command line of any process. If it is no control process, the result is None.
+        Command line of any process, as a list of arguments.
     """
     if tuple(command[-3:-1]) != ("-m", CONTROL_MODULE) or not command[-1].isdecimal():
         return None

@@ -1,4 +1,4 @@
-"""Sequence of a probing move: tare, enable, strokes, disable.
+"""Sequence of a probing move: tare, enable, move to and fro, disable.
 
 It uses the cycle of a session, with its interlocks, stops and watchdogs, but another controller,
 and records nothing.
@@ -7,10 +7,10 @@ and records nothing.
 from typing import TYPE_CHECKING, Any, cast
 
 from rigd.engine._probed_rig import probed_rig
-from rigd.engine._publish import Display
+from rigd.engine._publish import ReadingPublisher
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine.channels import Channels
-from rigd.engine.cycle import Cycle, Standstill
+from rigd.engine.cycle import Cycle, StandstillMonitor
 from rigd.engine.messages import Ending
 from rigd.engine.processes import Parent
 from rigd.engine.shared_state import Phase, StateField
@@ -25,22 +25,25 @@ if TYPE_CHECKING:
 
 
 class ProbeSequence(SessionSequence):
-    """One probing move on connected devices; parameters as for a `SessionSequence`."""
+    """Steps of one probing move on connected devices.
+
+    The parameters are those of a `SessionSequence`.
+    """
 
     def __init__(
         self,
         profile: Profile,
         cycle: Cycle,
         clock: Clock,
-        metronome: TickScheduler,
-        standstill: Standstill,
+        scheduler: TickScheduler,
+        standstill: StandstillMonitor,
         channels: Channels,
-        display: Display,
+        display: ReadingPublisher,
         parent: Parent,
         stop: StopRequest,
     ) -> None:
         super().__init__(
-            profile, (0.0,), cycle, clock, metronome, standstill, channels, display, parent, stop,
+            profile, (0.0,), cycle, clock, scheduler, standstill, channels, display, parent, stop,
             Ending(),
         )  # fmt: skip
         self._rig = probed_rig(profile)
@@ -48,36 +51,37 @@ class ProbeSequence(SessionSequence):
         self._last_tick = 0
 
     def move(self) -> dict[str, Any]:
-        """Make the strokes with an enabled drive, which is off afterwards.
+        """Run the probing move with the enabled drive, switch the torque off, return the estimate.
 
         Returns
         -------
         dict
-            ``end``: reason for the end; and the fields of a
+            The reason for the end (key ``end``), and the fields of a
             `rigd.safety.probe_estimate.ProbeEstimate`.
 
         Raises
         ------
         SessionEnd
-            If the operator or an interlock ends it.
+            If the operator or an interlock ends the move.
         """
         self._shared_state[StateField.PHASE] = Phase.PROBING
-        self._standstill.forget()
+        self._standstill.reset()
         cycle = self._cycle
         start_rad = cycle.angle_rad
         move = ProbingMove(self._rig, plan_probe(self._rig), start_rad, self._rest_spread_nm)
         cycle.encoder_watch = None  # the move itself compares angle and torques
         cycle.start(self._rest_spread_nm)
         cycle.controller = cast("PidController", move)  # the cycle only steps it
-        self._tick(start_rad, excused=True)  # enabling takes its time
-        self._move, self._last_tick = move, self._metronome.tick
+        self._run_tick(start_rad, excused=True)  # enabling takes its time
+        self._move, self._last_tick = move, self._scheduler.tick
         while move.end is None:
-            self._tick(cycle.angle_rad)
+            self._run_tick(cycle.angle_rad)
         cycle.torque_off()
         return {"end": move.end.name} | estimate_probe(self._rig, move).as_dict()
 
-    def _step(self, reference_rad: float) -> SessionEnd | None:
+    def _control_tick(self, reference_rad: float) -> SessionEnd | None:
+        """Run one tick of the probing move, and report missed ticks to it."""
         if self._move is not None:
-            self._move.missed = max(0, self._metronome.tick - self._last_tick - 1)
-            self._last_tick = self._metronome.tick
-        return super()._step(reference_rad)
+            self._move.missed = max(0, self._scheduler.tick - self._last_tick - 1)
+            self._last_tick = self._scheduler.tick
+        return super()._control_tick(reference_rad)

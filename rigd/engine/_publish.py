@@ -1,4 +1,4 @@
-"""Publication of a tick's results: to the shared state (`Display`), recorder and live view."""
+"""Publication of a tick's results to the shared state, the recorder and the live view."""
 
 import time
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from rigd.engine.timing import Clock, TickScheduler
 from rigd.session.layout import Status, pack_control_into, pack_sample_into, pack_timing_into
 
 
-class Display:
+class ReadingPublisher:
     """Publisher of the control process's readings in the shared state, several times a second.
 
     Parameters
@@ -27,9 +27,10 @@ class Display:
     Attributes
     ----------
     doubts
-        Doubts about the age of the readings at the last call of `show`, for the operator.
+        Sentences for the operator that explain why the age of a reading is doubtful, as of the last
+        call of `publish`.
     doubt_counts
-        Summaries of these doubts since the devices were connected.
+        Sentences with the number of doubtful readings since the devices were connected.
     """
 
     def __init__(self, shared_state: SharedState, devices: Devices) -> None:
@@ -37,17 +38,17 @@ class Display:
         self._devices = devices
         self.doubts: list[str] = []
         self.doubt_counts: list[str] = []
-        self._before: tuple[int, tuple[int, ...]] | None = None
+        self._last_bits: tuple[int, tuple[int, ...]] | None = None
 
-    def show(self, cycle: Cycle, now_ns: int) -> None:
-        """Publish the control process's heartbeat and readings.
+    def publish(self, cycle: Cycle, now_ns: int) -> None:
+        """Publish the control process's heartbeat and last readings in the shared state.
 
         Parameters
         ----------
         cycle
             Cycle with the last readings.
         now_ns
-            Time of the engine's clock. The load of a line is the mean since the call before.
+            Present time of the loop's clock. The load of a line is averaged since the last call.
         """
         shared_state = self._shared_state
         shared_state.beat(StateField.CONTROL_BEAT)
@@ -61,28 +62,30 @@ class Display:
         drive, sensor = self._devices.drive.health(), self._devices.sensor.health()
         self.doubts = [line.doubt for line in (drive, sensor) if line.doubt]
         self.doubt_counts = [line.doubt_count for line in (drive, sensor) if line.doubt_count]
-        known = [line.errors for line in (drive, sensor) if line.errors is not None]
-        shared_state[StateField.BUS_ERRORS] = sum(known) if known else UNKNOWN
+        error_counts = [line.errors for line in (drive, sensor) if line.errors is not None]
+        shared_state[StateField.BUS_ERRORS] = sum(error_counts) if error_counts else UNKNOWN
         shared_state[StateField.SENSOR_STATUS] = UNKNOWN if sensor.status is None else sensor.status
-        self._show_load((drive, sensor), now_ns)
+        self._publish_load((drive, sensor), now_ns)
 
-    def _show_load(self, lines: tuple[LineHealth, ...], now_ns: int) -> None:
-        """Publish the load of the busiest line since the last call."""
+    def _publish_load(self, lines: tuple[LineHealth, ...], now_ns: int) -> None:
+        """Publish the load of the busiest bus or serial line since the last call."""
         bits = tuple(line.bits or 0 for line in lines)
-        if self._before is None:
+        if self._last_bits is None:
             self._shared_state[StateField.BUS_LOAD_PPM] = UNKNOWN
         else:
-            then_ns, before = self._before
-            if now_ns <= then_ns:
+            previous_ns, previous_bits = self._last_bits
+            if now_ns <= previous_ns:
                 return  # virtual time has not advanced
-            per_ppm = 1e-15 * (now_ns - then_ns)  # 1e-9 s, 1e-6
-            loads = [
-                (now - then) / (line.bit_rate_bit_s * per_ppm)
-                for line, now, then in zip(lines, bits, before, strict=True)
+            ppm_s = 1e-15 * (now_ns - previous_ns)  # 1e-9 s, 1e-6
+            loads_ppm = [
+                (now - then) / (line.bit_rate_bit_s * ppm_s)
+                for line, now, then in zip(lines, bits, previous_bits, strict=True)
                 if line.bit_rate_bit_s
             ]
-            self._shared_state[StateField.BUS_LOAD_PPM] = round(max(loads)) if loads else UNKNOWN
-        self._before = now_ns, bits
+            self._shared_state[StateField.BUS_LOAD_PPM] = (
+                round(max(loads_ppm)) if loads_ppm else UNKNOWN
+            )
+        self._last_bits = now_ns, bits
 
 
 # Samples of a record
@@ -92,19 +95,22 @@ _AFTER_LOST = int(Status.AFTER_LOST)
 _LATE = int(Status.LATE)
 _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
-_STALE = _ANGLE_STALE | _WRENCH_STALE
+_STALE_FLAGS = _ANGLE_STALE | _WRENCH_STALE
 
-_TERMS_EVERY = CONTROL.every
-_ROOM_PATIENCE_S = 2.0
-_ROOM_POLL_S = 0.0002
+_TERMS_PERIOD_TICKS = CONTROL.every
+"""Number of ticks from one record of the controller's terms to the next."""
+_FREE_SLOT_TIMEOUT_S = 2.0
+"""Longest time in s to wait for free space in the ring while the recorder reads nothing."""
+_FREE_SLOT_POLL_S = 0.0002
+"""Pause in s between two checks for free space in the ring."""
 
 
 @dataclass(slots=True)
 class Counts:
-    """Counts of a record's ticks: scheduled = recorded + missed + lost.
+    """Numbers of a record's ticks, where scheduled = recorded + missed + lost.
 
-    Among the recorded ticks, `late` woke late, and `stale_angles` and `stale_wrenches` hold a
-    reading that is not of their own tick.
+    Among the recorded ticks, `late` counts those with a late wake-up. `stale_angles` and
+    `stale_wrenches` count those with a reading that is older than the tick.
     """
 
     scheduled: int = 0
@@ -116,16 +122,19 @@ class Counts:
 
 
 class SampleLog:
-    """Log of a record: sample and ages of each tick, controller terms of every tenth tick.
+    """Log of a record in shared memory, from which the recorder writes the session file.
+
+    It contains a sample and the ages of the readings for each tick, and the controller's terms for
+    every tenth tick.
 
     Parameters
     ----------
-    cycle, metronome, clock
-        Sources of a sample's content.
+    cycle, scheduler, clock
+        Cycle, schedule and clock, whose values a sample contains.
     channels
         Channels to write to.
     late_ns
-        Lateness above which a tick is flagged as late.
+        Lateness in ns above which a tick is flagged as late.
 
     Attributes
     ----------
@@ -136,13 +145,13 @@ class SampleLog:
     def __init__(
         self,
         cycle: Cycle,
-        metronome: TickScheduler,
+        scheduler: TickScheduler,
         clock: Clock,
         channels: Channels,
         late_ns: int,
     ) -> None:
         self._cycle = cycle
-        self._metronome = metronome
+        self._scheduler = scheduler
         self._clock = clock
         self._ring = channels.samples
         self._buffer = channels.samples.buffer
@@ -154,7 +163,7 @@ class SampleLog:
         self.counts = Counts()
 
     def write(self, tick: int, reference_rad: float, missed: int, *, wait: bool) -> None:
-        """Log the tick that was just run.
+        """Write the sample of the tick that was just run to the ring for the recorder.
 
         Parameters
         ----------
@@ -163,20 +172,20 @@ class SampleLog:
         reference_rad
             Reference angle.
         missed
-            Ticks that were missed right before it.
+            Number of ticks that were missed directly before this tick.
         wait
-            Wait for room in the ring, if nothing moves or time is virtual. Otherwise a sample
-            without room is lost.
+            Whether to wait for free space in a full ring, because nothing moves or time is
+            virtual. Otherwise the sample is lost.
         """
-        cycle, metronome, ring = self._cycle, self._metronome, self._ring
-        lateness_ns = metronome.lateness_ns
+        cycle, scheduler, ring = self._cycle, self._scheduler, self._ring
+        lateness_ns = scheduler.lateness_ns
         flags = cycle.flags
         if missed:
             flags |= _AFTER_MISSED
         if self.counts.lost:
             flags |= _AFTER_LOST
-        offset = ring.slot()
-        if offset < 0 and (not wait or (offset := self._wait_for_room()) < 0):
+        offset = ring.next_slot()
+        if offset < 0 and (not wait or (offset := self._wait_for_free_slot()) < 0):
             self.counts.lost += 1
             self._shared_state[StateField.LOST] = self.counts.lost
             return
@@ -184,9 +193,9 @@ class SampleLog:
             flags |= _LATE
             self.counts.late += 1
             self._shared_state[StateField.LATE] = self.counts.late
-        if flags & _STALE:
+        if flags & _STALE_FLAGS:
             self._count_stale(flags)
-        t_ns = metronome.t_ns
+        t_ns = scheduler.t_ns
         fx, fy, fz, tx, ty, tz = cycle.wrench
         pack_sample_into(
             self._buffer,
@@ -205,15 +214,16 @@ class SampleLog:
             tz,
             flags,
             lateness_ns,
-            self._clock.now_ns() - metronome.due_ns - lateness_ns,
+            self._clock.now_ns() - scheduler.due_ns - lateness_ns,
         )
         ring.publish()
         if self._timing_ring is not None:
             self._write_ages(self._timing_ring, tick, t_ns)
-        if tick % _TERMS_EVERY == 0:
+        if tick % _TERMS_PERIOD_TICKS == 0:
             self._write_terms(tick, t_ns)
 
     def _count_stale(self, flags: int) -> None:
+        """Count a tick with a stale angle or wrench, and publish the counts."""
         counts, shared_state = self.counts, self._shared_state
         if flags & _ANGLE_STALE:
             counts.stale_angles += 1
@@ -223,10 +233,11 @@ class SampleLog:
             shared_state[StateField.STALE_WRENCHES] = counts.stale_wrenches
 
     def _write_ages(self, ring: Ring, tick: int, t_ns: int) -> None:
-        offset = ring.slot()
+        """Write the ages of a tick's readings to a ring, or nothing if the ring is full."""
+        offset = ring.next_slot()
         if offset < 0:
             return  # dropped, like the terms
-        due_ns, devices = self._metronome.due_ns, self._cycle.devices
+        due_ns, devices = self._scheduler.due_ns, self._cycle.devices
         pack_timing_into(
             ring.buffer,
             offset,
@@ -238,8 +249,9 @@ class SampleLog:
         ring.publish()
 
     def _write_terms(self, tick: int, t_ns: int) -> None:
+        """Write the controller's terms of a tick to their ring, or nothing if it is full."""
         ring, terms = self._terms_ring, self._cycle.controller
-        offset = ring.slot()
+        offset = ring.next_slot()
         if offset < 0:
             return  # dropped: the terms explain a record, but no analysis needs them
         pack_control_into(
@@ -256,11 +268,14 @@ class SampleLog:
         )
         ring.publish()
 
-    def _wait_for_room(self) -> int:
-        """Return the next offset once the recorder makes room, or -1 if it stopped reading."""
+    def _wait_for_free_slot(self) -> int:
+        """Wait for free space in the ring of samples, and return the offset of the next sample.
+
+        Return -1 if the recorder has stopped reading.
+        """
         ring, recorder = self._ring, Heartbeat()
-        while (offset := ring.slot()) < 0:
-            if recorder.stalled_for(ring.read, time.monotonic()) > _ROOM_PATIENCE_S:
+        while (offset := ring.next_slot()) < 0:
+            if recorder.stalled_for(ring.read, time.monotonic()) > _FREE_SLOT_TIMEOUT_S:
                 break
-            time.sleep(_ROOM_POLL_S)
+            time.sleep(_FREE_SLOT_POLL_S)
         return offset

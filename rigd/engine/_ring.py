@@ -20,20 +20,25 @@ from pathlib import Path
 from typing import Self
 
 HEADER_SIZE = 64
-_WRITTEN, _READ = 0, 1
+"""Size in bytes of a ring's header, which contains its two counters."""
+_WRITTEN_COUNTER, _READ_COUNTER = 0, 1
+"""Indices of the counters in a ring's header: records written and records read."""
 
 
 @dataclass(frozen=True, slots=True)
 class RingSpec:
-    """Inherited descriptor and layout, with which a child attaches to a ring."""
+    """Descriptor and layout of a ring, with which a child process attaches to it."""
 
     fd: int
+    """File descriptor of the shared memory, which the child inherits."""
     record_size: int
+    """Size of a record in bytes."""
     capacity: int
+    """Number of records that the ring holds."""
 
 
 class Ring:
-    """Ring of ``capacity`` records of ``record_size`` bytes.
+    """Ring buffer in shared memory: ``capacity`` records of ``record_size`` bytes each.
 
     Parameters
     ----------
@@ -48,74 +53,85 @@ class Ring:
         self._memory = mmap.mmap(spec.fd, HEADER_SIZE + spec.capacity * spec.record_size)
         self.buffer = memoryview(self._memory)
         self._counters = self.buffer[:HEADER_SIZE].cast("Q")
-        self._next = self._counters[_WRITTEN]
+        self._next_record = self._counters[_WRITTEN_COUNTER]
 
     @classmethod
     def create(cls, record_size: int, capacity: int, fd: int) -> Self:
-        """Lay out an empty ring in the memory of `fd`, from :func:`shared_memory_fd`.
+        """Return a new empty ring in shared memory.
 
         Parameters
         ----------
         record_size
-            Bytes of a record.
+            Size of a record in bytes.
         capacity
             Number of records.
         fd
-            Descriptor of the memory.
+            Descriptor of the memory, from :func:`shared_memory_fd`.
         """
         reserve(fd, HEADER_SIZE + capacity * record_size)
         return cls(RingSpec(fd, record_size, capacity))
 
     @property
     def written(self) -> int:
-        """Number of records written since the ring was created."""
-        return self._counters[_WRITTEN]
+        """Number of records written to the ring since it was created."""
+        return self._counters[_WRITTEN_COUNTER]
 
     @property
     def read(self) -> int:
-        """Number of records that the consumer has released."""
-        return self._counters[_READ]
+        """Number of records that the consumer has read since the ring was created."""
+        return self._counters[_READ_COUNTER]
 
     @property
     def waiting(self) -> int:
-        """Number of records that wait for the consumer."""
-        return self._counters[_WRITTEN] - self._counters[_READ]
+        """Number of records in the ring that the consumer has not read yet."""
+        return self._counters[_WRITTEN_COUNTER] - self._counters[_READ_COUNTER]
 
     @property
     def oldest(self) -> int:
-        """Number of the oldest record that an observer reads; negative in a new ring.
+        """Index of the oldest record in the ring that an observer may read.
 
-        Half of the ring is a margin for records that are written during the copy.
+        Records are counted from the ring's creation, and the index is negative in a new ring. Half
+        of the ring is a margin for records that are written while the observer copies.
         """
-        return self._counters[_WRITTEN] - self.capacity // 2
+        return self._counters[_WRITTEN_COUNTER] - self.capacity // 2
 
     # Producer
 
-    def slot(self) -> int:
-        """Return the offset of the next record in :attr:`buffer`, or -1 if the ring is full."""
-        if self._next - self._counters[_READ] >= self.capacity:
+    def next_slot(self) -> int:
+        """Return the byte offset in :attr:`buffer` for the next record, or -1 if the ring is full.
+
+        The producer writes the record there and then calls :meth:`publish`.
+        """
+        if self._next_record - self._counters[_READ_COUNTER] >= self.capacity:
             return -1
-        return HEADER_SIZE + self._next % self.capacity * self.record_size
+        return HEADER_SIZE + self._next_record % self.capacity * self.record_size
 
     def publish(self) -> None:
-        """Announce the record just written at :meth:`slot`."""
-        self._next += 1
-        self._counters[_WRITTEN] = self._next
+        """Make the record just written at :meth:`next_slot` visible to the readers of the ring."""
+        self._next_record += 1
+        self._counters[_WRITTEN_COUNTER] = self._next_record
 
     # Consumer
 
-    def take(self, most: int) -> bytes:
-        """Return and release up to ``most`` records that are contiguous in memory."""
-        first = self._counters[_READ]
-        count = min(most, self._counters[_WRITTEN] - first, self.capacity - first % self.capacity)
+    def take(self, max_records: int) -> bytes:
+        """Remove up to ``max_records`` of the oldest records from the ring and return their bytes.
+
+        Only records that are contiguous in memory are returned.
+        """
+        first = self._counters[_READ_COUNTER]
+        count = min(
+            max_records,
+            self._counters[_WRITTEN_COUNTER] - first,
+            self.capacity - first % self.capacity,
+        )
         start = HEADER_SIZE + first % self.capacity * self.record_size
         block = bytes(self.buffer[start : start + count * self.record_size])
-        self._counters[_READ] = first + count
+        self._counters[_READ_COUNTER] = first + count
         return block
 
     def discard(self) -> None:
-        """Release all records unread, for a consumer that starts again."""
-        self._counters[_READ] = self._counters[_WRITTEN]
+        """Discard all records that are not read yet, for a consumer that starts again."""
+        self._counters[_READ_COUNTER] = self._counters[_WRITTEN_COUNTER]
 
     def close(self) -> None:
         """Unmap the memory; the descriptor stays open for the other processes that inherited it."""
@@ -125,44 +141,48 @@ class Ring:
 
 
 class Observer:
-    """A reader that never delays the producer, and counts the records that it missed.
+    """Reader of a ring that never delays the producer, and counts the records that it missed.
 
     Parameters
     ----------
     ring
         Ring to read.
     first
-        Number of the first record to read, counted since the ring was created; None: the next one.
+        Index of the first record to read, counted since the ring was created; None: the next
+        record that is written.
 
     Attributes
     ----------
     dropped
-        Records that were overwritten before they were read.
+        Number of records that were overwritten before they were read.
     """
 
     def __init__(self, ring: Ring, first: int | None = None) -> None:
         self._ring = ring
-        self._cursor = ring.written if first is None else first
+        self._next_index = ring.written if first is None else first
         self.dropped = 0
 
     @property
     def next(self) -> int:
-        """Number of the next record, counted as `first` is."""
-        return self._cursor
+        """Index of the record that the observer reads next, counted since the ring's creation."""
+        return self._next_index
 
-    def take(self, most: int) -> bytes:
-        """Return up to ``most`` unread records, oldest first."""
+    def take(self, max_records: int) -> bytes:
+        """Return the bytes of up to ``max_records`` records that this observer has not read yet.
+
+        The oldest record comes first.
+        """
         ring = self._ring
         oldest = ring.oldest
-        if self._cursor < oldest:
-            self.dropped += oldest - self._cursor
-            self._cursor = oldest
-        index = self._cursor % ring.capacity
-        count = min(most, ring.written - self._cursor, ring.capacity - index)
+        if self._next_index < oldest:
+            self.dropped += oldest - self._next_index
+            self._next_index = oldest
+        index = self._next_index % ring.capacity
+        count = min(max_records, ring.written - self._next_index, ring.capacity - index)
         start = HEADER_SIZE + index * ring.record_size
         block = bytes(ring.buffer[start : start + count * ring.record_size])
-        self._cursor += count
-        if ring.written - (self._cursor - count) >= ring.capacity:
+        self._next_index += count
+        if ring.written - (self._next_index - count) >= ring.capacity:
             # The producer overtook the copy: none of it is reliable.
             self.dropped += count
             return b""
@@ -173,7 +193,7 @@ class Observer:
 
 
 def shared_memory_fd() -> int:
-    """Return a descriptor of shared memory, still of size 0, that child processes can inherit."""
+    """Return a file descriptor of new shared memory of size 0, which child processes inherit."""
     folder = "/dev/shm" if Path("/dev/shm").is_dir() else None
     with tempfile.TemporaryFile(dir=folder) as file:
         fd = os.dup(file.fileno())
@@ -182,12 +202,13 @@ def shared_memory_fd() -> int:
 
 
 def reserve(fd: int, size: int) -> None:
-    """Allocate shared memory.
+    """Allocate `size` bytes of shared memory at the descriptor `fd`.
 
     Raises
     ------
     OSError
-        If there is not enough memory; without this, writing to it would raise a bus error.
+        If there is not enough memory. Without the allocation, writing to the memory would raise a
+        bus error.
     """
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(fd, 0, size)

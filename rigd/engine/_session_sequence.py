@@ -1,7 +1,7 @@
 """Sequence of a session: tare, enable, hold, record, damp, return, disable, check the tare.
 
-The record extends from tick 0 to the last tick of the excitation. Everything else uses the same
-cycle and writes its results to the metadata.
+The record extends from tick 0 to the last tick of the excitation. The other steps use the same
+cycle (`rigd.engine.cycle.Cycle`) and write their results to the metadata of the session file.
 """
 
 import time
@@ -14,9 +14,9 @@ import numpy as np
 
 from rigd.control.damper import VibrationDamper
 from rigd.devices.contracts import DeviceError
-from rigd.engine._publish import Display, SampleLog
+from rigd.engine._publish import ReadingPublisher, SampleLog
 from rigd.engine.channels import Channels
-from rigd.engine.cycle import Cycle, Rest, Standstill, observe_rest
+from rigd.engine.cycle import Cycle, RestReadings, StandstillMonitor, observe_rest
 from rigd.engine.messages import Ending
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import page_faults
@@ -32,43 +32,57 @@ from rigd.safety.limits import BY_NAME, OVERLOADED
 if TYPE_CHECKING:
     from rigd.engine._touch_watch import TouchWatch
 
-_SETTLE_S = 0.5
-_GO_POLL_S = 0.0002
-_GO_PATIENCE_S = 10.0
-_SUPERVISOR_PATIENCE_S = 2.0
-"""Only time in which this process ran counts: a stalled computer is not the supervisor's fault."""
-_MOTION_CHANNELS = tuple(BY_NAME[name].channel for name in ("angle", "velocity", "tracking error"))
+_SETTLING_S = 0.5
+"""Time in s for which the motor is held before tick 0, and the beam rests before the last tare."""
+_VIRTUAL_POLL_S = 0.0002
+"""Pause in s between two polls of the shared state while virtual time does not advance."""
+_START_TIMEOUT_S = 10.0
+"""Longest time in s that the control process waits for the supervisor to start the record."""
+_SUPERVISOR_TIMEOUT_S = 2.0
+"""Longest time in s without a heartbeat of the supervisor. Only time in which this process ran
+counts, because a stalled computer is not the supervisor's fault."""
+_WRONG_SIGN_CHANNELS = tuple(
+    BY_NAME[name].channel for name in ("angle", "velocity", "tracking error")
+)
+"""Channels of the limits that a wrong sign of angle or torque violates."""
 _ENCODER_CHANNELS = tuple(
     BY_NAME[name].channel
     for name in ("encoder jump", "frozen encoder", "stopped encoder", "repeated angle")
 )
-_AGAINST_TORQUE = (
+"""Channels of the interlocks that detect a failed encoder."""
+_WRONG_SIGN_REMEDY = (
     "The shaft accelerates against the torque: angle and torque have opposite signs. "
     "Check the drive's polarity (object 607E), cia402.direction and the wiring of motor and "
     "encoder; a lower amplitude does not help."
 )
-_ENCODER_TESTED = (
+"""Advice for the operator if the sign of angle or torque is wrong."""
+_ENCODER_TESTED_MESSAGE = (
     "The beam pulled at a shaft that stood still, so the encoder was tested: it works."
 )
-_SWINGING = 2.0
-"""Ratio of the torque's spread after a session to the one before, above which the beam vibrates."""
-_DAMPING_S = 5.0
-"""Longest active damping: twice the time for a vibration with the sensor's full range."""
+_VIBRATING_SPREAD_RATIO = 2.0
+"""Ratio of the coupling torque's standard deviation after a session to the one before it. Above
+this ratio the beam counts as vibrating."""
+_LONGEST_DAMPING_S = 5.0
+"""Longest duration of active damping in s, which is twice the time needed to damp a vibration with
+the sensor's full range."""
 _SPREAD_WINDOW_S = 0.4
-"""Time over which the spread of the torque is computed: a period of a first mode at 2.5 Hz."""
+"""Window in s over which the standard deviation of the coupling torque is computed. It is one
+period of a first mode at 2.5 Hz."""
 _SPREAD_CHECK_TICKS = 50
-"""Ticks between two checks of the spread."""
-_DAMPED = 1.25
-"""Ratio of the torque's spread to that at rest, up to which the beam counts as damped: the
-vibration is then less than the noise, and the spread over so short a time scatters by 4 %."""
-_MAX_YIELD_RAD = 0.1
-"""Largest angle by which active damping moves the motor."""
-_SHAPED_S = 5.0
-"""Longest return whose path is shaped: a slower one excites no vibration."""
+"""Number of ticks between two checks of the coupling torque's standard deviation."""
+_DAMPED_SPREAD_RATIO = 1.25
+"""Largest ratio of the coupling torque's standard deviation to its value at rest with which the
+beam counts as damped. The vibration is then less than the noise, and the standard deviation over
+so short a time scatters by 4 %."""
+_MAX_DAMPING_ANGLE_RAD = 0.1
+"""Largest angle in rad by which active damping moves the motor."""
+_LONGEST_SHAPED_RETURN_S = 5.0
+"""Longest duration in s of a return to the start angle whose path is shaped to excite no vibration.
+A slower return excites none in any case."""
 
 
 class SessionEnd(Exception):
-    """Early end of a session, with outcome and reason.
+    """Exception that ends a session early, with its outcome and the reason.
 
     Attributes
     ----------
@@ -86,7 +100,7 @@ class SessionEnd(Exception):
 
 
 class SessionSequence:
-    """One session on connected devices.
+    """Steps of one session on connected devices, from the tare to the check of the tare.
 
     Parameters
     ----------
@@ -94,8 +108,8 @@ class SessionSequence:
         Profile of the rig.
     reference_rad
         Angle per tick, relative to the start angle.
-    cycle, clock, metronome
-        Work of a tick, clock, and schedule of the ticks.
+    cycle, clock, scheduler
+        Cycle that runs each tick, clock, and schedule of the ticks.
     standstill
         Check of the angles that are read without torque.
     channels
@@ -103,15 +117,15 @@ class SessionSequence:
     display
         Publisher of the readings.
     parent
-        The supervisor.
+        Connection to the supervisor process.
     stop
         Stop signals that this process received itself.
     ending
         Steps after the record.
     touch
-        Detector of touches; None: none is expected.
+        Detector of touches, or None if the session does not search for an obstacle.
     reader
-        Reader of a reference that grows during the record; None: the reference is complete.
+        Reader of a reference that grows during the record, or None if the reference is complete.
     """
 
     def __init__(
@@ -120,10 +134,10 @@ class SessionSequence:
         reference_rad: Sequence[float],
         cycle: Cycle,
         clock: Clock,
-        metronome: TickScheduler,
-        standstill: Standstill,
+        scheduler: TickScheduler,
+        standstill: StandstillMonitor,
         channels: Channels,
-        display: Display,
+        display: ReadingPublisher,
         parent: Parent,
         stop: StopRequest,
         ending: Ending,
@@ -141,15 +155,15 @@ class SessionSequence:
         self._parent = parent
         self._stop = stop
         self._rate_hz = profile.rig.rate_hz
-        self._metronome = metronome
+        self._scheduler = scheduler
         self._standstill = standstill
-        self._suspends = SuspendWatch()
+        self._suspend_watch = SuspendWatch()
         self._page_faults = 0
         self._doubts_reported: set[str] = set()
-        self._unanswered_polls = 0
+        self._polls_without_heartbeat = 0
         self._supervisor_beat = -1
         late_ns = int(profile.realtime.late_us * 1000)
-        self._sample_log = SampleLog(cycle, self._metronome, clock, channels, late_ns)
+        self._sample_log = SampleLog(cycle, self._scheduler, clock, channels, late_ns)
         self._relative_reference = reference_rad
         # Each segment of a growing reference is planned with the start angle.
         planned_rad = np.asarray(reference_rad)
@@ -163,15 +177,15 @@ class SessionSequence:
         self._encoder_tests = 0
         self.counts = self._sample_log.counts
         self.results: dict[str, str] = {}
-        """Results for the record's outcome, in addition to the counts."""
+        """Results for the metadata ``outcome`` of the file, in addition to the counts."""
 
     def tare(self) -> dict[str, str]:
-        """Average the sensor at rest, before the drive is enabled.
+        """Measure the sensor's zero at rest before the drive is enabled, and return it as metadata.
 
         Returns
         -------
         dict
-            Metadata: mean and standard deviation of each axis, N and N·m.
+            Metadata: mean and standard deviation of each axis in N and N·m, and the start angle.
 
         Raises
         ------
@@ -190,7 +204,8 @@ class SessionSequence:
                 f"limits.angle_rad = {limit_rad:g} rad; turn it back and start again.",
             )
         goal_rad = max(
-            (self._start_angle_rad + part for part in self._reference_range_rad), key=abs
+            (self._start_angle_rad + extreme_rad for extreme_rad in self._reference_range_rad),
+            key=abs,
         )
         if abs(goal_rad) > limit_rad:
             raise SessionEnd(
@@ -210,6 +225,7 @@ class SessionSequence:
         return rest.as_metadata() | {"start_angle_rad": repr(self._start_angle_rad)}
 
     def _compare_with_tare_before(self, zero_nm: float) -> None:
+        """End the session if the torque's zero differs too much from that of the last tare."""
         watch = self._cycle.watch
         if watch.tared_nm is not None:
             violation = watch.check_tare(zero_nm - watch.tared_nm)
@@ -220,29 +236,33 @@ class SessionSequence:
                 )
         watch.tared_nm = zero_nm
 
-    def _wait_for_rest(self) -> Rest:
-        """Return the first interval of readings in which neither motor nor beam moves."""
+    def _wait_for_rest(self) -> RestReadings:
+        """Return the readings of the first interval in which neither the motor nor the beam moves.
+
+        Raise `SessionEnd` if the rig does not come to rest within ``session.rest_timeout_s``.
+        """
         settings = self._profile.session
         self._shared_state[StateField.PHASE] = Phase.TARING
-        patience_s = settings.rest_timeout_s
+        remaining_s = settings.rest_timeout_s
         while True:
             self._cycle.sensor_watch.learn()
-            rest = self._rest(settings.tare_s)
-            moving = self._motion_reason(rest)
-            if not moving:
+            rest = self._read_rest(settings.tare_s)
+            motion = self._describe_motion(rest)
+            if not motion:
                 return rest
-            patience_s -= rest.duration_s
-            if patience_s <= 0.0:
+            remaining_s -= rest.duration_s
+            if remaining_s <= 0.0:
                 raise SessionEnd(
                     "fault",
-                    f"{moving} It did not come to rest within session.rest_timeout_s = "
+                    f"{motion} It did not come to rest within session.rest_timeout_s = "
                     f"{settings.rest_timeout_s:g} s; wait until it is at rest and start again.",
                 )
             if self._shared_state[StateField.PHASE] != Phase.WAITING:
                 self._shared_state[StateField.PHASE] = Phase.WAITING
-                self._log_event("info", f"Waiting until the rig is at rest. {moving}")
+                self._log_event("info", f"Waiting until the rig is at rest. {motion}")
 
-    def _motion_reason(self, rest: Rest) -> str:
+    def _describe_motion(self, rest: RestReadings) -> str:
+        """Return a sentence that says how motor or beam moves, or an empty text if both rest."""
         settings = self._profile.session
         if rest.speed_rad_s > settings.rest_velocity_rad_s:
             return (
@@ -258,53 +278,57 @@ class SessionSequence:
         return ""
 
     def hold(self) -> None:
-        """Hold the motor at its angle after the drive has been enabled."""
+        """Hold the motor at its present angle for 0.5 s after the drive has been enabled."""
         self._shared_state[StateField.PHASE] = Phase.SETTLING
-        self._standstill.forget()
+        self._standstill.reset()
         # The last reading, not the mean: the controller must start without a step.
         self._start_angle_rad = self._cycle.angle_rad
         self._cycle.start(self._rest_spread_nm)
-        for number in range(round(_SETTLE_S * self._rate_hz)):
+        for number in range(round(_SETTLING_S * self._rate_hz)):
             # Enabling the drive before the first tick takes longer than a tick.
-            self._tick(self._start_angle_rad, excused=number == 0)
+            self._run_tick(self._start_angle_rad, excused=number == 0)
 
     def wait_for_go(self) -> None:
-        """Hold until the recorder is ready; virtual time does not advance meanwhile.
+        """Hold the motor until the supervisor reports that the recorder is ready.
+
+        Virtual time does not advance meanwhile.
 
         Raises
         ------
         SessionEnd
-            If the supervisor does not report this in time, although its process may exist.
+            If the supervisor does not report this within 10 s, although its process may exist.
         """
         self._shared_state[StateField.PHASE] = Phase.READY
-        deadline = time.monotonic() + _GO_PATIENCE_S
+        deadline = time.monotonic() + _START_TIMEOUT_S
         while not self._shared_state[StateField.GO]:
             if time.monotonic() > deadline:
                 raise SessionEnd(
                     "fault",
-                    f"The supervisor did not start the record within {_GO_PATIENCE_S:g} s. "
+                    f"The supervisor did not start the record within {_START_TIMEOUT_S:g} s. "
                     "Check CPU load.",
                 )
             if self._clock.virtual:
-                self._display.show(self._cycle, self._metronome.due_ns)
+                self._display.publish(self._cycle, self._scheduler.due_ns)
                 self._switch_off_if_stopped()
-                time.sleep(_GO_POLL_S)
+                time.sleep(_VIRTUAL_POLL_S)
             else:
-                self._tick(self._start_angle_rad)
+                self._run_tick(self._start_angle_rad)
 
     def record(self) -> None:
-        """Run the excitation; every tick is recorded, missed or lost.
+        """Run the excitation and log a sample of every tick.
+
+        Every tick of the record counts as recorded, missed or lost.
 
         Raises
         ------
         SessionEnd
-            If it ends early. The torque is off in the last sample, unless the record ends in
-            missed or lost ticks.
+            If the record ends early. The torque is off in the last sample, unless the record ends
+            in missed or lost ticks.
         """
         reference, start_rad = self._relative_reference, self._start_angle_rad
-        total = len(reference)
-        metronome, cycle, log, shared_state = (
-            self._metronome,
+        total_ticks = len(reference)
+        scheduler, cycle, log, shared_state = (
+            self._scheduler,
             self._cycle,
             self._sample_log,
             self._shared_state,
@@ -315,44 +339,46 @@ class SessionSequence:
             shared_state.view(StateField.STOP),
             shared_state.view(StateField.SCHEDULED),
         )
-        metronome.restart()
+        scheduler.restart()
         self._recording = True
         self._page_faults = page_faults()
         wall_ns, before_ns = time.time_ns(), time.monotonic_ns()
         # With the real clock tick 0 is still ahead, or up to one period in the past.
-        ahead_ns = 0 if virtual else metronome.start_ns - before_ns
+        ahead_ns = 0 if virtual else scheduler.start_ns - before_ns
         shared_state[StateField.START_UTC_NS] = wall_ns + ahead_ns
         shared_state[StateField.PHASE] = Phase.RUNNING
-        self._log_event("info", f"Record starts: {total} ticks at {self._rate_hz:g} Hz.")
+        self._log_event("info", f"Record starts: {total_ticks} ticks at {self._rate_hz:g} Hz.")
         last = -1
         first_ns = last_ns = 0
         reference_rad = start_rad
         end: SessionEnd | None = None
-        while end is None and last < total - 1:
+        while end is None and last < total_ticks - 1:
             if reader is not None:
                 if virtual:
                     self._await_segment(reader, last + 1)
-                if reader.over(last + 1):
+                if reader.is_after_end(last + 1):
                     break
-            missed = metronome.wait()
-            tick = metronome.tick
+            missed = scheduler.wait()
+            tick = scheduler.tick
             if missed:
-                missed = min(tick, total) - last - 1
+                missed = min(tick, total_ticks) - last - 1
                 counts.missed += missed
                 shared_state[StateField.MISSED] = counts.missed
-                end = self._missed_too_many(missed, min(tick, total))
-                if tick >= total:
-                    last, reference_rad = total - 1, start_rad + reference[-1]
+                end = self._check_missed_ticks(missed, min(tick, total_ticks))
+                if tick >= total_ticks:
+                    last, reference_rad = total_ticks - 1, start_rad + reference[-1]
                     break
             if end is None and cycle.stale:  # in the tick before
-                end = self._stale_too_many(tick)
+                end = self._check_stale_readings(tick)
             if end is None and (
                 stop[0] or counts.lost or signals.requested or tick % SLOW_CHECK_TICKS == 0
             ):
                 end = self._poll()
-            reference_rad = start_rad + (reference[tick] if reader is None else reader.at(tick))
+            reference_rad = start_rad + (
+                reference[tick] if reader is None else reader.reference_at(tick)
+            )
             if end is None:
-                end = self._step(reference_rad)
+                end = self._control_tick(reference_rad)
                 if touch is not None and end is None:
                     end = self._watch_touch(touch, tick, missed)
             else:
@@ -360,7 +386,7 @@ class SessionSequence:
             wait = virtual or end is not None
             log.write(tick, reference_rad, missed, wait=wait)
             scheduled[0] = tick + 1
-            last_ns = metronome.t_ns + metronome.lateness_ns
+            last_ns = scheduler.t_ns + scheduler.lateness_ns
             if last < 0:
                 first_ns = last_ns
             last = tick
@@ -370,7 +396,7 @@ class SessionSequence:
             end = self._stop_reason()
         if end is not None:
             cycle.torque_off()
-        self._show()
+        self._publish_readings()
         for count in self._display.doubt_counts:
             self._log_event("warning", count)
         self._record_clock_results(wall_ns, before_ns, last_ns - first_ns)
@@ -378,20 +404,24 @@ class SessionSequence:
             raise end
 
     def _await_segment(self, reader: ReferenceReader, tick: int) -> None:
-        """Stop virtual time until a tick has its reference.
+        """Stop virtual time until the fit process has planned the reference of a tick.
 
-        With devices on lines, a tick now and then holds the last angle and shows a sign of life.
+        With devices on a bus or serial line, return after 1 s: the tick then holds the last angle,
+        and shows the devices that their host still runs.
         """
         on_lines = self._cycle.devices.on_lines
-        begun_s = time.monotonic()
-        while reader.waits(tick) and self._stop_reason() is None:
-            if on_lines and time.monotonic() - begun_s > SIGN_OF_LIFE_S:
+        wait_start_s = time.monotonic()
+        while reader.must_wait(tick) and self._stop_reason() is None:
+            if on_lines and time.monotonic() - wait_start_s > SIGN_OF_LIFE_S:
                 return
-            self._display.show(self._cycle, self._metronome.due_ns)
-            time.sleep(_GO_POLL_S)
+            self._display.publish(self._cycle, self._scheduler.due_ns)
+            time.sleep(_VIRTUAL_POLL_S)
 
     def _watch_touch(self, touch: "TouchWatch", tick: int, missed: int) -> SessionEnd | None:
-        """Check the last tick for a touch; after one, the watch changes the reference."""
+        """Check the last tick for a touch, to which the touch watch reacts.
+
+        Return an error that ends the session if the touch requires that, otherwise None.
+        """
         contact = touch.step(tick, missed)
         if contact is None:
             return None
@@ -404,7 +434,7 @@ class SessionSequence:
         return None
 
     def damp(self) -> None:
-        """Damp the beam actively around the final angle of the record."""
+        """Damp the beam's vibration by small motor movements around the record's final angle."""
         self._shared_state[StateField.PHASE] = Phase.RETURNING
         end_rad = self._end_angle_rad
         if self._ending.damper is None:
@@ -413,35 +443,46 @@ class SessionSequence:
         cycle = self._cycle
         # The record may have ended at the limit of the angle.
         limit_rad = self._profile.limits.angle_rad
-        least_rad = min(0.0, max(-_MAX_YIELD_RAD, -limit_rad - end_rad))
-        most_rad = max(0.0, min(_MAX_YIELD_RAD, limit_rad - end_rad))
+        min_displacement_rad = min(0.0, max(-_MAX_DAMPING_ANGLE_RAD, -limit_rad - end_rad))
+        max_displacement_rad = max(0.0, min(_MAX_DAMPING_ANGLE_RAD, limit_rad - end_rad))
         torques_nm = np.zeros(round(_SPREAD_WINDOW_S * self._rate_hz))
-        for tick in range(round(_DAMPING_S * self._rate_hz)):
-            yielded_rad = damper.step(cycle.coupling_torque_nm)
-            self._end_angle_rad = end_rad + min(max(yielded_rad, least_rad), most_rad)
-            self._tick(self._end_angle_rad)
+        for tick in range(round(_LONGEST_DAMPING_S * self._rate_hz)):
+            damping_angle_rad = damper.step(cycle.coupling_torque_nm)
+            self._end_angle_rad = end_rad + min(
+                max(damping_angle_rad, min_displacement_rad), max_displacement_rad
+            )
+            self._run_tick(self._end_angle_rad)
             torques_nm[tick % torques_nm.size] = cycle.coupling_torque_nm
             if (
                 tick % _SPREAD_CHECK_TICKS == 0
                 and tick >= torques_nm.size
-                and float(torques_nm.std()) <= _DAMPED * self._rest_spread_nm
+                and float(torques_nm.std()) <= _DAMPED_SPREAD_RATIO * self._rest_spread_nm
             ):
                 return
 
-    def go_back(self) -> None:
-        """Return to the start angle, or to the end of a move, without exciting a vibration."""
+    def return_to_start(self) -> None:
+        """Move the motor back to the start angle without exciting a vibration.
+
+        If the session is a move (``ending.stays``), go to the last angle of the reference instead.
+        """
         goal_rad = self._start_angle_rad
         if self._ending.stays:
             goal_rad += self._relative_reference[-1]
         distance_rad = goal_rad - self._end_angle_rad
-        for part in self._return_path:
-            self._tick(self._end_angle_rad + distance_rad * part)
+        for fraction in self._return_path:
+            self._run_tick(self._end_angle_rad + distance_rad * fraction)
 
     def check_tare(self) -> None:
-        """Average the sensor again with the drive disabled, and check the drift of its zero."""
-        self._rest(_SETTLE_S)
-        rest = self._rest(self._profile.session.tare_s)
-        if rest.torque_spread_nm > _SWINGING * self._rest_spread_nm:
+        """Average the sensor again with the drive disabled, and check the drift of its zero.
+
+        Raises
+        ------
+        SessionEnd
+            If the zero of the coupling torque has drifted too much.
+        """
+        self._read_rest(_SETTLING_S)
+        rest = self._read_rest(self._profile.session.tare_s)
+        if rest.torque_spread_nm > _VIBRATING_SPREAD_RATIO * self._rest_spread_nm:
             self._log_event(
                 "info", "The beam still vibrates: the zero of the coupling torque was not checked."
             )
@@ -454,9 +495,12 @@ class SessionSequence:
         if violation is not None:
             raise SessionEnd("fault", str(violation))
 
-    def _tick(self, reference_rad: float, *, excused: bool = False) -> None:
-        """Run one tick outside the record, where missed ticks are limited but not counted."""
-        missed = self._metronome.wait()
+    def _run_tick(self, reference_rad: float, *, excused: bool = False) -> None:
+        """Run one tick outside the record, where missed ticks are limited but not counted.
+
+        Set `excused` for a tick that other work, such as enabling the drive, may delay.
+        """
+        missed = self._scheduler.wait()
         self._cycle.skip(missed)
         if missed > self._profile.limits.missed_ticks_in_a_row and not excused:
             raise SessionEnd(
@@ -466,14 +510,17 @@ class SessionSequence:
                 f"{self._profile.limits.missed_ticks_in_a_row}. {OVERLOADED}",
             )
         self._switch_off_if_stopped()
-        end = self._step(reference_rad)
+        end = self._control_tick(reference_rad)
         if end is not None:
             raise end
 
-    def _step(self, reference_rad: float) -> SessionEnd | None:
-        """Control one tick; if this ends the session, the torque is off."""
+    def _control_tick(self, reference_rad: float) -> SessionEnd | None:
+        """Run one tick of control; return an error that ends the session, or None.
+
+        If the session ends, the torque is off.
+        """
         try:
-            violation = self._cycle.step(self._metronome.due_ns, reference_rad)
+            violation = self._cycle.step(self._scheduler.due_ns, reference_rad)
         except (DeviceError, OSError) as error:
             self._cycle.mark_readings_stale()
             # A drive whose host stalled switches itself off by its own watchdog.
@@ -481,32 +528,36 @@ class SessionSequence:
             return SessionEnd("fault", reason, device_failed=True)
         if violation is None:
             return None
-        if violation.channel in _MOTION_CHANNELS and self._against_torque():
-            violation = replace(violation, remedy=_AGAINST_TORQUE)
-        violation = self._cycle.with_cause(violation)
+        if violation.channel in _WRONG_SIGN_CHANNELS and self._accelerates_against_torque():
+            violation = replace(violation, remedy=_WRONG_SIGN_REMEDY)
+        violation = self._cycle.with_reported_cause(violation)
         # The zero is then invalid, and with it the limits of all further sessions.
         failed = violation.channel in _ENCODER_CHANNELS
         return SessionEnd("fault", str(violation), device_failed=failed)
 
-    def _against_torque(self) -> bool:
+    def _accelerates_against_torque(self) -> bool:
+        """Return whether the shaft has just accelerated against the torque on it."""
         rig = self._profile.rig
         return self._cycle.accelerates_against_torque(
             rig.motor.inertia_kg_m2, rig.rate_hz, rig.encoder.resolution_rad
         )
 
     def _switch_off_and_observe(self) -> None:
-        """Switch off, and read the devices once more for the last sample, if they still respond."""
+        """Switch the torque off, and read the devices once more for the record's last sample.
+
+        Mark the readings as stale if a device no longer responds.
+        """
         self._cycle.torque_off()
         try:
-            self._cycle.observe(self._metronome.due_ns)
+            self._cycle.observe(self._scheduler.due_ns)
         except (DeviceError, OSError):
             self._cycle.mark_readings_stale()
 
-    def _rest(self, duration_s: float) -> Rest:
-        """Return readings without torque."""
+    def _read_rest(self, duration_s: float) -> RestReadings:
+        """Return the sensor and encoder readings of `duration_s` seconds without torque."""
         return observe_rest(
             self._cycle,
-            self._metronome,
+            self._scheduler,
             rate_hz=self._rate_hz,
             duration_s=duration_s,
             projection=self._profile.rig.sensor.projection,
@@ -514,13 +565,15 @@ class SessionSequence:
         )
 
     def _check_reading(self) -> None:
+        """End the session if a reading at rest shows a failed encoder or sensor, or on a stop."""
         self._switch_off_if_stopped()
-        self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
+        self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
         failed = self._cycle.check_stale() or self._cycle.check_sensor()
         if failed is not None:
-            raise SessionEnd("fault", str(self._cycle.with_cause(failed)))
+            raise SessionEnd("fault", str(self._cycle.with_reported_cause(failed)))
 
-    def _missed_too_many(self, missed: int, tick: int) -> SessionEnd | None:
+    def _check_missed_ticks(self, missed: int, tick: int) -> SessionEnd | None:
+        """Return an error that ends the session if too many ticks were missed, else None."""
         if not missed:
             return None
         self._cycle.skip_encoder(missed)
@@ -528,17 +581,23 @@ class SessionSequence:
         return None if reason is None else SessionEnd("fault", str(reason))
 
     def stop_requested(self) -> bool:
-        """Return whether the session must end, for steps that take longer than a tick."""
+        """Return whether the session must end; steps longer than a tick call this as they run."""
         return self._stop_reason() is not None
 
-    def _stale_too_many(self, scheduled: int) -> SessionEnd | None:
+    def _check_stale_readings(self, scheduled: int) -> SessionEnd | None:
+        """Return an error that ends the session if too many readings were stale, else None."""
         counts = self.counts
         reason = self._cycle.watch.check_stale_fraction(
             counts.stale_angles, counts.stale_wrenches, scheduled
         )
-        return None if reason is None else SessionEnd("fault", str(self._cycle.with_cause(reason)))
+        return (
+            None
+            if reason is None
+            else SessionEnd("fault", str(self._cycle.with_reported_cause(reason)))
+        )
 
     def _stop_reason(self) -> SessionEnd | None:
+        """Return an error that ends the session if a stop is requested or a process died."""
         stop = self._shared_state[StateField.STOP]
         if self._stop.requested or stop == Stop.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")
@@ -552,13 +611,14 @@ class SessionSequence:
         return None
 
     def _poll(self) -> SessionEnd | None:
-        """Publish heartbeat and readings; check slow limits, the supervisor and stop requests.
+        """Publish heartbeat and readings, and check slow limits, supervisor and stop requests.
 
-        The supervisor requests a stop when the recorder has died (`rigd.runner`).
+        Return an error that ends the session, or None. The supervisor requests a stop when the
+        recorder has died (`rigd.runner`).
         """
-        self._show()
+        self._publish_readings()
         violation = self._cycle.check_slow_limits(
-            self._metronome.due_ns,
+            self._scheduler.due_ns,
             # With the virtual clock the loop waits for the recorder.
             0.0 if self._clock.virtual else self._channels.samples.waiting / self._rate_hz,
             self._shared_state[StateField.DISK_FREE_MB] or inf,
@@ -567,7 +627,7 @@ class SessionSequence:
         if violation is not None:
             return SessionEnd("fault", str(violation))
         if not self._clock.virtual:
-            suspended_s = self._suspends.suspended_s()
+            suspended_s = self._suspend_watch.suspended_s()
             if suspended_s > SUSPENDED_S:
                 return SessionEnd(
                     "fault",
@@ -575,27 +635,34 @@ class SessionSequence:
                     "controlled; disable its power management.",
                 )
             beat = self._shared_state[StateField.SUPERVISOR_BEAT]
-            self._unanswered_polls = (
-                self._unanswered_polls + 1 if beat == self._supervisor_beat else 0
+            self._polls_without_heartbeat = (
+                self._polls_without_heartbeat + 1 if beat == self._supervisor_beat else 0
             )
             self._supervisor_beat = beat
-            if self._unanswered_polls * SLOW_CHECK_TICKS > _SUPERVISOR_PATIENCE_S * self._rate_hz:
+            if (
+                self._polls_without_heartbeat * SLOW_CHECK_TICKS
+                > _SUPERVISOR_TIMEOUT_S * self._rate_hz
+            ):
                 return SessionEnd(
                     "fault",
-                    f"Supervisor watchdog timeout ({_SUPERVISOR_PATIENCE_S:g} s); session aborted. "
+                    f"Supervisor watchdog timeout ({_SUPERVISOR_TIMEOUT_S:g} s); session aborted. "
                     "Check CPU load.",
                 )
         return self._stop_reason()
 
     def _switch_off_if_stopped(self) -> None:
-        poll_due = self._metronome.tick % SLOW_CHECK_TICKS == 0
+        """Switch the torque off and raise `SessionEnd` if a stop is requested or a check fails."""
+        poll_due = self._scheduler.tick % SLOW_CHECK_TICKS == 0
         end = self._poll() if poll_due else self._stop_reason()
         if end is not None:
             self._cycle.torque_off()
             raise end
 
     def _record_clock_results(self, wall_ns: int, before_ns: int, executed_ns: int) -> None:
-        """Store the drift between the two clocks over the record, and the true rate, as results."""
+        """Store the drift of the wall clock against the monotonic clock, and the true tick rate.
+
+        The results go into the file's metadata.
+        """
         now_ns = time.time_ns()
         self.results["end_utc_ns"] = str(now_ns)
         if self._clock.virtual:
@@ -607,15 +674,16 @@ class SessionSequence:
         if executed_ns > 0:
             self.results["true_rate_hz"] = repr(intervals / (executed_ns * 1e-9))
 
-    def _show(self) -> None:
-        """Publish the readings, and log each doubt about their age once."""
-        self._display.show(self._cycle, self._metronome.due_ns)
+    def _publish_readings(self) -> None:
+        """Publish the readings for the operator, and log each doubt about their age once."""
+        self._display.publish(self._cycle, self._scheduler.due_ns)
         for doubt in self._display.doubts:
             if doubt not in self._doubts_reported:
                 self._doubts_reported.add(doubt)
                 self._log_event("warning", doubt)
 
     def _report_warnings(self) -> None:
+        """Log new warnings of the limit, sensor and encoder monitors."""
         cycle = self._cycle
         for notice in cycle.watch.take_notices() + cycle.sensor_watch.take_notices():
             self._log_event("warning", notice)
@@ -623,21 +691,25 @@ class SessionSequence:
         if tests > self._encoder_tests:
             self.results["encoder_tests"] = str(tests)
             if not self._encoder_tests:
-                self._log_event("info", _ENCODER_TESTED)
+                self._log_event("info", _ENCODER_TESTED_MESSAGE)
             self._encoder_tests = tests
 
     def _log_event(self, level: Level, message: str) -> None:
+        """Write a line of the session's log for the operator and the file."""
         # Events before tick 0 have no time in the file yet.
-        t_ns = self._clock.now_ns() - self._metronome.start_ns if self._recording else 0
+        t_ns = self._clock.now_ns() - self._scheduler.start_ns if self._recording else 0
         write_event(self._channels.events, LogEvent(t_ns, level, message))
 
 
 def _return_path(profile: Profile, ending: Ending) -> list[float]:
-    """Return the path back, tick by tick from 0 to 1; computed before anything moves."""
+    """Return the path of the motor's return as a fraction from 0 to 1 for each tick.
+
+    It is computed before the drive is enabled, so that the loop does not pause for it.
+    """
     duration_s, rate_hz = profile.session.return_s, profile.rig.rate_hz
-    if ending.poles_rad_s and duration_s <= _SHAPED_S:
+    if ending.poles_rad_s and duration_s <= _LONGEST_SHAPED_RETURN_S:
         path = still_path(duration_s, rate_hz, np.array(ending.poles_rad_s))
     else:
         path = quintic(duration_s, rate_hz)
-    parts: list[float] = path.tolist()
-    return parts
+    fractions: list[float] = path.tolist()
+    return fractions

@@ -11,27 +11,29 @@ from rigd.touch import TouchDetector
 _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
 _TOUCHED = int(Status.TOUCHED)
-_HARD_TICKS = 2
-"""Consecutive ticks with an excessive force: a single one may be a disturbed reading."""
+_EXCESSIVE_FORCE_TICKS = 2
+"""Number of consecutive ticks with an excessive force that end a session: a single tick may be a
+disturbed reading."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectedContact:
-    """A contact that the loop has detected."""
+    """Contact of the beam with an obstacle, as the control loop has detected it."""
 
     message: str
     """Sentence for the operator."""
     ends: str = ""
-    """Outcome with which the session ends at once; empty: it continues."""
+    """Outcome with which the session ends at once; empty: the session continues."""
     detected: bool = True
-    """Whether the detector found a touch, which is then marked in its sample."""
+    """Whether the detector found a touch, which is then marked in the tick's sample."""
 
 
 class TouchWatch:
-    """Detector of touches in a search, with the reaction to a touch.
+    """Monitor that detects a touch during a search, and makes the motor react to it.
 
-    On the way out and in the pause after it, the motor brakes, waits, and returns to the start of
-    the pass. On the way back the motor cannot avoid the obstacle, so the session is stopped.
+    After a touch on the way out, or in the pause after it, the motor brakes, waits, and returns to
+    the start of the pass. After a touch on the way back the motor cannot avoid the obstacle, so the
+    session is stopped.
 
     Parameters
     ----------
@@ -56,18 +58,18 @@ class TouchWatch:
         self._detector = TouchDetector(order.beam, rate_hz, order.settings)
         self._passes = iter(order.approach.passes)
         self._pass = next(self._passes)
-        self._arms = self._pass.begins
-        self._hard = 0
+        self._arming_tick = self._pass.begins
+        self._excessive_force_ticks = 0
 
     def step(self, tick: int, missed: int) -> DetectedContact | None:
-        """Check the tick that was just run, and return the contact if there is one.
+        """Check the tick that was just run for a touch; return the contact, or None without one.
 
         Parameters
         ----------
         tick
-            Its number in the record.
+            Number of the tick in the record.
         missed
-            Ticks that were missed right before it.
+            Number of ticks that were missed directly before this tick.
         """
         cycle, detector = self._cycle, self._detector
         flags = cycle.flags
@@ -76,11 +78,11 @@ class TouchWatch:
             px, py, pz, qx, qy, qz = self._projection
             fx, fy, fz, tx, ty, tz = cycle.wrench
             shear_n = px * fx + py * fy + pz * fz + qx * tx + qy * ty + qz * tz
-        while tick >= self._pass.ends and (following := next(self._passes, None)) is not None:
-            self._pass = following
-            self._arms = following.begins
-        if self._arms <= tick:
-            self._arms = len(self._reference_rad)
+        while tick >= self._pass.ends and (next_pass := next(self._passes, None)) is not None:
+            self._pass = next_pass
+            self._arming_tick = next_pass.begins
+        if self._arming_tick <= tick:
+            self._arming_tick = len(self._reference_rad)
             detector.arm()
         touched = detector.step(
             cycle.angle_rad,
@@ -90,33 +92,38 @@ class TouchWatch:
             angle_stale=bool(flags & _ANGLE_STALE),
             wrench_stale=bool(flags & _WRENCH_STALE),
         )
-        too_hard = self._too_hard(shear_n)
-        if too_hard is not None or not touched:
-            return too_hard
+        forceful_contact = self._check_force_limit(shear_n)
+        if forceful_contact is not None or not touched:
+            return forceful_contact
         cycle.flags |= _TOUCHED
         if tick >= self._pass.returns:
             return DetectedContact(
                 "The beam met something on its way back. Find what stands in its way.", "stopped"
             )
-        self._react(tick)
+        self._return_after_touch(tick)
         return DetectedContact(f"Touch detected at {tick / self._rate_hz:.3f} s.")
 
-    def _react(self, tick: int) -> None:
-        """Replace the remainder of the pass in the reference."""
-        reference, current = self._reference_rad, self._pass
+    def _return_after_touch(self, tick: int) -> None:
+        """Replace the remaining reference of the pass by braking, waiting and the way back."""
+        reference_rad, current_pass = self._reference_rad, self._pass
         self._detector.disarm()
-        recent = reference[max(tick - 2, 0)], reference[max(tick - 1, 0)], reference[tick]
-        start_rad = reference[current.begins - 1] if current.begins else 0.0
-        path = after_touch(self._approach, current.ends, tick, recent, start_rad)
-        reference[tick + 1 : current.ends] = memoryview(path)  # type: ignore[arg-type] # numpy's stubs
+        last_angles_rad = (
+            reference_rad[max(tick - 2, 0)],
+            reference_rad[max(tick - 1, 0)],
+            reference_rad[tick],
+        )
+        start_rad = reference_rad[current_pass.begins - 1] if current_pass.begins else 0.0
+        path_rad = after_touch(self._approach, current_pass.ends, tick, last_angles_rad, start_rad)
+        reference_rad[tick + 1 : current_pass.ends] = memoryview(path_rad)  # type: ignore[arg-type] # numpy's stubs
 
-    def _too_hard(self, shear_n: float) -> DetectedContact | None:
+    def _check_force_limit(self, shear_n: float) -> DetectedContact | None:
+        """Return the contact if its force exceeds the limit in two ticks in a row, else None."""
         if self._projection is None:
             return None
         force_n = abs(self._detector.contact_force_n(shear_n))
         limit_n = self._approach.force_limit_n
-        self._hard = self._hard + 1 if force_n > limit_n else 0
-        if self._hard < _HARD_TICKS:
+        self._excessive_force_ticks = self._excessive_force_ticks + 1 if force_n > limit_n else 0
+        if self._excessive_force_ticks < _EXCESSIVE_FORCE_TICKS:
             return None
         return DetectedContact(
             f"Contact force {force_n:.3g} N exceeds force_limit_n = {limit_n:g} N. Choose a lower "

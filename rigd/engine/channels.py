@@ -16,93 +16,102 @@ from rigd.session.layout import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 # Topics
 
 VIRTUAL_BUFFERED_S = 160.0
-"""Time that the rings hold under the virtual clock, instead of `BUFFERED_S`: there a session takes
-about a second, and observers lag behind."""
+"""Time in s whose records the rings hold under the virtual clock. It is longer than `BUFFERED_S`,
+because there a session takes about a second and observers lag behind."""
 _EVENTS = 256
+"""Number of log events that their ring holds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One kind of record, and the processes that read it."""
+    """Kind of record that the control process publishes, and the processes that read it."""
 
     name: str
-    """Name of its channel in the file."""
+    """Name of the topic's channel in the session file."""
     record_size: int
     """Size of a record in bytes."""
     every: int
-    """Period in ticks of the record; 0: irregular."""
+    """Number of ticks from one record to the next; 0: irregular."""
     logged: bool
     """Whether the recorder writes each record to the file."""
     live: bool
-    """Whether the live publisher reads them, and drops what it cannot show in time."""
+    """Whether the live publisher reads the records, and drops those it cannot show in time."""
 
     def capacity(self, rate_hz: float, buffered_s: float = BUFFERED_S) -> int:
-        """Return the number of records that the ring holds.
+        """Return the number of records that a topic's ring must hold.
 
         Parameters
         ----------
         rate_hz
             Ticks a second.
         buffered_s
-            Time that the ring holds.
+            Time in s whose records the ring holds.
         """
         return ceil(rate_hz * buffered_s / self.every) if self.every else _EVENTS
 
     def expected_hz(self, rate_hz: float) -> float | None:
-        """Return the records per second of a recorded session; None if the rate is not fixed."""
+        """Return the topic's records per second while a session is recorded, or None if irregular.
+
+        `rate_hz` is the number of ticks a second.
+        """
         return rate_hz / self.every if self.every else None
 
 
 EVENT = Topic("/rig/event", EVENT_SIZE, every=0, logged=True, live=True)
+"""Topic of the log events."""
 CONTROL = Topic("/rig/control", CONTROL_SIZE, every=10, logged=True, live=False)
+"""Topic of the controller's terms."""
 TIMING = Topic("/rig/timing", TIMING_SIZE, every=1, logged=True, live=True)
+"""Topic of the ages of the readings."""
 SAMPLE = Topic("/rig/sample", SAMPLE_SIZE, every=1, logged=True, live=True)
+"""Topic of the samples."""
 
 TOPICS = (EVENT, CONTROL, TIMING, SAMPLE)
-"""Topics in the order of logging: the samples last, so that what explains a sample precedes it."""
+"""Topics in the order in which the recorder writes them. Samples come last, so that the events that
+explain a sample precede it in the file."""
 
 
 # Memory of a rig
 
 DESCRIPTORS = len(TOPICS) + 2
-"""File descriptors of shared memory, for :func:`create_channels`."""
+"""Number of file descriptors of shared memory that :func:`create_channels` needs."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelSpecs:
-    """Descriptors and layout that a child process needs to attach."""
+    """Descriptors and layout with which a child process attaches to the shared memory."""
 
     rings: tuple[RingSpec, ...]
-    """All rings, in the order of :data:`TOPICS`."""
+    """Descriptors and layouts of all rings, in the order of :data:`TOPICS`."""
     shared_state_fd: int
     """Descriptor of the memory of the shared state."""
 
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """The rings, in the order of :data:`TOPICS`, and the shared state."""
+    """Shared memory of a rig's processes: the rings of records and the shared state."""
 
     events: Ring
-    """Lines of the log."""
+    """Ring of log events."""
     controls: Ring
-    """Terms of the controller."""
+    """Ring of the controller's terms."""
     timings: Ring
-    """Ages of the readings."""
+    """Ring of the ages of the readings."""
     samples: Ring
-    """Samples."""
+    """Ring of samples."""
     shared_state: SharedState
     """State that every process can read."""
     reference_fd: int = -1
-    """Descriptor of the memory for the reference of a session."""
+    """Descriptor of the memory for the reference of a session; -1: none."""
 
     @property
     def rings(self) -> tuple[Ring, ...]:
-        """All rings, in the order of the table."""
+        """All rings in the order of `TOPICS`."""
         return (self.events, self.controls, self.timings, self.samples)
 
     @property
     def specs(self) -> ChannelSpecs:
-        """Descriptors and layout to hand to a child process."""
+        """Descriptors and layout with which a child process attaches to the shared memory."""
         return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.shared_state.fd)
 
     def ask_to_stop(self) -> None:
@@ -111,19 +120,19 @@ class Channels:
             self.shared_state[StateField.STOP] = Stop.OPERATOR
 
     def clear(self) -> None:
-        """Discard the records of the last session; only while no recorder runs."""
+        """Discard the records of the last session in all rings, while no recorder runs."""
         for ring in self.rings:
             ring.discard()
 
     def close(self) -> None:
-        """Unmap the memory; the descriptors stay open."""
+        """Unmap the shared memory of rings and state; the descriptors stay open."""
         for ring in self.rings:
             ring.close()
         self.shared_state.close()
 
 
 def create_channels(rate_hz: float, fds: Sequence[int], buffered_s: float = BUFFERED_S) -> Channels:
-    """Lay out the memory for sessions at ``rate_hz`` in descriptors of shared memory.
+    """Create the rings and the shared state of a rig's processes in shared memory.
 
     Parameters
     ----------
@@ -132,21 +141,24 @@ def create_channels(rate_hz: float, fds: Sequence[int], buffered_s: float = BUFF
     fds
         Descriptors, as many as `DESCRIPTORS`: for the rings, the shared state and the reference.
     buffered_s
-        Time that the rings hold.
+        Time in s whose records the rings hold.
     """
     *for_rings, for_shared_state, for_reference = fds
     rings = [
         Ring.create(topic.record_size, topic.capacity(rate_hz, buffered_s), fd)
         for topic, fd in zip(TOPICS, for_rings, strict=True)
     ]
-    return _together(rings, SharedState.create(for_shared_state), for_reference)
+    return _make_channels(rings, SharedState.create(for_shared_state), for_reference)
 
 
 def attach_channels(specs: ChannelSpecs) -> Channels:
-    """Return the channels that the supervisor created, attached in a child process."""
-    return _together([Ring(spec) for spec in specs.rings], SharedState(specs.shared_state_fd))
+    """Attach a child process to the channels that the supervisor created, and return them."""
+    return _make_channels([Ring(spec) for spec in specs.rings], SharedState(specs.shared_state_fd))
 
 
-def _together(rings: Sequence[Ring], shared_state: SharedState, reference_fd: int = -1) -> Channels:
+def _make_channels(
+    rings: Sequence[Ring], shared_state: SharedState, reference_fd: int = -1
+) -> Channels:
+    """Return channels from rings in the order of `TOPICS`, and the shared state."""
     events, controls, timings, samples = rings
     return Channels(events, controls, timings, samples, shared_state, reference_fd)

@@ -14,13 +14,13 @@ from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
 from rigd.devices.contracts import DeviceError, Devices, StatedDrive
 from rigd.engine._control_names import CONNECTING_NAME, IDLE_NAME, SESSION_NAME
-from rigd.engine._publish import Display
+from rigd.engine._publish import ReadingPublisher
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.cycle import (
     Cycle,
-    Rest,
-    Standstill,
+    RestReadings,
+    StandstillMonitor,
     make_observers,
     make_watch,
     observe_rest,
@@ -51,16 +51,18 @@ from rigd.runtime.processes import name_this_process
 from rigd.safety import SLOW_CHECK_TICKS
 from rigd.session.layout import WRENCH_FIELDS
 
-_SILENCE_S = 1.0
-"""Time for which a device may be silent between sessions."""
+_MAX_SILENCE_S = 1.0
+"""Longest time in s for which a device may send no reading between sessions."""
 _STANDSTILL_POLL_S = 0.05
-_ZERO_S = 0.2
+"""Longest time in s to wait for an order of the supervisor while virtual time does not advance."""
+_ZERO_READING_S = 0.2
+"""Duration in s of the readings whose last angle becomes the rig's zero."""
 _STANDSTILL_TICKS = 2
-"""Ticks after which the motor's angle and speed are known."""
+"""Number of ticks after which the motor's angle and speed are known."""
 
 
 def main() -> None:
-    """Run as ``python -m rigd.engine.control_process``."""
+    """Run the control process, started as ``python -m rigd.engine.control_process``."""
     stop = StopRequest()
     stop.catch()
     parent = Parent()
@@ -68,16 +70,16 @@ def main() -> None:
     channels = attach_channels(job.channels)
     realtime = job.profile.realtime
     if job.fast:
-        obtained = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
+        granted = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
     else:
-        obtained = {"clock": "real"} | apply_realtime(priority=realtime.priority, cpu=realtime.cpu)
+        granted = {"clock": "real"} | apply_realtime(priority=realtime.priority, cpu=realtime.cpu)
     try:
         devices = open_devices(job.profile.rig, job.moving)
     except DeviceError as error:
         parent.send(Ended(str(error)))
         return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
-    run_control(job.profile, devices, clock, channels, parent, stop, obtained)
+    run_control(job.profile, devices, clock, channels, parent, stop, granted)
 
 
 def run_control(
@@ -87,9 +89,9 @@ def run_control(
     channels: Channels,
     parent: Parent,
     stop: StopRequest,
-    obtained: dict[str, str],
+    granted: dict[str, str],
 ) -> None:
-    """Connect the devices, serve the supervisor, and close the devices whatever happens.
+    """Connect the devices, execute the supervisor's orders, and close the devices in any case.
 
     Parameters
     ----------
@@ -99,7 +101,7 @@ def run_control(
         Devices, not yet connected.
     clock, channels, parent, stop
         As for :class:`rigd.engine._session_sequence.SessionSequence`.
-    obtained
+    granted
         Real-time settings that were granted, for the file.
     """
     failure = ""
@@ -109,7 +111,7 @@ def run_control(
         devices.sensor.connect()
         drive = devices.drive
         drive.connect()
-        server = _ControlServer(profile, devices, clock, channels, parent, stop, obtained)
+        server = _ControlServer(profile, devices, clock, channels, parent, stop, granted)
         channels.shared_state[StateField.PHASE] = Phase.OFF
         server.observe_standstill()
         name_this_process(IDLE_NAME)
@@ -117,7 +119,7 @@ def run_control(
             Connected(
                 calibration=devices.sensor.calibration(),
                 drive=drive.statement() if isinstance(drive, StatedDrive) else {},
-                realtime=obtained,
+                realtime=granted,
                 simulated=devices.simulated,
             )
         )
@@ -133,7 +135,7 @@ def run_control(
 
 
 class _ControlServer:
-    """Server of the supervisor's requests, with connected devices."""
+    """Executor of the supervisor's orders on connected devices."""
 
     def __init__(
         self,
@@ -143,34 +145,36 @@ class _ControlServer:
         channels: Channels,
         parent: Parent,
         stop: StopRequest,
-        obtained: dict[str, str],
+        granted: dict[str, str],
     ) -> None:
         self._profile = profile
         self._devices = devices
         self._clock = clock
-        self._metronome = TickScheduler(clock, profile.rig.rate_hz)
+        self._scheduler = TickScheduler(clock, profile.rig.rate_hz)
         self._channels = channels
         self._shared_state = channels.shared_state
         self._parent = parent
         self._stop = stop
-        self._obtained = obtained
+        self._granted = granted
         self._zero_rad = 0.0
-        self._silent = 0
+        self._silent_ticks = 0
         self._on_lines = devices.on_lines
         # A simulated motor starts cold.
-        warm = not devices.simulated
-        self._watch = make_watch(profile, recalled_heat_nm2(profile) if warm else 0.0)
-        self._standstill = Standstill(profile)
-        self._display = Display(channels.shared_state, devices)
+        real_motor = not devices.simulated
+        self._watch = make_watch(profile, recalled_heat_nm2(profile) if real_motor else 0.0)
+        self._standstill = StandstillMonitor(profile)
+        self._display = ReadingPublisher(channels.shared_state, devices)
         self._cycle = self._make_cycle(profile)
 
     def store_heat(self) -> None:
-        """Store the motor's heat for the next connection, when nothing is urgent."""
+        """Store the heat of a real motor in a file for the next connection to the rig."""
         if not self._devices.simulated:
             remember_heat(self._profile, self._watch.heat_nm2)
 
     def observe_standstill(self) -> None:
-        """Read the motor's angle, unless it is known, because virtual time stops after this.
+        """Read the devices until the motor's angle and speed at rest are known, and publish them.
+
+        Virtual time stops after this.
 
         Raises
         ------
@@ -178,13 +182,13 @@ class _ControlServer:
             If a device failed.
         """
         for _ in range(_STANDSTILL_TICKS):
-            if not self._standstill.begun:
-                self._metronome.wait()
+            if not self._standstill.has_speed:
+                self._scheduler.wait()
                 self._read_at_rest()
-        self._show()
+        self._publish_readings()
 
     def serve(self) -> None:
-        """Serve the supervisor until it is gone, or a stop is requested between sessions.
+        """Execute the supervisor's orders until it has ended or a stop is requested.
 
         Raises
         ------
@@ -201,21 +205,22 @@ class _ControlServer:
                     self.observe_standstill()
                     gc.collect()  # the torque is off: the only time for it
                 case Tare():
-                    self._answer(self._tare)
+                    self._send_measurement(self._measure_tare)
                 case Zero():
-                    self._answer(self._zero)
+                    self._send_measurement(self._set_zero)
                 case Probe():
-                    self._probe(order.profile)
+                    self._run_probe(order.profile)
                     self.observe_standstill()
 
     def _await_order(self) -> object | None:
-        """Observe with the torque off and return the next order; None if no more will come.
+        """Read the devices with the torque off until the supervisor sends an order; return it.
 
-        Virtual time does not advance meanwhile, except for occasional ticks with devices on lines.
+        Return None if the supervisor has ended or a stop is requested. Virtual time does not
+        advance meanwhile, except for occasional ticks with devices on a bus or serial line.
         """
-        seen_s = time.monotonic()
+        last_tick_s = time.monotonic()
         while not self._stop.requested:
-            self._show()
+            self._publish_readings()
             try:
                 message = self._parent.poll(_STANDSTILL_POLL_S if self._clock.virtual else 0.0)
             except EOFError:
@@ -223,38 +228,38 @@ class _ControlServer:
             if message is not None:
                 return message
             if not self._clock.virtual:
-                self._observe()
-            elif self._on_lines and time.monotonic() - seen_s > SIGN_OF_LIFE_S:
-                seen_s = time.monotonic()
-                self._metronome.wait()
+                self._read_idle_devices()
+            elif self._on_lines and time.monotonic() - last_tick_s > SIGN_OF_LIFE_S:
+                last_tick_s = time.monotonic()
+                self._scheduler.wait()
                 self._read_at_rest()
         return None
 
-    def _observe(self) -> None:
-        """Read the devices for some ticks with the torque off."""
+    def _read_idle_devices(self) -> None:
+        """Read the devices for some ticks with the torque off; raise if a device is silent."""
         cycle = self._cycle
         for _ in range(SLOW_CHECK_TICKS):
-            self._metronome.wait()
+            self._scheduler.wait()
             self._read_at_rest()
-            self._silent = self._silent + 1 if cycle.stale else 0
-        if self._silent > _SILENCE_S * self._profile.rig.rate_hz:
+            self._silent_ticks = self._silent_ticks + 1 if cycle.stale else 0
+        if self._silent_ticks > _MAX_SILENCE_S * self._profile.rig.rate_hz:
             raise DeviceError(
-                f"{cycle.stale_names} has not come for {_SILENCE_S:g} s; check that the device "
+                f"{cycle.stale_names} has not come for {_MAX_SILENCE_S:g} s; check that the device "
                 "is on and connected."
             )
 
     def _read_at_rest(self) -> None:
         """Read the devices for one tick with the torque off."""
-        self._cycle.observe(self._metronome.due_ns)
-        self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
+        self._cycle.observe(self._scheduler.due_ns)
+        self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
 
     def _run_session(self, job: SessionJob) -> None:
-        """Run one session; the drive ends disabled and a final message is sent, whatever happens.
+        """Run one session, disable the drive in any case, and send `Finished` to the supervisor.
 
         Raises
         ------
         DeviceError
-            If a device failed; the message has been sent nevertheless.
+            If a device failed. `Finished` has been sent nevertheless.
         """
         shared_state, devices = self._shared_state, self._devices
         for field in (
@@ -283,12 +288,12 @@ class _ControlServer:
         reader = None
         if job.reference.planned is not None:
             reader = ReferenceReader(reference, job.reference.planned, shared_state)
-        procedure = SessionSequence(
+        sequence = SessionSequence(
             job.profile,
             reference,
             cycle,
             self._clock,
-            self._metronome,
+            self._scheduler,
             self._standstill,
             self._channels,
             self._display,
@@ -302,18 +307,18 @@ class _ControlServer:
         recorded = device_failed = False
         name_this_process(SESSION_NAME)
         try:
-            seed = self._renew_noise(job)
-            tare = procedure.tare()
-            devices.drive.enable(procedure.stop_requested)
-            procedure.hold()
+            seed = self._restart_noise(job)
+            tare = sequence.tare()
+            devices.drive.enable(sequence.stop_requested)
+            sequence.hold()
             self._parent.send(Ready(tare | seed))
-            procedure.wait_for_go()
-            procedure.record()
+            sequence.wait_for_go()
+            sequence.record()
             recorded = True
-            procedure.damp()
-            procedure.go_back()
+            sequence.damp()
+            sequence.return_to_start()
             cycle.torque_off()
-            procedure.check_tare()
+            sequence.check_tare()
         except SessionEnd as end:
             outcome, reason, device_failed = end.outcome, end.reason, end.device_failed
         except (DeviceError, OSError) as error:
@@ -322,7 +327,7 @@ class _ControlServer:
             devices.drive.disable()
             cycle.torque_off()
             shared_state[StateField.PHASE] = Phase.OFF
-            self._show()
+            self._publish_readings()
         doubt = devices.drive.off_doubt
         if doubt:
             outcome, reason, device_failed = "fault", f"{reason} {doubt}".strip(), True
@@ -337,27 +342,27 @@ class _ControlServer:
                 outcome=outcome,
                 reason=reason,
                 fault=fault,
-                counts=asdict(procedure.counts),
-                results=procedure.results,
+                counts=asdict(sequence.counts),
+                results=sequence.results,
                 device_failed=device_failed,
             )
         )
         if device_failed:
             raise DeviceError(failure)
 
-    def _renew_noise(self, job: SessionJob) -> dict[str, str]:
-        """Restart the noise of a simulated rig; return its seed as metadata.
+    def _restart_noise(self, job: SessionJob) -> dict[str, str]:
+        """Restart the noise of a simulated rig and return its seed as metadata; {} for a real rig.
 
         Raises
         ------
         DeviceError
             If the simulated rig does not answer.
         """
-        renew = self._devices.renew_noise
-        return {} if renew is None else {"simulation_seed": str(renew(job.seed))}
+        restart_noise = self._devices.renew_noise
+        return {} if restart_noise is None else {"simulation_seed": str(restart_noise(job.seed))}
 
-    def _probe(self, profile: Profile) -> None:
-        """Run the probing move of a profile and report its result; the drive ends disabled.
+    def _run_probe(self, profile: Profile) -> None:
+        """Run the probing move of a profile, disable the drive, and send the result.
 
         Raises
         ------
@@ -371,7 +376,7 @@ class _ControlServer:
             profile,
             cycle,
             self._clock,
-            self._metronome,
+            self._scheduler,
             self._standstill,
             self._channels,
             self._display,
@@ -392,24 +397,27 @@ class _ControlServer:
             self._devices.drive.disable()
             cycle.torque_off()
             self._shared_state[StateField.PHASE] = Phase.OFF
-            self._show()
+            self._publish_readings()
         failure = f"{failure} {self._devices.drive.off_doubt}".strip()
         if failure:
             raise DeviceError(failure)
         name_this_process(IDLE_NAME)
         self._parent.send(answer)
 
-    def _answer(self, measure: Callable[[], dict[str, object]]) -> None:
-        """Send the result of a measurement at rest, or the reason why it was refused."""
+    def _send_measurement(self, measure: Callable[[], dict[str, object]]) -> None:
+        """Run a measurement at rest and send its result, or the reason why it was refused."""
         try:
             self._parent.send(Measured(measure()))
         except SessionEnd as end:
             self._parent.send(Refused(end.reason))
 
-    def _tare(self) -> dict[str, object]:
-        """Average the sensor for display; each session tares for itself."""
+    def _measure_tare(self) -> dict[str, object]:
+        """Measure the sensor's zero at rest, and return mean and standard deviation by axis.
+
+        The values are for display, because each session measures the zero itself.
+        """
         self._cycle.sensor_watch.learn()
-        rest = self._rest(self._profile.session.tare_s)
+        rest = self._read_rest(self._profile.session.tare_s)
         failed = self._cycle.sensor_watch.finish_learning()
         if failed is not None:
             raise SessionEnd("fault", str(failed))
@@ -421,15 +429,17 @@ class _ControlServer:
             "torque_std_nm": rest.torque_spread_nm,
         }
 
-    def _zero(self) -> dict[str, object]:
+    def _set_zero(self) -> dict[str, object]:
         """Set the rig's zero, from which its limits are measured, to the present angle.
+
+        Return the change of the zero in rad.
 
         Raises
         ------
         SessionEnd
             If the motor moves.
         """
-        rest = self._rest(_ZERO_S)
+        rest = self._read_rest(_ZERO_READING_S)
         limit_rad_s = self._profile.session.rest_velocity_rad_s
         if rest.speed_rad_s > limit_rad_s:
             raise SessionEnd(
@@ -441,17 +451,19 @@ class _ControlServer:
         self._zero_rad += moved_rad
         self._cycle.zero_rad = self._zero_rad
         self._cycle.angle_rad = 0.0
-        self._show()
+        self._publish_readings()
         return {"moved_rad": moved_rad}
 
-    def _show(self) -> None:
-        self._display.show(self._cycle, self._metronome.due_ns)
+    def _publish_readings(self) -> None:
+        """Publish the last readings in the shared state."""
+        self._display.publish(self._cycle, self._scheduler.due_ns)
 
-    def _rest(self, duration_s: float) -> Rest:
+    def _read_rest(self, duration_s: float) -> RestReadings:
+        """Return the sensor and encoder readings of `duration_s` seconds without torque."""
         rig = self._profile.rig
         return observe_rest(
             self._cycle,
-            self._metronome,
+            self._scheduler,
             rate_hz=rig.rate_hz,
             duration_s=duration_s,
             projection=rig.sensor.projection,
@@ -459,21 +471,23 @@ class _ControlServer:
         )
 
     def _check_reading(self) -> None:
-        if self._metronome.tick % SLOW_CHECK_TICKS == 0:
-            self._show()
+        """End a measurement if encoder or sensor failed, or the supervisor wants to end."""
+        if self._scheduler.tick % SLOW_CHECK_TICKS == 0:
+            self._publish_readings()
         if self._stop.requested or not self._parent.alive():
             raise SessionEnd("stopped", "The rig is being shut down.")
-        self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
+        self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
         failed = self._cycle.check_stale() or self._cycle.check_sensor()
         if failed is not None:
-            raise SessionEnd("fault", str(self._cycle.with_cause(failed)))
+            raise SessionEnd("fault", str(self._cycle.with_reported_cause(failed)))
 
     def _make_cycle(self, profile: Profile) -> Cycle:
+        """Return a new cycle with the controller and monitors of a profile."""
         rig = profile.rig
         cycle = Cycle(
             self._devices,
             rig.sensor.projection,
-            _controller(profile),
+            _make_controller(profile),
             self._watch,
             make_observers(profile, self._devices),
         )
@@ -481,9 +495,12 @@ class _ControlServer:
         return cycle
 
     def _warn_of_refusals(self, job: SessionJob) -> None:
-        own = {name: text for name, text in self._obtained.items() if text.startswith(REFUSED)}
+        """Log the real-time settings that the system did not grant, as warnings."""
+        own_refusals = {
+            name: text for name, text in self._granted.items() if text.startswith(REFUSED)
+        }
         for refused, consequence in (
-            (own, "more ticks will be late"),
+            (own_refusals, "more ticks will be late"),
             (job.refused, "a computer that is busy with other programs may end the session"),
         ):
             if refused:
@@ -492,12 +509,14 @@ class _ControlServer:
                 write_event(self._channels.events, LogEvent(0, "warning", message))
 
     def _log_accepted(self, job: SessionJob) -> None:
+        """Log the failed rows of ``rigd check`` that the operator accepted, as warnings."""
         for text in job.accepted:
             message = f"Accepted by the operator, though rigd check fails: {text}"
             write_event(self._channels.events, LogEvent(0, "warning", message))
 
 
-def _controller(profile: Profile) -> PidController:
+def _make_controller(profile: Profile) -> PidController:
+    """Return the angle controller with the gains of a profile's pole placement."""
     motor = profile.control_motor
     gains = design_pid(motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s)
     return PidController(gains, profile.control, profile.rig.rate_hz, motor.peak_torque_nm)

@@ -1,9 +1,9 @@
 """One tick: read the devices, check the limits, control, command; and the checks at rest.
 
-`Cycle` does the work of a tick. Readings without torque give the tare (`observe_rest`). The zero of
+`Cycle` runs a tick. The tare is the mean of readings without torque (`observe_rest`). The zero of
 the angle, and with it the limits, depend on the encoder's count. `LimitWatch` checks every reading
-during a session, and `Standstill` before, between and after sessions. While the torque is off, a
-hand may turn the motor, but its angle cannot jump.
+during a session, and `StandstillMonitor` before, between and after sessions. While the torque is
+off, a person may turn the motor by hand, but its angle cannot jump.
 """
 
 import json
@@ -27,44 +27,50 @@ from rigd.safety import BeamPrediction, EncoderWatch, LimitWatch, ScaleWatch, Se
 from rigd.safety.limits import BY_NAME, Violation
 from rigd.session.layout import WRENCH_FIELDS, Status
 
-REMEDY = (
+ENCODER_REMEDY = (
     "The zero of the angle and its limits are invalid: check the encoder, its cable and shield, "
     "then reset the rig and set the zero again."
 )
-
+"""Advice for the operator after an encoder fault, the end of several error messages."""
 
 _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
 _WRENCH_SATURATED = int(Status.WRENCH_SATURATED)
-_UNUSABLE = _ANGLE_STALE | _WRENCH_STALE | _WRENCH_SATURATED
+_UNUSABLE_FLAGS = _ANGLE_STALE | _WRENCH_STALE | _WRENCH_SATURATED
 _TORQUE_SATURATED = int(Status.TORQUE_SATURATED)
 _LIMIT_WARNING = int(Status.LIMIT_WARNING)
 _TORQUE_OFF = int(Status.TORQUE_OFF)
 
-_STALE_ANGLES = tuple(BY_NAME[name].channel for name in ("stale angle", "stale angle share"))
-_STALE_WRENCHES = tuple(BY_NAME[name].channel for name in ("stale wrench", "stale wrench share"))
+_STALE_ANGLE_CHANNELS = tuple(
+    BY_NAME[name].channel for name in ("stale angle", "stale angle share")
+)
+_STALE_WRENCH_CHANNELS = tuple(
+    BY_NAME[name].channel for name in ("stale wrench", "stale wrench share")
+)
 
 _RECENT_TICKS = 32
+"""Number of ticks whose angles and torques are compared to detect a wrong sign."""
 _SPEED_TICKS = 4
-"""Ticks at either end of the recent ticks over which the speed is computed."""
-_SURE_STEPS = 10
+"""Number of ticks over which the speed is computed, at either end of the last `_RECENT_TICKS`."""
+_MIN_SPEED_STEPS = 10
 """Encoder steps within `_SPEED_TICKS` above which the speed exceeds the encoder's noise."""
-_GAIN = 0.2
-"""Least fraction of the speed gained in these ticks: below it the torque explains little."""
-_AGAINST = 1 / 3, 3.0
-"""Range of the ratio of the acceleration to the one opposite to the torque: it allows for friction
-and for an inertia that is only assumed."""
+_MIN_SPEED_CHANGE = 0.2
+"""Least change of speed over the last `_RECENT_TICKS`, as a fraction of the speed. With a smaller
+change the torque explains little of the motion."""
+_OPPOSITE_ACCELERATION_RATIOS = 1 / 3, 3.0
+"""Smallest and largest ratio of the measured acceleration to the one expected with the opposite
+sign. The range allows for friction and for an inertia that is only assumed."""
 
 
 # The encoder without torque
 
 
-class Standstill:
-    """Check of each angle that is read without torque against the angles before it.
+class StandstillMonitor:
+    """Check that the motor's angle does not jump while the torque is off.
 
-    From one tick to the next the speed may change by what ``limits.acceleration_rad_s2`` allows,
-    as in the loop; over ticks that were missed the motor may move as fast as
-    ``limits.velocity_rad_s``.
+    Each angle is compared with the angles before it. From one tick to the next the speed may change
+    as much as ``limits.acceleration_rad_s2`` allows, as in the loop. Over ticks that were missed
+    the motor may move as fast as ``limits.velocity_rad_s``.
 
     Parameters
     ----------
@@ -76,60 +82,60 @@ class Standstill:
         rate_hz, limits = profile.rig.rate_hz, profile.limits
         self._period_ns = 1e9 / rate_hz
         # A difference of two movements has four readings in it, each half a step wrong.
-        self._steps_rad = 2.0 * profile.rig.encoder.resolution_rad
+        self._resolution_rad = 2.0 * profile.rig.encoder.resolution_rad
         self._per_tick2_rad = limits.acceleration_rad_s2 / rate_hz**2
         self._per_tick_rad = limits.velocity_rad_s / rate_hz
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
-        """Start again with the next angle, because the drive is or was controlled."""
+    def reset(self) -> None:
+        """Forget the angles checked so far, because the drive has moved the motor meanwhile."""
         self._angle_rad: float | None = None
         self._due_ns = 0
-        self._moved: tuple[float, float] | None = None
+        self._last_movements_rad: tuple[float, float] | None = None
 
     @property
-    def begun(self) -> bool:
-        """Whether angle and speed are known, against which the next angle is checked."""
-        return self._moved is not None
+    def has_speed(self) -> bool:
+        """Whether angle and speed are known, with which the next angle can be compared."""
+        return self._last_movements_rad is not None
 
     def check(self, angle_rad: float, due_ns: int) -> None:
-        """Check an angle that is not stale.
+        """Raise `DeviceError` if the motor cannot have turned to an angle since the last tick.
 
         Parameters
         ----------
         angle_rad
-            Angle from any zero that does not change.
+            Angle from any zero that does not change. It must not be stale.
         due_ns
             Time at which its tick was due.
 
         Raises
         ------
         DeviceError
-            If no motor can turn like that.
+            If the angle has jumped further than the motor can turn in that time.
         """
         before_rad, ticks = self._angle_rad, round((due_ns - self._due_ns) / self._period_ns)
         self._angle_rad, self._due_ns = angle_rad, due_ns
         if before_rad is None:
             return
         moved_rad = angle_rad - before_rad
-        moved, self._moved = self._moved, None
+        movements_rad, self._last_movements_rad = self._last_movements_rad, None
         if ticks > 1:
-            possible_rad = self._per_tick_rad * ticks + self._steps_rad
+            possible_rad = self._per_tick_rad * ticks + self._resolution_rad
             jump_rad, key = moved_rad, "limits.velocity_rad_s"
         else:
             # The movement before the first is unknown.
-            last_rad, before_that_rad = moved or (0.0, self._per_tick_rad)
+            last_rad, before_that_rad = movements_rad or (0.0, self._per_tick_rad)
             # One latch may be late by most of a period, and the next one punctual.
             possible_rad = (
-                self._per_tick2_rad + self._steps_rad + abs(last_rad) + abs(before_that_rad)
+                self._per_tick2_rad + self._resolution_rad + abs(last_rad) + abs(before_that_rad)
             )
             jump_rad, key = moved_rad - last_rad, "limits.acceleration_rad_s2"
-            self._moved = moved_rad, last_rad
+            self._last_movements_rad = moved_rad, last_rad
         if not abs(jump_rad) <= possible_rad:
             ticks_taken = f"{ticks} ticks" if ticks > 1 else "one tick"
             raise DeviceError(
                 f"The encoder jumped by {jump_rad:.4g} rad within {ticks_taken} while the torque "
-                f"was off; at most {possible_rad:.2g} rad is possible ({key}). {REMEDY}"
+                f"was off; at most {possible_rad:.2g} rad is possible ({key}). {ENCODER_REMEDY}"
             )
 
 
@@ -137,7 +143,7 @@ class Standstill:
 
 
 class Cycle:
-    """The work of a tick, and its results.
+    """Cycle of the control loop: reads, checks, controls and commands in each tick.
 
     Parameters
     ----------
@@ -146,8 +152,9 @@ class Cycle:
     projection
         Coupling torque about the motor's axis = projection · wrench.
     controller, watch
-        Ready to step; the watch sees every reading before the controller does.
-    observers
+        Controller and limit monitor. The monitor checks every reading before the controller
+        uses it.
+    reading_monitors
         Checks of the readings against physics and noise.
 
     Attributes
@@ -157,14 +164,14 @@ class Cycle:
     zero_rad
         The drive's own angle at the rig's zero.
     angle_rad, raw_wrench, wrench, coupling_torque_nm
-        The last readings, the angle from the rig's zero; wrench and torque are tared, the raw
-        wrench is not.
+        The last readings. The angle is measured from the rig's zero. Wrench and torque are tared,
+        the raw wrench is not.
     torque_command_nm
         The present torque command, after the limits.
     flags
         Status bits of the last tick.
     encoder_watch
-        Check of the encoder against the torques; None: a probing move has its own.
+        Check of the encoder against the torques, or None in a probing move, which has its own.
     """
 
     def __init__(
@@ -173,7 +180,7 @@ class Cycle:
         projection: Wrench,
         controller: PidController,
         watch: LimitWatch,
-        observers: "Observers",
+        reading_monitors: "ReadingMonitors",
     ) -> None:
         self.devices = devices
         self._drive = devices.drive
@@ -181,8 +188,8 @@ class Cycle:
         self._projection = projection
         self.controller = controller
         self.watch = watch
-        self.encoder_watch: EncoderWatch | None = observers.encoder
-        self.sensor_watch = observers.sensor
+        self.encoder_watch: EncoderWatch | None = reading_monitors.encoder
+        self.sensor_watch = reading_monitors.sensor
         self._gauges = devices.sensor if isinstance(devices.sensor, GaugeSensor) else None
         self.tare: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.zero_rad = 0.0
@@ -192,13 +199,13 @@ class Cycle:
         self.coupling_torque_nm = 0.0
         self.torque_command_nm = 0.0
         self.flags = _TORQUE_OFF
-        self._were_unusable = False
+        self._last_unusable = False
         self._commanding = False
         self._torque_squares_nm2 = 0.0
-        self._recent: deque[tuple[float, float, float]] = deque(maxlen=_RECENT_TICKS)
+        self._recent_ticks: deque[tuple[float, float, float]] = deque(maxlen=_RECENT_TICKS)
 
     def observe(self, due_ns: int) -> None:
-        """Read angle and wrench; the torque stays as it is (zero, before the drive is enabled)."""
+        """Read angle and wrench from the devices without changing the torque command."""
         drive, sensor = self._drive, self._sensor
         drive.latch(due_ns)
         sensor.request(due_ns)
@@ -221,14 +228,16 @@ class Cycle:
         self.flags = flags
 
     def step(self, due_ns: int, reference_rad: float) -> Violation | None:
-        """Run one tick; if it returns a violation, the torque is off.
+        """Run one tick of the loop, and return the violated limit or None.
+
+        After a violation the torque is off.
 
         Parameters
         ----------
         due_ns
             Time at which the tick was due.
         reference_rad
-            Reference of this tick, from the rig's zero.
+            Reference angle of this tick, from the rig's zero.
         """
         self.observe(due_ns)
         flags = self.flags & ~_TORQUE_OFF
@@ -246,10 +255,10 @@ class Cycle:
                 self.angle_rad,
                 self.coupling_torque_nm,
                 self.torque_command_nm,
-                fresh=not flags & _UNUSABLE,
+                fresh=not flags & _UNUSABLE_FLAGS,
             )
         if violation is not None:
-            self._recent.append((self.angle_rad, 0.0, 0.0))
+            self._recent_ticks.append((self.angle_rad, 0.0, 0.0))
             self.torque_off()
             self.flags |= _LIMIT_WARNING
             return violation
@@ -270,12 +279,12 @@ class Cycle:
         self._commanding = True
         sent_nm = self.torque_command_nm = self._drive.command(torque_nm)
         self._torque_squares_nm2 += sent_nm * sent_nm
-        self._recent.append((self.angle_rad, self.coupling_torque_nm, sent_nm))
+        self._recent_ticks.append((self.angle_rad, self.coupling_torque_nm, sent_nm))
         self.flags = flags
         return None
 
     def start(self, noise_nm: float) -> None:
-        """Start the control from rest at the angle last read.
+        """Reset controller and monitors to rest at the angle last read.
 
         Parameters
         ----------
@@ -286,16 +295,16 @@ class Cycle:
         self.watch.reset(self.angle_rad)
         if self.encoder_watch is not None:
             self.encoder_watch.reset(self.angle_rad, noise_nm)
-        self._recent.clear()
+        self._recent_ticks.clear()
 
     def skip(self, missed: int) -> None:
-        """Account for missed ticks, in which the torque was held."""
+        """Pass the number of missed ticks to limit and encoder monitors; the torque was held."""
         if missed:
             self.watch.skip(missed)
             self.skip_encoder(missed)
 
     def skip_encoder(self, missed: int) -> None:
-        """Account for missed ticks in the encoder watch only."""
+        """Pass the number of missed ticks to the encoder monitor only."""
         if self.encoder_watch is not None:
             self.encoder_watch.skip(missed, self.angle_rad)
 
@@ -318,22 +327,27 @@ class Cycle:
         resolution_rad
             Resolution of the encoder.
         """
-        recent = self._recent
+        recent = self._recent_ticks
         if len(recent) < _RECENT_TICKS:
             return False
         angles_rad = [angle_rad for angle_rad, _, _ in recent]
         before_rad = angles_rad[_SPEED_TICKS] - angles_rad[0]
         now_rad = angles_rad[-1] - angles_rad[-1 - _SPEED_TICKS]
-        faster_rad = now_rad - before_rad
-        if abs(now_rad) < _SURE_STEPS * resolution_rad or abs(faster_rad) < _GAIN * abs(now_rad):
+        speed_change_rad = now_rad - before_rad
+        if abs(now_rad) < _MIN_SPEED_STEPS * resolution_rad or abs(
+            speed_change_rad
+        ) < _MIN_SPEED_CHANGE * abs(now_rad):
             return False
-        half = _SPEED_TICKS // 2
+        half_window = _SPEED_TICKS // 2
         torques_nm = [sent_nm - coupling_nm for _, coupling_nm, sent_nm in recent]
-        impulse_nm_s = sum(torques_nm[half : -1 - half]) / rate_hz
+        impulse_nm_s = sum(torques_nm[half_window : -1 - half_window]) / rate_hz
         expected_rad = impulse_nm_s / inertia_kg_m2 * _SPEED_TICKS / rate_hz
-        least, most = _AGAINST
-        against = -faster_rad * expected_rad
-        return least * expected_rad**2 <= against <= most * expected_rad**2 and against > 0.0
+        min_ratio, max_ratio = _OPPOSITE_ACCELERATION_RATIOS
+        opposition = -speed_change_rad * expected_rad
+        return (
+            min_ratio * expected_rad**2 <= opposition <= max_ratio * expected_rad**2
+            and opposition > 0.0
+        )
 
     @property
     def stale(self) -> bool:
@@ -346,8 +360,8 @@ class Cycle:
         names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
         return " and ".join(name for flag, name in names if self.flags & flag).capitalize()
 
-    def check_encoder(self, standstill: Standstill, due_ns: int) -> None:
-        """Check the angle just read against those before it, while the torque is off.
+    def check_encoder(self, standstill: StandstillMonitor, due_ns: int) -> None:
+        """Raise `DeviceError` if the angle just read has jumped, while the torque is off.
 
         Parameters
         ----------
@@ -365,33 +379,41 @@ class Cycle:
             standstill.check(self.angle_rad + self.zero_rad, due_ns)
 
     def check_sensor(self) -> Violation | None:
-        """Return a violation if the sensor repeats its readings; call it after each reading."""
-        if self.flags & _UNUSABLE & ~_ANGLE_STALE:
+        """Return a violation if the sensor repeats its readings, otherwise None.
+
+        Call it after each reading.
+        """
+        if self.flags & _UNUSABLE_FLAGS & ~_ANGLE_STALE:
             return None
         gauges = self._gauges
         return self.sensor_watch.step(self.raw_wrench if gauges is None else gauges.gauges)
 
     def check_stale(self) -> Violation | None:
-        """Return a violation if a device gave no usable reading for too long."""
+        """Return a violation if a device has sent no usable reading for too long, else None."""
         flags = self.flags
-        if not (flags & _UNUSABLE or self._were_unusable):
+        if not (flags & _UNUSABLE_FLAGS or self._last_unusable):
             return None
-        self._were_unusable = bool(flags & _UNUSABLE)
+        self._last_unusable = bool(flags & _UNUSABLE_FLAGS)
         return self.watch.check_stale(
             bool(flags & _ANGLE_STALE),
             bool(flags & _WRENCH_STALE),
             bool(flags & _WRENCH_SATURATED),
         )
 
-    def with_cause(self, violation: Violation) -> Violation:
-        """Return a violation whose remedy is the cause that the device reports, if any.
+    def with_reported_cause(self, violation: Violation) -> Violation:
+        """Return a violation with the cause that the device reports as its remedy.
+
+        Return the violation unchanged if the device reports no cause.
 
         Parameters
         ----------
         violation
             Any violation; devices report causes of stale readings only.
         """
-        for device, names in ((self._drive, _STALE_ANGLES), (self._sensor, _STALE_WRENCHES)):
+        for device, names in (
+            (self._drive, _STALE_ANGLE_CHANNELS),
+            (self._sensor, _STALE_WRENCH_CHANNELS),
+        ):
             if violation.channel in names and (cause := device.health().cause):
                 return replace(violation, remedy=cause)
         return violation
@@ -399,16 +421,16 @@ class Cycle:
     def check_slow_limits(
         self, due_ns: int, recorder_lag_s: float = 0.0, disk_free_mb: float = inf
     ) -> Violation | None:
-        """Check the quantities that change slowly, every `SLOW_CHECK_TICKS` ticks.
+        """Check motor heat, recorder lag and free disk space, every `SLOW_CHECK_TICKS` ticks.
 
         Parameters
         ----------
         due_ns
             Time at which the present tick was due.
         recorder_lag_s
-            Time by which the recorder is behind the loop.
+            Time in s by which the recorder is behind the loop.
         disk_free_mb
-            Free space on the disk that holds the session file.
+            Free space in MB on the disk that holds the session file.
 
         Returns
         -------
@@ -422,7 +444,7 @@ class Cycle:
         return violation
 
     def torque_off(self) -> None:
-        """Set the torque to zero and disable the drive, once: disabling takes time."""
+        """Set the torque to zero, and disable the drive unless that has been done already."""
         if self._commanding:
             self._commanding = False
             self._drive.disable()
@@ -430,7 +452,7 @@ class Cycle:
         self.flags |= _TORQUE_OFF
 
     def mark_readings_stale(self) -> None:
-        """Switch off after a device failure, and mark the last readings as stale."""
+        """Switch the torque off after a device failure, and mark the last readings as stale."""
         self.torque_off()
         self.flags |= _ANGLE_STALE | _WRENCH_STALE
 
@@ -439,8 +461,8 @@ class Cycle:
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
-    """Readings at rest, without torque.
+class RestReadings:
+    """Readings of angle and wrench at rest, without torque.
 
     Attributes
     ----------
@@ -461,74 +483,74 @@ class Rest:
 
     @property
     def speed_rad_s(self) -> float:
-        """Range of the angles over the duration."""
+        """Range of the motor's angles divided by the duration, in rad/s."""
         return float(np.ptp(self.angles_rad)) / self.duration_s
 
     @property
     def torque_spread_nm(self) -> float:
-        """Standard deviation of the coupling torque: noise and vibration of the beam."""
+        """Standard deviation of the coupling torque in N·m, from noise and the beam's vibration."""
         return float(self.torques_nm.std())
 
     @property
     def mean(self) -> Wrench:
-        """Mean of each axis, N and N·m."""
+        """Mean of the raw wrench at rest on each axis, in N and N·m."""
         fx, fy, fz, tx, ty, tz = (float(value) for value in self.wrenches.mean(axis=0))
         return fx, fy, fz, tx, ty, tz
 
     @property
     def spread(self) -> Wrench:
-        """Standard deviation of each axis, N and N·m."""
+        """Standard deviation of the raw wrench at rest on each axis, in N and N·m."""
         fx, fy, fz, tx, ty, tz = (float(value) for value in self.wrenches.std(axis=0, ddof=1))
         return fx, fy, fz, tx, ty, tz
 
     def as_metadata(self) -> dict[str, str]:
-        """Return the tare as metadata of the session file."""
+        """Return duration, mean and standard deviation as metadata of the session file."""
         return {"tare_s": repr(self.duration_s)} | {
-            f"tare_{what}_{axis}": repr(value)
-            for what, values in (("mean", self.mean), ("std", self.spread))
+            f"tare_{statistic}_{axis}": repr(value)
+            for statistic, values in (("mean", self.mean), ("std", self.spread))
             for axis, value in zip(WRENCH_FIELDS, values, strict=True)
         }
 
 
 def observe_rest(
     cycle: Cycle,
-    metronome: TickScheduler,
+    scheduler: TickScheduler,
     *,
     rate_hz: float,
     duration_s: float,
     projection: Wrench,
     check: Callable[[], None],
-) -> Rest:
-    """Read angle and wrench for some time without changing the torque.
+) -> RestReadings:
+    """Read angle and wrench for `duration_s` without changing the torque, return the readings.
 
     Parameters
     ----------
-    cycle, metronome
+    cycle, scheduler
         Cycle that reads the devices, and the schedule of its ticks.
     rate_hz, duration_s
         Rate and duration of the readings.
     projection
         Coupling torque = projection · wrench.
     check
-        Called after each reading; it ends the readings by raising.
+        Function that is called after each reading and ends the readings by raising.
     """
     wrenches: list[Wrench] = []
     angles: list[float] = []
     for _ in range(round(duration_s * rate_hz)):
-        metronome.wait()
-        cycle.observe(metronome.due_ns)
+        scheduler.wait()
+        cycle.observe(scheduler.due_ns)
         check()
         wrenches.append(cycle.raw_wrench)
         angles.append(cycle.angle_rad)
     readings = np.array(wrenches)
-    return Rest(duration_s, readings, np.array(angles), readings @ np.array(projection))
+    return RestReadings(duration_s, readings, np.array(angles), readings @ np.array(projection))
 
 
 # The limits' watch, and the motor's heat
 
 
 def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
-    """Return the limit monitor of a rig; it exists as long as the rig is connected.
+    """Return the limit monitor of a rig, which is used as long as the rig is connected.
 
     Parameters
     ----------
@@ -553,17 +575,17 @@ def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
 
 
 @dataclass(frozen=True, slots=True)
-class Observers:
-    """Checks of the readings against physics and noise, for one profile and its devices."""
+class ReadingMonitors:
+    """Monitors that check encoder and sensor readings for plausibility."""
 
     encoder: EncoderWatch
     """Check of the encoder against the torques on the shaft."""
     sensor: SensorWatch
-    """Check of each reading of the sensor against the one before."""
+    """Check that the sensor does not repeat its last reading."""
 
 
-def make_observers(profile: Profile, devices: Devices) -> Observers:
-    """Return the observers of a profile's rig.
+def make_observers(profile: Profile, devices: Devices) -> ReadingMonitors:
+    """Return the monitors that check a rig's encoder and sensor for plausible readings.
 
     Parameters
     ----------
@@ -584,18 +606,18 @@ def make_observers(profile: Profile, devices: Devices) -> Observers:
         scales=ScaleWatch(rig.motor.inertia_kg_m2, profile.limits.torque_ratio),
     )
     simulation = rig.simulation
-    noisy = [True] * 6
+    is_noisy = [True] * 6
     if simulation is not None:
-        noisy = [simulation.force_noise_n > 0.0] * 3 + [simulation.torque_noise_nm > 0.0] * 3
+        is_noisy = [simulation.force_noise_n > 0.0] * 3 + [simulation.torque_noise_nm > 0.0] * 3
     channels: Sequence[str] = WRENCH_FIELDS
     if isinstance(devices.sensor, GaugeSensor):
         # Each gauge shows the noise of all axes.
-        channels, noisy = [f"gauge {number}" for number in range(6)], [all(noisy)] * 6
-    return Observers(encoder, SensorWatch(channels, noisy, rig.rate_hz))
+        channels, is_noisy = [f"gauge {number}" for number in range(6)], [all(is_noisy)] * 6
+    return ReadingMonitors(encoder, SensorWatch(channels, is_noisy, rig.rate_hz))
 
 
 def remember_heat(profile: Profile, heat_nm2: float) -> None:
-    """Store the heat of the motor for the next connection of this user.
+    """Store the heat of the motor in a file for this user's next connection to the rig.
 
     If it cannot be stored, the next connection assumes a cold motor.
 
@@ -610,9 +632,9 @@ def remember_heat(profile: Profile, heat_nm2: float) -> None:
     with suppress(OSError, UnsafeFolderError):
         path = _heat_file(profile)
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        fresh = path.with_suffix(".new")
-        fresh.write_text(json.dumps(document), encoding="utf-8")
-        fresh.replace(path)
+        temporary_path = path.with_suffix(".new")
+        temporary_path.write_text(json.dumps(document), encoding="utf-8")
+        temporary_path.replace(path)
 
 
 def recalled_heat_nm2(profile: Profile) -> float:
@@ -625,14 +647,15 @@ def recalled_heat_nm2(profile: Profile) -> float:
         heat_nm2, boot_s = float(document["heat_nm2"]), float(document["boot_s"])
     except (OSError, UnsafeFolderError, ValueError, TypeError, KeyError):
         return 0.0
-    passed_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_s
-    if not isfinite(heat_nm2) or not passed_s >= 0.0:  # from before a reboot
+    elapsed_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_s
+    if not isfinite(heat_nm2) or not elapsed_s >= 0.0:  # from before a reboot
         return 0.0
     motor = profile.rig.motor
-    warmest_nm2 = motor.peak_torque_nm**2
-    return min(max(0.0, heat_nm2), warmest_nm2) * exp(-passed_s / motor.thermal_time_constant_s)
+    max_heat_nm2 = motor.peak_torque_nm**2
+    return min(max(0.0, heat_nm2), max_heat_nm2) * exp(-elapsed_s / motor.thermal_time_constant_s)
 
 
 def _heat_file(profile: Profile) -> Path:
-    plain = "".join(c if c.isalnum() else "-" for c in profile.name).strip("-")
-    return runtime_folder() / f"heat-{plain}.json"
+    """Return the path of the file that stores the heat of a rig's motor."""
+    file_name_part = "".join(c if c.isalnum() else "-" for c in profile.name).strip("-")
+    return runtime_folder() / f"heat-{file_name_part}.json"

@@ -1,6 +1,6 @@
 """Messages between the processes of a rig, and their encoding.
 
-The supervisor sends jobs and orders, the others answer:
+The supervisor sends jobs and orders, the other processes answer:
 
 ============  =============================================  ================================
 process       receives                                       sends
@@ -37,9 +37,11 @@ if TYPE_CHECKING:  # children start before the supervisor has imported any of th
     from rigd.profile import Profile, RealtimeSettings
     from rigd.touch import DetectorSettings, TouchModel, WatchedBeam
 
-_LENGTH: Final = struct.Struct("=I")
-_MOST_BYTES: Final = 1 << 24
-"""Limit of a message's length: beyond it, the pipe contains something else, such as text."""
+_LENGTH_HEADER: Final = struct.Struct("=I")
+"""Binary format of the length in bytes that precedes each message."""
+_MAX_MESSAGE_BYTES: Final = 1 << 24
+"""Largest length of a message in bytes. A larger length means that the pipe contains something
+else, such as text."""
 
 
 # Control
@@ -47,77 +49,77 @@ _MOST_BYTES: Final = 1 << 24
 
 @dataclass(frozen=True, slots=True)
 class ControlJob:
-    """The rig to control."""
+    """Job of the control process: the rig to connect and control."""
 
     profile: "Profile"
     """Profile whose devices are connected."""
     moving: "ActuationTarget | None"
-    """The only thing that may move, as stated to the operator; None: nothing was stated."""
+    """The only motor that may move, as stated to the operator; None: no motor was stated."""
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
     fast: bool
-    """Whether to run with the virtual clock."""
+    """Whether sessions run with the virtual clock, faster than real time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """Steps after the record, with the motor still held; planned before the session."""
+    """Plan of the steps that follow a record while the motor is still held."""
 
     stays: bool = False
     """Whether the motor stays at the end of the reference instead of returning to the start."""
     poles_rad_s: tuple[complex, ...] = ()
-    """Poles of the modes that the return must not excite; empty if they are unknown."""
+    """Poles in rad/s of the modes that the return must not excite; empty if they are unknown."""
     damper: "DamperSettings | None" = None
     """Active damping of the remaining vibration; None: no active damping."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchOrder:
-    """Search for an obstacle in a session."""
+    """Order to search for an obstacle in a session."""
 
     beam: "WatchedBeam"
-    """Model of the beam for the detector."""
+    """Model of the beam for the touch detector."""
     settings: "DetectorSettings"
-    """Thresholds of the detector."""
+    """Sensitivity of the touch detector."""
     approach: "Approach"
     """Passes of the search, and the reaction to a touch."""
     shear_projection: tuple[float, ...] | None
-    """Base shear = projection · wrench; None: it is not measured."""
+    """Coefficients of the base shear force, shear = projection · wrench; None: not measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionJob:
-    """A session to run."""
+    """Order of the supervisor to run a session."""
 
     profile: "Profile"
     """Profile of the rig, possibly with another controller and other limits."""
     reference: "ReferenceSpec"
-    """Angles relative to the one at the start."""
+    """Reference angles in shared memory, relative to the angle at the start."""
     refused: Mapping[str, str] = field(default_factory=dict)
-    """Settings that the system refused to supervisor and recorder, with the reasons."""
+    """Reasons why the system refused real-time settings to supervisor and recorder, by setting."""
     ending: Ending = field(default_factory=Ending)
     """Steps after the record."""
     touch: TouchOrder | None = None
     """Search for an obstacle; None: no search."""
     seed: int | None = None
-    """Seed of a simulated rig's noise; None: the rig chooses one."""
+    """Seed of a simulated rig's noise; None: the rig chooses a seed."""
     accepted: tuple[str, ...] = ()
     """Failed rows of `rigd check` that the operator accepted, each as a text for the log."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tare:
-    """Average the sensor at rest."""
+    """Order to measure the sensor's zero by averaging at rest."""
 
 
 @dataclass(frozen=True, slots=True)
 class Zero:
-    """Make the present angle the zero."""
+    """Order to set the rig's zero to the present angle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """Make the probing move of a profile."""
+    """Order to run the probing move, with the data of a profile."""
 
     profile: "Profile"
     """Profile of the rig, possibly with another beam."""
@@ -125,7 +127,7 @@ class Probe:
 
 @dataclass(frozen=True, slots=True)
 class Connected:
-    """The devices are connected, and the torque is off."""
+    """Message that the devices are connected and the torque is off."""
 
     calibration: Mapping[str, Any]
     """Identity and calibration as read from the sensor, for the file."""
@@ -139,7 +141,7 @@ class Connected:
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """The motor is held at its angle; the record may begin."""
+    """Message that the motor is held at its angle and the record may begin."""
 
     tare: Mapping[str, str]
     """Metadata of the tare, and the seed of a simulated rig's noise."""
@@ -147,25 +149,25 @@ class Ready:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A session has ended, and the torque is off."""
+    """Message that a session has ended and the torque is off."""
 
     outcome: str
     """Outcome of the record: ``complete``, ``stopped`` or ``fault``."""
     reason: str
     """Reason for an early end, or failure after the record; empty if neither."""
     fault: bool
-    """Whether something failed, in the record or after it."""
+    """Whether anything failed during the record or after it."""
     counts: Mapping[str, int]
-    """Numbers of ticks: scheduled, missed, late, lost, and those with stale readings."""
+    """Numbers of scheduled, missed, late and lost ticks, and of ticks with stale readings."""
     results: Mapping[str, str] = field(default_factory=dict)
-    """Results for the record's outcome, in addition to the counts."""
+    """Results for the metadata ``outcome`` of the file, in addition to the counts."""
     device_failed: bool = False
     """Whether a device failed, so that the control process closes the devices and ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Result of a measurement between sessions."""
+    """Message with the result of a measurement between sessions."""
 
     values: dict[str, Any]
     """Results by name, as the methods `tare`, `zero` and `probe` of `rigd.runner.Rig` return."""
@@ -173,18 +175,18 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """A measurement was not possible."""
+    """Message that a measurement was not possible."""
 
     reason: str
-    """Obstacle to the measurement, such as a moving motor; a sentence for the operator."""
+    """Reason, such as a moving motor, as a sentence for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """The devices are closed; the last message."""
+    """Last message of the control process: the devices are closed."""
 
     reason: str
-    """Failure; empty if the end was requested."""
+    """Description of the failure; empty if the end was requested."""
 
 
 # Recorder
@@ -192,19 +194,19 @@ class Ended:
 
 @dataclass(frozen=True, slots=True)
 class RecorderJob:
-    """The file to write."""
+    """Job of the recorder process: the session file to write."""
 
     path: Path
-    """Path of the session file; one that exists is not overwritten."""
+    """Path of the session file; an existing file is not overwritten."""
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
     realtime: "RealtimeSettings | None" = None
-    """Scheduling that it may request; None: none, because the session is not in real time."""
+    """Real-time scheduling that the recorder may request; None: the session is not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
 class FileHeader:
-    """Contents of the file before its first sample."""
+    """Contents of the session file that precede its first sample."""
 
     metadata: Mapping[str, str]
     """Metadata ``session`` of docs/session_format.md."""
@@ -216,32 +218,32 @@ class FileHeader:
 
 @dataclass(frozen=True, slots=True)
 class Close:
-    """Close the file with its outcome."""
+    """Order to the recorder to write the outcome and close the session file."""
 
     outcome: Mapping[str, str]
     """Metadata ``outcome`` of docs/session_format.md; the recorder recounts the samples."""
     touches: bytes = b""
-    """Estimated touches, packed."""
+    """Estimated touches in the binary format of the session file."""
     segments: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    """Segments that were not known before the record."""
+    """First tick and end of the segments that were not known before the record, by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """The file exists."""
+    """Message that the session file exists."""
 
     realtime: Mapping[str, str]
-    """Scheduling that was granted."""
+    """Real-time scheduling that the system granted to the recorder."""
 
 
 @dataclass(frozen=True, slots=True)
 class Armed:
-    """The record may begin."""
+    """Message that the recorder is ready, so the record may begin."""
 
 
 @dataclass(frozen=True, slots=True)
 class Closed:
-    """The file is complete."""
+    """Message that the session file is complete."""
 
     path: Path | None = None
     """Path of the file; None: no record had begun, and there is no file."""
@@ -250,19 +252,19 @@ class Closed:
     outcome: str = ""
     """``complete``, ``stopped`` or ``fault``, as in the file; empty without a file."""
     reason: str = ""
-    """Reason as in the file."""
+    """Reason for an early end of the record, as in the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """A recorder, live publisher or fit process failed, and ends."""
+    """Message that a recorder, live publisher or fit process has failed and ends."""
 
     reason: str
     """Description of the failure, for the operator."""
     taken: bool = False
-    """Whether the file exists already and belongs to something else."""
+    """Whether a file with the session's name exists already, which is the reason of the failure."""
     saved_path: Path | None = None
-    """Path of the record, if it was not saved under its own name."""
+    """Path of the record, if it was saved under another name."""
 
 
 # Touch
@@ -270,39 +272,40 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class TouchJob:
-    """Estimation of the touches of a session."""
+    """Job of the touch process: estimate the touches of a session."""
 
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
     first: int
-    """Number of samples in the ring before the session."""
+    """Number of samples written to the ring before the session."""
     rate_hz: float
     """Ticks a second."""
     model: "TouchModel"
     """Model of the beam."""
     shear_projection: tuple[float, ...] | None
-    """Base shear = projection · wrench; None: it is not measured."""
+    """Coefficients of the base shear force, shear = projection · wrench; None: not measured."""
     realtime: "RealtimeSettings | None" = None
-    """Real-time settings, whose loop core it must avoid; None: not in real time."""
+    """Real-time settings, which name the loop's core that this process must avoid; None: the
+    session is not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchReady:
-    """Touches are estimated from now on."""
+    """Message that the touch process is ready to estimate touches."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchReport:
-    """Estimate of a touch."""
+    """Message with the estimate of a touch."""
 
     number: int
     """Number of the touch in its session, from 1 on."""
     tick: int
-    """Tick of its detection."""
+    """Tick at which the touch was detected."""
     final: bool
-    """Whether it is the last estimate of this touch."""
+    """Whether this is the last estimate of the touch."""
     document: Mapping[str, Any]
-    """Point, instant, force, stiffness and kind, as in JSON documents."""
+    """Contact point, instant, force, stiffness and kind of the touch, as in JSON documents."""
 
 
 # Fit
@@ -310,12 +313,12 @@ class TouchReport:
 
 @dataclass(frozen=True, slots=True)
 class FitJob:
-    """Fit of a session's record during the session."""
+    """Job of the fit process: fit the beam model to a session's record while it is recorded."""
 
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
     first: int
-    """Number of samples in the ring before the session."""
+    """Number of samples written to the ring before the session."""
     profile: "Profile"
     """Profile of the rig."""
     reference: "ReferenceSpec"
@@ -323,45 +326,46 @@ class FitJob:
     search: "PrecisionSearch | None" = None
     """Target precision, for which segments are planned; None: the reference is fixed."""
     realtime: "RealtimeSettings | None" = None
-    """Real-time settings, whose loop core it must avoid; None: not in real time."""
+    """Real-time settings, which name the loop's core that this process must avoid; None: the
+    session is not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordEnded:
-    """The record has ended: fit all of it."""
+    """Message to the fit process that the record has ended, so that it fits the whole record."""
 
     ticks: int
-    """Ticks that were scheduled."""
+    """Number of ticks that were scheduled in the record."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitReady:
-    """The record is fitted from now on."""
+    """Message that the fit process is ready to fit the record."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitReport:
-    """Estimate from the record so far."""
+    """Message with the model that the fit process has estimated from the record so far."""
 
     document: Mapping[str, Any]
-    """Modes and parameters with their intervals, as in JSON documents."""
+    """Estimated modes and parameters with their intervals, as in JSON documents."""
     final: bool = False
-    """Whether it uses the whole record and is the last."""
+    """Whether this is the last estimate, which uses the whole record."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedSegment:
-    """Segment of excitation that was appended to the reference."""
+    """Message that a segment of excitation was appended to the reference."""
 
     name: str
-    """Name for the operator."""
+    """Name of the segment for the operator."""
     document: Mapping[str, Any]
-    """Expected improvement, as in JSON documents."""
+    """Improvement of the estimate that the segment is expected to bring, as in JSON documents."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchEnded:
-    """No further segment follows; the record ends with the present ones."""
+    """Message that no further segment follows, so the record ends with the planned segments."""
 
     reached: bool
     """Whether the target precision is reached."""
@@ -375,13 +379,13 @@ class SearchEnded:
 
 
 def encode(message: object) -> bytes:
-    """Return the bytes of a message."""
+    """Return a message as bytes for a pipe: its length and the pickled object."""
     data = pickle.dumps(message)
-    return _LENGTH.pack(len(data)) + data
+    return _LENGTH_HEADER.pack(len(data)) + data
 
 
 class MessageReader:
-    """Reader of messages from a descriptor, which never exceeds the given timeout.
+    """Reader of messages from a pipe, which never waits longer than a given timeout.
 
     Parameters
     ----------
@@ -394,12 +398,12 @@ class MessageReader:
         self._pending = bytearray()
 
     def next(self, timeout_s: float | None) -> object | None:
-        """Return the next message, or None if none is complete in time.
+        """Return the next message, or None if no complete message arrives in time.
 
         Parameters
         ----------
         timeout_s
-            Longest wait; None: forever.
+            Longest time to wait in s; None: wait forever.
 
         Raises
         ------
@@ -408,7 +412,7 @@ class MessageReader:
         ValueError
             If the data are not a message.
         """
-        while (message := self._whole()) is None:
+        while (message := self._take_complete_message()) is None:
             if not is_ready(self._fd, select.POLLIN, timeout_s):
                 return None
             data = os.read(self._fd, 65_536)
@@ -417,32 +421,33 @@ class MessageReader:
             self._pending += data
         return message
 
-    def _whole(self) -> object | None:
-        if len(self._pending) < _LENGTH.size:
+    def _take_complete_message(self) -> object | None:
+        """Remove and return the first complete message of the data read so far, or None."""
+        if len(self._pending) < _LENGTH_HEADER.size:
             return None
-        (length,) = _LENGTH.unpack_from(self._pending)
-        if length > _MOST_BYTES:
+        (length,) = _LENGTH_HEADER.unpack_from(self._pending)
+        if length > _MAX_MESSAGE_BYTES:
             raise ValueError(f"no message, but {bytes(self._pending[:80])!r}")
-        end = _LENGTH.size + length
+        end = _LENGTH_HEADER.size + length
         if len(self._pending) < end:
             return None
-        message: object = pickle.loads(self._pending[_LENGTH.size : end])
+        message: object = pickle.loads(self._pending[_LENGTH_HEADER.size : end])
         del self._pending[:end]
         return message
 
 
 def is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
-    """Wait until a descriptor can be used, and return whether it can.
+    """Wait until a descriptor can be read or written, and return whether it can.
 
     Parameters
     ----------
     fd
-        Descriptor; unlike `select`, `poll` takes numbers beyond 1023.
+        File descriptor. Unlike `select`, `poll` accepts numbers beyond 1023.
     event
-        ``select.POLLIN`` or ``select.POLLOUT``.
+        ``select.POLLIN`` to read or ``select.POLLOUT`` to write.
     timeout_s
-        Longest wait; None: forever.
+        Longest time to wait in s; None: wait forever.
     """
-    waiting = select.poll()
-    waiting.register(fd, event)
-    return bool(waiting.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))
+    poller = select.poll()
+    poller.register(fd, event)
+    return bool(poller.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))

@@ -2,7 +2,7 @@
 
 The table `PROCESSES` defines how each process is started, watched and ended. Every process counts
 up its heartbeat in the `SharedState` several times a second. The supervisor notices a dead process
-at once and a hung one by its heartbeat; the table states the consequence.
+at once and a hung process by its heartbeat. The table states the consequence.
 
 A child is ``python -m MODULE``. It receives its job and then messages on standard input, whose end
 means that the supervisor is gone. It sends its answers on standard output (`messages`).
@@ -26,35 +26,39 @@ from rigd.errors import FailureError
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, signal_when_orphaned, signals_blocked
 
 _WRITE_PATIENCE_S = 5.0
-_SILENT_GRACE_S = 1.0
+"""Longest time in s that a child may take to read a message."""
+_EXIT_GRACE_S = 1.0
+"""Longest time in s from the end of a child's output to the end of its process."""
 _KILLED_GRACE_S = 2.0
+"""Longest time in s to wait for a killed child to end."""
 
 
 # Both ends
 
 
 class ChildError(FailureError):
-    """A child process ended, or its answer was unexpected."""
+    """Error of a child process: it cannot be started, has ended or sent no valid message."""
 
 
 class Child:
-    """A process started by the supervisor.
+    """Child process that the supervisor starts, with the supervisor's end of its pipes.
 
     Parameters
     ----------
     name
-        Name in messages to the operator.
+        Name of the process in messages to the operator.
     module
-        Run as ``python -m module``; it starts its imports at once and waits for its job.
+        Module that is run as ``python -m module``. It starts its imports at once and waits for its
+        job.
     fds
-        Descriptors that it inherits.
+        Descriptors that the child inherits.
     cores
-        Cores that it may use, if they differ from this process's own.
+        Cores that the child may use; empty: those of this process.
 
     Raises
     ------
     ChildError
-        If the system does not start it.
+        If the system does not start the process.
     """
 
     def __init__(
@@ -83,31 +87,33 @@ class Child:
         self._messages = MessageReader(self._stdout_fd)
 
     def start(self, job: object) -> None:
-        """Send its job, which is the first message."""
+        """Send the child its job, which is the first message."""
         self.send(job)
 
     def send(self, message: object) -> None:
-        """Send one message; the next `poll` reports a child that is gone.
+        """Send one message to the child.
+
+        If the child has ended, nothing is raised here, but by the next `poll`.
 
         Raises
         ------
         ChildError
-            If the child does not read it in time.
+            If the child does not read the message in time.
         """
         self._write(encode(message))
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """Process id of the child."""
         return self._process.pid
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the child process still runs."""
         return self._process.poll() is None
 
     def poll(self, timeout_s: float) -> object | None:
-        """Return its next message, or None if none comes in time.
+        """Return the child's next message, or None if none arrives within `timeout_s`.
 
         Raises
         ------
@@ -118,13 +124,15 @@ class Child:
             return self._messages.next(timeout_s)
         except EOFError:
             code = self._process.wait()
-            how = f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-            raise ChildError(f"The {self.name} process was {how}.") from None
+            how_it_ended = (
+                f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+            )
+            raise ChildError(f"The {self.name} process was {how_it_ended}.") from None
         except ValueError as error:
             raise ChildError(f"The {self.name} process sent {error}.") from None
 
     def messages(self, timeout_s: float) -> Iterator[object]:
-        """Yield the available messages, waiting only for the first.
+        """Yield the child's available messages; wait up to `timeout_s` for the first message only.
 
         Raises
         ------
@@ -140,34 +148,37 @@ class Child:
         self._process.send_signal(signal.SIGCONT)
 
     def kill(self) -> None:
-        """Kill the child; the next :meth:`poll` reports it."""
+        """Kill the child process at once; the next :meth:`poll` then raises `ChildError`."""
         self._process.kill()
 
     def stop(self, grace_s: float) -> None:
-        """End the child: close its input and wait, then terminate, then kill; repeatable."""
+        """End the child: close its input, terminate it after `grace_s` seconds, then kill it.
+
+        Calling this again has no effect.
+        """
         if self._process.stdout is None or self._process.stdout.closed:
             return
         if self._process.stdin is not None and not self._process.stdin.closed:
             with contextlib.suppress(BrokenPipeError):  # it had ended already
                 self._process.stdin.close()
         self.wake()
-        for end in (self._process.terminate, self._process.kill):
+        for end_process in (self._process.terminate, self._process.kill):
             try:
-                self._process.wait(_SILENT_GRACE_S if self._falls_silent(grace_s) else 0.0)
+                self._process.wait(_EXIT_GRACE_S if self._wait_for_output_end(grace_s) else 0.0)
                 break
             except subprocess.TimeoutExpired:
-                end()
+                end_process()
         with contextlib.suppress(
             subprocess.TimeoutExpired
         ):  # stuck in a call, on a disk that hangs
             self._process.wait(_KILLED_GRACE_S)
         self._process.stdout.close()
 
-    def _falls_silent(self, patience_s: float) -> bool:
-        """Return whether its output ends in time; waiting for the process itself would poll."""
+    def _wait_for_output_end(self, patience_s: float) -> bool:
+        """Wait until the child's output ends, and return whether it ends within `patience_s`."""
         deadline = time.monotonic() + patience_s
-        while (left_s := deadline - time.monotonic()) > 0:
-            if is_ready(self._stdout_fd, select.POLLIN, left_s) and not os.read(
+        while (remaining_s := deadline - time.monotonic()) > 0:
+            if is_ready(self._stdout_fd, select.POLLIN, remaining_s) and not os.read(
                 self._stdout_fd, 65536
             ):
                 return True
@@ -175,29 +186,32 @@ class Child:
 
     @property
     def _stdout_fd(self) -> int:
+        """File descriptor from which the child's messages are read."""
         assert self._process.stdout is not None
         return self._process.stdout.fileno()
 
     @property
     def _stdin_fd(self) -> int:
+        """File descriptor to which messages for the child are written."""
         assert self._process.stdin is not None
         return self._process.stdin.fileno()
 
     def _write(self, data: bytes) -> None:
-        rest = memoryview(data)
+        """Write bytes to the child's input; raise `ChildError` if it does not read them in time."""
+        unsent = memoryview(data)
         deadline = time.monotonic() + _WRITE_PATIENCE_S
-        while rest:
+        while unsent:
             patience_s = max(0.0, deadline - time.monotonic())
             if not is_ready(self._stdin_fd, select.POLLOUT, patience_s):
                 raise ChildError(f"The {self.name} process does not listen.")
             try:
-                rest = rest[os.write(self._stdin_fd, rest) :]
+                unsent = unsent[os.write(self._stdin_fd, unsent) :]
             except BrokenPipeError:
                 return  # poll() reports how it ended
 
 
 class Parent:
-    """The supervisor, seen from a child, whose only argument is the supervisor's process id.
+    """A child process's connection to the supervisor, whose process id is its only argument.
 
     (The parent's id at the start of the child would be wrong if the supervisor has died already.)
     """
@@ -212,29 +226,34 @@ class Parent:
         signal_when_orphaned(signal.SIGCONT)
 
     def receive_job(self) -> Any:  # noqa: ANN401 - the child knows its type
-        """Return the job; end this process quietly if the supervisor ends without sending one."""
+        """Wait for the supervisor's first message, the job of this process, and return it.
+
+        End this process without an error if the supervisor ends before it has sent a job.
+        """
         try:
             return self.poll(None)
         except EOFError:
             sys.exit(0)
 
     def poll(self, timeout_s: float | None) -> object | None:
-        """Return the next message, or None if none comes in time (None: wait forever).
+        """Return the supervisor's next message, or None if none arrives within `timeout_s`.
+
+        A timeout of None waits forever.
 
         Raises
         ------
         EOFError
-            If the supervisor is gone.
+            If the supervisor has ended.
         """
         return self._messages.next(timeout_s)
 
     def send(self, message: object) -> None:
-        """Send one short message, even if the supervisor may be gone."""
+        """Send one short message to the supervisor; nothing happens if the supervisor has ended."""
         with contextlib.suppress(BrokenPipeError):
             os.write(self._messages_fd, encode(message))
 
     def alive(self) -> bool:
-        """Return whether the supervisor still runs; fast enough for the loop."""
+        """Return whether the supervisor still runs, fast enough for use in the control loop."""
         return os.getppid() == self._pid
 
 
@@ -243,22 +262,22 @@ class Parent:
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """One kind of process."""
+    """How one of the rig's processes is started, watched and ended."""
 
     name: str
-    """Name in messages to the operator."""
+    """Name of the process in messages to the operator."""
     module: str
-    """Run as ``python -m module``; empty for the process that starts the others."""
+    """Module that is run as ``python -m module``; empty for the supervisor."""
     beat: StateField
-    """Field of its heartbeat in the shared state."""
+    """Field of the process's heartbeat in the shared state."""
     hung_after_s: float | None
-    """Longest time without a heartbeat; None: its results are checked instead."""
+    """Longest time in s without a heartbeat; None: the process's results are checked instead."""
     grace_s: float
-    """Time to end on request, before it is terminated and then killed."""
+    """Time in s in which the process must end on request, before it is terminated, then killed."""
     for_one_session: bool
-    """Whether each session starts a new one."""
+    """Whether each session starts a new process of this kind."""
     loss: str
-    """Consequence of its death or hanging."""
+    """Consequence if the process dies or hangs, for the operator."""
 
 
 CONTROL = Process(
@@ -320,17 +339,19 @@ SUPERVISOR = Process(
 )
 
 PROCESSES = (CONTROL, RECORDER, LIVE, TOUCH, FIT, SUPERVISOR)
-"""All processes in the order in which they are ended: the process with the torque first."""
+"""All processes of a rig in the order in which they are ended: first the control process, which
+switches the torque off."""
 
 
 class Heartbeat:
-    """Heartbeat of a process, polled by another one.
+    """Detector of a hung process by its heartbeat, polled by another process.
 
     Only time in which the polling process itself ran counts: a computer that stalls for a second
     does not make a process count as hung.
     """
 
     _MAX_STEP_S = 0.2
+    """Longest time in s that counts between two polls."""
 
     def __init__(self) -> None:
         self._beat = -1
@@ -338,12 +359,12 @@ class Heartbeat:
         self.still_s = 0.0
 
     def stalled_for(self, beat: int, now_s: float) -> float:
-        """Return the time in s for which the count has not changed.
+        """Return the time in s for which a process's heartbeat count has not changed.
 
         Parameters
         ----------
         beat
-            Count that the process increments while it runs.
+            Present count, which the process increments while it runs.
         now_s
             Time of a monotonic clock.
         """

@@ -15,26 +15,32 @@ from collections.abc import Callable
 from pathlib import Path
 
 REFUSED = "refused: "
-"""Prefix of the report on a setting that was not granted."""
+"""Prefix of the text for a real-time setting that the system did not grant; the reason follows."""
 LOCKED = "locked"
-"""Report on memory that is locked, so that it causes no page faults."""
+"""Text for a process whose memory is locked, so that it causes no page faults."""
 WAKE_UP_US = 2
-"""Idle states with a longer exit latency are disabled. Halting is faster than that; with 0 an idle
-core would poll and consume power."""
+"""Longest exit latency in µs of the processor's idle states; deeper states are disabled. Halting is
+faster than that. With 0 an idle core would poll and consume power."""
 
 NICE = -10
-"""Niceness of supervisor and recorder where the system grants no real-time priority."""
+"""Niceness of supervisor and recorder if the system grants no real-time priority."""
 
 _MCL_CURRENT = 1
+"""Flag of ``mlockall``: lock the memory that is allocated now."""
 _MCL_FUTURE = 2
+"""Flag of ``mlockall``: lock memory that is allocated later."""
 _PR_SET_TIMERSLACK = 29
-_ISOLATED = "sys/devices/system/cpu/isolated"
-_IDLE_STATES = "sys/devices/system/cpu"
-_IDLE_STATES_BOUND = "dev/cpu_dma_latency"
+"""Operation of ``prctl`` that sets the timer slack."""
+_ISOLATED_CORES_FILE = "sys/devices/system/cpu/isolated"
+"""File that lists the kernel's isolated cores."""
+_IDLE_STATES_FOLDER = "sys/devices/system/cpu"
+"""Folder with the idle states of each core."""
+_IDLE_LATENCY_DEVICE = "dev/cpu_dma_latency"
+"""Device file that limits the exit latency of idle states while it is open."""
 
 
 def collect_no_garbage() -> str:
-    """Turn off the cyclic garbage collector, whose run can take ten periods."""
+    """Turn off Python's cyclic garbage collector, whose run can take ten periods; return "off"."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -42,15 +48,15 @@ def collect_no_garbage() -> str:
 
 
 def apply_realtime(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]:
-    """Apply the real-time settings of a 1 kHz loop, and return which were granted.
+    """Apply the real-time settings of a 1 kHz loop, and return the result of each setting.
 
     Parameters
     ----------
     priority
         Priority under SCHED_FIFO, 1 to 99; 0 leaves the scheduling policy as it is.
     cpu
-        Core to run on; -1: the last isolated one, or the last one that this process may use if none
-        is isolated.
+        Core to run on; -1: the last isolated core or, if none is isolated, the last core that this
+        process may use.
     root
         Root of the file system.
 
@@ -60,22 +66,22 @@ def apply_realtime(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[s
         One entry per setting: the granted value, or "refused: " and the reason.
     """
     libc = ctypes.CDLL(None, use_errno=True)
-    wanted: dict[str, Callable[[], str]] = {
+    settings: dict[str, Callable[[], str]] = {
         "memory": lambda: lock_memory(libc),
         "timer_slack": lambda: _set_timer_slack(libc),
         "garbage_collector": collect_no_garbage,
-        "cpu": lambda: _pin(cpu, root),
+        "cpu": lambda: _pin_to_loop_core(cpu, root),
         "idle_states": lambda: _limit_idle_states(root),
     }
     if priority > 0:
-        wanted["scheduling"] = lambda: _schedule(priority)
-    return {name: _attempt(setting) for name, setting in wanted.items()}
+        settings["scheduling"] = lambda: _set_fifo_priority(priority)
+    return {name: _try_setting(setting) for name, setting in settings.items()}
 
 
 def pin_off_loop_core(loop_cpu: int) -> None:
-    """Restrict this process to cores other than the loop's, if it may use any.
+    """Restrict this process to cores other than the control loop's, if it may use others.
 
-    The loop has the higher priority in any case, but not over the kernel that clears or compacts
+    The loop has the higher priority in any case, but not over the kernel when it clears or compacts
     memory for this process.
 
     Parameters
@@ -84,17 +90,17 @@ def pin_off_loop_core(loop_cpu: int) -> None:
         Core of the loop, as in ``realtime.cpu``.
     """
     core, _ = _core_of_loop(loop_cpu, Path("/"))
-    others = os.sched_getaffinity(0) - {core}
-    if others:
-        os.sched_setaffinity(0, others)
+    other_cores = os.sched_getaffinity(0) - {core}
+    if other_cores:
+        os.sched_setaffinity(0, other_cores)
 
 
 class Precedence:
-    """Priority of this process above ordinary programs and below the loop, until its release.
+    """Raised priority of this process: above ordinary programs and below the control loop.
 
-    If the real-time priority is granted, the process also avoids the loop's core where it may use
-    another one. Its children are ordinary processes, but inherit the cores: give them
-    :attr:`cores_before`.
+    It lasts from :meth:`take` to :meth:`release`. If the real-time priority is granted, the process
+    also avoids the loop's core where it may use another core. Its children are ordinary processes,
+    but inherit the restriction to these cores: start them with :attr:`cores_before`.
 
     Parameters
     ----------
@@ -115,11 +121,11 @@ class Precedence:
         self._priority = priority
         self.cores_before = frozenset(os.sched_getaffinity(0))
         core, _ = _core_of_loop(loop_cpu, root)
-        self._others = self.cores_before - {core}
+        self._other_cores = self.cores_before - {core}
         self._apply: Callable[[int], None] | None = None
 
     def take(self) -> dict[str, str]:
-        """Request the priority and return what was granted.
+        """Request the raised priority, and return which scheduling and cores were granted.
 
         Returns
         -------
@@ -129,16 +135,19 @@ class Precedence:
         """
         if self._priority == 0:
             return {}
-        obtained = _attempt(self._try_realtime)
-        if not obtained.startswith(REFUSED):
-            return {"scheduling": obtained, "cores": _list_of(self._others or self.cores_before)}
-        nice = _attempt(self._try_nice)
-        if not nice.startswith(REFUSED):
-            return {"scheduling": f"{nice} (SCHED_RR {obtained})"}
-        return {"scheduling": obtained}
+        granted = _try_setting(self._raise_to_realtime)
+        if not granted.startswith(REFUSED):
+            return {
+                "scheduling": granted,
+                "cores": _format_cores(self._other_cores or self.cores_before),
+            }
+        granted_niceness = _try_setting(self._raise_by_niceness)
+        if not granted_niceness.startswith(REFUSED):
+            return {"scheduling": f"{granted_niceness} (SCHED_RR {granted})"}
+        return {"scheduling": granted}
 
     def cover(self) -> None:
-        """Extend the priority to new threads, which hold the same interpreter lock."""
+        """Extend the raised priority to new threads, which hold the same interpreter lock."""
         if self._apply is None:
             return
         for thread in Path("/proc/self/task").iterdir():
@@ -146,63 +155,69 @@ class Precedence:
                 self._apply(int(thread.name))
 
     def release(self) -> None:
-        """Return to ordinary priority; repeatable."""
+        """Return to ordinary priority; calling this again has no effect."""
         if self._apply is None:
             return
         self._apply = self._restore
         self.cover()
         self._apply = None
 
-    def _try_realtime(self) -> str:
+    def _raise_to_realtime(self) -> str:
+        """Set the real-time priority SCHED_RR for all threads, and return its description."""
         self._set_realtime(0)
         self._apply = self._set_realtime
         self.cover()
         return f"SCHED_RR {self._priority}"
 
-    def _try_nice(self) -> str:
+    def _raise_by_niceness(self) -> str:
+        """Set the niceness `NICE` for all threads, and return its description."""
         self._set_nice(0)
         self._apply = self._set_nice
         self.cover()
         return f"nice {NICE}"
 
     def _set_realtime(self, thread: int) -> None:
+        """Set the real-time priority of a thread, and keep it off the loop's core."""
         # Forked processes and new threads start with the ordinary policy.
         policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(thread, policy, os.sched_param(self._priority))
-        if not self._others:
+        if not self._other_cores:
             return
         try:
-            os.sched_setaffinity(thread, self._others)
+            os.sched_setaffinity(thread, self._other_cores)
         except OSError:  # the set of usable cores has changed meanwhile
             _set_ordinary(thread)
             raise
 
     def _set_nice(self, thread: int) -> None:
+        """Set the niceness of a thread under the ordinary scheduling policy."""
         os.setpriority(os.PRIO_PROCESS, thread, NICE)
         _set_ordinary(thread)
 
     def _restore(self, thread: int) -> None:
+        """Set ordinary priority and the original cores of a thread."""
         _set_ordinary(thread)
         os.setpriority(os.PRIO_PROCESS, thread, max(0, os.getpriority(os.PRIO_PROCESS, thread)))
         os.sched_setaffinity(thread, self.cores_before)
 
 
 def _set_ordinary(thread: int) -> None:
+    """Set the ordinary scheduling policy of a thread."""
     # The flag stays: removing it needs a privilege, and it is harmless.
     policy = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
     os.sched_setscheduler(thread, policy, os.sched_param(0))
 
 
 def isolated_cores(root: Path = Path("/")) -> frozenset[int]:
-    """Return the isolated cores of the kernel (``isolcpus``)."""
+    """Return the processor cores that the kernel isolates (``isolcpus``); empty if unknown."""
     try:
-        return cores_of((root / _ISOLATED).read_text())
+        return cores_of((root / _ISOLATED_CORES_FILE).read_text())
     except (OSError, ValueError):
         return frozenset()
 
 
 def cores_of(text: str) -> frozenset[int]:
-    """Return the cores in a list in the kernel's format: ``0-2,5``.
+    """Return the numbers of the cores that a text in the kernel's format, as ``0-2,5``, lists.
 
     Raises
     ------
@@ -210,8 +225,8 @@ def cores_of(text: str) -> frozenset[int]:
         If the text is no such list.
     """
     cores: set[int] = set()
-    for part in filter(None, text.strip().split(",")):
-        first, _, last = part.partition("-")
+    for core_range in filter(None, text.strip().split(",")):
+        first, _, last = core_range.partition("-")
         cores.update(range(int(first), int(last or first) + 1))
     return frozenset(cores)
 
@@ -222,7 +237,8 @@ def page_faults() -> int:
     return usage.ru_minflt + usage.ru_majflt
 
 
-def _attempt(setting: Callable[[], str]) -> str:
+def _try_setting(setting: Callable[[], str]) -> str:
+    """Apply a setting and return its result, or "refused: " and the reason of the failure."""
     try:
         return setting()
     except (OSError, AttributeError, ValueError) as error:
@@ -230,23 +246,27 @@ def _attempt(setting: Callable[[], str]) -> str:
 
 
 def lock_memory(libc: ctypes.CDLL) -> str:
-    """Lock the memory of this process through `libc`, and report which part was locked."""
+    """Lock the memory of this process against paging, and return a text that says how much.
+
+    `libc` is the C library, whose ``mlockall`` is called.
+    """
     limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
-        _call(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE))
+        _check_return_code(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE))
         return LOCKED
     # With MCL_FUTURE, an allocation beyond the limit would fail in mid-session.
-    _call(libc.mlockall(_MCL_CURRENT))
+    _check_return_code(libc.mlockall(_MCL_CURRENT))
     return f"{LOCKED}, but for what is allocated later (limit of {limit / 1e6:.0f} MB)"
 
 
 def _set_timer_slack(libc: ctypes.CDLL) -> str:
-    _call(libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0))
+    """Set the smallest timer slack, so that sleeps end on time, and return its value as text."""
+    _check_return_code(libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0))
     return "1 ns"
 
 
 def _core_of_loop(cpu: int, root: Path) -> tuple[int, bool]:
-    """Return the core that a control process chooses, and whether it is isolated."""
+    """Return the core on which the control process runs, and whether the kernel isolates it."""
     if cpu >= 0:  # chosen whether it may be used or not
         return cpu, False
     isolated = isolated_cores(root)
@@ -260,32 +280,37 @@ def _core_of_loop(cpu: int, root: Path) -> tuple[int, bool]:
     return max(os.sched_getaffinity(0)), False
 
 
-def _list_of(cores: frozenset[int]) -> str:
+def _format_cores(cores: frozenset[int]) -> str:
+    """Return the numbers of cores as text, separated by commas."""
     return ",".join(map(str, sorted(cores)))
 
 
-def _pin(cpu: int, root: Path) -> str:
+def _pin_to_loop_core(cpu: int, root: Path) -> str:
+    """Restrict this process to the core of the loop, and return its number as text."""
     core, isolated = _core_of_loop(cpu, root)
     os.sched_setaffinity(0, {core})
     return f"{core}, isolated" if isolated else str(core)
 
 
 def _limit_idle_states(root: Path) -> str:
-    states = (root / _IDLE_STATES).glob("cpu[0-9]*/cpuidle/state[0-9]*/latency")
+    """Disable idle states that a core leaves slowly, until this process ends; return a text."""
+    states = (root / _IDLE_STATES_FOLDER).glob("cpu[0-9]*/cpuidle/state[0-9]*/latency")
     if all(int(state.read_text()) <= WAKE_UP_US for state in states):
         return f"none slower than {WAKE_UP_US} µs"
-    fd = os.open(root / _IDLE_STATES_BOUND, os.O_WRONLY | os.O_CLOEXEC)
+    fd = os.open(root / _IDLE_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
     # The bound holds while the descriptor is open, until this process ends.
     os.write(fd, struct.pack("=i", WAKE_UP_US))
     return f"those that are left within {WAKE_UP_US} µs"
 
 
-def _schedule(priority: int) -> str:
+def _set_fifo_priority(priority: int) -> str:
+    """Set the real-time policy SCHED_FIFO for this process, and return it as text."""
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     return f"SCHED_FIFO {priority}"
 
 
-def _call(result: int) -> None:
+def _check_return_code(result: int) -> None:
+    """Raise the C library's last error if `result`, the return value of a call, is not 0."""
     if result != 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
+        error_number = ctypes.get_errno()
+        raise OSError(error_number, os.strerror(error_number))

@@ -1,8 +1,8 @@
 """The recorder process: it writes the records of the rings to the session file.
 
-It opens the file before anything moves, writes what the loop publishes as fast as the disk allows,
-and closes the file with the outcome. If the supervisor dies, it waits until the loop has stopped
-and then closes the file itself.
+The recorder opens the file before the motor moves, writes the records of the loop as fast as the
+disk allows, and closes the file with the outcome. If the supervisor dies, it waits until the loop
+has stopped and then closes the file itself.
 """
 
 import contextlib
@@ -33,63 +33,73 @@ from rigd.runtime import ignore as ignore_signals
 from rigd.session import SessionError, SessionExistsError, SessionWriter, segments_until
 from rigd.session.layout import SAMPLE_SIZE
 
-_BLOCK = 250
-_IDLE_S = 0.005
+_MAX_BLOCK_RECORDS = 250
+"""Largest number of records that are taken from a ring at once."""
+_IDLE_PAUSE_S = 0.005
+"""Pause in s when the rings contain no new record."""
 _ORPHAN_PATIENCE_S = 3.0
+"""Longest time in s without a new record before a recorder without supervisor closes the file."""
 _DISK_POLL_S = 1.0
+"""Time in s between two checks of the free disk space."""
 
 
 def main() -> None:
-    """Run as ``python -m rigd.engine.recorder``."""
+    """Run the recorder process, started as ``python -m rigd.engine.recorder``."""
     ignore_signals()
     parent = Parent()
     job: RecorderJob = parent.receive_job()
     channels = attach_channels(job.channels)
-    obtained = {}
+    granted = {}
     if job.realtime is not None:
-        obtained = Precedence(job.realtime.supervision_priority, job.realtime.cpu).take()
+        granted = Precedence(job.realtime.supervision_priority, job.realtime.cpu).take()
     try:
         writer = SessionWriter(job.path)
     except SessionError as error:
         parent.send(Failed(str(error), taken=isinstance(error, SessionExistsError)))
         raise SystemExit(1) from None
-    _show_free_space(channels.shared_state, job.path.parent)
-    parent.send(Opened(obtained))
+    _publish_free_space(channels.shared_state, job.path.parent)
+    parent.send(Opened(granted))
     try:
-        _record(parent, channels, writer, job.path.parent)
+        _record_until_closed(parent, channels, writer, job.path.parent)
     except SessionError as error:
-        text, saved = _abandoned(writer)
-        parent.send(Failed(f"{error}{text}", saved_path=saved))
+        text, saved_path = _abandon_recording(writer)
+        parent.send(Failed(f"{error}{text}", saved_path=saved_path))
         raise SystemExit(1) from None
 
 
-def _abandoned(writer: SessionWriter) -> tuple[str, Path | None]:
-    """Abandon a recording; return a sentence and the path of the data, if not at its own name."""
+def _abandon_recording(writer: SessionWriter) -> tuple[str, Path | None]:
+    """Abandon a recording; return a sentence about its data, and their path or None.
+
+    The sentence is empty and the path None if the data stay in the recording's own file.
+    """
     try:
-        saved = writer.abandon()
+        saved_path = writer.abandon()
     except SessionError:
         return "", None  # disk full, device gone: what reached the disk stays there
-    if saved == writer.part:
+    if saved_path == writer.part:
         return "", None
-    if saved is None:
+    if saved_path is None:
         return " What was recorded could not be saved elsewhere.", None
     return (
-        f" What was recorded is now {saved}; rigd recover {shlex.quote(str(saved))} makes "
-        "a session file of it.",
-        saved,
+        f" What was recorded is now {saved_path}; rigd recover {shlex.quote(str(saved_path))} "
+        "makes a session file of it.",
+        saved_path,
     )
 
 
-def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: Path) -> None:
+def _record_until_closed(
+    parent: Parent, channels: Channels, writer: SessionWriter, folder: Path
+) -> None:
+    """Write the records of the rings until the supervisor orders to close the file, or ends."""
     recorder = Recorder(channels, writer)
     polled_s = time.monotonic()
     while True:
-        moved = recorder.transfer()
+        transferred = recorder.transfer()
         if time.monotonic() - polled_s > _DISK_POLL_S:
             polled_s = time.monotonic()
-            _show_free_space(channels.shared_state, folder)
+            _publish_free_space(channels.shared_state, folder)
         try:
-            message = parent.poll(0.0 if moved else _IDLE_S)
+            message = parent.poll(0.0 if transferred else _IDLE_PAUSE_S)
         except EOFError:
             recorder.finish_orphaned()
             return
@@ -108,38 +118,38 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
                 return
 
 
-def _show_free_space(shared_state: SharedState, folder: Path) -> None:
-    """Publish the free disk space; the next write reports a folder that is gone."""
+def _publish_free_space(shared_state: SharedState, folder: Path) -> None:
+    """Publish the free space on the disk of a folder, in MB, in the shared state."""
     with contextlib.suppress(OSError):
         shared_state[StateField.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))
 
 
 class Recorder:
-    """Writer of the rings' records to a session file.
+    """Recorder of one session, which copies the records of the rings to the session file.
 
     Parameters
     ----------
     channels
-        Attached channels.
+        Channels with the rings, to which this process is attached.
     writer
-        Writer of the file, not yet begun.
+        Writer of the session file, on which `begin` has not been called yet.
 
     Attributes
     ----------
     begun
-        Whether the record and the file have begun.
+        Whether the record has begun, and with it the contents of the file.
     """
 
     def __init__(self, channels: Channels, writer: SessionWriter) -> None:
         self._channels = channels
         self._writer = writer
         writers: dict[Topic, Callable[[bytes], None]] = {
-            EVENT: self._log,
+            EVENT: self._write_events,
             CONTROL: writer.write_controls,
             TIMING: writer.write_timings,
             SAMPLE: self._write_samples,
         }
-        self._ways = [
+        self._ring_writers = [
             (ring, writers[topic])
             for topic, ring in zip(TOPICS, channels.rings, strict=True)
             if topic.logged
@@ -150,31 +160,34 @@ class Recorder:
         self.begun = False
 
     def _begin(self, header: FileHeader) -> None:
+        """Write metadata, segments and attachments at the start of the file."""
         attachments = {name: text.encode() for name, text in header.attachments.items()}
         start_utc_ns = self._channels.shared_state[StateField.START_UTC_NS]
         self._writer.begin(start_utc_ns, header.metadata, header.segments, attachments)
         self.begun = True
 
     def transfer(self) -> bool:
-        """Write the available records to the file; return whether there were any."""
+        """Copy available records from the rings to the file, and return whether there were any."""
         self._channels.shared_state.beat(StateField.RECORDER_BEAT)
         if not self.begun:
             if self.header is None or not self._channels.shared_state[StateField.START_UTC_NS]:
                 return False
             self._begin(self.header)
-        moved = False
-        for ring, write in self._ways:
-            block = ring.take(_BLOCK)
+        transferred = False
+        for ring, write in self._ring_writers:
+            block = ring.take(_MAX_BLOCK_RECORDS)
             if block:
                 write(block)
-                moved = True
-        return moved
+                transferred = True
+        return transferred
 
-    def _log(self, block: bytes) -> None:
+    def _write_events(self, block: bytes) -> None:
+        """Write a block of log events to the file."""
         for event in read_events(block):
             self._writer.log(event.t_ns, event.level, event.message)
 
     def _write_samples(self, block: bytes) -> None:
+        """Write a block of samples to the file and count them."""
         self._writer.write_samples(block)
         self._recorded += len(block) // SAMPLE_SIZE
 
@@ -194,13 +207,13 @@ class Recorder:
         """
         while self.transfer():
             pass
-        accounted = self._recorded + int(outcome["missed"])
+        accounted_ticks = self._recorded + int(outcome["missed"])
         # A killed control process may not have counted its last sample.
-        scheduled = max(int(outcome["scheduled"]), accounted)
+        scheduled = max(int(outcome["scheduled"]), accounted_ticks)
         counts = {
             "scheduled": scheduled,
             "recorded": self._recorded,
-            "lost": scheduled - accounted,
+            "lost": scheduled - accounted_ticks,
         }
         if counts["lost"] and outcome["outcome"] == "complete":
             outcome = {
@@ -208,37 +221,37 @@ class Recorder:
                 "outcome": "fault",
                 "reason": "Samples were lost before the recorder.",
             }
-        counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
+        outcome_with_counts = {**outcome, **{name: str(count) for name, count in counts.items()}}
         shared_state = self._channels.shared_state
         if self.header is not None and (
             shared_state[StateField.PLANNED] or shared_state[StateField.LAST_SEGMENT]
         ):
             # Segments of a growing reference end with the record.
             segments = segments_until({**self.header.segments, **segments}, scheduled)
-        path = self._writer.close(counted, segments)
+        path = self._writer.close(outcome_with_counts, segments)
         return Closed(path, counts, outcome["outcome"], outcome["reason"])
 
     def finish_orphaned(self) -> None:
-        """Close the file after the loop has stopped, because the supervisor is gone."""
+        """Wait until the loop has stopped, and close the file without the supervisor's order."""
         shared_state = self._channels.shared_state
         self.transfer()  # all of the record may still be in the rings
         deadline = time.monotonic() + _ORPHAN_PATIENCE_S
         while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < deadline:
             if self.transfer():
                 deadline = time.monotonic() + _ORPHAN_PATIENCE_S
-            time.sleep(_IDLE_S)
+            time.sleep(_IDLE_PAUSE_S)
         if self.header is None or not self.begun:
             self._writer.discard()
             return
         scheduled = shared_state[StateField.SCHEDULED]
-        whole = is_whole(
+        complete = is_whole(
             shared_state, scheduled, max(end for _, end in self.header.segments.values())
         )
         self.close(
             {
-                "outcome": "complete" if whole else "fault",
+                "outcome": "complete" if complete else "fault",
                 "reason": "After the record: The supervising process ended."
-                if whole
+                if complete
                 else "The supervising process ended during the session.",
                 "scheduled": str(scheduled),
                 "missed": str(shared_state[StateField.MISSED]),

@@ -19,35 +19,36 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_SIZE = 8  # bytes of a double
+_DOUBLE_BYTES = 8  # bytes of a double
 _AT_REST_RAD = 1e-4
-"""Largest angle at either end of a segment: one or two encoder steps."""
-_FULL_TURN_RAD = 6.3
+"""Largest distance in rad of a segment's ends from the start angle: one or two encoder steps."""
+_MAX_ANGLE_RAD = 6.3
+"""Angle in rad that no reference reaches; a larger number in the memory is an error."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSpec:
-    """Inherited descriptor and length, with which the control process attaches to a reference."""
+    """Descriptor and length of a reference in shared memory, for processes that attach to it."""
 
     fd: int
-    """Descriptor of the memory."""
+    """File descriptor of the shared memory, which child processes inherit."""
     ticks: int
-    """Capacity in ticks."""
+    """Capacity of the reference in ticks."""
     planned: int | None = None
-    """Ticks that are planned at the start, before segments are appended; None: all."""
+    """Number of ticks that are planned at the start, before segments are appended; None: all."""
 
 
 def put_reference(
     fd: int, reference_rad: "NDArray[np.float64]", planned: int | None = None
 ) -> ReferenceSpec:
-    """Write a reference, shape (n,), to the memory of `fd`.
+    """Write a reference to shared memory, and return the description with which others attach.
 
     Parameters
     ----------
     fd
         Descriptor of the memory.
     reference_rad
-        Angles from the rig's zero, one per tick.
+        Angles from the rig's zero, one per tick; shape (n,).
     planned
         Number of ticks that are planned; None: all.
 
@@ -56,7 +57,7 @@ def put_reference(
     OSError
         If there is not enough shared memory.
     """
-    size = _SIZE * reference_rad.size
+    size = _DOUBLE_BYTES * reference_rad.size
     reserve(fd, size)
     with mmap.mmap(fd, size) as memory:
         memory[:] = reference_rad.astype("float64").tobytes()
@@ -64,26 +65,26 @@ def put_reference(
 
 
 def map_reference(spec: ReferenceSpec) -> "memoryview[float]":
-    """Return a view of a reference in shared memory, one number per tick.
+    """Return a view of a reference in shared memory: the angle in rad for each tick.
 
-    Writes to a complete reference stay in this process.
+    Changes of a complete reference are visible in this process only.
     """
     access = mmap.ACCESS_COPY if spec.planned is None else mmap.ACCESS_READ
-    memory = mmap.mmap(spec.fd, _SIZE * spec.ticks, access=access)
+    memory = mmap.mmap(spec.fd, _DOUBLE_BYTES * spec.ticks, access=access)
     return memoryview(memory).cast("d")
 
 
 def is_whole(shared_state: SharedState, scheduled: int, ticks: int) -> bool:
-    """Return whether a record contains all of its reference.
+    """Return whether a record extends to the end of its reference.
 
     Parameters
     ----------
     shared_state
         State of the session.
     scheduled
-        Ticks of the record.
+        Number of ticks of the record.
     ticks
-        Ticks of the reference; for a growing one, its capacity.
+        Number of ticks of the reference; for a growing reference, its capacity.
     """
     if scheduled == ticks:
         return True
@@ -94,7 +95,7 @@ def is_whole(shared_state: SharedState, scheduled: int, ticks: int) -> bool:
 
 
 class ReferenceWriter:
-    """Writer that appends segments to a reference while it is followed.
+    """Writer that appends segments to a reference while the control loop follows it.
 
     Parameters
     ----------
@@ -106,42 +107,45 @@ class ReferenceWriter:
 
     def __init__(self, spec: ReferenceSpec, shared_state: SharedState) -> None:
         assert spec.planned is not None
-        self._memory = mmap.mmap(spec.fd, _SIZE * spec.ticks)
+        self._memory = mmap.mmap(spec.fd, _DOUBLE_BYTES * spec.ticks)
         self._shared_state = shared_state
         self.ticks = spec.planned
-        """Number of planned ticks."""
+        """Number of ticks of the reference that are planned so far."""
         self.room = spec.ticks - spec.planned
-        """Remaining capacity in ticks."""
+        """Number of ticks that can still be appended to the reference."""
 
     def append(self, reference_rad: "NDArray[np.float64]") -> None:
-        """Append a segment, shape (n,), relative to the start angle.
+        """Append a segment of angles to the reference, and announce it to the control loop.
 
         Parameters
         ----------
         reference_rad
-            Angles of the segment, which begins and ends at rest at the start angle.
+            Angles of the segment relative to the start angle, shape (n,). It begins and ends at
+            rest at the start angle.
 
         Raises
         ------
         ValueError
-            If there is no room, or the segment does not begin and end at the start angle.
+            If the capacity is exceeded, or the segment does not begin and end at the start angle.
         """
         size = int(reference_rad.size)
         ends_rad = abs(reference_rad[0]), abs(reference_rad[-1])
         # Also refuse NaN: the loop follows every angle in this memory.
-        if not (max(ends_rad) <= _AT_REST_RAD and abs(reference_rad).max() < _FULL_TURN_RAD):
+        if not (max(ends_rad) <= _AT_REST_RAD and abs(reference_rad).max() < _MAX_ANGLE_RAD):
             raise ValueError(f"a segment from {reference_rad[0]} rad to {reference_rad[-1]} rad")
         if size > self.room:
             raise ValueError(f"a segment of {size} ticks; there is room for {self.room}")
-        start = _SIZE * self.ticks
-        self._memory[start : start + _SIZE * size] = reference_rad.astype("float64").tobytes()
+        start = _DOUBLE_BYTES * self.ticks
+        self._memory[start : start + _DOUBLE_BYTES * size] = reference_rad.astype(
+            "float64"
+        ).tobytes()
         self.ticks += size
         self.room -= size
         self._shared_state[StateField.PLANNED] = self.ticks
 
 
 class ReferenceReader:
-    """Reader of a growing reference, which holds the last angle until the next segment.
+    """Reader of a growing reference, which holds the last angle until the next segment arrives.
 
     A segment that would extend beyond the record does not begin, because the motor would have to
     stop at full speed.
@@ -151,7 +155,7 @@ class ReferenceReader:
     reference_rad
         Memory of the reference.
     planned
-        Ticks that are planned at the start.
+        Number of ticks that are planned at the start.
     shared_state
         `StateField.PLANNED` announces the planned ticks, and `StateField.LAST_SEGMENT` the last
         segment. The reader writes the number of held ticks to `StateField.HELD`, the number before
@@ -166,34 +170,34 @@ class ReferenceReader:
         self._planned = planned
         self._announced = shared_state.view(StateField.PLANNED)
         self._last_segment = shared_state.view(StateField.LAST_SEGMENT)
-        self._held_view = shared_state.view(StateField.HELD)
-        self._before_view = shared_state.view(StateField.HELD_BEFORE)
-        self._begun_view = shared_state.view(StateField.BEGUN)
+        self._held_ticks = shared_state.view(StateField.HELD)
+        self._held_before = shared_state.view(StateField.HELD_BEFORE)
+        self._begun_ticks = shared_state.view(StateField.BEGUN)
         self._held = 0
 
-    def at(self, tick: int) -> float:
-        """Return the reference of a tick later than that of the last call."""
+    def reference_at(self, tick: int) -> float:
+        """Return the reference angle of a tick in rad; ticks must increase from call to call."""
         index = tick - self._held
         if index >= self._planned:
             announced = self._announced[0]
             if self._planned < announced <= len(self._reference_rad) - self._held:
                 self._planned = announced
-                self._before_view[0] = self._held
-                self._begun_view[0] = announced
+                self._held_before[0] = self._held
+                self._begun_ticks[0] = announced
             if index >= self._planned:
                 # The next segment starts at its first angle, however long the wait.
                 self._held += index + 1 - self._planned
-                self._held_view[0] = self._held
+                self._held_ticks[0] = self._held
                 return self._reference_rad[self._planned - 1]
         return self._reference_rad[index]
 
-    def waits(self, tick: int) -> bool:
-        """Return whether a tick has no reference yet and a segment may still come."""
+    def must_wait(self, tick: int) -> bool:
+        """Return whether the reference of a tick is not planned yet but may still be appended."""
         index = tick - self._held
         return index >= self._planned and index >= self._announced[0] and not self._last_segment[0]
 
-    def over(self, tick: int) -> bool:
-        """Return whether a tick is after the last segment."""
+    def is_after_end(self, tick: int) -> bool:
+        """Return whether a tick is after the last segment, so that the record ends."""
         if not self._last_segment[0]:
             return False
         return tick - self._held >= max(self._planned, self._announced[0])

@@ -33,10 +33,13 @@ class Phase(IntEnum):
     SETTLING = 1
     """Drive enabled, the motor held at its present angle."""
     TARING = 2
+    """Measuring the sensor's zero with the torque off."""
     READY = 3
     """Waiting for the recorder before tick 0."""
     RUNNING = 4
+    """Recording the excitation."""
     RETURNING = 5
+    """Damping the beam and returning to the start angle after the record."""
     OFF = 6
     """Torque is zero and the drive is disabled: between sessions, and at the end."""
     WAITING = 7
@@ -47,26 +50,27 @@ class Phase(IntEnum):
     @property
     def words(self) -> str:
         """Name of the phase for the operator."""
-        return _WORDS.get(self, self.name.lower())
+        return _OPERATOR_NAMES.get(self, self.name.lower())
 
 
-_WORDS = {
+_OPERATOR_NAMES = {
     Phase.RUNNING: "recording",
     Phase.OFF: "drive off",
     Phase.WAITING: "waiting for the beam to rest",
     Phase.PROBING: "probing move",
 }
+"""Names of phases for the operator, where they differ from the names in the code."""
 
 
 class Activity(StrEnum):
-    """State of a session for the operator, with the same name in every view."""
+    """Stage of a session for the operator, with the same name in every view."""
 
     PREPARING = "preparing"
     """The record has not begun."""
     RUNNING = "running"
     """The record runs."""
     RETURNING = "returning"
-    """The record is over, and the motor returns to where it started."""
+    """The record is over, and the motor returns to its start angle."""
     FINISHING = "finishing"
     """The record is over and the torque off; the file is being completed."""
     STOPPING = "stopping"
@@ -74,11 +78,14 @@ class Activity(StrEnum):
 
 
 class Stop(IntEnum):
-    """Reason for which the supervisor requests a stop: the values of :attr:`StateField.STOP`."""
+    """Reason why the supervisor requests a stop: the values of :attr:`StateField.STOP`."""
 
     NO = 0
+    """No stop is requested."""
     OPERATOR = 1
+    """The operator requested the stop."""
     NO_RECORDER = 2
+    """The recorder process has ended."""
 
 
 class StateField(IntEnum):
@@ -86,71 +93,88 @@ class StateField(IntEnum):
 
     # Written by the supervisor
     STOP = 0
+    """Reason for a requested stop, a value of :class:`Stop`."""
     GO = 1
+    """1 once the record may begin, because the recorder is ready."""
     SUPERVISOR_BEAT = 2
-    """Heartbeats count up several times a second: a process whose count does not increase hangs."""
+    """Heartbeat count of the supervisor. All heartbeats count up several times a second, so a
+    process whose count does not increase hangs."""
     # Written by the control process
     PHASE = 3
+    """Phase of the control process, a value of :class:`Phase`."""
     START_UTC_NS = 4
+    """UTC time of tick 0 in ns since 1970; 0: the record has not begun."""
     SCHEDULED = 5
+    """Number of ticks of the record so far, missed and lost ticks included."""
     MISSED = 6
+    """Number of ticks of the record that were missed."""
     LATE = 7
+    """Number of ticks of the record with a late wake-up."""
     LOST = 8
+    """Number of samples of the record for which the ring was full."""
     ANGLE_NRAD = 9
-    """The last readings and the present torque command, in 1e-9 rad and 1e-9 N·m."""
+    """Last angle of the motor in 1e-9 rad."""
     COUPLING_TORQUE_NNM = 10
+    """Last coupling torque in 1e-9 N·m."""
     TORQUE_COMMAND_NNM = 11
+    """Present torque command in 1e-9 N·m."""
     CONTROL_BEAT = 12
+    """Heartbeat count of the control process."""
     BUS_LOAD_PPM = 17
-    """Measured load of the busiest line, or UNKNOWN."""
+    """Measured load of the busiest bus or serial line in 1e-6, or UNKNOWN."""
     BUS_ERRORS = 18
     """Errors on all lines since the devices were connected, or UNKNOWN."""
     SENSOR_STATUS = 19
-    """Status word, 0: no fault; or UNKNOWN."""
+    """Status word of the sensor, with 0 for no fault, or UNKNOWN."""
     # Written by the recorder
     RECORDER_BEAT = 13
+    """Heartbeat count of the recorder process."""
     DISK_FREE_MB = 14
     """Free space on the disk of the session file, in 10⁶ bytes, at least 1; 0: not known yet."""
     # Written by the live publisher
     LIVE_DROPPED = 15
+    """Number of samples that the live publisher did not show in time."""
     LIVE_BEAT = 16
+    """Heartbeat count of the live publisher."""
     LIVE_SEEN = 20
     """Number of samples of the ring that have been shown, or counted as dropped."""
     # Written by the control process
     STALE_ANGLES = 21
-    """Recorded ticks with a stale angle."""
+    """Number of recorded ticks with a stale angle."""
     STALE_WRENCHES = 22
-    """Recorded ticks with a stale wrench."""
+    """Number of recorded ticks with a stale wrench."""
     TOUCHES = 23
-    """Touches detected in the record."""
+    """Number of touches detected in the record."""
     HELD = 25
-    """Ticks of the record in which the angle was held because there was no next segment."""
+    """Number of recorded ticks in which the angle was held because no next segment was planned."""
     HELD_BEFORE = 29
-    """Number of these ticks before the segment that began last."""
+    """Number of ticks in which the angle was held before the segment that began last."""
     BEGUN = 30
-    """Ticks of the reference up to the end of that segment; 0: none has begun."""
+    """Number of ticks of the reference up to the end of the segment that began last; 0: none."""
     # Written by the touch process
     TOUCH_BEAT = 24
+    """Heartbeat count of the touch process."""
     # Written by the fit process
     FIT_BEAT = 26
+    """Heartbeat count of the fit process."""
     PLANNED = 27
-    """Planned ticks of a reference that grows during the session."""
+    """Number of planned ticks of a reference that grows during the session."""
     # Written by the supervisor
     LAST_SEGMENT = 28
-    """The record ends with the segments that are planned."""
+    """Whether the record ends with the segments that are planned: 1, otherwise 0."""
 
 
 UNKNOWN = -1
-"""Value for a line that does not exist or does not report."""
+"""Value of a field about a bus or serial line that does not exist or does not report."""
 
 
 class SharedState:
-    """Array of signed 64-bit integers in shared memory, indexed by :class:`StateField`.
+    """State of a rig's processes in shared memory: an integer for each :class:`StateField`.
 
     Parameters
     ----------
     fd
-        Descriptor of the memory, laid out by `create`.
+        Descriptor of the memory, laid out by `create`; each field has 64 bits with sign.
     """
 
     def __init__(self, fd: int) -> None:
@@ -160,7 +184,7 @@ class SharedState:
 
     @classmethod
     def create(cls, fd: int) -> Self:
-        """Reserve shared memory for the fields, all of them 0."""
+        """Reserve shared memory at descriptor `fd`, and return the state with all fields 0."""
         reserve(fd, 8 * len(StateField))
         return cls(fd)
 
@@ -171,15 +195,15 @@ class SharedState:
         self._fields[field] = value
 
     def known(self, field: StateField) -> int | None:
-        """Return a field, or None if it says that this is not known."""
+        """Return the value of a field, or None if the value is `UNKNOWN`."""
         return None if (value := self._fields[field]) == UNKNOWN else value
 
     def view(self, field: StateField) -> "memoryview[int]":
-        """Return a view of one field, the quickest way to it: ``view[0]``."""
+        """Return a memory view of one field, whose value ``view[0]`` reads and writes quickly."""
         return self._fields[field : field + 1]
 
     def beat(self, field: StateField) -> None:
-        """Give the heartbeat of the process that this field belongs to."""
+        """Increment the heartbeat counter of a process in its field."""
         self._fields[field] += 1
 
     def close(self) -> None:
@@ -192,29 +216,34 @@ class SharedState:
 # Events
 
 Level = Literal["debug", "info", "warning", "error", "fatal"]
+"""Severity of a log event."""
 LEVELS: tuple[Level, ...] = ("debug", "info", "warning", "error", "fatal")
+"""Severities of log events in ascending order."""
 
 EVENT_SIZE = 512
+"""Size of a log event in its ring, in bytes."""
 _HEADER = struct.Struct("<qBH")
+"""Binary header of an event: time in ns, index of the level, length of the text in bytes."""
 _TEXT_SIZE = EVENT_SIZE - _HEADER.size
+"""Largest length of an event's text in bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogEvent:
-    """One line of the session's log."""
+    """Event in the session's log, which is one line of text."""
 
     t_ns: int
-    """Time since the session's start."""
+    """Time in ns since the session's start."""
     level: Level
-    """Severity."""
+    """Severity of the event."""
     message: str
     """Text for the operator."""
     notable: bool = False
-    """Show it to the operator at once, whatever the level; not stored in the file."""
+    """Whether the operator sees the line at once, whatever its level; not stored in the file."""
 
 
 def write_event(ring: Ring, event: LogEvent) -> None:
-    """Append an event; it is dropped if the ring is full.
+    """Append a log event to a ring, or drop the event if the ring is full.
 
     Parameters
     ----------
@@ -223,7 +252,7 @@ def write_event(ring: Ring, event: LogEvent) -> None:
     event
         Event; its text is cut to the size of a record.
     """
-    offset = ring.slot()
+    offset = ring.next_slot()
     if offset < 0:
         return
     text = event.message.encode()[:_TEXT_SIZE]
@@ -234,7 +263,7 @@ def write_event(ring: Ring, event: LogEvent) -> None:
 
 
 def read_events(block: bytes) -> list[LogEvent]:
-    """Return the events in a block that :meth:`Ring.take` returned."""
+    """Decode the log events in a block of bytes that :meth:`Ring.take` returned."""
     events = []
     for offset in range(0, len(block), EVENT_SIZE):
         t_ns, level, size = _HEADER.unpack_from(block, offset)
@@ -245,7 +274,7 @@ def read_events(block: bytes) -> list[LogEvent]:
 
 
 def activity(shared_state: SharedState) -> Activity:
-    """Return the state of the session from the shared state of the processes.
+    """Return the stage of the present session, derived from the shared state of the processes.
 
     Parameters
     ----------

@@ -11,21 +11,24 @@ from functools import partial
 from typing import Protocol
 
 SUSPENDED_S = 0.01
-"""Threshold of :meth:`SuspendWatch.suspended_s` for a suspend; every real suspend is longer."""
+"""Time in s from :meth:`SuspendWatch.suspended_s` above which the computer counts as suspended;
+every real suspend is longer."""
 SIGN_OF_LIFE_S = 1.0
-"""Longest pause of virtual time with devices on lines, which assume that a silent host is dead."""
+"""Longest pause in s between two ticks of virtual time with devices on a bus or serial line, which
+would otherwise treat the silent host as failed."""
 
 
 class Clock(Protocol):
     """Monotonic clock with a method to wait for a deadline."""
 
     virtual: bool
+    """Whether the clock jumps to each deadline instead of waiting."""
 
     def now_ns(self) -> int:
-        """Return the present time."""
+        """Return the present time in ns of the monotonic clock."""
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Wait for a deadline and return the lateness in ns (never negative)."""
+        """Wait for a deadline, and return the lateness of the wake-up in ns, which is ≥ 0."""
 
 
 class RealClock:
@@ -50,22 +53,22 @@ class RealClock:
         self._spin_ns = spin_ns
 
     def now_ns(self) -> int:
-        """Return the present time."""
+        """Return the present time in ns of the system's monotonic clock."""
         return time.monotonic_ns()
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Wait for a deadline and return the lateness in ns (never negative)."""
-        remainder = deadline_ns - time.monotonic_ns() - self._spin_ns
-        if remainder > 0:
-            time.sleep(remainder * 1e-9)
-        late = time.monotonic_ns() - deadline_ns
-        while late < 0:
-            late = time.monotonic_ns() - deadline_ns
-        return late
+        """Wait for a deadline, and return the lateness of the wake-up in ns, which is ≥ 0."""
+        remaining_ns = deadline_ns - time.monotonic_ns() - self._spin_ns
+        if remaining_ns > 0:
+            time.sleep(remaining_ns * 1e-9)
+        late_ns = time.monotonic_ns() - deadline_ns
+        while late_ns < 0:
+            late_ns = time.monotonic_ns() - deadline_ns
+        return late_ns
 
 
 class VirtualClock:
-    """A clock that jumps to each deadline: no sleep, no lateness, no execution time."""
+    """Simulated clock that jumps to each deadline, without sleep, lateness or execution time."""
 
     virtual = True
 
@@ -73,11 +76,11 @@ class VirtualClock:
         self._now_ns = 0
 
     def now_ns(self) -> int:
-        """Return the present time."""
+        """Return the present virtual time in ns."""
         return self._now_ns
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Set the time to the deadline and return 0."""
+        """Set the virtual time to a deadline, and return 0 as the lateness in ns."""
         self._now_ns = deadline_ns
         return 0
 
@@ -106,22 +109,23 @@ class SuspendWatch:
         self._ahead_ns = self._boot_ns() - before_ns
 
     def suspended_s(self) -> float:
-        """Return the time for which the computer was suspended since this watch began.
+        """Return the time in s for which the computer was suspended since this object was created.
 
-        It takes about a microsecond: call it now and then, not in every tick.
+        A call takes about a microsecond, so call it every few ticks only.
         """
         ahead_ns = self._boot_ns() - self._monotonic_ns()
         return max(0, ahead_ns - self._ahead_ns) * 1e-9
 
 
 def _clock_since_boot() -> Callable[[], int]:
+    """Return a clock in ns that also runs during a suspend, or the monotonic clock if none does."""
     if not hasattr(time, "CLOCK_BOOTTIME"):
         return time.monotonic_ns
     return partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
 
 
 class TickScheduler:
-    """Schedule of absolute deadlines, one per period; missed ticks are skipped, not made up.
+    """Schedule of the loop's ticks with an absolute deadline for each; missed ticks are skipped.
 
     Parameters
     ----------
@@ -139,7 +143,7 @@ class TickScheduler:
     due_ns
         Scheduled time of the current tick on the clock; a restart does not change it.
     lateness_ns
-        Wake-up latency: time since its deadline, less than a period.
+        Wake-up latency: time in ns from the deadline to the wake-up, less than a period.
 
     Examples
     --------
@@ -161,16 +165,16 @@ class TickScheduler:
 
     @property
     def start_ns(self) -> int:
-        """Clock time of tick 0."""
+        """Time of tick 0 on the clock, in ns."""
         return self._start_ns
 
     def restart(self) -> None:
-        """Make the next tick number 0, without moving its deadline."""
+        """Restart the count of ticks: the next tick becomes tick 0, at its unchanged deadline."""
         self._start_ns += round((self.tick + 1) * self._period_ns)
         self.tick = -1
 
     def wait(self) -> int:
-        """Wait for the next tick and return how many were missed before it.
+        """Wait for the next tick, and return the number of ticks missed before it.
 
         A wake-up one period or more late counts as missed ticks: the current tick is
         then the last one whose deadline has passed.

@@ -32,13 +32,15 @@ from rigd.touch.samples import (
     touch_record,
 )
 
-_BLOCK = 250
-_IDLE_S, _WAITING_S = 0.005, 0.001
-"""Pause without new samples: while there is no touch, and while an estimate is awaited."""
+_MAX_BLOCK_SAMPLES = 250
+"""Largest number of samples that are read from the ring at once."""
+_IDLE_PAUSE_S, _PENDING_PAUSE_S = 0.005, 0.001
+"""Pauses in s when there are no new samples: without a touch, and while a touch waits for its
+estimate."""
 
 
 def main() -> None:
-    """Run as ``python -m rigd.engine.touch_estimator``."""
+    """Run the touch process, started as ``python -m rigd.engine.touch_estimator``."""
     ignore_signals()
     parent = Parent()
     job: TouchJob = parent.receive_job()
@@ -51,11 +53,11 @@ def main() -> None:
     touches = TouchFollower(estimator, job)
     while True:
         channels.shared_state.beat(StateField.TOUCH_BEAT)
-        block = reader.take(_BLOCK)
+        block = reader.take(_MAX_BLOCK_SAMPLES)
         if block:
             touches.take(decode_samples(block))
         else:
-            time.sleep(_IDLE_S if touches.idle else _WAITING_S)
+            time.sleep(_IDLE_PAUSE_S if touches.idle else _PENDING_PAUSE_S)
         for report in touches.reports():
             parent.send(report)
         try:
@@ -66,27 +68,32 @@ def main() -> None:
 
 
 @dataclass(slots=True)
-class _Waiting:
-    """A touch whose final estimate is pending."""
+class _PendingTouch:
+    """Detected touch that waits for its final estimate."""
 
     number: int
+    """Number of the touch in its session, from 1 on."""
     tick: int
+    """Tick at which the touch was detected."""
     free_from: int
-    """First tick at which the beam is free again after the touch before."""
+    """First tick at which the beam is free again after the previous touch."""
     estimate: GrowingEstimate
+    """Estimate of the touch, which improves as samples arrive."""
     previewed: bool = False
+    """Whether the estimate has used the first samples already, to save time later."""
     reported: bool = False
+    """Whether the first estimate has been sent."""
 
 
 class TouchFollower:
-    """Follower of a record's samples, which estimates each touch as soon as possible.
+    """Estimates each detected touch of a record as soon as there are enough samples.
 
     Parameters
     ----------
     estimator
-        Prepared for the model and the rate.
+        Estimator for the model and the rate of the job.
     job
-        Job of the process.
+        Job of the touch process.
     """
 
     def __init__(self, estimator: TouchEstimator, job: TouchJob) -> None:
@@ -103,7 +110,7 @@ class TouchFollower:
             for seconds in (HISTORY_S, PREVIEW_S, FIRST_S, FINAL_S, CONTACT_S)
         )
         self._samples: NDArray[np.void] | None = None
-        self._waiting: deque[_Waiting] = deque()
+        self._pending_touches: deque[_PendingTouch] = deque()
         self._free_from = 0
         self._count = 0
         self._record_ended = False
@@ -111,57 +118,68 @@ class TouchFollower:
     @property
     def idle(self) -> bool:
         """Whether no touch waits for an estimate."""
-        return not self._waiting
+        return not self._pending_touches
 
     def take(self, samples: NDArray[np.void]) -> None:
-        """Process the next samples of the record, shape (n,)."""
-        earlier = self._samples
-        self._samples = samples if earlier is None else np.concatenate([earlier, samples])
+        """Add the next samples of the record, shape (n,), and register the touches in them."""
+        earlier_samples = self._samples
+        self._samples = (
+            samples if earlier_samples is None else np.concatenate([earlier_samples, samples])
+        )
         for tick in samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist():
             self._count += 1
             estimate = self._estimator.follow()
-            self._waiting.append(_Waiting(self._count, tick, self._free_from, estimate))
+            self._pending_touches.append(
+                _PendingTouch(self._count, tick, self._free_from, estimate)
+            )
             self._free_from = tick + self._contact_ticks
         self._record_ended |= bool(samples["status"][-1] & Status.TORQUE_OFF)
-        if not self._waiting:
+        if not self._pending_touches:
             self._samples = self._samples[-self._history_ticks :]
 
     def reports(self) -> list[TouchReport]:
-        """Return the estimates for which there are enough samples."""
-        if self._samples is None or not self._waiting:
+        """Return the estimate of the oldest pending touch in a list, if it has enough samples.
+
+        The list is empty if no estimate is due.
+        """
+        if self._samples is None or not self._pending_touches:
             return []
-        touch = self._waiting[0]
-        there = int(self._samples["tick"][-1]) - touch.tick + 1
-        final = self._record_ended or there >= self._final_ticks
+        touch = self._pending_touches[0]
+        available_ticks = int(self._samples["tick"][-1]) - touch.tick + 1
+        is_final = self._record_ended or available_ticks >= self._final_ticks
         # In real time the operator waits for the first estimate, even if the record is complete.
-        first = self._job.realtime is not None or not final
-        if there >= self._first_ticks and first and not touch.reported:
+        is_first = self._job.realtime is not None or not is_final
+        if available_ticks >= self._first_ticks and is_first and not touch.reported:
             touch.reported = True
-            return [self._estimate(touch, self._first_ticks, final=False)]
-        if final:
-            self._waiting.popleft()
-            return [self._estimate(touch, self._final_ticks, final=True)]
-        if there >= self._preview_ticks and not touch.previewed:
+            return [self._estimate(touch, self._first_ticks, is_final=False)]
+        if is_final:
+            self._pending_touches.popleft()
+            return [self._estimate(touch, self._final_ticks, is_final=True)]
+        if available_ticks >= self._preview_ticks and not touch.previewed:
             touch.previewed = True
             record, _ = self._record(touch, self._preview_ticks)
             touch.estimate.preview(record)
         return []
 
-    def _estimate(self, touch: _Waiting, after: int, *, final: bool) -> TouchReport:
-        record, start_s = self._record(touch, after)
-        found = touch.estimate.update(record, scan=False, first=not final)
-        document = found.as_dict(start_s)
-        return TouchReport(touch.number, touch.tick, final, document)
+    def _estimate(self, touch: _PendingTouch, after_ticks: int, *, is_final: bool) -> TouchReport:
+        """Return the estimate of a touch from the record until `after_ticks` past its detection."""
+        record, start_s = self._record(touch, after_ticks)
+        touch_estimate = touch.estimate.update(record, scan=False, first=not is_final)
+        document = touch_estimate.as_dict(start_s)
+        return TouchReport(touch.number, touch.tick, is_final, document)
 
-    def _record(self, touch: _Waiting, after: int) -> tuple[TouchRecord, float]:
-        """Return the record up to `after` ticks from the detection, and its start in s."""
+    def _record(self, touch: _PendingTouch, after_ticks: int) -> tuple[TouchRecord, float]:
+        """Return the record around a touch until `after_ticks` past its detection, and its start.
+
+        The start is the time in s since the start of the session's record.
+        """
         assert self._samples is not None
         job = self._job
         # Soon after another touch the beam may not have been free: the estimate is then unknown.
         free_from = min(touch.free_from, touch.tick)
-        part = around_touch(self._samples, touch.tick, job.rate_hz, free_from)
-        record = touch_record(part, touch.tick, job.rate_hz, job.shear_projection)
-        return record.until(record.detected + after), int(part["tick"][0]) / job.rate_hz
+        samples = around_touch(self._samples, touch.tick, job.rate_hz, free_from)
+        record = touch_record(samples, touch.tick, job.rate_hz, job.shear_projection)
+        return record.until(record.detected + after_ticks), int(samples["tick"][0]) / job.rate_hz
 
 
 if __name__ == "__main__":

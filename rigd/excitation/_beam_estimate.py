@@ -22,9 +22,9 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating[Any, Any]]
 
 BAND_HZ: Final = 50.0
-"""Upper end of the band that the whole-record fit compares."""
+"""Upper end in Hz of the band that the whole-record fit uses."""
 
-OF_UNIFORM: Final = (
+UNIFORM_BEAM_PARAMETERS: Final = (
     "zeta",
     "alpha",
     "gamma",
@@ -34,67 +34,70 @@ OF_UNIFORM: Final = (
     "delay_s",
     "tool_inertia_kg_m2",
 )
-"""Parameters of the fit of a uniform beam on a rigid clamp."""
+"""Names of the parameters in the fit of a uniform beam on a rigid clamp."""
 
-_OF_ENDS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
+_END_PARAMETERS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
+"""Names of the parameters that describe the two ends of the beam."""
 
-PARAMETERS: Final = (*OF_UNIFORM, *_OF_ENDS)
-"""Parameters of the fit; the `LOGARITHMIC` ones count by their logarithm."""
+PARAMETERS: Final = (*UNIFORM_BEAM_PARAMETERS, *_END_PARAMETERS)
+"""Names of all parameters of the fit; `LOGARITHMIC_PARAMETERS` are fitted as logarithms."""
 
-LOGARITHMIC: Final = frozenset(
+LOGARITHMIC_PARAMETERS: Final = frozenset(
     {"zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"}
 )
+"""Names of the parameters that are fitted as logarithms."""
 
-BY_PARAMETER: Final = {
+DERIVATIVE_NAMES: Final = {
     "density_over_stiffness": "ln_density_over_stiffness",
     "bending_stiffness_n_m2": "ln_stiffness",
 }
-"""Names by which the exact model is differentiated, where they differ."""
+"""Name of each parameter in the derivatives of the exact model, if it differs there."""
 
-_OF_RIG: Final = ("delay_s", "tool_inertia_kg_m2", *_OF_ENDS)
-"""Parameters in addition to beam and damping; 0 by default."""
+_ADDITIONAL_PARAMETERS: Final = ("delay_s", "tool_inertia_kg_m2", *_END_PARAMETERS)
+"""Names of the parameters in addition to those of beam and damping; their default value is 0."""
 
-TOLERATED: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
-"""Difference between a mode of the antenna and that of the beam: its standard deviation over the
-uniformity, as the analyser defines it. The mode's number follows the name."""
+TOLERATED_DEVIATIONS: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
+"""Constants of a mode that may deviate from those of a uniform beam, with the standard deviation of
+the deviation over the uniformity, as in the analyser. In the names of free parameters the number of
+the mode follows."""
 
-MODAL: Final = (*TOLERATED, "ln_damping_ratio", "residue_phase_rad")
-"""Free constants of each mode of the modal model."""
+MODAL_CONSTANTS: Final = (*TOLERATED_DEVIATIONS, "ln_damping_ratio", "residue_phase_rad")
+"""Names of the free constants of each mode in the modal model."""
 
-_BACKGROUND: Final = 5
-"""Terms of the modal model's background."""
+_BACKGROUND_TERMS: Final = 5
+"""Number of terms of the modal model's background, a polynomial in s."""
 
 
 @dataclass(frozen=True, slots=True)
 class BeamEstimate:
-    """Estimated beam, with the noise of its torque."""
+    """Estimated beam and damping, with the noise of the measured torque."""
 
     beam: Beam
-    """Length as given, density and stiffness as estimated."""
+    """Beam with the given length, and the estimated density and stiffness."""
     damping: Damping
-    """Damping as estimated; a coefficient of 0 means that the structure has no such damping."""
+    """Estimated damping; a coefficient of 0 means that the structure has no such damping."""
     names: tuple[str, ...]
-    """Free parameters of the fit, of `PARAMETERS`, and deviations of modes."""
+    """Names of the fit's free parameters: some of `PARAMETERS`, and deviations of modes."""
     noise_frequency_hz: Real
-    """Shape (m,), increasing: frequencies of the noise spectrum."""
+    """Frequencies of the noise spectrum in increasing order, shape (m,)."""
     noise_nm2_per_hz: Real
-    """Shape (m,): one-sided power spectral density of the torque's noise."""
+    """One-sided power spectral density of the torque's noise, shape (m,)."""
     delay_s: float = 0.0
     """Delay of the torque relative to the angle."""
     tool_inertia_kg_m2: float = 0.0
     """Inertia between torque sensor and beam."""
     tip_mass_kg: float = 0.0
-    """Point mass at the tip."""
+    """Point mass at the tip of the beam."""
     root_compliance_rad_per_nm: float = 0.0
     """Rotation of the clamp per torque."""
     stiffness_offsets: tuple[float, ...] = ()
-    """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
+    """Relative differences of the stiffness of modes 2, 3, … from that of the uniform beam."""
     uniformity: float = 0.0
-    """Relative standard deviation of each mode's frequency from that of the beam."""
+    """Relative standard deviation of each mode's frequency from that of the uniform beam."""
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "BeamEstimate":
-        """Return an estimate from JSON.
+        """Return the estimate of a beam that a JSON document contains.
 
         Parameters
         ----------
@@ -127,7 +130,7 @@ class BeamEstimate:
                 names=tuple(name for name in document["names"] if name in PARAMETERS),
                 noise_frequency_hz=np.array(noise["frequency_hz"], dtype=np.float64),
                 noise_nm2_per_hz=np.array(noise["nm2_per_hz"], dtype=np.float64),
-                **{key: float(document.get(key, 0.0)) for key in _OF_RIG},
+                **{key: float(document.get(key, 0.0)) for key in _ADDITIONAL_PARAMETERS},
                 stiffness_offsets=tuple(map(float, document.get("stiffness_offsets", ()))),
             )
         except KeyError as error:
@@ -146,11 +149,11 @@ class BeamEstimate:
         Parameters
         ----------
         beam, damping
-            As stated.
+            Known beam and damping.
         noise_nm2_per_hz
-            One-sided power spectral density of the torque's noise, white.
+            One-sided power spectral density of the torque's white noise.
         tip_mass_kg
-            Point mass at the tip, fixed.
+            Point mass at the tip, which is not a free parameter.
         """
         absent = {
             *(() if damping.zeta else ("zeta", "alpha")),
@@ -159,14 +162,14 @@ class BeamEstimate:
         return cls(
             beam,
             damping,
-            tuple(name for name in OF_UNIFORM if name not in absent),
+            tuple(name for name in UNIFORM_BEAM_PARAMETERS if name not in absent),
             np.array([1.0]),
             np.array([noise_nm2_per_hz]),
             tip_mass_kg=tip_mass_kg,
         )
 
     def check(self) -> None:
-        """Raise if the estimate cannot predict a record.
+        """Raise `ExcitationError` if the estimate cannot predict a record.
 
         Raises
         ------
@@ -174,7 +177,7 @@ class BeamEstimate:
             If a value is not finite or out of range, or no parameter is free.
         """
         beam, damping = self.beam, self.damping
-        for key, value, least, below in (
+        for key, value, least, upper_bound in (
             ("beam.length_m", beam.length_m, 1e-6, np.inf),
             ("beam.density_kg_per_m", beam.density_kg_per_m, 1e-12, np.inf),
             ("beam.bending_stiffness_n_m2", beam.bending_stiffness_n_m2, 1e-12, np.inf),
@@ -182,10 +185,10 @@ class BeamEstimate:
             ("damping.alpha", damping.alpha, 0.0, 2.0),
             ("damping.gamma", damping.gamma, 0.0, np.inf),
             ("damping.lambda", damping.lambda_, 0.0, 2.0),
-            *((key, getattr(self, key), -np.inf, np.inf) for key in _OF_RIG),
+            *((key, getattr(self, key), -np.inf, np.inf) for key in _ADDITIONAL_PARAMETERS),
             *(("stiffness_offsets", each, -0.9, 10.0) for each in self.stiffness_offsets),
         ):
-            if not (isfinite(value) and least <= value < below):
+            if not (isfinite(value) and least <= value < upper_bound):
                 raise ExcitationError(f"The estimate of the beam has {key} = {value}.")
         frequency_hz, density = self.noise_frequency_hz, self.noise_nm2_per_hz
         if not (
@@ -203,34 +206,38 @@ class BeamEstimate:
             raise ExcitationError("The estimate of the beam has no free parameter in names.")
 
     def with_tolerance(self, uniformity: float) -> "BeamEstimate":
-        """Return the estimate with modes free within a tolerance of the geometry.
+        """Return the estimate of a beam whose modes may deviate from those of a uniform beam.
 
-        The orders of the damping are free as well.
+        The deviations of the modes, and the orders of the damping, are free parameters as well.
 
         Parameters
         ----------
         uniformity
-            Relative standard deviation of each mode's frequency; 0 changes nothing.
+            Relative standard deviation of each mode's frequency from that of a uniform beam; 0: the
+            estimate is returned unchanged.
         """
         if not uniformity:
             return self
         orders = [name for name in ("alpha", "lambda") if name not in self.names]
         present = {"alpha": self.damping.zeta, "lambda": self.damping.gamma}
         modes = [mode.number for mode in self.modes()]
-        deviations = [f"{name}_{number}" for number in modes for name in TOLERATED]
+        deviations = [f"{name}_{number}" for number in modes for name in TOLERATED_DEVIATIONS]
         free = (*self.names, *(name for name in orders if present[name]), *deviations)
         return replace(self, names=free, uniformity=uniformity)
 
     def modal(self) -> "BeamEstimate":
-        """Return the estimate with free constants of each mode and a background only."""
+        """Return the estimate with the free parameters of a modal model.
+
+        They are the constants of each mode, and those of a background.
+        """
         modes = [mode.number for mode in self.modes()]
-        constants = [f"{name}_{number}" for number in modes for name in MODAL]
-        background = [f"background_{power}" for power in range(_BACKGROUND)]
+        constants = [f"{name}_{number}" for number in modes for name in MODAL_CONSTANTS]
+        background = [f"background_{power}" for power in range(_BACKGROUND_TERMS)]
         return replace(self, names=(*constants, *background), uniformity=1.0)
 
     @property
     def values(self) -> dict[str, float]:
-        """Return the values of all `PARAMETERS` by name."""
+        """Values of all `PARAMETERS` by name."""
         beam, damping = self.beam, self.damping
         return dict(
             zip(
@@ -238,7 +245,7 @@ class BeamEstimate:
                 (
                     *(damping.zeta, damping.alpha, damping.gamma, damping.lambda_),
                     *(beam.density_over_stiffness, beam.bending_stiffness_n_m2),
-                    *(getattr(self, key) for key in _OF_RIG),
+                    *(getattr(self, key) for key in _ADDITIONAL_PARAMETERS),
                 ),
                 strict=True,
             )
@@ -246,15 +253,20 @@ class BeamEstimate:
 
     @property
     def loaded(self) -> LoadedBeam | None:
-        """The beam with tip mass and root compliance; None if it has none and none is free."""
-        at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
-        if not at_ends and set(_OF_ENDS).isdisjoint(self.names):
+        """Beam with tip mass, root compliance and offsets of the modes' stiffness.
+
+        It is None if all of these are 0 and not free, so that the beam is uniform.
+        """
+        differs_from_uniform = (
+            self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
+        )
+        if not differs_from_uniform and set(_END_PARAMETERS).isdisjoint(self.names):
             return None
         return self.loaded_beam
 
     @property
     def loaded_beam(self) -> LoadedBeam:
-        """The beam with tip mass and root compliance."""
+        """Beam with tip mass, root compliance and stiffness offsets, which may all be 0."""
         return LoadedBeam(
             self.beam,
             self.damping,
@@ -264,20 +276,20 @@ class BeamEstimate:
         )
 
     def modes(self, highest_hz: float = BAND_HZ) -> tuple["EstimatedMode", ...]:
-        """Return the modes that oscillate below a frequency, with their gradients.
+        """Return the beam's modes below a frequency, with their derivatives by the parameters.
 
         Parameters
         ----------
         highest_hz
-            Upper end of the band.
+            Highest frequency of a mode.
         """
         count = 2
         while True:
             z = clamped_free_eigenvalues(count)
-            reached = (z / self.beam.length_m) ** 2 > 2 * pi * highest_hz * np.sqrt(
+            is_above_band = (z / self.beam.length_m) ** 2 > 2 * pi * highest_hz * np.sqrt(
                 self.beam.density_over_stiffness
             )
-            if reached[-1]:
+            if is_above_band[-1]:
                 break
             count *= 2
         loaded = self.loaded
@@ -285,79 +297,90 @@ class BeamEstimate:
             poles_for_eigenvalues(z, self.beam, self.damping) if loaded is None else loaded.poles(z)
         )
         parameters = [name for name in self.names if name in PARAMETERS]
-        names = [BY_PARAMETER.get(name, name) for name in parameters]
-        shown = {
+        names = [DERIVATIVE_NAMES.get(name, name) for name in parameters]
+        poles_in_band = {
             number: pole
             for number, pole in enumerate(pairs[:, 0].tolist(), start=1)
             if np.isfinite(pole) and 0.0 < pole.imag < 2 * pi * highest_hz
         }
         if loaded is None:
             stiffness = (z / self.beam.length_m) ** 4
-            moved: Iterable[Complex] = (
+            pole_gradients_by_mode: Iterable[Complex] = (
                 pole_gradient(pole, float(stiffness[number - 1]), self.beam, self.damping, names)
-                for number, pole in shown.items()
+                for number, pole in poles_in_band.items()
             )
         else:
-            moved = loaded.pole_gradients(np.array([*shown.values()], dtype=np.complex128), names)
+            pole_gradients_by_mode = loaded.pole_gradients(
+                np.array([*poles_in_band.values()], dtype=np.complex128), names
+            )
         scales = parameter_scales(self)
-        found = []
-        for (number, pole), row in zip(shown.items(), moved, strict=True):
+        estimated_modes = []
+        for (number, pole), row in zip(poles_in_band.items(), pole_gradients_by_mode, strict=True):
             gradient = np.zeros(len(self.names), dtype=np.complex128)
             gradient[: len(parameters)] = row * scales
             for index, name in enumerate(self.names):
                 if name.endswith(f"_{number}"):
-                    gradient[index] = CHANGES[name.rpartition("_")[0]](pole, 0j)[0]
-            found.append(EstimatedMode(number, pole, gradient))
-        return tuple(found)
+                    gradient[index] = POLE_AND_RESIDUE_DERIVATIVES[name.rpartition("_")[0]](
+                        pole, 0j
+                    )[0]
+            estimated_modes.append(EstimatedMode(number, pole, gradient))
+        return tuple(estimated_modes)
 
 
-CHANGES: Final[Mapping[str, Callable[[complex, complex], tuple[complex, complex]]]] = {
+POLE_AND_RESIDUE_DERIVATIVES: Final[
+    Mapping[str, Callable[[complex, complex], tuple[complex, complex]]]
+] = {
     "ln_frequency": lambda pole, _: (pole, 0j),
     "ln_damping_ratio": lambda pole, _: (complex(pole.real), 0j),
     "ln_residue": lambda _, residue: (0j, residue),
     "residue_phase_rad": lambda _, residue: (0j, 1j * residue),
     "background": lambda *_: (0j, 0j),
 }
-"""Derivatives of the pole and the residue of a mode by its constants."""
+"""Functions that return the derivatives of a mode's pole and residue by one of its constants, from
+pole and residue."""
 
 
 @dataclass(frozen=True, slots=True)
 class EstimatedMode:
-    """A mode of the estimated beam with locked hub."""
+    """Mode of the estimated beam with locked hub."""
 
     number: int
-    """From 1."""
+    """Number of the mode, from 1."""
     pole_rad_s: complex
-    """Upper one of the pair."""
+    """Pole of the mode with positive imaginary part."""
     gradient: Complex
-    """Shape (k,): derivatives of the pole by the free parameters."""
+    """Derivatives of the pole by the free parameters, shape (k,)."""
 
     @property
     def frequency_hz(self) -> float:
-        """Frequency of the free decay."""
+        """Frequency of the mode's free decay in Hz."""
         return self.pole_rad_s.imag / (2 * pi)
 
     @property
     def damping_ratio(self) -> float:
-        """Fraction of critical damping."""
+        """Damping ratio of the mode, as a fraction of critical damping."""
         return -self.pole_rad_s.real / abs(self.pole_rad_s)
 
     @property
     def frequency_gradient_hz(self) -> Real:
-        """Derivatives of the frequency, shape (k,)."""
+        """Derivatives of the mode's frequency in Hz by the free parameters, shape (k,)."""
         return np.asarray(self.gradient.imag / (2 * pi), dtype=np.float64)
 
     @property
     def damping_gradient(self) -> Real:
-        """Derivatives of the damping ratio, shape (k,)."""
+        """Derivatives of the mode's damping ratio by the free parameters, shape (k,)."""
         p, size = self.pole_rad_s, abs(self.pole_rad_s)
-        of_size = (p.conjugate() * self.gradient).real / size
-        slope = -self.gradient.real / size - self.damping_ratio * of_size / size
+        size_gradient = (p.conjugate() * self.gradient).real / size
+        slope = -self.gradient.real / size - self.damping_ratio * size_gradient / size
         return np.asarray(slope, dtype=np.float64)
 
 
 def parameter_scales(estimate: BeamEstimate) -> Real:
-    """Return factors from derivatives of the exact model to those by the free parameters."""
+    """Return the factors that convert derivatives of the exact model to the fit's parameters.
+
+    The fit uses the logarithms of zeta and gamma, so their factors are zeta and gamma. The other
+    factors are 1.
+    """
     values = estimate.values
     names = [name for name in estimate.names if name in PARAMETERS]
     return np.array([values[name] if name in ("zeta", "gamma") else 1.0 for name in names])

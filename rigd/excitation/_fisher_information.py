@@ -1,14 +1,14 @@
 """Fisher information of a record on the parameters of the beam, before or after it is recorded.
 
-The torque caused by a motion of the motor is known except for the parameters. Its derivatives,
-whitened with the spectrum of the noise, give the precision of a whole-record fit: the inverse of
-their Gram matrix is the lower bound of any unbiased estimate's covariance (Cramér and
-Rao), and the fit of `analysis` attains it. The nuisance terms of that fit are projected out here
-as well: free decay from before the record, offset and drift of the torque.
+The torque caused by a motion of the motor is known except for the parameters. Its derivatives by
+the parameters, whitened with the spectrum of the noise, determine the precision of a whole-record
+fit: the inverse of their Gram matrix is the lower bound of any unbiased estimate's covariance
+(Cramér and Rao), and the fit of `analysis` attains it. The nuisance terms of that fit are projected
+out here as well: free decay from before the record, offset and drift of the torque.
 
 The computation is in the time domain, at a reduced rate: the derivatives of a record and of a
-segment after it add up sample by sample. A segment costs no more than its own length, and the
-vibration after all earlier ones counts.
+segment after it add up sample by sample. The computing time of a segment depends on its own length
+only, and the vibration after all earlier segments counts.
 
 References
 ----------
@@ -27,11 +27,11 @@ from rigd.beam import transfer, transfer_and_gradient
 from rigd.beam.tip import tip_response
 from rigd.excitation._beam_estimate import (
     BAND_HZ,
-    BY_PARAMETER,
-    CHANGES,
-    MODAL,
+    DERIVATIVE_NAMES,
+    MODAL_CONSTANTS,
     PARAMETERS,
-    TOLERATED,
+    POLE_AND_RESIDUE_DERIVATIVES,
+    TOLERATED_DEVIATIONS,
     BeamEstimate,
     Complex,
     Real,
@@ -47,12 +47,15 @@ _PRIOR_STD: Final = {
     "bending_stiffness_n_m2": 0.5,
     "delay_s": 0.05,
 }
-"""Prior knowledge without a record: coefficients within a factor of 20, orders within (0, 2)."""
+"""Prior standard deviation of each parameter without a record: coefficients are known within a
+factor of 20, and orders are in (0, 2)."""
 
-_RATE_OVER_BAND: Final = 2.4
-_TAPER: Final = 1.1
-_DECAY: Final = 5.0
-"""The wrap-around of a transform of twice the length has decayed by exp(-5)."""
+_SAMPLE_RATE_OVER_BAND: Final = 2.4
+"""Smallest rate of the samples over the upper end of the band."""
+_FADED_OVER_BAND: Final = 1.1
+"""Frequency at which the weight of the noise has faded to 0, over the upper end of the band."""
+_WRAP_AROUND_DECAY: Final = 5.0
+"""Exponent by which the wrap-around of a transform of twice the length has decayed: exp(-5)."""
 
 
 # Whitened derivatives of the torque
@@ -60,26 +63,30 @@ _DECAY: Final = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueModel:
-    """Exact model on the frequencies of records of one length, for any motion."""
+    """Exact beam model, evaluated once at the frequencies of records of a given length.
+
+    It then predicts torque and slope of the tip for any motion of the motor.
+    """
 
     estimate: BeamEstimate
     """Parameters of the model."""
     rate_hz: float
-    """Rate of the angle."""
+    """Rate of the angle in ticks a second."""
     ticks: int
-    """Length of the records, at that rate: a multiple of `factor`."""
+    """Length of the records in ticks, a multiple of `factor`."""
     factor: int
-    """One tick in so many is a sample."""
+    """Number of ticks from one sample to the next."""
     sigma_per_s: float
-    """Real part of the Laplace variable."""
+    """Real part of the Laplace variable in 1/s."""
     kernels: Complex
-    """Shape (k, K): whitened derivatives of the response from angle to torque."""
+    """Whitened derivatives of the response from angle to torque by the free parameters, shape
+    (k, K)."""
     channels: Complex
-    """Shape (2, K): responses from angle to torque in N·m/rad, and to the slope of the tip."""
+    """Responses from angle to torque in N·m/rad and to the slope of the tip, shape (2, K)."""
 
     @classmethod
-    def of(cls, estimate: BeamEstimate, rate_hz: float, ticks: int) -> "TorqueModel":
-        """Evaluate the model for records of at least so many ticks.
+    def for_records(cls, estimate: BeamEstimate, rate_hz: float, ticks: int) -> "TorqueModel":
+        """Return the torque model of a beam for records of at least a given number of ticks.
 
         Parameters
         ----------
@@ -88,19 +95,19 @@ class TorqueModel:
         rate_hz
             Rate of the angle.
         ticks
-            Least length.
+            Smallest length of the records in ticks.
         """
-        factor = reduction(rate_hz)
+        factor = ticks_per_sample(rate_hz)
         # Twice the length, and one of which a transform is quick.
-        half = -(-ticks // factor)
-        half = _quick(half)
-        ticks = half * factor
-        samples = 2 * half
+        half_samples = -(-ticks // factor)
+        half_samples = _fast_transform_length(half_samples)
+        ticks = half_samples * factor
+        samples = 2 * half_samples
         sample_hz = rate_hz / factor
-        sigma = _DECAY * sample_hz / samples
+        sigma = _WRAP_AROUND_DECAY * sample_hz / samples
         frequency_hz = np.fft.rfftfreq(samples, 1.0 / sample_hz)
         # Higher frequencies belong neither to the band nor to a visible mode.
-        frequency_hz = frequency_hz[frequency_hz <= _TAPER * BAND_HZ]
+        frequency_hz = frequency_hz[frequency_hz <= _FADED_OVER_BAND * BAND_HZ]
         s = sigma + 2j * pi * frequency_hz
         kernels = whitened_kernels(estimate, s, sample_hz)
         return cls(
@@ -109,33 +116,45 @@ class TorqueModel:
 
     @property
     def sample_hz(self) -> float:
-        """Rate of the samples."""
+        """Rate of the samples in Hz, at which derivatives of the torque are computed."""
         return self.rate_hz / self.factor
 
     def spectrum(self, angle_rad: Real) -> Complex:
-        """Return the transform of an angle from rest, (n,) with n at most `ticks`, in the band."""
+        """Return the Laplace transform of a motor angle at the frequencies of the band.
+
+        The angle in rad begins at rest and has the shape (n,), with n at most `ticks`.
+        """
         time_s = np.arange(angle_rad.size) / self.rate_hz
-        faded = angle_rad * np.exp(-self.sigma_per_s * time_s)
-        spectrum: Complex = np.fft.rfft(faded, 2 * self.ticks)[: self.kernels.shape[1]]
+        decaying_angle_rad = angle_rad * np.exp(-self.sigma_per_s * time_s)
+        spectrum: Complex = np.fft.rfft(decaying_angle_rad, 2 * self.ticks)[: self.kernels.shape[1]]
         return spectrum
 
-    def rows(self, spectrum: Complex) -> Real:
-        """Return whitened derivatives of the torque, shape (k, ticks / factor)."""
-        return self._in_time(self.kernels * (spectrum / self.factor), self.ticks // self.factor, 1)
+    def whitened_derivatives(self, spectrum: Complex) -> Real:
+        """Return whitened derivatives of the torque by the parameters at each sample.
 
-    def motion(self, spectrum: Complex) -> Real:
-        """Return torque (N·m) and slope of the tip (rad) at every tick, shape (2, ticks)."""
-        return self._in_time(self.channels * spectrum, self.ticks, self.factor)
+        `spectrum` is the transform of the angle. The shape is (k, ticks / factor).
+        """
+        return self._inverse_transform(
+            self.kernels * (spectrum / self.factor), self.ticks // self.factor, 1
+        )
 
-    def _in_time(self, spectra: Complex, samples: int, finer: int) -> Real:
-        time_s = np.arange(samples) * (self.factor / finer / self.rate_hz)
+    def torque_and_slope(self, spectrum: Complex) -> Real:
+        """Return torque in N·m and slope of the tip in rad at every tick, shape (2, ticks).
+
+        `spectrum` is the transform of the angle.
+        """
+        return self._inverse_transform(self.channels * spectrum, self.ticks, self.factor)
+
+    def _inverse_transform(self, spectra: Complex, samples: int, values_per_sample: int) -> Real:
+        """Return functions of time, with some values per sample, from their Laplace transforms."""
+        time_s = np.arange(samples) * (self.factor / values_per_sample / self.rate_hz)
         values = np.fft.irfft(spectra, 2 * samples)[:, :samples]
         values *= np.exp(self.sigma_per_s * time_s)
         return values
 
 
 def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Complex]:
-    """Return the responses from the angle to torques in N·m/rad and to the slope of the tip.
+    """Return the transfer functions from the motor's angle to torques and to the slope of the tip.
 
     Parameters
     ----------
@@ -147,8 +166,8 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
     Returns
     -------
     of_beam, measured, slope
-        Torque on the beam; measured torque, with tool inertia and delay; slope of the tip against
-        the root.
+        Torque on the beam in N·m/rad; measured torque in N·m/rad, with tool inertia and delay;
+        slope of the tip relative to the root, per angle.
     """
     loaded = estimate.loaded
     if loaded is None:
@@ -162,7 +181,9 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
 
 
 def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Complex:
-    """Differentiate the response from angle to torque, in units of the noise; shape (k, K).
+    """Return derivatives of the response from angle to torque by the parameters, shape (k, K).
+
+    They are whitened: divided by the noise spectrum so that the noise of a sample has variance 1.
 
     Parameters
     ----------
@@ -171,37 +192,42 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     s
         Laplace variable in rad/s, shape (K,).
     sample_hz
-        Rate of the samples whose noise is to have variance 1.
+        Rate of the samples.
     """
     names = [name for name in estimate.names if name in PARAMETERS]
-    wrt = [BY_PARAMETER.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")]
+    derivative_names = [
+        DERIVATIVE_NAMES.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")
+    ]
     loaded = estimate.loaded
-    g = of_beam = np.zeros((0, s.size), dtype=np.complex128)
+    g = beam_gradient = np.zeros((0, s.size), dtype=np.complex128)
     if names:
-        g, of_beam = (
-            transfer_and_gradient(s, estimate.beam, estimate.damping, wrt)
+        g, beam_gradient = (
+            transfer_and_gradient(s, estimate.beam, estimate.damping, derivative_names)
             if loaded is None
-            else loaded.transfer_and_gradient(s.astype(np.complex128), wrt)
+            else loaded.transfer_and_gradient(s.astype(np.complex128), derivative_names)
         )
-    late = np.exp(-s * estimate.delay_s)
+    delay_factor = np.exp(-s * estimate.delay_s)
     kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
-    kernels[len(names) :] = _by_constants(estimate, s) * late
-    rows = iter(of_beam)
+    kernels[len(names) :] = _derivatives_by_constants(estimate, s) * delay_factor
+    rows = iter(beam_gradient)
     for out, name, scale in zip(
         kernels[: len(names)], names, parameter_scales(estimate), strict=True
     ):
         if name == "delay_s":
-            out[:] = -s * (g + estimate.tool_inertia_kg_m2 * s * s) * late
+            out[:] = -s * (g + estimate.tool_inertia_kg_m2 * s * s) * delay_factor
         elif name == "tool_inertia_kg_m2":
-            out[:] = s * s * late
+            out[:] = s * s * delay_factor
         else:
-            out[:] = scale * next(rows) * late
-    kernels *= _whitening(estimate, s.imag / (2 * pi), sample_hz)
+            out[:] = scale * next(rows) * delay_factor
+    kernels *= _whitening_weights(estimate, s.imag / (2 * pi), sample_hz)
     return kernels
 
 
-def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
-    """Differentiate the response by the constants of free modes and of the background."""
+def _derivatives_by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
+    """Return derivatives of the response by the constants of free modes and of the background.
+
+    The shape is (number of constants, K).
+    """
     poles = {mode.number: mode.pole_rad_s for mode in estimate.modes()}
     rows = []
     for name in estimate.names:
@@ -213,7 +239,7 @@ def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
             continue
         pole = poles[int(number)]
         residue = complex(estimate.loaded_beam.residues(np.array([pole]))[0]) * pole**2
-        by_pole, by_residue = CHANGES[kind](pole, residue)
+        by_pole, by_residue = POLE_AND_RESIDUE_DERIVATIVES[kind](pole, residue)
         upper, lower = s - pole, s - pole.conjugate()
         row = residue * by_pole / upper**2 + by_residue / upper
         other = (residue * by_pole).conjugate() / lower**2 + by_residue.conjugate() / lower
@@ -221,26 +247,29 @@ def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
     return np.array(rows, dtype=np.complex128).reshape(-1, s.size)
 
 
-def reduction(rate_hz: float) -> int:
-    """Return how many ticks make a sample of the band."""
-    return max(int(rate_hz / (_RATE_OVER_BAND * BAND_HZ)), 1)
+def ticks_per_sample(rate_hz: float) -> int:
+    """Return the number of ticks from one sample to the next, so that samples contain the band."""
+    return max(int(rate_hz / (_SAMPLE_RATE_OVER_BAND * BAND_HZ)), 1)
 
 
-def _whitening(
+def _whitening_weights(
     estimate: BeamEstimate, frequency_hz: NDArray[np.floating[Any]], sample_hz: float
 ) -> Real:
-    """Return the weight that gives a sample's noise variance 1, fading at the end of the band."""
+    """Return the weights at some frequencies that give the noise of a sample variance 1.
+
+    They fade to 0 above the end of the band.
+    """
     density = np.interp(
         frequency_hz, estimate.noise_frequency_hz, np.log(estimate.noise_nm2_per_hz)
     )
-    fade = np.clip((frequency_hz / BAND_HZ - 1.0) / (_TAPER - 1.0), 0.0, 1.0)
+    fade = np.clip((frequency_hz / BAND_HZ - 1.0) / (_FADED_OVER_BAND - 1.0), 0.0, 1.0)
     weight: Real = np.exp(-0.5 * density) * np.sqrt(2.0 / sample_hz)
     weight *= 0.5 + 0.5 * np.cos(pi * fade)
     return weight
 
 
-def _quick(least: int) -> int:
-    """Return a length with a fast transform, at most an eighth above the least one."""
+def _fast_transform_length(least: int) -> int:
+    """Return a length for a fast Fourier transform: `least`, or at most an eighth more."""
     unit = 1 << max(0, least.bit_length() - 4)
     return -(-least // unit) * unit
 
@@ -250,68 +279,71 @@ def _quick(least: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordSoFar:
-    """Information of a record up to now, and the vibration that continues after it."""
+    """Fisher information of a record up to now, and the vibration that continues after it."""
 
     estimate: BeamEstimate
-    """Estimate from which it was computed."""
+    """Estimate of the beam from which the information is computed."""
     before: Real
-    """(k + m, k + m): Gram matrix of the derivatives and of m nuisance terms up to now."""
+    """Gram matrix of the torque's derivatives and of m nuisance terms up to now, shape
+    (k + m, k + m)."""
     ahead: Real
-    """(k + m, samples): the same derivatives and terms from now on, the motor held."""
+    """Derivatives and nuisance terms from now on if the motor is held, shape (k + m, samples)."""
     ringing: Real
-    """(2, ticks): torque (N·m) and slope of the tip (rad) from now on, the motor held."""
+    """Torque in N·m and slope of the tip in rad from now on if the motor is held, shape
+    (2, ticks)."""
 
     @classmethod
-    def of(
+    def from_angle(
         cls, angle_rad: Real, estimate: BeamEstimate, rate_hz: float, ahead_s: float = 0.0
     ) -> "RecordSoFar":
-        """Evaluate a record.
+        """Return the information of a record of the motor's angle.
 
         Parameters
         ----------
         angle_rad
-            Shape (n,): motor angle so far, measured or predicted; the beam rested at the first.
+            Motor angle so far, measured or predicted, shape (n,). The beam is at rest at the first
+            tick.
         estimate
             Beam, damping and noise.
         rate_hz
             Rate of the angle.
         ahead_s
-            Time from now on for which the vibration is computed.
+            Time in s from now on for which the continuing vibration is computed.
         """
-        factor = reduction(rate_hz)
+        factor = ticks_per_sample(rate_hz)
         # Rest before it, so that a sample lies at its end.
         angle_rad = np.concatenate([np.zeros(-angle_rad.size % factor), angle_rad - angle_rad[0]])
         ahead = -(-round(ahead_s * rate_hz) // factor)
         samples = angle_rad.size // factor
-        model = TorqueModel.of(estimate, rate_hz, angle_rad.size + ahead * factor)
+        model = TorqueModel.for_records(estimate, rate_hz, angle_rad.size + ahead * factor)
         spectrum = model.spectrum(angle_rad)
         rows = np.concatenate(
             [
-                model.rows(spectrum)[:, : samples + ahead],
-                _nuisance(estimate, samples + ahead, model.sample_hz),
+                model.whitened_derivatives(spectrum)[:, : samples + ahead],
+                _nuisance_terms(estimate, samples + ahead, model.sample_hz),
             ]
         )
         ringing = np.zeros((2, 0))
         if ahead:
             first = angle_rad.size
-            ringing = model.motion(spectrum)[:, first : first + ahead * factor]
+            ringing = model.torque_and_slope(spectrum)[:, first : first + ahead * factor]
         before = rows[:, :samples]
         return cls(estimate, before @ before.T, rows[:, samples:], ringing)
 
     @property
-    def through(self) -> Real:
-        """Projection of the nuisance terms out of the derivatives: (k, k + m)."""
+    def nuisance_projection(self) -> Real:
+        """Matrix that projects the nuisance terms out of the derivatives, shape (k, k + m)."""
         k = len(self.estimate.names)
-        return np.concatenate([np.eye(k), -_explained(self.before, k)], axis=1)
+        return np.concatenate([np.eye(k), -_regression_coefficients(self.before, k)], axis=1)
 
-    def after(self, more: Real | None, samples: int) -> Real:
-        """Return the information (k, k) after a number of further samples.
+    def information_after(self, more: Real | None, samples: int) -> Real:
+        """Return the information on the parameters after further samples, shape (k, k).
 
         Parameters
         ----------
         more
-            Shape (k, n): derivatives that a segment adds from now on, n at least `samples`; None:
-            the motor is held.
+            Derivatives that a segment adds from now on, shape (k, n) with n at least `samples`;
+            None: the motor is held.
         samples
             Number of further samples that count.
         """
@@ -319,20 +351,21 @@ class RecordSoFar:
         if more is not None:
             rows = rows.copy()
             rows[: more.shape[0]] += more[:, :samples]
-        return projected(self.before + rows @ rows.T, len(self.estimate.names))
+        return projected_information(self.before + rows @ rows.T, len(self.estimate.names))
 
 
 def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real:
     """Return a record's Fisher information on the free parameters of the beam, shape (k, k).
 
     Free decay from before the record, and offset and drift of the torque, are unknown as well and
-    reduce the information. In the order of ``estimate.names``; zeta, gamma, density over stiffness
-    and stiffness count by their logarithms. Its inverse is the least covariance.
+    reduce the information. The parameters are in the order of ``estimate.names``. For zeta, gamma,
+    density over stiffness and stiffness they are the logarithms. The inverse of the information is
+    the smallest covariance that an unbiased estimate can have.
 
     Parameters
     ----------
     angle_rad
-        Shape (n,): motor angle, measured or predicted; the beam rested at the first.
+        Motor angle, measured or predicted, shape (n,). The beam is at rest at the first tick.
     estimate
         Beam, damping, noise, and the free parameters.
     rate_hz
@@ -355,25 +388,28 @@ def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real
     >>> print(f"zeta {std[0]:.1%}, gamma {std[1]:.1%}")
     zeta 0.4%, gamma 1.4%
     """
-    return RecordSoFar.of(angle_rad, estimate, rate_hz).after(None, 0)
+    return RecordSoFar.from_angle(angle_rad, estimate, rate_hz).information_after(None, 0)
 
 
-def projected(gram: Real, k: int) -> Real:
+def projected_information(gram: Real, k: int) -> Real:
     """Return the information on the first k parameters if all others are unknown, shape (k, k).
 
     Parameters
     ----------
     gram
-        Shape (k + m, k + m): of the derivatives.
+        Gram matrix of the derivatives by all parameters, shape (k + m, k + m).
     k
         Number of parameters of interest.
     """
-    information: Real = gram[:k, :k] - _explained(gram, k) @ gram[k:, :k]
+    information: Real = gram[:k, :k] - _regression_coefficients(gram, k) @ gram[k:, :k]
     return 0.5 * (information + information.T)
 
 
-def _explained(gram: Real, k: int) -> Real:
-    """Return the regression of the first k derivatives on the others, shape (k, m)."""
+def _regression_coefficients(gram: Real, k: int) -> Real:
+    """Return the coefficients of the regression of the first k derivatives on the m others.
+
+    The shape is (k, m), and `gram` is the Gram matrix of all derivatives.
+    """
     size = np.sqrt(np.maximum(np.diag(gram)[k:], 1e-300))
     unit = gram[k:, k:] / np.outer(size, size) + 1e-12 * np.eye(size.size)
     factors: Real = np.linalg.solve(unit, gram[k:, :k] / size[:, None]).T / size
@@ -381,7 +417,7 @@ def _explained(gram: Real, k: int) -> Real:
 
 
 def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
-    """Return the covariance for an information, with prior knowledge of each parameter."""
+    """Return the covariance of the parameters for a Fisher information plus prior knowledge."""
     prior = np.array([_prior_std(name, estimate) for name in estimate.names])
     # In units of the prior the matrix is well scaled wherever something is known.
     unit = information * np.outer(prior, prior) + np.eye(len(prior))
@@ -391,12 +427,13 @@ def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
 
 
 def _prior_std(name: str, estimate: BeamEstimate) -> float:
+    """Return the standard deviation of a parameter that is known before any record."""
     beam = estimate.beam
     kind = name.rpartition("_")[0]
     if kind == "background":
         return 10.0 * beam.bending_stiffness_n_m2 / beam.length_m
-    if kind in MODAL:
-        return TOLERATED.get(kind, 1.0) * estimate.uniformity
+    if kind in MODAL_CONSTANTS:
+        return TOLERATED_DEVIATIONS.get(kind, 1.0) * estimate.uniformity
     if name == "tool_inertia_kg_m2":
         return beam.inertia_kg_m2
     if name == "tip_mass_kg":
@@ -406,12 +443,15 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
     return _PRIOR_STD[name]
 
 
-def _nuisance(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
-    """Return whitened decays from the first sample, offset and drift, shape (m, samples)."""
+def _nuisance_terms(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
+    """Return the whitened nuisance terms of a record: free decays, offset and drift of the torque.
+
+    The shape is (m, samples).
+    """
     time_s = np.arange(samples) / sample_hz
     poles = np.array([mode.pole_rad_s for mode in estimate.modes()])
     decays = np.exp(np.outer(poles, time_s))
-    weight = _whitening(estimate, poles.imag / (2 * pi), sample_hz)[:, None]
-    slow = _whitening(estimate, np.zeros(1), sample_hz)[0]
-    level = np.stack([np.ones(samples), time_s]) * slow
-    return np.concatenate([decays.real * weight, decays.imag * weight, level])
+    weight = _whitening_weights(estimate, poles.imag / (2 * pi), sample_hz)[:, None]
+    constant_weight = _whitening_weights(estimate, np.zeros(1), sample_hz)[0]
+    offset_and_drift = np.stack([np.ones(samples), time_s]) * constant_weight
+    return np.concatenate([decays.real * weight, decays.imag * weight, offset_and_drift])

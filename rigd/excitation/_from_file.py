@@ -9,26 +9,30 @@ import numpy.typing as npt
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
-    assemble,
+    assemble_excitation,
     check_ticks,
     lay_out_segments,
-    within_a_turn,
+    require_within_turn,
 )
 from rigd.runtime import open_plain_file
 from rigd.session.limits import MAX_SAMPLES
 from rigd.text_table import MissingColumnError, TableError, TextTable, read_table
 from rigd.text_table.titles import time_unit_s
 
-MOST_BYTES: Final = 256_000_000
-TIME: Final = "time_s"
-ANGLE: Final = "angle_rad"
-_RADIANS: Final = ("rad", "radian", "radians")
+MAX_FILE_BYTES: Final = 256_000_000
+"""Largest size in bytes of a text file with a reference."""
+TIME_COLUMN: Final = "time_s"
+"""Heading of the column of times."""
+ANGLE_COLUMN: Final = "angle_rad"
+"""Heading of the column of angles."""
+_RADIAN_NAMES: Final = ("rad", "radian", "radians")
+"""Names of the unit that a column of angles may state."""
 
 
 def from_csv(
     path: str | Path, *, rate_hz: float, rest_s: float = 1.0, ring_down_s: float = 15.0
 ) -> Excitation:
-    """Read a reference from a text file.
+    """Return an excitation whose reference angles are read from a text file.
 
     `rigd.text_table.read_table` detects separator, decimal sign, heading and encoding; an
     invalid line is an error.
@@ -36,13 +40,14 @@ def from_csv(
     Parameters
     ----------
     path
-        Either columns ``time_s`` and ``angle_rad`` (more columns are ignored; angles are
-        interpolated linearly to the ticks, times counted from the first), or a single column of
-        angles in rad, one per tick, with or without the heading ``angle_rad``.
+        Text file. Either it has the columns ``time_s`` and ``angle_rad`` (more columns are ignored,
+        angles are interpolated linearly to the ticks, and times are counted from the first row). Or
+        it has a single column of angles in rad, one per tick, with or without the heading
+        ``angle_rad``.
     rate_hz
         Ticks a second.
     rest_s, ring_down_s
-        Time before and after the trajectory.
+        Time in s before and after the trajectory.
 
     Raises
     ------
@@ -60,7 +65,7 @@ def from_csv(
         # The last row is reached exactly; rounding must not lose its tick.
         ticks = int(np.floor(time_s[-1] * rate_hz + 1e-6)) + 1
         sweep = np.interp(np.arange(ticks) / rate_hz, time_s, angles)
-    within_a_turn(f"{path}: the largest angle_rad", float(np.max(np.abs(sweep))))
+    require_within_turn(f"{path}: the largest angle_rad", float(np.max(np.abs(sweep))))
     duration_s = ticks / rate_hz
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters: dict[str, float | int | str] = {
@@ -70,69 +75,73 @@ def from_csv(
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
     }
-    return assemble("file", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("file", parameters, rate_hz, segments, sweep)
 
 
 def _read_columns(
     path: Path,
 ) -> tuple[npt.NDArray[np.float64] | None, npt.NDArray[np.float64]]:
-    """Return times in s (None for one angle a tick) and angles in rad."""
+    """Read times in s and angles in rad; the times are None if the file has one angle a tick."""
     try:
-        with open_plain_file(path, MOST_BYTES) as file:
-            table = _table(file.buffer)
+        with open_plain_file(path, MAX_FILE_BYTES) as file:
+            table = _read_table(file.buffer)
     except OSError as error:
         raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
     except TableError as error:
         # Without its text: the daemon may read files that the requesting user may not.
         raise ExcitationError(f"{path}: {error.unquoted()}") from error
-    angles = next(column for name, column in table.columns.items() if name != TIME)
-    times = table.columns.get(TIME)
+    angles = next(column for name, column in table.columns.items() if name != TIME_COLUMN)
+    times = table.columns.get(TIME_COLUMN)
     if len(angles.values) < 2:
         raise ExcitationError(
             f"{path}: has {len(angles.values)} angles; a reference needs at least two."
         )
     if len(angles.values) > MAX_SAMPLES:
         raise ExcitationError(f"{path}: has more than {MAX_SAMPLES} angles; shorten it.")
-    if angles.unit and angles.unit.lower() not in _RADIANS:
-        raise ExcitationError(f"{path}: states another unit than rad for {ANGLE}; write rad.")
+    if angles.unit and angles.unit.lower() not in _RADIAN_NAMES:
+        raise ExcitationError(
+            f"{path}: states another unit than rad for {ANGLE_COLUMN}; write rad."
+        )
     if times is not None and times.unit and time_unit_s(times.unit) != 1.0:
-        raise ExcitationError(f"{path}: states another unit than s for {TIME}; write seconds.")
-    for name, column in ((ANGLE, angles), (TIME, times)):
+        raise ExcitationError(
+            f"{path}: states another unit than s for {TIME_COLUMN}; write seconds."
+        )
+    for name, column in ((ANGLE_COLUMN, angles), (TIME_COLUMN, times)):
         if column is not None and not np.isfinite(column.values).all():
             row = int(np.argmin(np.isfinite(column.values)))
             raise ExcitationError(
                 f"{path}: line {table.lines[row]}: {name} is not a finite number."
             )
-    if times is not None and (late := times.values[1:] <= times.values[:-1]).any():
-        row = int(np.argmax(late)) + 1
+    if times is not None and (not_increasing := times.values[1:] <= times.values[:-1]).any():
+        row = int(np.argmax(not_increasing)) + 1
         raise ExcitationError(
-            f"{path}: line {table.lines[row]}: {TIME} does not come after the one before it; times "
-            "must increase."
+            f"{path}: line {table.lines[row]}: {TIME_COLUMN} does not come after the one before "
+            "it; times must increase."
         )
     return (None if times is None else times.values), angles.values
 
 
-def _table(stream: BinaryIO) -> TextTable:
-    """Read times and angles, or a single column."""
+def _read_table(stream: BinaryIO) -> TextTable:
+    """Read a table with the columns of times and angles, or with a single column of angles."""
     try:
-        return read_table(stream, (TIME, ANGLE), most_rows=MAX_SAMPLES)
+        return read_table(stream, (TIME_COLUMN, ANGLE_COLUMN), most_rows=MAX_SAMPLES)
     except MissingColumnError:
         pass
     try:
-        table = read_table(stream, (ANGLE,), most_rows=MAX_SAMPLES)
+        table = read_table(stream, (ANGLE_COLUMN,), most_rows=MAX_SAMPLES)
     except MissingColumnError:
         pass
     else:
         if table.width > 1:
             raise TableError(
-                f"has {table.width} columns, {ANGLE} among them, but no {TIME}; name the column of "
-                f"times in seconds so, or leave {ANGLE} alone."
+                f"has {table.width} columns, {ANGLE_COLUMN} among them, but no {TIME_COLUMN}; name "
+                f"the column of times in seconds so, or leave {ANGLE_COLUMN} alone."
             )
         return table
     table = read_table(stream, ("#1",), most_rows=MAX_SAMPLES)
     if table.width > 1 or table.columns["#1"].title:
         raise TableError(
-            f"must name the columns {TIME} (s) and {ANGLE} (rad) in one line above the numbers, or "
-            "be one column of angles in rad."
+            f"must name the columns {TIME_COLUMN} (s) and {ANGLE_COLUMN} (rad) in one line above "
+            "the numbers, or be one column of angles in rad."
         )
     return table

@@ -13,10 +13,11 @@ from rigd.excitation._touch_passes import touch
 from rigd.excitation._until import ScanRig, until
 
 Value = float | int | str | Path
+"""Type of an option's value in a request for an excitation."""
 
 
 class ExcitationRig(SweepRig, MoveRig, ScanRig, Protocol):
-    """Interface to a rig for which an excitation is made."""
+    """Interface to a rig's limits and predicted behaviour, for which an excitation is planned."""
 
 
 KINDS: Mapping[str, Callable[..., Excitation]] = {
@@ -30,23 +31,25 @@ KINDS: Mapping[str, Callable[..., Excitation]] = {
     "touch": touch,
     "until": until,
 }
-"""Functions by the names that the command line and session files use."""
+"""Functions that return an excitation, by its name on the command line and in session files."""
 
 FROM_THE_RIG = frozenset({"rate_hz", "rig", "tip_slope_rad"})
-"""Arguments that are not options of an excitation: data and limits of the rig."""
+"""Names of arguments of these functions that are data or limits of the rig, not options of the
+excitation."""
 
 
 def make_excitation(
     kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: ExcitationRig | None = None
 ) -> Excitation:
-    """Return an excitation at a rig's rate.
+    """Return the excitation of a given kind, such as ``"chirp"``, at a rig's rate.
 
     Parameters
     ----------
     kind
-        A name of `KINDS`.
+        Kind of excitation, a key of `KINDS`.
     parameters
-        Keyword arguments of its function; missing ones have their defaults.
+        Options of the excitation: keyword arguments of its function. Missing options have their
+        default values.
     rate_hz
         Ticks a second.
     rig
@@ -55,7 +58,7 @@ def make_excitation(
     Raises
     ------
     ExcitationError
-        If a value is absurd.
+        If the value of an option is invalid.
 
     Examples
     --------

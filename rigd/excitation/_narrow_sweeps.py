@@ -1,11 +1,11 @@
 """Narrow sweeps over the modes of a beam: their bands, amplitudes and times.
 
-A table of modes gives the bands. The rig's limits give the amplitude in each, and the information
-on the damping gives the time in each. That is measured by the Fisher
-information of the exact model (`rigd.beam`): information from the torque, with white noise of any
-size on it, on the damping's parameters, with density, stiffness, delay and tool inertia free as
-well. A band that is swept slowly gives information in proportion to the time spent there, so the
-times follow from the information of each band per second.
+A table of modes determines the bands, the rig's limits determine the amplitude in each band, and
+the information on the damping determines the time in each band. It is the Fisher information of the
+exact model (`rigd.beam`) on the damping's parameters, from the torque with white noise of any size,
+with density, stiffness, delay and tool inertia free as well. A band that is swept slowly gives
+information in proportion to the time spent there, so the times follow from the information of each
+band per second.
 """
 
 import json
@@ -28,35 +28,42 @@ from rigd.excitation._signals import (
     LIMIT_FRACTION,
     Excitation,
     ExcitationError,
-    assemble,
-    frequency,
+    assemble_excitation,
     lay_out_segments,
-    positive,
-    within_a_turn,
+    require_frequency,
+    require_positive,
+    require_within_turn,
 )
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-_EASINGS: Final = 8
-_CLOSE_ENOUGH: Final = 1.005
+_MAX_REDUCTIONS: Final = 8
+"""Largest number of times that the amplitude of a sweep is reduced to stay within the limits."""
+_LIMIT_TOLERANCE: Final = 1.005
+"""Factor by which a sweep may exceed its fraction of the limits, which ends the reductions."""
 
 LEAST_TIME_FRACTION: Final = 0.5
-"""Least time of a band, as a fraction of an equal division: no mode is left out."""
+"""Shortest time of a band over the time of an equal division, so that no mode is left out."""
 
-SAME_MODE: Final = 1.1
-"""Fits of one record differ by less than this factor in a mode's frequency; the frequencies of a
-slender beam differ by more."""
+SAME_MODE_FREQUENCY_RATIO: Final = 1.1
+"""Largest ratio of two frequencies that belong to one mode. Fits of one record differ by less in a
+mode's frequency; the frequencies of a slender beam's modes differ by more."""
 
 
 # Table of modes
 
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+"""Type of a finite number above 0 in a document."""
 _NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+"""Type of a finite number of at least 0 in a document."""
 
 
-class _Entry(BaseModel):
-    """Mode of one fit; null where the fit has none, 0 Hz where it does not oscillate."""
+class _ModeEntry(BaseModel):
+    """Mode of one fit in an analyser's document.
+
+    A value is None if the fit has none, and the frequency is 0 Hz if the mode does not oscillate.
+    """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -67,11 +74,12 @@ class _Entry(BaseModel):
 
     @property
     def oscillates(self) -> bool:
+        """Whether the mode has a frequency above 0 Hz and a damping ratio."""
         return bool(self.frequency_hz) and self.damping_ratio is not None
 
 
-class _Number(BaseModel):
-    """Number of a headline."""
+class _HeadlineValue(BaseModel):
+    """Value with its standard deviation in the main results of an analysis."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -80,17 +88,17 @@ class _Number(BaseModel):
 
 
 class _HeadlineMode(BaseModel):
-    """Mode of a headline: of the modal model where the record shows it."""
+    """Mode in the main results of an analysis: of the modal model, if the record shows it."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    frequency_hz: _Number
-    damping_ratio: _Number
+    frequency_hz: _HeadlineValue
+    damping_ratio: _HeadlineValue
 
     @property
-    def entry(self) -> _Entry:
-        """Return it in the form of one fit's mode."""
-        return _Entry(
+    def entry(self) -> _ModeEntry:
+        """The mode in the form of a single fit's mode."""
+        return _ModeEntry(
             frequency_hz=self.frequency_hz.value,
             damping_ratio=self.damping_ratio.value or None,
             frequency_std_hz=self.frequency_hz.std,
@@ -106,34 +114,38 @@ class _Headline(BaseModel):
 
 
 class _Document(BaseModel):
-    """The part of the analyser's document that is used here."""
+    """Analyser's document, reduced to the keys from which modes are read."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     headlines: Annotated[list[_Headline], FailFast()] = []
-    modes: Annotated[list[_Entry], FailFast()]  # the errors of a million take gigabytes
+    modes: Annotated[list[_ModeEntry], FailFast()]  # the errors of a million take gigabytes
 
 
 @dataclass(frozen=True, slots=True)
 class FoundMode:
-    """A mode, from one fit or from several."""
+    """Mode of a beam, estimated by one fit or as the median of several fits."""
 
     frequency_hz: float
+    """Frequency of the free decay in Hz."""
     damping_ratio: float
+    """Damping ratio, as a fraction of critical damping."""
     uncertainty_hz: float
-    """Uncertainty of the frequency: two standard deviations, stated or from the fits' scatter."""
+    """Uncertainty of the frequency in Hz: two standard deviations, stated or from the scatter of
+    the fits."""
 
 
 def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
-    """Read the modes, lowest frequency first.
+    """Read the modes of a beam from an analyser's document, lowest frequency first.
 
     Parameters
     ----------
     path
         JSON with the key ``modes``: a list of objects with ``frequency_hz`` (Hz, of the free decay)
-        and ``damping_ratio``, and optionally ``frequency_std_hz``. Other keys are ignored. Where
-        several fits found a mode, their medians are used; fits of the estimator ``record`` have
-        priority over others. Modes of ``headlines``, those of the modal model, replace all these.
+        and ``damping_ratio``, and optionally ``frequency_std_hz``. Other keys are ignored. If
+        several fits found a mode, their medians are used. Fits of the estimator ``record`` have
+        priority over others. Modes of ``headlines``, which are those of the modal model, replace
+        all these.
 
     Raises
     ------
@@ -144,12 +156,14 @@ def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
     try:
         document = _Document.model_validate(_read_json(path))
     except ValidationError as error:
-        complaint = _complaint(error.errors(include_url=False, include_context=False)[0])
+        complaint = _describe_invalid_value(
+            error.errors(include_url=False, include_context=False)[0]
+        )
         raise ExcitationError(f"{path}: {complaint}") from None
     reported = [mode.entry for headline in document.headlines for mode in headline.modes]
     entries = [entry for entry in reported or document.modes if entry.oscillates]
-    of_records = [entry for entry in entries if entry.estimator == "record"]
-    modes = tuple(_merged(group) for group in _groups(of_records or entries))
+    record_entries = [entry for entry in entries if entry.estimator == "record"]
+    modes = tuple(_median_mode(group) for group in _mode_groups(record_entries or entries))
     if not modes:
         raise ExcitationError(
             f"{path}: modes has no mode that oscillates; take the document of an analysis that "
@@ -159,6 +173,7 @@ def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
 
 
 def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
+    """Return the content of a JSON file, or raise `ExcitationError` if it cannot be read."""
     try:
         return read_json(path)
     except DocumentError as error:
@@ -167,18 +182,20 @@ def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
         ) from error
 
 
-def _complaint(detail: ErrorDetails) -> str:
-    """Describe one invalid value, in one sentence with a remedy."""
-    where = ""
+def _describe_invalid_value(detail: ErrorDetails) -> str:
+    """Return a sentence that names an invalid value in a document, with a remedy."""
+    document_path = ""
     for part in detail["loc"]:
-        where += f"[{part}]" if isinstance(part, int) else f".{part}" if where else part
-    if not where:
+        document_path += (
+            f"[{part}]" if isinstance(part, int) else f".{part}" if document_path else part
+        )
+    if not document_path:
         return 'is no JSON object; it must have the key "modes".'
     if detail["type"] == "missing":
-        return f"{where} is missing; give it as analyze --json writes it."
-    unit = " Hz" if where.endswith("_hz") else ""
-    given = json.dumps(detail["input"], default=str)
-    given = given if len(given) <= 60 else f"{given[:60]}..."
+        return f"{document_path} is missing; give it as analyze --json writes it."
+    unit = " Hz" if document_path.endswith("_hz") else ""
+    given_text = json.dumps(detail["input"], default=str)
+    given_text = given_text if len(given_text) <= 60 else f"{given_text[:60]}..."
     remedy = {
         "greater_than": f"must be more than 0{unit}",
         "greater_than_equal": f"must not be negative: give it in{unit}",
@@ -187,14 +204,14 @@ def _complaint(detail: ErrorDetails) -> str:
         "model_type": "must be an object with frequency_hz and damping_ratio",
         "string_type": "must be a text",
     }.get(detail["type"], f"must be a number{' in Hz' if unit else ''}")
-    return f"{where} = {given}{unit} {remedy}."
+    return f"{document_path} = {given_text}{unit} {remedy}."
 
 
-def _groups(entries: Sequence[_Entry]) -> Iterator[list[_Entry]]:
-    """Group the entries of several fits that describe one mode."""
-    group: list[_Entry] = []
+def _mode_groups(entries: Sequence[_ModeEntry]) -> Iterator[list[_ModeEntry]]:
+    """Yield lists of entries of several fits that describe the same mode, by rising frequency."""
+    group: list[_ModeEntry] = []
     for entry in sorted(entries, key=_frequency_hz):
-        if group and _frequency_hz(entry) > SAME_MODE * _frequency_hz(group[0]):
+        if group and _frequency_hz(entry) > SAME_MODE_FREQUENCY_RATIO * _frequency_hz(group[0]):
             yield group
             group = []
         group.append(entry)
@@ -202,60 +219,71 @@ def _groups(entries: Sequence[_Entry]) -> Iterator[list[_Entry]]:
         yield group
 
 
-def _merged(group: Sequence[_Entry]) -> FoundMode:
+def _median_mode(group: Sequence[_ModeEntry]) -> FoundMode:
+    """Return the median of several fits' entries for one mode."""
     middle_hz = median(_frequency_hz(entry) for entry in group)
     stated_hz = median(entry.frequency_std_hz or 0.0 for entry in group)
     # Fits of unsuitable structures lie far off: the median of the distances tolerates them.
-    between_hz = 1.4826 * median(abs(_frequency_hz(entry) - middle_hz) for entry in group)
+    scatter_hz = 1.4826 * median(abs(_frequency_hz(entry) - middle_hz) for entry in group)
     return FoundMode(
         frequency_hz=middle_hz,
         damping_ratio=median(entry.damping_ratio or 0.0 for entry in group),
-        uncertainty_hz=2.0 * max(stated_hz, between_hz),
+        uncertainty_hz=2.0 * max(stated_hz, scatter_hz),
     )
 
 
-def _frequency_hz(entry: _Entry) -> float:
+def _frequency_hz(entry: _ModeEntry) -> float:
+    """Return the frequency of a mode's entry in Hz, or 0 if it has none."""
     return entry.frequency_hz or 0.0
 
 
 # Bands, and the time spent in each
 
-_POINTS: Final = 64
-"""Frequencies in a band at which the information is computed."""
+_BAND_POINTS: Final = 64
+"""Number of frequencies in a band at which the information is computed."""
 
-_ROUNDS: Final = 500
+_TIME_STEPS: Final = 500
+"""Number of multiplicative steps in the search for the best division of the time."""
 _REGULARISATION: Final = 1e-12
-"""Relative regularisation: few bands leave some combinations of parameters undetermined."""
+"""Relative regularisation of the information matrix, since few bands leave some combinations of
+parameters undetermined."""
 
 
 class SweepRig(Protocol):
-    """Interface to a rig's predicted behaviour before it moves."""
+    """Interface to a rig's predicted behaviour, for which narrow sweeps are planned."""
 
     @property
     def beam(self) -> Beam:
-        """The specimen according to the profile."""
+        """Beam of the rig's profile."""
 
     def tracking(self, frequency_hz: Real) -> Complex:
-        """Return angle over reference, in the shape of the frequencies."""
+        """Return the frequency response from reference to angle at some frequencies in Hz."""
 
     def fraction_of_limits(self, reference_rad: Real) -> float:
-        """Return the largest predicted fraction of a limit for a reference (n,)."""
+        """Return the largest fraction of a limit that a reference in rad is predicted to use."""
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
-        """Return the largest predicted slope of the free end for a reference (n,)."""
+        """Return the largest predicted slope in rad of the beam's free end for a reference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """A narrow band that is swept linearly from its lower to its upper end."""
+    """Narrow band of frequencies around a mode, which is swept linearly upwards."""
 
     mode: FoundMode
+    """Mode in the band."""
     start_hz: float
+    """Lower end of the band in Hz."""
     stop_hz: float
+    """Upper end of the band in Hz."""
 
     @classmethod
-    def of_mode(cls, mode: FoundMode, widths: float) -> "Band":
-        """Return the band around a mode: so many half-power widths beyond its uncertainty."""
+    def around_mode(cls, mode: FoundMode, widths: float) -> "Band":
+        """Return the band around a mode.
+
+        On either side it extends by the uncertainty of the frequency and by `widths` half-power
+        widths.
+        """
         half_hz = widths * 2.0 * mode.damping_ratio * mode.frequency_hz + mode.uncertainty_hz
         # A sweep needs a period: strongly damped modes would begin at 0 Hz or below.
         return cls(
@@ -265,12 +293,12 @@ class Band:
 
     @property
     def decay_s(self) -> float:
-        """Time constant with which the mode rings up and down."""
+        """Time constant in s with which the mode in the band rings up and decays."""
         return 1.0 / (2.0 * pi * self.mode.frequency_hz * self.mode.damping_ratio)
 
 
 def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig) -> Real:
-    """Return the time fractions of the bands that determine the damping most precisely.
+    """Return the fractions of the time in each band that determine the damping most precisely.
 
     They minimise the geometric mean of the standard deviations of the damping's parameters, with
     all other parameters free, by multiplicative steps (D. M. Titterington, 1976; for criteria
@@ -279,74 +307,79 @@ def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: 
     Parameters
     ----------
     bands, amplitudes_rad
-        Bands, and the amplitude of the reference in each.
+        Bands, and the amplitude of the reference in each band.
     rig
-        Gives the angle for a reference.
+        Predicted behaviour of the rig.
 
     Returns
     -------
     ndarray, shape (len(bands),)
         Fractions with the sum 1.
     """
-    damping = damping_of([band.mode for band in bands], rig.beam)
-    rates, wanted = _information_rates(bands, amplitudes_rad, rig, damping)
+    damping = first_order_damping([band.mode for band in bands], rig.beam)
+    rates, damping_count = _information_rates(bands, amplitudes_rad, rig, damping)
     scale = np.sqrt(np.einsum("bii->i", rates))
     rates = rates / np.outer(scale, scale)
     fractions = np.full(len(bands), 1.0 / len(bands))
-    for _ in range(_ROUNDS):
+    for _ in range(_TIME_STEPS):
         information = np.tensordot(fractions, rates, axes=1)
         covariance = np.linalg.inv(information + _REGULARISATION * np.eye(len(scale)))
-        lines = covariance[:wanted]
-        of_bands = np.einsum("pi,bij,pj->bp", lines, rates, lines) / np.diag(covariance)[:wanted]
-        fractions = fractions * np.sqrt(of_bands.sum(axis=1))
+        lines = covariance[:damping_count]
+        precision_gains = (
+            np.einsum("pi,bij,pj->bp", lines, rates, lines) / np.diag(covariance)[:damping_count]
+        )
+        fractions = fractions * np.sqrt(precision_gains.sum(axis=1))
         fractions /= fractions.sum()
     return fractions
 
 
-def damping_of(modes: Sequence[FoundMode], beam: Beam) -> Damping:
-    """Fit a first-order damping, internal and external, to the modes' damping ratios.
+def first_order_damping(modes: Sequence[FoundMode], beam: Beam) -> Damping:
+    """Return the internal and external damping of order 1 that fits the modes' damping ratios best.
 
-    Relative least squares of ``2 ratio = zeta omega + gamma / ((rho/EI) omega)``; no coefficient
-    is negative.
+    It minimises the relative squares of ``2 ratio = zeta omega + gamma / ((rho/EI) omega)`` with
+    coefficients that are not negative.
     """
     omega = np.array([2.0 * pi * mode.frequency_hz for mode in modes])
     ratio = np.array([mode.damping_ratio for mode in modes])
     columns = np.stack([omega, 1.0 / (beam.density_over_stiffness * omega)]) / (2.0 * ratio)
-    both = np.linalg.lstsq(columns.T, np.ones(len(modes)), rcond=None)[0]
-    if (both < 0.0).any():
-        alone = columns.sum(axis=1) / (columns**2).sum(axis=1)
-        left = ((alone[:, None] * columns - 1.0) ** 2).sum(axis=1)
-        both = np.where(np.arange(2) == np.argmin(left), alone, 0.0)
-    return Damping(zeta=float(both[0]), alpha=1.0, gamma=float(both[1]), lambda_=1.0)
+    coefficients = np.linalg.lstsq(columns.T, np.ones(len(modes)), rcond=None)[0]
+    if (coefficients < 0.0).any():
+        single_coefficients = columns.sum(axis=1) / (columns**2).sum(axis=1)
+        squared_errors = ((single_coefficients[:, None] * columns - 1.0) ** 2).sum(axis=1)
+        coefficients = np.where(np.arange(2) == np.argmin(squared_errors), single_coefficients, 0.0)
+    return Damping(
+        zeta=float(coefficients[0]), alpha=1.0, gamma=float(coefficients[1]), lambda_=1.0
+    )
 
 
 def _information_rates(
     bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig, damping: Damping
 ) -> tuple[Real, int]:
-    """Return the information per second of each band, (bands, k, k), damping parameters first.
+    """Return the Fisher information per second of each band, and the number of damping parameters.
 
-    Coefficients are relative. The order of an absent damping cannot be estimated.
+    The information has the shape (bands, k, k), with the damping's parameters first. Coefficients
+    are relative. The order of an absent damping cannot be estimated.
     """
     factors = {"zeta": damping.zeta, "alpha": 1.0, "gamma": damping.gamma, "lambda": 1.0}
     orders = {"alpha": damping.zeta, "lambda": damping.gamma}
     names = [n for n, factor in factors.items() if factor > 0.0 and orders.get(n, 1.0) > 0.0]
     rates = []
     for band, amplitude_rad in zip(bands, amplitudes_rad, strict=True):
-        frequency_hz = np.linspace(band.start_hz, band.stop_hz, _POINTS)
+        frequency_hz = np.linspace(band.start_hz, band.stop_hz, _BAND_POINTS)
         s = 2j * pi * frequency_hz
-        beam = _tuned(rig.beam, band.mode.frequency_hz)
+        beam = _beam_with_mode(rig.beam, band.mode.frequency_hz)
         g, gradient = transfer_and_gradient(s, beam, damping, (*names, *PARAMETERS[4:]))
         gradient[: len(names)] *= np.array([factors[name] for name in names])[:, None]
         rows = np.concatenate([gradient, [-s * g, s * s]])
         rows *= amplitude_rad * rig.tracking(frequency_hz)
-        rates.append((rows.conj() @ rows.T).real / _POINTS)
+        rates.append((rows.conj() @ rows.T).real / _BAND_POINTS)
     return np.array(rates), len(names)
 
 
-def _tuned(beam: Beam, frequency_hz: float) -> Beam:
-    """Change the density so that the nearest undamped mode has the given frequency.
+def _beam_with_mode(beam: Beam, frequency_hz: float) -> Beam:
+    """Return the beam with another density, so that its nearest mode has the given frequency.
 
-    The profile's beam is wrong by more than the width of such a band.
+    The profile's beam is wrong by more than the width of a band.
     """
     omega = 2.0 * pi * frequency_hz
     modes_rad_s = undamped_frequencies_rad_s(beam, 12)
@@ -375,7 +408,7 @@ def modes(
     tip_slope_rad: float = SMALL_SLOPE_RAD,
     rig: SweepRig | None = None,
 ) -> Excitation:
-    """Return linear sweeps through narrow bands around modes, one after the other.
+    """Return an excitation with a linear sweep through a narrow band around each mode.
 
     Parameters
     ----------
@@ -384,37 +417,39 @@ def modes(
     path
         JSON with the modes: see `rigd.excitation._narrow_sweeps.read_modes`.
     amplitude_rad
-        Amplitude in each band; lower where the rig's limits or the slope of the tip require it.
+        Amplitude in each band. It is lower if the rig's limits or the slope of the tip require it.
     stop_hz
-        Modes above it are left out.
+        Highest frequency of a mode that is swept.
     widths
-        Half-power widths swept on either side of a mode, in addition to its uncertainty.
+        Number of half-power widths swept on either side of a mode, in addition to the uncertainty
+        of its frequency.
     duration_s
-        Duration of all sweeps together.
+        Total duration of all sweeps in s.
     rest_s, ring_down_s
-        Time before and after them.
+        Time in s before and after the sweeps.
     taper_s
-        Raised-cosine fade at both ends of every sweep: angle and speed are zero at the joints.
+        Duration in s of the raised-cosine fade at both ends of every sweep, so that angle and speed
+        are zero where two sweeps meet.
     tip_slope_rad
         Largest slope of the beam's free end, of which the sweeps use 90 %.
     rig
-        Limits the amplitudes, and divides the time by the information on the damping. None:
-        equal amplitudes and times.
+        Rig whose limits determine the amplitudes, and whose beam determines the times by the
+        information on the damping; None: equal amplitudes and times.
 
     Raises
     ------
     ExcitationError
         If an option is out of range or the file is invalid.
     """
-    positive("amplitude_rad", amplitude_rad, "rad")
-    within_a_turn("amplitude_rad", amplitude_rad)
-    frequency("stop_hz", stop_hz, rate_hz)
-    positive("widths", widths, "half-power widths")
-    positive("taper_s", taper_s, "s")
-    positive("tip_slope_rad", tip_slope_rad, "rad")
+    require_positive("amplitude_rad", amplitude_rad, "rad")
+    require_within_turn("amplitude_rad", amplitude_rad)
+    require_frequency("stop_hz", stop_hz, rate_hz)
+    require_positive("widths", widths, "half-power widths")
+    require_positive("taper_s", taper_s, "s")
+    require_positive("tip_slope_rad", tip_slope_rad, "rad")
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     first, end = segments["sweep"]
-    bands = _bands(Path(path), stop_hz, widths, rate_hz)
+    bands = _read_bands(Path(path), stop_hz, widths, rate_hz)
     fades = 2 * round(taper_s * rate_hz)
     if fades < 2 or LEAST_TIME_FRACTION * (end - first) / len(bands) < fades:
         raise ExcitationError(
@@ -423,14 +458,16 @@ def modes(
             f"{2.0 * taper_s * len(bands) / LEAST_TIME_FRACTION:g} s, or a taper_s from "
             f"{2 / rate_hz:g} s."
         )
-    lengths = _lengths(np.full(len(bands), 1.0 / len(bands)), end - first)
+    lengths = _divide_ticks(np.full(len(bands), 1.0 / len(bands)), end - first)
     amplitudes_rad = [amplitude_rad] * len(bands)
     sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
     if rig is not None:
-        eased_rad = _within_limits(sweeps, amplitude_rad, tip_slope_rad, rig)
-        lengths = _lengths(_at_least(time_fractions(bands, eased_rad, rig)), end - first)
+        reduced_rad = _admissible_amplitudes(sweeps, amplitude_rad, tip_slope_rad, rig)
+        lengths = _divide_ticks(
+            _raise_to_least(time_fractions(bands, reduced_rad, rig)), end - first
+        )
         sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
-        amplitudes_rad = _within_limits(sweeps, amplitude_rad, tip_slope_rad, rig)
+        amplitudes_rad = _admissible_amplitudes(sweeps, amplitude_rad, tip_slope_rad, rig)
     reference_rad = np.concatenate([a * s for a, s in zip(amplitudes_rad, sweeps, strict=True)])
     parameters: dict[str, float | int | str] = {
         "file": Path(path).name,
@@ -449,67 +486,76 @@ def modes(
             for band, amplitude, ticks in zip(bands, amplitudes_rad, lengths, strict=True)
         ),
     }
-    return assemble("modes", parameters, rate_hz, segments, reference_rad)
+    return assemble_excitation("modes", parameters, rate_hz, segments, reference_rad)
 
 
-def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Band]:
-    """Return the bands in the order of their sweeps: the slowest decay comes first."""
-    found = read_modes(path)
-    inside = [mode for mode in found if mode.frequency_hz <= stop_hz]
-    if not inside:
+def _read_bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Band]:
+    """Read modes from a document and return their bands, that of the slowest decay first."""
+    read = read_modes(path)
+    modes_in_band = [mode for mode in read if mode.frequency_hz <= stop_hz]
+    if not modes_in_band:
         raise ExcitationError(
-            f"{path}: the lowest mode, frequency_hz = {found[0].frequency_hz:g} Hz, lies above "
+            f"{path}: the lowest mode, frequency_hz = {read[0].frequency_hz:g} Hz, lies above "
             f"stop_hz = {stop_hz:g} Hz; raise stop_hz."
         )
-    bands = sorted((Band.of_mode(mode, widths) for mode in inside), key=lambda band: -band.decay_s)
+    bands = sorted(
+        (Band.around_mode(mode, widths) for mode in modes_in_band), key=lambda band: -band.decay_s
+    )
     for band in bands:
-        frequency(f"The upper end of a band of {widths:g} widths", band.stop_hz, rate_hz)
+        require_frequency(f"The upper end of a band of {widths:g} widths", band.stop_hz, rate_hz)
     return bands
 
 
-def _within_limits(
+def _admissible_amplitudes(
     sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: SweepRig
 ) -> list[float]:
-    """Return the amplitude of each sweep, reduced where the rig's limits require it.
+    """Return the amplitude of each sweep in rad, reduced where the rig's limits require it.
 
-    One after the other, since a mode still rings during the next sweep.
+    Each sweep is predicted together with those before it, since a mode still rings during the next
+    sweep.
     """
     amplitudes_rad = []
     before_rad = np.empty(0)
     for sweep in sweeps:
-        eased_rad = amplitude_rad
-        for _ in range(_EASINGS):
-            so_far_rad = np.concatenate([before_rad, eased_rad * sweep])
+        reduced_rad = amplitude_rad
+        for _ in range(_MAX_REDUCTIONS):
+            so_far_rad = np.concatenate([before_rad, reduced_rad * sweep])
             fraction = max(
                 rig.fraction_of_limits(so_far_rad), rig.tip_slope_rad(so_far_rad) / tip_slope_rad
             )
-            if fraction <= LIMIT_FRACTION * _CLOSE_ENOUGH:
+            if fraction <= LIMIT_FRACTION * _LIMIT_TOLERANCE:
                 break
-            eased_rad *= LIMIT_FRACTION / fraction
-        amplitudes_rad.append(eased_rad)
-        before_rad = np.concatenate([before_rad, eased_rad * sweep])
+            reduced_rad *= LIMIT_FRACTION / fraction
+        amplitudes_rad.append(reduced_rad)
+        before_rad = np.concatenate([before_rad, reduced_rad * sweep])
     return amplitudes_rad
 
 
-def _lengths(fractions: Real, ticks: int) -> list[int]:
-    """Divide ticks by fractions, without losing one to rounding."""
+def _divide_ticks(fractions: Real, ticks: int) -> list[int]:
+    """Return numbers of ticks in proportion to fractions, whose sum is exactly `ticks`."""
     ends = np.round(np.cumsum(fractions) * ticks).astype(int)
     return [int(length) for length in np.diff(ends, prepend=0)]
 
 
-def _at_least(fractions: Real) -> Real:
-    """Raise fractions to the least one, at the cost of the others in proportion."""
+def _raise_to_least(fractions: Real) -> Real:
+    """Return fractions of the time of which none is less than `LEAST_TIME_FRACTION` allows.
+
+    The other fractions are reduced in proportion, so that the sum remains 1.
+    """
     least = LEAST_TIME_FRACTION / len(fractions)
-    low = fractions < least
+    is_low = fractions < least
     for _ in fractions:
-        rest = (1.0 - least * np.count_nonzero(low)) / fractions[~low].sum()
-        raised = np.where(low, least, fractions * rest)
-        low = raised <= least
-    return raised
+        remaining_scale = (1.0 - least * np.count_nonzero(is_low)) / fractions[~is_low].sum()
+        raised_fractions = np.where(is_low, least, fractions * remaining_scale)
+        is_low = raised_fractions <= least
+    return raised_fractions
 
 
 def _unit_sweep(band: Band, ticks: int, fades: int, rate_hz: float) -> Real:
-    """Return a sweep of amplitude 1, (ticks,), with raised-cosine ends of ``fades / 2`` ticks."""
+    """Return a sweep of amplitude 1 through a band, shape (ticks,).
+
+    Both ends have a raised-cosine fade of ``fades / 2`` ticks.
+    """
     duration_s = ticks / rate_hz
     t = np.arange(ticks) / rate_hz
     phase = (

@@ -12,20 +12,20 @@ from rigd.excitation.moves import ROBUST_BELOW_HZ
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-ARRIVED_RAD: Final = 1e-3
-"""Distance from its end within which the angle has arrived."""
+ARRIVAL_TOLERANCE_RAD: Final = 1e-3
+"""Distance in rad from the end of a move within which the angle counts as arrived."""
 
-_FOLLOWED_S: Final = 1.0
-"""Time after the reference for which the motion is simulated."""
-_SEEN_FOR_S: Final = 1.0
-"""Shortest ring-down for which the floor of the sensor is stated."""
-_EXCEEDED_1_IN_1000: Final = 13.8
-"""Square of the amplitude that noise exceeds once in 1000 times, over the variance of its cosine
-and of its sine: exp(-a²/2) = 0.001."""
+_MIN_SIMULATED_S: Final = 1.0
+"""Shortest time in s after the reference for which the motion is simulated."""
+_MIN_RING_DOWN_S: Final = 1.0
+"""Duration in s that a shorter ring-down is replaced with to compute the sensor's noise floor."""
+_SQUARED_AMPLITUDE_1_IN_1000: Final = 13.8
+"""Square of the amplitude a that noise exceeds once in 1000 times, over the variance of its cosine
+or sine component: exp(-a²/2) = 0.001."""
 
 
 class DisturbedRig(Protocol):
-    """Rig with friction, encoder steps and noise."""
+    """Interface to a rig's predicted behaviour with friction, encoder steps and noise."""
 
     @property
     def rate_hz(self) -> float:
@@ -33,51 +33,56 @@ class DisturbedRig(Protocol):
 
     @property
     def disturbed(self) -> Callable[[Real, int], tuple[Real, Real]]:
-        """Return angle (n, draws) and torque of the lowest modes (n, modes, draws)."""
+        """Function of a reference, shape (n,), and a number of lowest modes.
+
+        It returns the angle in rad, shape (n, draws), and the amplitude of each mode's coupling
+        torque in N·m, shape (n, modes, draws), for several random draws.
+        """
 
     @property
     def poles_rad_s(self) -> Complex:
-        """Poles of the modes, shape (m,)."""
+        """Poles of the modes in rad/s, shape (m,)."""
 
     @property
     def settling_s(self) -> float:
-        """Time in which the loop catches up with the reference."""
+        """Time in s after which the angle of the closed loop has reached the reference."""
 
     @property
     def torque_noise_nm(self) -> float:
-        """Noise of one reading of the coupling torque."""
+        """Standard deviation in N·m of the noise of one reading of the coupling torque."""
 
 
 @dataclass(frozen=True, slots=True)
 class MoveEnd:
-    """Arrival and residual vibration after the reference of a move.
+    """Predicted arrival time and residual vibration of a move.
 
     The vibration is the root of the sum of squares of the amplitudes of the modes below
-    `ROBUST_BELOW_HZ`, in the coupling torque, at the end of the reference; the modes above have
+    `ROBUST_BELOW_HZ`, in the coupling torque, at the end of the reference. The modes above have
     decayed when the motor has arrived.
     """
 
     arrival_s: float | None
-    """Time from the move's start after which the angle stays within `ARRIVED_RAD`; None: that is
-    more than a second after the reference's end."""
+    """Time in s from the start of the move after which the angle stays within
+    `ARRIVAL_TOLERANCE_RAD` of its end; None: the motor arrives more than a second after the end of
+    the reference."""
     residual_nm: float
-    """Residual vibration, with friction, encoder steps and noise of the sensor."""
+    """Coupling torque in N·m of the residual vibration, with friction, encoder steps and noise."""
     floor_nm: float
-    """Vibration read from the ring-down after the arrival because of the sensor's noise alone,
-    exceeded in one of 1000 cases: less cannot be detected."""
+    """Coupling torque in N·m that the sensor's noise alone simulates in the ring-down, exceeded in
+    one of 1000 cases. A smaller vibration cannot be detected."""
 
 
-def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
-    """Predict the arrival of a move and the vibration after it.
+def predict_move_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
+    """Predict when the motor arrives at the end of a move, and the vibration after it.
 
     Parameters
     ----------
     rig
-        The rig.
+        Predicted behaviour of the rig.
     reference_rad
-        Shape (n,): at the ticks after the start, relative to the angle there.
+        Reference angle at the ticks after the start, relative to the start angle; shape (n,).
     ring_down_s
-        Time of the ring-down in the session.
+        Duration of the ring-down in the session, in s.
     """
     rate_hz, end = rig.rate_hz, reference_rad.size
     ringing = rig.poles_rad_s[np.abs(rig.poles_rad_s) < 2 * np.pi * ROBUST_BELOW_HZ]
@@ -85,18 +90,30 @@ def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> M
         ringing = rig.poles_rad_s[:1]
     decay_per_s = -ringing.real
     # The loop has followed up and the motor is at rest; from here the amplitudes only decay.
-    measured = end + round(2 * rig.settling_s * rate_hz)
-    held = np.full(max(measured - end + 1, round(_FOLLOWED_S * rate_hz)), reference_rad[-1])
-    angle, torque = rig.disturbed(np.concatenate([[0.0], reference_rad, held]), ringing.size)
-    away = np.flatnonzero((np.abs(angle - reference_rad[-1]) > ARRIVED_RAD).any(axis=1))
-    arrived = int(away[-1]) + 1 if away.size else 0
-    amplitude = torque[measured] * np.exp(decay_per_s * (measured - end) / rate_hz)[:, None]
+    measured_tick = end + round(2 * rig.settling_s * rate_hz)
+    held_angle_rad = np.full(
+        max(measured_tick - end + 1, round(_MIN_SIMULATED_S * rate_hz)), reference_rad[-1]
+    )
+    angle, torque = rig.disturbed(
+        np.concatenate([[0.0], reference_rad, held_angle_rad]), ringing.size
+    )
+    ticks_outside = np.flatnonzero(
+        (np.abs(angle - reference_rad[-1]) > ARRIVAL_TOLERANCE_RAD).any(axis=1)
+    )
+    arrival_tick = int(ticks_outside[-1]) + 1 if ticks_outside.size else 0
+    amplitude = (
+        torque[measured_tick] * np.exp(decay_per_s * (measured_tick - end) / rate_hz)[:, None]
+    )
     # Variance of a decaying cosine's amplitude in white noise, by least squares.
-    first_s, last_s = max(arrived - end, 0) / rate_hz, max(ring_down_s, _SEEN_FOR_S)
-    decayed = [np.exp(-2 * decay_per_s * at_s) for at_s in (first_s, max(last_s, 2 * first_s))]
-    variance = rig.torque_noise_nm**2 * 4 * decay_per_s / (decayed[0] - decayed[1]) / rate_hz
+    first_s, last_s = max(arrival_tick - end, 0) / rate_hz, max(ring_down_s, _MIN_RING_DOWN_S)
+    decay_factors = [
+        np.exp(-2 * decay_per_s * at_s) for at_s in (first_s, max(last_s, 2 * first_s))
+    ]
+    variance = (
+        rig.torque_noise_nm**2 * 4 * decay_per_s / (decay_factors[0] - decay_factors[1]) / rate_hz
+    )
     return MoveEnd(
-        arrival_s=arrived / rate_hz if arrived < angle.shape[0] - 1 else None,
+        arrival_s=arrival_tick / rate_hz if arrival_tick < angle.shape[0] - 1 else None,
         residual_nm=float(np.sqrt((amplitude**2).sum(axis=0).mean())),
-        floor_nm=float(np.sqrt(_EXCEEDED_1_IN_1000 * variance.sum())),
+        floor_nm=float(np.sqrt(_SQUARED_AMPLITUDE_1_IN_1000 * variance.sum())),
     )

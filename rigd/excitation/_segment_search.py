@@ -1,6 +1,6 @@
 """Search for the next segment of excitation: its sweeps, information and limits.
 
-Serves `rigd.excitation.experiment_design`.
+`rigd.excitation.experiment_design` uses it.
 """
 
 from collections.abc import Collection
@@ -28,140 +28,169 @@ from rigd.excitation.targets import Precision, Quantities
 Real = NDArray[np.float64]
 
 DURATIONS_S: Final = (1.0, 1.5, 2.0, 3.0)
-"""Candidate durations of a segment."""
+"""Durations in s of the candidate segments."""
 SHORTEST_S: Final = DURATIONS_S[0]
-"""Duration of the shortest segment."""
+"""Duration in s of the shortest segment."""
 
 _FADE_S: Final = 0.25
+"""Shortest duration in s of a sweep's fade at either end."""
 _SETTLING_S: Final = 0.25
+"""Time in s after a segment for which its response is checked against the limits."""
 _TAIL_S: Final = 1.0
-"""Time after a segment in which the modes that it does not excite are brought to rest."""
+"""Time in s after a segment over which the vibration of the modes is separated, and the modes that
+the segment does not excite are brought to rest."""
 HORIZON_S: Final = 8.0
-"""Planning horizon: a mode gives information on its damping only after it has rung for a while."""
+"""Planning horizon in s from the start of a segment. A mode gives information on its damping only
+after it has rung for a while."""
 _HALF_WIDTH_HZ: Final = 0.5
-_OVER: Final = 2.0
-"""Half the width of a sweep over a whole resonance, in its half-power half-widths."""
+"""Half the width in Hz of a narrow sweep through a mode."""
+_RESONANCE_HALF_WIDTHS: Final = 2.0
+"""Half the width of a sweep over a whole resonance, in half-power half-widths of the mode."""
 _SIDE_OFFSET: Final = 0.06
 """Distance of the off-resonance sweeps from a mode, relative to its frequency. They determine
-stiffness and tool inertia; without these the height of a resonance does not give the damping."""
-_LINES: Final = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
-"""Steady sines of the forecast, in half-power half-widths from a mode."""
-_PHASES: Final = 8
-_FRACTIONS: Final = (1.0, 0.8, 0.5)
-"""Fractions of a segment with which further bands are combined."""
-_ROUNDS: Final = 60
-_EFFICIENCY: Final = 0.7
-"""Time of a mixture of steady sines over that of segments, which have to ring up (measured)."""
-_NEVER_S: Final = 1e5
-_TIGHTENINGS: Final = 3
-_THINNED: Final = 4
-"""While segments are compared, limits are checked in one tick of so many."""
+stiffness and tool inertia, without which the height of a resonance does not give the damping."""
+_SINE_OFFSETS: Final = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
+"""Distances of the forecast's steady sines from a mode, in half-power half-widths of the mode."""
+_PHASE_COUNT: Final = 8
+"""Number of phases of a sweep that are compared."""
+_BASE_AMPLITUDE_FACTORS: Final = (1.0, 0.8, 0.5)
+"""Factors by which a segment's amplitude is multiplied when a further band is added to it."""
+_MIXTURE_STEPS: Final = 60
+"""Number of multiplicative steps in the search for a mixture of steady sines."""
+_MIXTURE_EFFICIENCY: Final = 0.7
+"""Time of a mixture of steady sines over the time of segments with the same information, whose
+modes have to ring up (measured)."""
+_UNREACHABLE_S: Final = 1e5
+"""Time in s above which the targets count as never reached."""
+_MAX_RELAXATIONS: Final = 3
+"""Largest number of times that the targets are relaxed to fit into the remaining time."""
+_LIMIT_CHECK_TICKS: Final = 4
+"""Number of ticks from one check of the limits to the next while candidates are compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class PrecisionForecast:
-    """Expected time until the targets are reached."""
+    """Forecast of the time until all target precisions are reached."""
 
     seconds: float
-    """Time until all targets are reached at the rate of the best segments; infinite: never."""
+    """Time in s until all targets are reached with the best segments; infinite: never."""
     reason: str
-    """Why the targets are not reached in the remaining time; empty if they are."""
+    """Reason why the targets are not reached in the remaining time; empty if they are reached."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segment:
-    """A segment of excitation; begins and ends at angle, speed and acceleration zero."""
+    """Planned segment of excitation, with the precision expected from it.
+
+    It begins and ends with angle, speed and acceleration zero.
+    """
 
     name: str
     """Modes, frequencies, duration and amplitudes, as text for the operator."""
     reference_rad: Real
-    """Shape (n,): one value per tick, relative to the start angle."""
+    """Reference angle at each tick, relative to the start angle; shape (n,)."""
     angle_rad: Real
-    """Shape (n,): the predicted angle."""
+    """Predicted angle of the motor at each tick; shape (n,)."""
     names: tuple[str, ...]
-    """Free parameters, in the order of the covariance."""
+    """Names of the free parameters, in the order of the covariance."""
     covariance: Real
-    """Shape (k, k): covariance expected at the end of the segment; see `information`."""
+    """Covariance of the free parameters that is expected at the end of the segment, shape (k, k);
+    see `information` for their units."""
     now: tuple[Precision, ...]
-    """Precision of each target expected at the beginning of the segment."""
+    """Precision of each target that is expected at the beginning of the segment."""
     expected: tuple[Precision, ...]
-    """Precision of each target expected at its end."""
+    """Precision of each target that is expected at the end of the segment."""
     forecast: PrecisionForecast
-    """When all targets are expected to be reached, from the beginning of the segment."""
+    """Forecast of the time from the beginning of the segment until all targets are reached."""
     fraction_of_limits: float
-    """Largest predicted fraction of a limit, or of the range of small slopes, with the remaining
-    vibration included."""
+    """Largest predicted fraction of a limit, or of the largest slope of the tip, including the
+    vibration from before the segment."""
 
 
 # Sweeps of which segments consist
 
 
 @dataclass(frozen=True, slots=True)
-class _Band:
-    """A band of frequencies to sweep, and the mode that it excites."""
+class _SweepBand:
+    """Band of frequencies that a candidate sweep covers, and the mode that it excites."""
 
-    number: int
+    mode_number: int
+    """Number of the mode, from 1."""
     middle_hz: float
+    """Centre of the band in Hz."""
     half_width_hz: float
+    """Half the width of the band in Hz; 0: a sine."""
     fade_s: float
+    """Duration in s of the fade at either end of the sweep."""
     at_mode: bool = True
+    """Whether the band is centred at the mode, not on one side of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Sweep:
-    """Response to a sweep of amplitude 1 in one phase."""
+class _UnitSweep:
+    """Reference and predicted response of a sweep of amplitude 1 rad in one phase."""
 
     reference_rad: Real
-    """(n,)."""
+    """Reference angle at each tick of the segment; shape (n,)."""
     angle_rad: Real
-    """(n,)."""
+    """Predicted angle of the motor at each tick of the segment; shape (n,)."""
     rows: Real
-    """(k, samples): whitened derivatives of the torque from the beginning of the segment."""
+    """Whitened derivatives of the torque by the free parameters from the beginning of the segment;
+    shape (k, samples)."""
     weighted: Real
-    """(q, samples): their weighted combinations."""
+    """Combinations of these derivatives with the weights of the mixture; shape (q, samples)."""
     channels: Real
-    """(6, ticks): limited quantities, as fractions of their limits."""
+    """Limited quantities, such as speed and torque, as fractions of their limits; shape
+    (6, ticks)."""
     slope: Real
-    """(samples,): slope of the tip up to the planning horizon, as a fraction of its limit."""
+    """Slope of the tip up to the planning horizon, as a fraction of its limit; shape (samples,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
-    """A possible segment at its amplitude."""
+class _SegmentCandidate:
+    """Candidate for the next segment, at the largest amplitude that the limits allow."""
 
     duration_s: float
-    parts: tuple[tuple[_Band, float], ...]
-    """Bands and amplitudes in rad."""
-    terms: tuple[tuple[float, _Sweep], ...]
-    """Sweeps and their factors; the segment is their sum."""
+    """Duration of the segment in s."""
+    parts: tuple[tuple[_SweepBand, float], ...]
+    """Bands of the segment, and their amplitudes in rad."""
+    terms: tuple[tuple[float, _UnitSweep], ...]
+    """Amplitudes in rad and unit sweeps, whose sum of products is the segment."""
     channels: Real
-    """(6, ticks): at one tick in `_THINNED`."""
+    """Limited quantities as fractions of their limits, at one tick in `_LIMIT_CHECK_TICKS`; shape
+    (6, ticks)."""
     weighted: Real
-    """(q, samples)."""
-    swing: Real
-    """(samples,): slope of the tip as a fraction of its limit."""
+    """Combinations of the torque's derivatives with the weights of the mixture; shape
+    (q, samples)."""
+    tip_slope: Real
+    """Slope of the tip as a fraction of its limit; shape (samples,)."""
     value: float
-    """Information up to the planning horizon if the first band is driven on after the segment; in
-    seconds of the best mixture."""
+    """Information up to the planning horizon if the first band is driven on after the segment, as
+    the time in s in which the best mixture would give it."""
 
-    def total(self, name: str) -> Real:
-        """Sum one of the arrays of `_Sweep` over the terms."""
+    def weighted_sum(self, name: str) -> Real:
+        """Return an array of the whole segment: the weighted sum of an attribute of its sweeps.
+
+        `name` is an attribute of `_UnitSweep`.
+        """
         values: Real = sum(factor * getattr(sweep, name) for factor, sweep in self.terms)
         return values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _GoingOn:
-    """Response of a mode that is driven on after a segment, in two phases."""
+class _ContinuedDrive:
+    """Response to driving a mode further after a segment, in two phases of the sine."""
 
     weighted: Real
-    """(2, q, samples): for amplitude 1."""
+    """Weighted derivatives of the torque for a sine of amplitude 1 rad in either phase; shape
+    (2, q, samples)."""
     per_amplitude: Real
-    """(2, 2): factors that hold the amplitude of the mode constant, real and imaginary."""
+    """Amplitudes of the two sines that hold the mode's vibration constant, per real and imaginary
+    part of its amplitude; shape (2, 2)."""
 
 
 class SegmentSearch:
-    """Search for the best segment, with the quantities common to all candidates of one decision."""
+    """Search for the best next segment, with the quantities that all candidates have in common."""
 
     def __init__(
         self,
@@ -180,7 +209,7 @@ class SegmentSearch:
             raise ExcitationError(
                 f"The estimated beam has no mode below {BAND_HZ:g} Hz that could be driven."
             )
-        self.model = TorqueModel.of(estimate, plant.rate_hz, record.ringing.shape[1])
+        self.model = TorqueModel.for_records(estimate, plant.rate_hz, record.ringing.shape[1])
         self.samples = record.ahead.shape[1]
         self.limits = LIMIT_FRACTION * np.array(
             [
@@ -194,38 +223,50 @@ class SegmentSearch:
         )
         # The torque of the remaining vibration acts on the motor that holds, and on the sensor.
         torque_nm, slope_rad = record.ringing
-        none = np.zeros_like(torque_nm)
-        rings = np.stack([none, none, none, torque_nm, torque_nm, slope_rad])
-        self.ringing = rings / self.limits[:, None]
-        self.line_hz, line_rad = self.lines()
-        known = record.after(None, 0)
+        zeros = np.zeros_like(torque_nm)
+        ringing = np.stack([zeros, zeros, zeros, torque_nm, torque_nm, slope_rad])
+        self.ringing = ringing / self.limits[:, None]
+        self.line_hz, line_rad = self.steady_sines()
+        known = record.information_after(None, 0)
         self.mixture = best_mixture(known, estimate, quantities, self.line_hz, line_rad)
-        self.needed_s = self.with_ring_up() / _EFFICIENCY
+        self.needed_s = self.time_with_ring_up() / _MIXTURE_EFFICIENCY
         # With too little time all targets are missed by one factor, not the last mode alone.
-        missed, needed_s = 1.0, self.needed_s
-        for _ in range(_TIGHTENINGS):
-            if not time_left_s < needed_s < _NEVER_S:
+        relaxation, needed_s = 1.0, self.needed_s
+        for _ in range(_MAX_RELAXATIONS):
+            if not time_left_s < needed_s < _UNREACHABLE_S:
                 break
-            missed *= (needed_s / time_left_s) ** 0.5
-            self.mixture = best_mixture(known, estimate, quantities, self.line_hz, line_rad, missed)
-            needed_s = self.with_ring_up() / _EFFICIENCY
-        self.held = self.mixture.weights @ record.through @ record.ahead
-        self._going_on: dict[float, _GoingOn] = {}
-        self.swing = self.ringing[-1, :: self.model.factor][: self.samples]
+            relaxation *= (needed_s / time_left_s) ** 0.5
+            self.mixture = best_mixture(
+                known, estimate, quantities, self.line_hz, line_rad, relaxation
+            )
+            needed_s = self.time_with_ring_up() / _MIXTURE_EFFICIENCY
+        self.weighted_if_held = self.mixture.weights @ record.nuisance_projection @ record.ahead
+        self._continued_drives: dict[float, _ContinuedDrive] = {}
+        self.tip_slope = self.ringing[-1, :: self.model.factor][: self.samples]
 
-    def bands(self) -> list[_Band]:
-        """Return the candidate bands: through every mode, and on either side of it."""
-        found = []
+    def candidate_bands(self) -> list[_SweepBand]:
+        """Return the bands that candidate sweeps cover: through every mode, and on either side."""
+        bands = []
         for mode in self.modes:
             hz = mode.frequency_hz
             # A sine, a narrow sweep, and one over the whole resonance where that is wider.
-            half_hz = min(_HALF_WIDTH_HZ, 0.2 * hz)
-            over_hz = min(_OVER * mode.damping_ratio * hz, 0.2 * hz)
-            widths_hz = [0.0, half_hz, *([over_hz] if over_hz > 1.5 * half_hz else [])]
-            found += [_Band(mode.number, hz, each, _FADE_S) for each in widths_hz]
+            narrow_half_width_hz = min(_HALF_WIDTH_HZ, 0.2 * hz)
+            resonance_half_width_hz = min(
+                _RESONANCE_HALF_WIDTHS * mode.damping_ratio * hz, 0.2 * hz
+            )
+            widths_hz = [
+                0.0,
+                narrow_half_width_hz,
+                *(
+                    [resonance_half_width_hz]
+                    if resonance_half_width_hz > 1.5 * narrow_half_width_hz
+                    else []
+                ),
+            ]
+            bands += [_SweepBand(mode.number, hz, each, _FADE_S) for each in widths_hz]
             # Fades as long as the beat with the mode: a shorter one excites the mode as well.
-            found += [
-                _Band(
+            bands += [
+                _SweepBand(
                     mode.number,
                     (1.0 + step) * hz,
                     0.0,
@@ -235,12 +276,15 @@ class SegmentSearch:
                 for step in (-_SIDE_OFFSET, _SIDE_OFFSET)
                 if (1.0 + step) * hz < BAND_HZ
             ]
-        return found
+        return bands
 
-    def lines(self) -> tuple[Real, Real]:
-        """Return frequencies (m,) in Hz and amplitudes (m,) of the angle in rad of steady sines."""
+    def steady_sines(self) -> tuple[Real, Real]:
+        """Return the steady sines of the forecast, at the largest amplitudes that limits allow.
+
+        The results are frequencies in Hz and amplitudes of the angle in rad, each of shape (m,).
+        """
         steps = [
-            (*(mode.damping_ratio * np.array(_LINES)), -_SIDE_OFFSET, _SIDE_OFFSET)
+            (*(mode.damping_ratio * np.array(_SINE_OFFSETS)), -_SIDE_OFFSET, _SIDE_OFFSET)
             for mode in self.modes
         ]
         frequency_hz = np.array(
@@ -257,102 +301,139 @@ class SegmentSearch:
         pulse = np.zeros(round(self.plant.rate_hz))
         rise = quintic(0.01, self.plant.rate_hz)
         pulse[: 2 * rise.size] = 1e-3 * np.concatenate([rise, rise[::-1]])
-        answer = self.plant.respond(pulse)
-        turn = np.exp(-np.outer(s, np.arange(pulse.size) / self.plant.rate_hz))
-        angle = turn @ answer.angle_rad
-        lag = turn @ (pulse - answer.angle_rad) / angle
-        own = turn @ (answer.torque_nm - answer.coupling_torque_nm) / angle
-        fractions = np.abs([np.ones_like(s), s, lag, own + response, response, slope])
+        pulse_response = self.plant.respond(pulse)
+        transform = np.exp(-np.outer(s, np.arange(pulse.size) / self.plant.rate_hz))
+        angle = transform @ pulse_response.angle_rad
+        lag = transform @ (pulse - pulse_response.angle_rad) / angle
+        motor_torque = (
+            transform @ (pulse_response.torque_nm - pulse_response.coupling_torque_nm) / angle
+        )
+        fractions = np.abs([np.ones_like(s), s, lag, motor_torque + response, response, slope])
         return frequency_hz, 1.0 / (fractions / self.limits[:, None]).max(axis=0)
 
-    def best(self, time_left_s: float, through: Collection[int] = ()) -> _Candidate:
-        """Return the best segment that fits into the time and drives one of the given modes."""
+    def best_candidate(
+        self, time_left_s: float, through: Collection[int] = ()
+    ) -> _SegmentCandidate:
+        """Return the most informative candidate that fits into `time_left_s`.
+
+        It drives one of the modes in `through`, or any mode if `through` is empty.
+        """
         durations_s = [d for d in DURATIONS_S if d <= time_left_s + 1e-9]
         if not durations_s:
             raise ExcitationError(
                 f"No segment of excitation fits into {time_left_s:g} s: the shortest takes "
                 f"{DURATIONS_S[0]:g} s."
             )
-        return max((self.best_of(d, through) for d in durations_s), key=lambda each: each.value)
+        return max(
+            (self.best_of_duration(d, through) for d in durations_s), key=lambda each: each.value
+        )
 
-    def best_of(self, duration_s: float, through: Collection[int]) -> _Candidate:
-        """Return the best segment of a duration: one mode first, then further ones in addition."""
-        bases = [(band, self.basis(band, duration_s)) for band in self.bands()]
-        nothing = _Candidate(
+    def best_of_duration(self, duration_s: float, through: Collection[int]) -> _SegmentCandidate:
+        """Return the most informative candidate of a given duration.
+
+        The best band comes first; bands of further modes are added if they give more information.
+        """
+        sweep_pairs = [(band, self.sweep_pair(band, duration_s)) for band in self.candidate_bands()]
+        empty_candidate = _SegmentCandidate(
             duration_s,
             (),
             (),
-            self.ringing[:, : self.ticks(duration_s + _SETTLING_S) : _THINNED],
-            self.held,
-            self.swing,
+            self.ringing[:, : self.ticks(duration_s + _SETTLING_S) : _LIMIT_CHECK_TICKS],
+            self.weighted_if_held,
+            self.tip_slope,
             0.0,
         )
-        at_modes = {band.number: basis for band, basis in reversed(bases) if band.at_mode}
+        mode_sweeps = {
+            band.mode_number: sweep_pair
+            for band, sweep_pair in reversed(sweep_pairs)
+            if band.at_mode
+        }
         # A single line does not show a mode: any smooth response could produce it.
-        over = {band.number: band for band, _ in bases if band.at_mode and band.number in through}
-        quiet = {number: self.quieted(nothing, number, at_modes) for number in at_modes}
-        found = max(
+        resonance_bands = {
+            band.mode_number: band
+            for band, _ in sweep_pairs
+            if band.at_mode and band.mode_number in through
+        }
+        candidates_at_rest = {
+            mode_number: self.with_modes_at_rest(empty_candidate, mode_number, mode_sweeps)
+            for mode_number in mode_sweeps
+        }
+        best = max(
             (
-                self.added(start, 1.0, band, basis, turn)
-                for band, basis in bases
-                if band.at_mode and (not through or band is over.get(band.number))
-                for start in (nothing, quiet[band.number])
-                for turn in range(_PHASES)
+                self.with_band(start, 1.0, band, sweep_pair, phase_index)
+                for band, sweep_pair in sweep_pairs
+                if band.at_mode and (not through or band is resonance_bands.get(band.mode_number))
+                for start in (empty_candidate, candidates_at_rest[band.mode_number])
+                for phase_index in range(_PHASE_COUNT)
             ),
             key=lambda each: each.value,
         )
         for _ in range(2):
-            driven = {band.number for band, _ in found.parts}
-            more = [
-                self.added(found, fraction, band, basis, turn)
-                for band, basis in bases
-                if band.number not in driven
-                for fraction in _FRACTIONS
-                for turn in range(0, _PHASES, 2)
+            driven_modes = {band.mode_number for band, _ in best.parts}
+            extended_candidates = [
+                self.with_band(best, fraction, band, sweep_pair, phase_index)
+                for band, sweep_pair in sweep_pairs
+                if band.mode_number not in driven_modes
+                for fraction in _BASE_AMPLITUDE_FACTORS
+                for phase_index in range(0, _PHASE_COUNT, 2)
             ]
-            better = max(more, key=lambda each: each.value, default=found)
-            if better.value <= found.value:
+            better_candidate = max(extended_candidates, key=lambda each: each.value, default=best)
+            if better_candidate.value <= best.value:
                 break
-            found = better
-        return found
+            best = better_candidate
+        return best
 
     def ticks(self, time_s: float) -> int:
+        """Return a time in s as a number of ticks of the rig."""
         return round(time_s * self.plant.rate_hz)
 
     def model_samples(self, time_s: float) -> int:
+        """Return a time in s as a number of samples of the torque model."""
         return round(time_s * self.model.sample_hz)
 
-    def quieted(
-        self, start: _Candidate, number: int, at_modes: dict[int, tuple[_Sweep, _Sweep]]
-    ) -> _Candidate:
-        """Bring all modes but one to rest by the end of the segment, within the limits."""
-        sweeps = [sweep for other, basis in at_modes.items() if other != number for sweep in basis]
+    def with_modes_at_rest(
+        self,
+        start: _SegmentCandidate,
+        mode_number: int,
+        mode_sweeps: dict[int, tuple[_UnitSweep, _UnitSweep]],
+    ) -> _SegmentCandidate:
+        """Return a candidate that also brings all modes but one to rest by the segment's end.
+
+        If the limits do not allow that, the modes' vibration is reduced as far as they allow.
+        """
+        sweeps = [
+            sweep
+            for other, sweep_pair in mode_sweeps.items()
+            if other != mode_number
+            for sweep in sweep_pair
+        ]
         if not sweeps:
             return start
         first = self.model_samples(start.duration_s)
         tail = slice(first, first + self.model_samples(_TAIL_S))
         # One second of the tip's slope suffices to separate the modes.
-        swings = np.stack([sweep.slope[tail] for sweep in sweeps], axis=1)
-        rings = self.swing[tail]
-        factors = -np.linalg.lstsq(swings, rings)[0]
+        tip_slopes = np.stack([sweep.slope[tail] for sweep in sweeps], axis=1)
+        present_slope = self.tip_slope[tail]
+        factors = -np.linalg.lstsq(tip_slopes, present_slope)[0]
         unit = sum(
-            f * sweep.channels[:, ::_THINNED] for f, sweep in zip(factors, sweeps, strict=True)
+            f * sweep.channels[:, ::_LIMIT_CHECK_TICKS]
+            for f, sweep in zip(factors, sweeps, strict=True)
         )
         fraction = min(1.0, largest_factor(start.channels, unit))
         weighted = sum(f * sweep.weighted for f, sweep in zip(factors, sweeps, strict=True))
-        return _Candidate(
+        return _SegmentCandidate(
             start.duration_s,
             (),
             tuple((fraction * f, sweep) for f, sweep in zip(factors, sweeps, strict=True)),
             start.channels + fraction * unit,
             start.weighted + fraction * weighted,
-            start.swing
+            start.tip_slope
             + fraction * sum(f * sweep.slope for f, sweep in zip(factors, sweeps, strict=True)),
             0.0,
         )
 
-    def basis(self, band: _Band, duration_s: float) -> tuple[_Sweep, _Sweep]:
-        """Return the sweeps through a band in two phases, a quarter of a period apart."""
+    def sweep_pair(self, band: _SweepBand, duration_s: float) -> tuple[_UnitSweep, _UnitSweep]:
+        """Return two unit sweeps through a band, whose phases differ by a quarter of a period."""
         rate_hz = self.plant.rate_hz
         n = self.ticks(duration_s)
         from_middle_s = np.arange(1, n + 1) / rate_hz - 0.5 * duration_s
@@ -365,27 +446,29 @@ class SegmentSearch:
         window[:last] = 1.0
         window[: fade.size] = fade
         window[last - fade.size : last] = np.minimum(window[last - fade.size : last], 1.0 - fade)
-        return self.sweep(window * np.sin(phase)), self.sweep(window * np.cos(phase))
+        return self.unit_sweep(window * np.sin(phase)), self.unit_sweep(window * np.cos(phase))
 
-    def sweep(self, reference_rad: Real) -> _Sweep:
-        """Return the response to a reference from rest."""
+    def unit_sweep(self, reference_rad: Real) -> _UnitSweep:
+        """Return the predicted response to a reference of amplitude 1 rad from rest, shape (n,)."""
         n = reference_rad.size
-        longer = np.concatenate([reference_rad, np.zeros(round(_SETTLING_S * self.plant.rate_hz))])
-        response = self.plant.respond(longer)
+        extended_reference_rad = np.concatenate(
+            [reference_rad, np.zeros(round(_SETTLING_S * self.plant.rate_hz))]
+        )
+        response = self.plant.respond(extended_reference_rad)
         spectrum = self.model.spectrum(response.angle_rad)
-        rows = self.model.rows(spectrum)[:, : self.samples]
-        slope_rad = self.model.motion(spectrum)[1]
+        rows = self.model.whitened_derivatives(spectrum)[:, : self.samples]
+        slope_rad = self.model.torque_and_slope(spectrum)[1]
         channels = np.stack(
             [
                 response.angle_rad,
                 response.velocity_rad_s,
-                longer - response.angle_rad,
+                extended_reference_rad - response.angle_rad,
                 response.torque_nm,
                 response.coupling_torque_nm,
-                slope_rad[: longer.size],
+                slope_rad[: extended_reference_rad.size],
             ]
         )
-        return _Sweep(
+        return _UnitSweep(
             reference_rad=reference_rad,
             angle_rad=response.angle_rad[:n],
             rows=rows,
@@ -394,29 +477,36 @@ class SegmentSearch:
             channels=channels / self.limits[:, None],
         )
 
-    def added(
+    def with_band(
         self,
-        base: _Candidate,
+        base: _SegmentCandidate,
         fraction: float,
-        band: _Band,
-        basis: tuple[_Sweep, _Sweep],
-        turn: int,
-    ) -> _Candidate:
-        """Drive a band as far as the limits allow, in addition to a fraction of another segment."""
-        angle = 2 * pi * turn / _PHASES
-        sine, cosine = float(np.cos(angle)), float(np.sin(angle))
-        first, second = basis
-        rings = self.ringing[:, : first.channels.shape[1] : _THINNED]
-        unit = sine * first.channels[:, ::_THINNED] + cosine * second.channels[:, ::_THINNED]
-        before = rings + fraction * (base.channels - rings)
+        band: _SweepBand,
+        sweep_pair: tuple[_UnitSweep, _UnitSweep],
+        phase_index: int,
+    ) -> _SegmentCandidate:
+        """Return a candidate with a further band, at the largest amplitude that limits allow.
+
+        The amplitudes of the candidate `base` are multiplied by `fraction`. The phase of the new
+        sweep is ``phase_index / _PHASE_COUNT`` of a turn.
+        """
+        phase_rad = 2 * pi * phase_index / _PHASE_COUNT
+        sine, cosine = float(np.cos(phase_rad)), float(np.sin(phase_rad))
+        first, second = sweep_pair
+        ringing = self.ringing[:, : first.channels.shape[1] : _LIMIT_CHECK_TICKS]
+        unit = (
+            sine * first.channels[:, ::_LIMIT_CHECK_TICKS]
+            + cosine * second.channels[:, ::_LIMIT_CHECK_TICKS]
+        )
+        before = ringing + fraction * (base.channels - ringing)
         amplitude_rad = largest_factor(before, unit)
-        swing = self.swing + fraction * (base.swing - self.swing)
-        swing += amplitude_rad * (sine * first.slope + cosine * second.slope)
-        weighted = self.held + fraction * (base.weighted - self.held)
+        tip_slope = self.tip_slope + fraction * (base.tip_slope - self.tip_slope)
+        tip_slope += amplitude_rad * (sine * first.slope + cosine * second.slope)
+        weighted = self.weighted_if_held + fraction * (base.weighted - self.weighted_if_held)
         weighted += amplitude_rad * (sine * first.weighted + cosine * second.weighted)
         leading = base.parts[0][0] if base.parts else band
-        value = self.value(leading, weighted, swing, base.duration_s)
-        return _Candidate(
+        value = self.information_to_horizon(leading, weighted, tip_slope, base.duration_s)
+        return _SegmentCandidate(
             base.duration_s,
             (*((other, fraction * size) for other, size in base.parts), (band, amplitude_rad)),
             (
@@ -426,66 +516,79 @@ class SegmentSearch:
             ),
             before + amplitude_rad * unit,
             weighted,
-            swing,
+            tip_slope,
             value,
         )
 
-    def value(self, band: _Band, weighted: Real, swing: Real, duration_s: float) -> float:
-        """Compute the information up to the horizon if a mode is driven on after a segment.
+    def information_to_horizon(
+        self, band: _SweepBand, weighted: Real, tip_slope: Real, duration_s: float
+    ) -> float:
+        """Return the information up to the planning horizon if a mode is driven after a segment.
 
-        The drive holds the amplitude that the mode has at the end of the segment.
+        The motor then holds the amplitude that the mode has at the end of the segment.
         """
         first = self.model_samples(duration_s)
-        rest = self.samples - first
-        going_on = self.going_on(band)
-        amplitudes = self.decays @ swing[first : first + self.decays.shape[1]]
-        index = 2 * [mode.number for mode in self.modes].index(band.number)
-        factors = going_on.per_amplitude @ amplitudes[index : index + 2]
+        remaining_samples = self.samples - first
+        continued_drive = self.continued_drive(band)
+        amplitudes = (
+            self.amplitude_matrix @ tip_slope[first : first + self.amplitude_matrix.shape[1]]
+        )
+        index = 2 * [mode.number for mode in self.modes].index(band.mode_number)
+        factors = continued_drive.per_amplitude @ amplitudes[index : index + 2]
         before = weighted[:, :first]
-        after = weighted[:, first:] + np.tensordot(factors, going_on.weighted[:, :, :rest], axes=1)
+        after = weighted[:, first:] + np.tensordot(
+            factors, continued_drive.weighted[:, :, :remaining_samples], axes=1
+        )
         return float(np.vdot(before, before) + np.vdot(after, after))
 
     @cached_property
-    def decays(self) -> Real:
-        """Matrix (2 m, n) from one second of slope to modal amplitudes, real and imaginary."""
+    def amplitude_matrix(self) -> Real:
+        """Matrix from one second of the tip's slope to the modes' complex amplitudes.
+
+        The shape is (2 m, n), with a row each for real and imaginary part of the m amplitudes.
+        """
         time_s = np.arange(self.model_samples(_TAIL_S)) / self.model.sample_hz
         free = np.exp(np.outer([mode.pole_rad_s for mode in self.modes], time_s))
         columns = np.stack([free.real, -free.imag], axis=1).reshape(-1, time_s.size)
         return np.linalg.pinv(columns.T)
 
-    def going_on(self, band: _Band) -> _GoingOn:
-        """Return the response to driving a mode up to the planning horizon."""
-        if band.middle_hz not in self._going_on:
+    def continued_drive(self, band: _SweepBand) -> _ContinuedDrive:
+        """Return the response to driving the mode of a band by a sine up to the horizon."""
+        if band.middle_hz not in self._continued_drives:
             duration_s = HORIZON_S - DURATIONS_S[0]
-            sweeps = self.basis(replace(band, half_width_hz=0.0), duration_s)
+            sweeps = self.sweep_pair(replace(band, half_width_hz=0.0), duration_s)
             weighted = np.stack([sweep.weighted for sweep in sweeps])
-            mode = next(each for each in self.modes if each.number == band.number)
+            mode = next(each for each in self.modes if each.number == band.mode_number)
             last = self.model_samples(duration_s - _FADE_S)
-            here = slice(last - self.model_samples(_TAIL_S), last)
-            time_s = np.arange(here.start, here.stop) / self.model.sample_hz
+            window = slice(last - self.model_samples(_TAIL_S), last)
+            time_s = np.arange(window.start, window.stop) / self.model.sample_hz
             # Fraction of the steady amplitude that the mode has reached by then.
-            rising = 1.0 - np.exp(mode.pole_rad_s.real * (time_s - 0.5 * _FADE_S))
-            turn = np.exp(1j * mode.pole_rad_s.imag * time_s)
-            columns = np.stack([turn.real, -turn.imag], axis=1) * rising[:, None]
-            slopes = np.stack([sweep.slope[here] for sweep in sweeps], axis=1)
+            ring_up_fraction = 1.0 - np.exp(mode.pole_rad_s.real * (time_s - 0.5 * _FADE_S))
+            oscillation = np.exp(1j * mode.pole_rad_s.imag * time_s)
+            columns = (
+                np.stack([oscillation.real, -oscillation.imag], axis=1) * ring_up_fraction[:, None]
+            )
+            slopes = np.stack([sweep.slope[window] for sweep in sweeps], axis=1)
             per_amplitude = np.linalg.inv(np.linalg.lstsq(columns, slopes)[0])
-            self._going_on[band.middle_hz] = _GoingOn(weighted, per_amplitude)
-        return self._going_on[band.middle_hz]
+            self._continued_drives[band.middle_hz] = _ContinuedDrive(weighted, per_amplitude)
+        return self._continued_drives[band.middle_hz]
 
-    def segment(self, chosen: _Candidate, time_left_s: float) -> Segment:
-        """Return a candidate as a segment, with the precisions expected of it."""
+    def segment(self, chosen: _SegmentCandidate, time_left_s: float) -> Segment:
+        """Return the chosen candidate as a segment, with the precisions expected from it."""
         estimate, quantities = self.estimate, self.quantities
         samples = self.model_samples(chosen.duration_s)
-        channels = chosen.total("channels")
+        channels = chosen.weighted_sum("channels")
         ringing = self.ringing[:, : channels.shape[1]]
         # Between the checked ticks a peak is a little higher.
         fraction = min(1.0, largest_factor(ringing, channels))
-        now = covariance_of(self.record.after(None, 0), estimate)
-        after = covariance_of(self.record.after(fraction * chosen.total("rows"), samples), estimate)
+        now = covariance_of(self.record.information_after(None, 0), estimate)
+        after = covariance_of(
+            self.record.information_after(fraction * chosen.weighted_sum("rows"), samples), estimate
+        )
         return Segment(
-            name=_in_words(chosen),
-            reference_rad=fraction * chosen.total("reference_rad"),
-            angle_rad=fraction * chosen.total("angle_rad"),
+            name=_describe_candidate(chosen),
+            reference_rad=fraction * chosen.weighted_sum("reference_rad"),
+            angle_rad=fraction * chosen.weighted_sum("angle_rad"),
             names=estimate.names,
             covariance=after,
             now=quantities.precisions(now),
@@ -494,22 +597,23 @@ class SegmentSearch:
             fraction_of_limits=LIMIT_FRACTION * float(np.abs(ringing + fraction * channels).max()),
         )
 
-    def with_ring_up(self) -> float:
-        """Return the time of the best mixture plus the time in which its modes ring up.
+    def time_with_ring_up(self) -> float:
+        """Return the time in s of the best mixture, plus the time in which its modes ring up.
 
         The information on the damping grows as ``1 - exp(-t / tau)`` at a constant amplitude.
         """
         times_s = self.mixture.times_s
         needed_s = float(times_s.sum())
         grid = np.geomspace(1e-3, 1e3, 400)
-        gained = grid - 2.0 * (1.0 - np.exp(-grid)) + 0.5 * (1.0 - np.exp(-2.0 * grid))
+        information_gain = grid - 2.0 * (1.0 - np.exp(-grid)) + 0.5 * (1.0 - np.exp(-2.0 * grid))
         for mode in self.modes:
-            reach_hz = 1.5 * _LINES[-1] * mode.damping_ratio * mode.frequency_hz
-            at_mode_s = float(times_s[np.abs(self.line_hz - mode.frequency_hz) < reach_hz].sum())
+            range_hz = 1.5 * _SINE_OFFSETS[-1] * mode.damping_ratio * mode.frequency_hz
+            at_mode_s = float(times_s[np.abs(self.line_hz - mode.frequency_hz) < range_hz].sum())
             decay_s = -1.0 / mode.pole_rad_s.real
             if at_mode_s > 0.01 * needed_s:
                 needed_s += (
-                    decay_s * float(np.interp(at_mode_s / decay_s, gained, grid)) - at_mode_s
+                    decay_s * float(np.interp(at_mode_s / decay_s, information_gain, grid))
+                    - at_mode_s
                 )
         return needed_s
 
@@ -519,7 +623,7 @@ class SegmentSearch:
         if impossible:
             return PrecisionForecast(inf, impossible[0])
         seconds = self.needed_s
-        if not seconds < _NEVER_S:
+        if not seconds < _UNREACHABLE_S:
             return PrecisionForecast(inf, "the motor cannot excite the modes that determine it")
         if seconds <= time_left_s:
             return PrecisionForecast(seconds, "")
@@ -532,14 +636,14 @@ class SegmentSearch:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mixture:
-    """Mixture of steady sines, without ring-up, that reaches all targets in the shortest time."""
+class SineMixture:
+    """Mixture of steady sines that reaches all targets in the shortest time, without ring-up."""
 
     times_s: Real
-    """Shape (m,): time of each."""
+    """Time in s for which each sine lasts; shape (m,)."""
     weights: Real
-    """Shape (q, k): combinations of the torque's derivatives; the sum of their squares is the
-    information that brings the targets closer."""
+    """Combinations of the torque's derivatives by the parameters, the sum of whose squares is the
+    information that brings the targets closer; shape (q, k)."""
 
 
 def best_mixture(
@@ -548,9 +652,9 @@ def best_mixture(
     quantities: Quantities,
     frequency_hz: Real,
     angle_rad: Real,
-    missed: float = 1.0,
-) -> Mixture:
-    """Find the times of steady sines that reach all targets soonest.
+    relaxation: float = 1.0,
+) -> SineMixture:
+    """Return the times of steady sines that together reach all targets soonest.
 
     Uses multiplicative steps, as `time_fractions`, with a multiplier for each quantity. By the
     equivalence theorem all sines of the best mixture give the same information per second on the
@@ -560,29 +664,29 @@ def best_mixture(
     Parameters
     ----------
     information
-        Shape (k, k): information that exists already.
+        Information that the record contains already, shape (k, k).
     estimate
         Beam, damping and noise.
     quantities
         The q target quantities.
     frequency_hz, angle_rad
-        Shape (m,): frequencies of the sines and amplitudes of the angle.
-    missed
-        Factor by which all deviations may exceed their targets.
+        Frequencies of the sines and amplitudes of the angle, each of shape (m,).
+    relaxation
+        Factor by which all standard deviations may exceed their targets.
     """
     rates = _information_rates(estimate, frequency_hz, angle_rad)
     target_stds = np.array(
         [inf if each.impossible else each.target_std for each in quantities.items]
     )
-    wanted = quantities.gradients / (missed * target_stds[:, None])
-    if not wanted.any():
-        return Mixture(np.zeros(frequency_hz.size), wanted)
-    multipliers = np.ones(len(wanted))
+    scaled_gradients = quantities.gradients / (relaxation * target_stds[:, None])
+    if not scaled_gradients.any():
+        return SineMixture(np.zeros(frequency_hz.size), scaled_gradients)
+    multipliers = np.ones(len(scaled_gradients))
     times_s = np.full(frequency_hz.size, 1.0 / frequency_hz.size)
-    for _ in range(_ROUNDS):
+    for _ in range(_MIXTURE_STEPS):
         covariance = covariance_of(information + np.tensordot(times_s, rates, axes=1), estimate)
-        lines = wanted @ covariance
-        variances = np.einsum("qi,qi->q", lines, wanted)
+        lines = scaled_gradients @ covariance
+        variances = np.einsum("qi,qi->q", lines, scaled_gradients)
         multipliers = multipliers * np.maximum(variances, 1e-12) ** 0.5
         multipliers /= max(float(multipliers.sum()), 1e-300)
         gain_rates = np.einsum("q,qi,fij,qj->f", multipliers, lines, rates, lines)
@@ -591,14 +695,14 @@ def best_mixture(
         )
         # Scale the total time towards the targets, until they are met or the time is too long.
         times_s *= float(np.clip(np.sqrt(variances.max()), 0.5, 2.0))
-        if times_s.sum() > _NEVER_S:
+        if times_s.sum() > _UNREACHABLE_S:
             break
-    worth = np.sqrt(multipliers / max(float(times_s @ gain_rates / times_s.sum()), 1e-300))
-    return Mixture(times_s, worth[:, None] * lines)
+    scale = np.sqrt(multipliers / max(float(times_s @ gain_rates / times_s.sum()), 1e-300))
+    return SineMixture(times_s, scale[:, None] * lines)
 
 
 def _information_rates(estimate: BeamEstimate, frequency_hz: Real, angle_rad: Real) -> Real:
-    """Return the information per second of each steady sine, shape (m, k, k)."""
+    """Return the Fisher information per second of each steady sine, shape (m, k, k)."""
     kernels = whitened_kernels(estimate, 2j * pi * frequency_hz, 1.0) * (angle_rad / 2.0**0.5)
     rates: Real = np.einsum("if,jf->fij", kernels, kernels.conj()).real
     return rates
@@ -612,52 +716,55 @@ def least_deviations(
     angle_rad: Real,
     duration_s: float,
 ) -> Real:
-    """Return the deviation of each quantity with the best mixture of sines for it alone.
+    """Return the smallest standard deviation that each quantity can have in a record.
+
+    For each quantity the mixture of sines is the best for this quantity alone.
 
     Parameters
     ----------
     information, estimate, quantities, frequency_hz, angle_rad
         As for `best_mixture`.
     duration_s
-        Time of all sines together.
+        Total duration of all sines in s.
 
     Returns
     -------
     ndarray, shape (q,)
-        Expected lower bound for a record of that length.
+        Lower bound of each standard deviation for a record of this duration.
     """
     rates = _information_rates(estimate, frequency_hz, angle_rad)
-    found = np.empty(len(quantities.gradients))
+    deviations = np.empty(len(quantities.gradients))
     for row, gradient in enumerate(quantities.gradients):
         times_s = np.full(frequency_hz.size, duration_s / frequency_hz.size)
-        for _ in range(_ROUNDS):
+        for _ in range(_MIXTURE_STEPS):
             total = information + np.tensordot(times_s, rates, axes=1)
             line = gradient @ covariance_of(total, estimate)
-            found[row] = np.sqrt(max(float(line @ gradient), 0.0))
+            deviations[row] = np.sqrt(max(float(line @ gradient), 0.0))
             times_s = times_s * np.sqrt(np.einsum("i,fij,j->f", line, rates, line))
             times_s *= duration_s / max(float(times_s.sum()), 1e-300)
-    return found
+    return deviations
 
 
 def largest_factor(before: Real, unit: Real) -> float:
-    """Return the largest factor of a motion that holds its sum with another within -1 and 1.
+    """Return the largest factor by which a motion can be added without exceeding the limits.
 
-    Where the other motion exceeds this range by itself, the sum may be as large, but no larger.
+    All quantities are fractions of their limits, so the sum must be between -1 and 1. If the
+    existing motion exceeds this range by itself, the sum may be as large, but no larger.
 
     Parameters
     ----------
     before, unit
-        Shape (c, n): channels of the existing motion, and of the added one.
+        Quantities of the existing motion and of the added motion, shape (c, n).
     """
     size = np.abs(unit)
-    room = np.maximum(1.0, np.abs(before)) - np.sign(unit) * before
+    margin = np.maximum(1.0, np.abs(before)) - np.sign(unit) * before
     with np.errstate(divide="ignore", invalid="ignore"):
-        factor = np.where(size > 1e-9 * size.max(), room / size, inf)
+        factor = np.where(size > 1e-9 * size.max(), margin / size, inf)
     return max(float(factor.min()), 0.0)
 
 
-def _in_words(chosen: _Candidate) -> str:
-    """Describe the bands of a segment, for the operator."""
+def _describe_candidate(chosen: _SegmentCandidate) -> str:
+    """Return a text for the operator with modes, bands, duration and amplitudes of a segment."""
     parts = sorted(chosen.parts, key=lambda part: part[0].middle_hz)
     bands = [
         f"{band.middle_hz - band.half_width_hz:.3g}–{band.middle_hz + band.half_width_hz:.3g}"
@@ -666,7 +773,8 @@ def _in_words(chosen: _Candidate) -> str:
         for band, _ in parts
     ]
     return (
-        f"mode{'s' if len(parts) > 1 else ''} {' + '.join(str(band.number) for band, _ in parts)}, "
+        f"mode{'s' if len(parts) > 1 else ''} "
+        f"{' + '.join(str(band.mode_number) for band, _ in parts)}, "
         f"{' + '.join(bands)} Hz, {chosen.duration_s:g} s, "
         f"{' + '.join(f'{size:.2g}' for _, size in parts)} rad"
     )

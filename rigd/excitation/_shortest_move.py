@@ -1,6 +1,6 @@
 """The shortest move that leaves no vibration within a rig's limits: a linear programme.
 
-For a given duration the programme finds the accelerations that take the smallest fraction of the
+For a given duration the programme finds the accelerations that use the smallest fraction of the
 limits of torque, speed, tracking error and sensor, and leave every mode at rest. At the shortest
 duration that fraction is 1. The responses are those of the closed loop to a unit of acceleration:
 all limits are linear in the accelerations, and Coulomb friction is subtracted from the torque.
@@ -15,125 +15,136 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._residual_vibration import predict_end
+from rigd.excitation._residual_vibration import predict_move_end
 from rigd.excitation._signals import (
     LIMIT_FRACTION,
     Excitation,
     ExcitationError,
-    assemble,
-    finite,
+    assemble_excitation,
     lay_out_segments,
-    within_a_turn,
+    require_finite,
+    require_within_turn,
 )
 from rigd.excitation.moves import (
     ROBUST_BELOW_HZ,
     Braking,
-    braked,
+    braked_reference,
     braking_path,
     from_acceleration,
     modal_state,
     quintic,
-    zero_rows,
+    residual_vibration_map,
 )
 from rigd.identified_beam import MOVE, IdentifiedBeam, Use
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-LONGEST_S: Final = 60.0
-"""A longer move is an error."""
+LONGEST_MOVE_S: Final = 60.0
+"""Longest duration of a move in s; a longer one is an error."""
 
-_HELD_S: Final = 2e-3
-"""Least time for which an acceleration is held; longer in long moves."""
-_MOST_INTERVALS: Final = 60
-_CLOSE: Final = 1.03
-_NEARLY_ALL: Final = 0.93
-"""The search ends at this ratio of a sufficient time to an insufficient one, or where the move
-takes this fraction of the limits: a time shorter by 4 % would exceed them."""
-_MOST_ROUNDS: Final = 14
-_FARTHEST: Final = 0.98
-"""Fraction of the angle limit at which a move may end; the remainder is for overshoot."""
-_BACKWARD: Final = 0.01
-"""Fraction of its mean speed with which a robust move may go backward."""
-_LEAST_RAD: Final = 1e-3
+_MIN_INTERVAL_S: Final = 2e-3
+"""Shortest time in s for which the acceleration is constant; it is longer in long moves."""
+_MAX_INTERVALS: Final = 60
+"""Largest number of intervals of constant acceleration, the unknowns of the linear programme."""
+_CONVERGED_DURATION_RATIO: Final = 1.03
+"""Ratio of a sufficient duration to an insufficient one at which the search for the shortest move
+ends."""
+_CONVERGED_LIMIT_FRACTION: Final = 0.93
+"""Fraction of the limits that a move must use for the search to end: a duration shorter by 4 %
+would exceed the limits."""
+_MAX_ROUNDS: Final = 14
+"""Largest number of durations that the search tries."""
+_MAX_END_ANGLE_FRACTION: Final = 0.98
+"""Largest fraction of the angle limit at which a move may end; the remainder is for overshoot."""
+_MAX_BACKWARD_SPEED_FRACTION: Final = 0.01
+"""Largest backward speed of a robust move, as a fraction of its mean speed."""
+_MIN_DISTANCE_RAD: Final = 1e-3
+"""Smallest distance of a move in rad."""
 _BRAKING_STARTS: Final = 16
-_BRAKING_S: Final = (0.02, 5.0)
+"""Number of ticks along a reference from which braking is simulated."""
+_BRAKING_DURATIONS_S: Final = (0.02, 5.0)
+"""Shortest and longest duration in s of a braking path that is tried."""
 
 
 class Response(Protocol):
-    """Response of the closed loop to a reference, as arrays (n,)."""
+    """Response of the closed loop to a reference, with a value for each tick; arrays (n,)."""
 
     @property
     def angle_rad(self) -> Real:
-        """At the output shaft."""
+        """Angle of the output shaft in rad."""
 
     @property
     def velocity_rad_s(self) -> Real:
-        """At the output shaft."""
+        """Speed of the output shaft in rad/s."""
 
     @property
     def torque_nm(self) -> Real:
-        """The command, not limited."""
+        """Torque command in N·m without the limit of the motor."""
 
     @property
     def coupling_torque_nm(self) -> Real:
-        """What the sensor measures."""
+        """Coupling torque in N·m that the sensor measures."""
 
 
 @dataclass(frozen=True, slots=True)
 class MovePlant:
-    """Model of a rig for planning a motion."""
+    """Linear model of the closed loop, with the rig's limits, for planning a motion."""
 
     rate_hz: float
     """Ticks a second."""
     respond: Callable[[Real], Response]
-    """Response of the closed loop to a reference (n,) from rest, without friction."""
+    """Function that returns the response of the closed loop to a reference in rad, shape (n,), from
+    rest and without friction."""
     disturbed: Callable[[Real, int], tuple[Real, Real]]
-    """Response to a reference (n,) from rest with friction, encoder steps and noise, in several
-    draws: angle (n, draws), and amplitude of the torque of the lowest modes (n, modes, draws)."""
+    """Function that returns the response to a reference in rad, shape (n,), from rest with
+    friction, encoder steps and noise, in several random draws. The second argument is the number of
+    lowest modes. The result is the angle in rad, shape (n, draws), and the amplitude of each mode's
+    coupling torque in N·m, shape (n, modes, draws)."""
     poles_rad_s: Complex
-    """Shape (m,): poles of the closed loop at the modes of the beam, one of each pair."""
+    """Poles of the closed loop at the modes of the beam, one of each pair; shape (m,)."""
     torque_per_state_nm_s: Real
-    """Shape (m,): amplitude of the coupling torque per `modal_state` of a mode."""
+    """Amplitude of the coupling torque per `modal_state` of a mode, in N·m·s; shape (m,)."""
     frequency_uncertainty: Real
-    """Shape (m,): relative standard uncertainty of the modes' frequencies."""
+    """Relative standard uncertainty of the modes' frequencies, shape (m,)."""
     torque_noise_nm: float
-    """Standard deviation of the noise of one reading of the coupling torque."""
+    """Standard deviation in N·m of the noise of one reading of the coupling torque."""
     settling_s: float
-    """Time in which the loop catches up with the reference."""
+    """Time in s after which the angle of the closed loop has reached the reference."""
     peak_torque_nm: float
-    """Largest torque of the motor."""
+    """Largest torque of the motor in N·m."""
     friction_nm: float
-    """Torque for friction, in addition to the linear response's."""
+    """Torque in N·m against friction, which adds to the torque of the linear response."""
     largest_acceleration_rad_s2: float
-    """Bound of the reference's acceleration, including the effect of the loop's filters."""
+    """Upper bound of the reference's acceleration, including the effect of the loop's filters."""
     velocity_rad_s: float
     """Limit of the speed."""
     tracking_error_rad: float
-    """Limit of reference minus angle."""
+    """Limit of the tracking error, reference minus angle."""
     coupling_torque_nm: float
-    """Range of the sensor."""
+    """Range of the sensor's coupling torque in N·m."""
     angle_rad: float
-    """Limit of the angle from the rig's zero, either way."""
+    """Limit of the angle from the rig's zero, to either side."""
     model: IdentifiedBeam | None = None
-    """Beam of an analysis; None: the profile's, or an estimate."""
+    """Beam of an analysis; None: the beam of the profile, or an estimate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
-    """A planned move."""
+    """Planned move of the motor to another angle, with its predicted residual vibration."""
 
     reference_rad: Real
-    """Shape (n,): at the ticks after the start, relative to the angle there; the last one stays."""
+    """Reference angle at the ticks after the start, relative to the start angle; shape (n,). The
+    last angle is that of the end of the move."""
     duration_s: float
-    """Time of the reference."""
+    """Duration of the move in s."""
     limit_fraction: float
-    """Largest predicted fraction of a limit; at most `LIMIT_FRACTION`."""
+    """Largest fraction of a limit that the move is predicted to use; at most `LIMIT_FRACTION`."""
     residual_nm: float
-    """Residual coupling torque of the modes in the linear loop: the sum of their amplitudes, each
-    for a frequency that is wrong by its standard uncertainty."""
+    """Coupling torque in N·m of the vibration after the move in the linear loop: the sum of the
+    modes' amplitudes, each for a frequency that is wrong by its standard uncertainty."""
     quintic_residual_nm: float
-    """The same for a quintic of the same duration."""
+    """Coupling torque in N·m of the vibration after a quintic path of the same duration."""
 
 
 def shortest_move(
@@ -144,27 +155,27 @@ def shortest_move(
     robust: bool = False,
     ringing: Complex | None = None,
 ) -> Move:
-    """Plan the shortest move that leaves no vibration.
+    """Plan the shortest move within a rig's limits that leaves no vibration.
 
     Parameters
     ----------
     plant
-        The rig.
+        Model of the rig.
     distance_rad
-        Angle from start to end, either sign.
+        Angle from start to end, of either sign.
     start_rad
-        Angle of the start from the rig's zero.
+        Start angle from the rig's zero.
     robust
-        Zeros of second order for the modes below `ROBUST_BELOW_HZ`, to tolerate a 1 % frequency
-        error, and no turning back; the move takes longer.
+        Whether the move has zeros of second order for the modes below `ROBUST_BELOW_HZ`, to
+        tolerate a 1 % frequency error, and does not turn back. It then takes longer.
     ringing
-        Shape (m,): state of the modes at the start as of `modal_state`, which the move cancels;
-        None: they are at rest.
+        Complex state of the modes at the start as `modal_state` returns it, shape (m,), which the
+        move cancels; None: the modes are at rest.
 
     Raises
     ------
     ExcitationError
-        If no move of at most `LONGEST_S` stays within the limits.
+        If no move of at most `LONGEST_MOVE_S` stays within the limits.
 
     Notes
     -----
@@ -173,33 +184,36 @@ def shortest_move(
     the limits of the rig instead of an impulse's.
     """
     search = _MoveSearch(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
-    acceleration = search.shortest()
+    acceleration = search.shortest_accelerations()
     reference = from_acceleration(acceleration, plant.rate_hz)
     n = reference.size
-    usual = distance_rad * quintic(n / plant.rate_hz, plant.rate_hz)
+    quintic_rad = distance_rad * quintic(n / plant.rate_hz, plant.rate_hz)
     return Move(
         reference_rad=reference,
         duration_s=n / plant.rate_hz,
         limit_fraction=search.limit_fraction(reference),
-        residual_nm=_residual_nm(plant, reference, ringing),
-        quintic_residual_nm=_residual_nm(plant, usual, ringing),
+        residual_nm=_residual_torque_nm(plant, reference, ringing),
+        quintic_residual_nm=_residual_torque_nm(plant, quintic_rad, ringing),
     )
 
 
-def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> float:
-    """Sum the residual amplitudes of the modes, each frequency wrong by its uncertainty."""
-    left = []
-    for off in (-plant.frequency_uncertainty, plant.frequency_uncertainty):
-        poles = plant.poles_rad_s * (1.0 + off)
+def _residual_torque_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> float:
+    """Return the coupling torque in N·m of the vibration after a move.
+
+    It is the sum of the modes' amplitudes, each for a frequency wrong by its uncertainty.
+    """
+    residuals_nm = []
+    for frequency_error in (-plant.frequency_uncertainty, plant.frequency_uncertainty):
+        poles = plant.poles_rad_s * (1.0 + frequency_error)
         state = modal_state(np.concatenate([[0.0], reference]), plant.rate_hz, poles)
         if ringing is not None:
             state = state + ringing * np.exp(poles * reference.size / plant.rate_hz)
-        left.append(np.abs(state) * plant.torque_per_state_nm_s)
-    return float(np.maximum(*left).sum())
+        residuals_nm.append(np.abs(state) * plant.torque_per_state_nm_s)
+    return float(np.maximum(*residuals_nm).sum())
 
 
 class _MoveSearch:
-    """Search for the shortest time, with one linear programme for each candidate."""
+    """Search for the shortest duration of a move, with a linear programme for each duration."""
 
     def __init__(
         self,
@@ -214,16 +228,16 @@ class _MoveSearch:
         self._start_rad = start_rad
         self._order = order
         self._ringing = ringing
-        self._unit = _UnitResponse(plant)
-        rung_nm = 0.0
+        self._unit_response = _UnitResponse(plant)
+        ringing_torque_nm = 0.0
         if ringing is not None:
-            rung_nm = float(np.abs(ringing) @ plant.torque_per_state_nm_s)
+            ringing_torque_nm = float(np.abs(ringing) @ plant.torque_per_state_nm_s)
         # The remaining vibration is fed forward to the motor, and is in the sensor's reading.
         self._limits = {
-            "torque": LIMIT_FRACTION * plant.peak_torque_nm - plant.friction_nm - rung_nm,
+            "torque": LIMIT_FRACTION * plant.peak_torque_nm - plant.friction_nm - ringing_torque_nm,
             "velocity": LIMIT_FRACTION * plant.velocity_rad_s,
             "tracking": LIMIT_FRACTION * plant.tracking_error_rad,
-            "coupling": LIMIT_FRACTION * plant.coupling_torque_nm - rung_nm,
+            "coupling": LIMIT_FRACTION * plant.coupling_torque_nm - ringing_torque_nm,
         }
         if min(self._limits.values()) <= 0.0:
             raise ExcitationError(
@@ -231,178 +245,210 @@ class _MoveSearch:
                 "sensor.range for a move; wait until the beam is at rest."
             )
 
-    def shortest(self) -> Real:
-        """Return the accelerations (n,) of the shortest move.
+    def shortest_accelerations(self) -> Real:
+        """Return the accelerations of the shortest move in rad/s², shape (n,).
 
-        Raises
-        ------
-        ExcitationError
-            If it would take more than `LONGEST_S`.
+        Raise `ExcitationError` if the move would take more than `LONGEST_MOVE_S`.
         """
         rate_hz = self._plant.rate_hz
-        most = round(LONGEST_S * rate_hz)
+        longest_ticks = round(LONGEST_MOVE_S * rate_hz)
         slowest_rad_s = float(np.abs(self._plant.poles_rad_s).min())
         n = round((1.0 if self._order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
-        too_short, found, fraction_short, fraction_found = 8, most + 1, inf, 0.0
+        too_short, sufficient, fraction_short, fraction_sufficient = 8, longest_ticks + 1, inf, 0.0
         best: Real | None = None
-        for _ in range(_MOST_ROUNDS):
+        for _ in range(_MAX_ROUNDS):
             fraction, acceleration = self._least_limit_fraction(n)
             if fraction <= 1.0:
-                found, fraction_found, best = n, fraction, acceleration
+                sufficient, fraction_sufficient, best = n, fraction, acceleration
             else:
                 too_short, fraction_short = n, fraction
-            if fraction_found >= _NEARLY_ALL or found <= max(_CLOSE * too_short, too_short + 1):
+            if fraction_sufficient >= _CONVERGED_LIMIT_FRACTION or sufficient <= max(
+                _CONVERGED_DURATION_RATIO * too_short, too_short + 1
+            ):
                 break
-            if too_short >= most:
+            if too_short >= longest_ticks:
                 break
-            n = _next(too_short, found, fraction_short, fraction_found, n, fraction, self._order)
-            n = min(n, most)
+            n = _next_duration_ticks(
+                too_short, sufficient, fraction_short, fraction_sufficient, n, fraction, self._order
+            )
+            n = min(n, longest_ticks)
         if best is None:
             raise ExcitationError(
-                f"No move of at most {LONGEST_S:g} s by {self._distance_rad:g} rad stays within "
-                "the limits of the profile; choose a smaller angle, or check limits.velocity_rad_s."
+                f"No move of at most {LONGEST_MOVE_S:g} s by {self._distance_rad:g} rad stays "
+                "within the limits of the profile; choose a smaller angle, or check "
+                "limits.velocity_rad_s."
             )
         return best
 
     def _least_limit_fraction(self, n: int) -> tuple[float, Real | None]:
-        """Return the smallest fraction of the limits for n ticks, and its accelerations (n,).
+        """Solve the linear programme for a move of n ticks.
 
-        The fraction is infinite without a solution.
+        Return the smallest fraction of the limits that such a move uses, and its accelerations in
+        rad/s², shape (n,). If there is no such move, return infinity and None.
         """
         from scipy.optimize import linprog
 
         plant, rate_hz = self._plant, self._plant.rate_hz
-        held = max(1, round(_HELD_S * rate_hz))
-        intervals = min(ceil(n / held), _MOST_INTERVALS)
+        held = max(1, round(_MIN_INTERVAL_S * rate_hz))
+        intervals = min(ceil(n / held), _MAX_INTERVALS)
         edges = np.round(np.linspace(0, n, intervals + 1)).astype(int)
         scale = plant.largest_acceleration_rad_s2
 
-        zeros = zero_rows(n, rate_hz, plant.poles_rad_s, self._order)
+        zeros = residual_vibration_map(n, rate_hz, plant.poles_rad_s, self._order)
         per_interval = np.add.reduceat(zeros, edges[:-1], axis=1) * scale
         steps = np.diff(edges) / rate_hz
         # The centre of an interval's held acceleration, as `from_acceleration` sums them up.
-        left_s = (n - (edges[:-1] + edges[1:] - 1) / 2) / rate_hz
-        equal = np.concatenate([[steps * scale], [steps * left_s * scale], per_interval])
-        goal = np.zeros(len(equal))
-        goal[1] = self._distance_rad
+        remaining_s = (n - (edges[:-1] + edges[1:] - 1) / 2) / rate_hz
+        equality_matrix = np.concatenate(
+            [[steps * scale], [steps * remaining_s * scale], per_interval]
+        )
+        equality_values = np.zeros(len(equality_matrix))
+        equality_values[1] = self._distance_rad
         if self._ringing is not None:
-            goal[2:] = np.negative(self._ringing_rows(n))
-        size = np.linalg.norm(equal, axis=1)
+            equality_values[2:] = np.negative(self._ringing_rows(n))
+        size = np.linalg.norm(equality_matrix, axis=1)
 
-        limited, bounded, bounds = self._responses(n, edges, scale)
+        limited, bounded, bounds = self._inequalities(n, edges, scale)
         limited = np.concatenate([limited, np.eye(intervals)])
         fraction_column = -np.ones((len(limited), 1))
-        none = np.zeros((len(bounded), 1))
-        least = np.block([[limited, fraction_column], [-limited, fraction_column], [bounded, none]])
-        below = np.concatenate([np.zeros(2 * len(limited)), bounds])
-        found = linprog(
+        zero_column = np.zeros((len(bounded), 1))
+        inequality_matrix = np.block(
+            [[limited, fraction_column], [-limited, fraction_column], [bounded, zero_column]]
+        )
+        upper_bounds = np.concatenate([np.zeros(2 * len(limited)), bounds])
+        solution = linprog(
             np.append(np.zeros(intervals), 1.0),
-            A_ub=least,
-            b_ub=below,
-            A_eq=np.column_stack([equal / size[:, None], np.zeros(len(equal))]),
-            b_eq=goal / size,
+            A_ub=inequality_matrix,
+            b_ub=upper_bounds,
+            A_eq=np.column_stack([equality_matrix / size[:, None], np.zeros(len(equality_matrix))]),
+            b_eq=equality_values / size,
             bounds=[(None, None)] * intervals + [(0.0, None)],
             method="highs-ds",
         )
-        if found.x is None or found.status != 0:
+        if solution.x is None or solution.status != 0:
             return inf, None
-        return float(found.fun), np.repeat(found.x[:-1] * scale, np.diff(edges))
+        return float(solution.fun), np.repeat(solution.x[:-1] * scale, np.diff(edges))
 
     def _ringing_rows(self, n: int) -> list[float]:
-        """Return the vibration of the initial state at the end, in the order of `zero_rows`."""
+        """Return the state at the end of the move that the initial vibration decays to.
+
+        Real and imaginary parts are in the order of the rows of `residual_vibration_map`.
+        """
         assert self._ringing is not None
         rows: list[float] = []
         for pole, state in zip(self._plant.poles_rad_s, self._ringing, strict=True):
-            later = state * np.exp(pole * n / self._plant.rate_hz)
+            end_state = state * np.exp(pole * n / self._plant.rate_hz)
             # The row of the derivative weighs the start by 1.
-            twice = self._order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
-            for _ in range(2 if twice else 1):
-                rows += [later.real, later.imag] if pole.imag != 0.0 else [later.real]
+            second_order = self._order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
+            for _ in range(2 if second_order else 1):
+                rows += [end_state.real, end_state.imag] if pole.imag != 0.0 else [end_state.real]
         return rows
 
-    def _responses(self, n: int, edges: NDArray[np.intp], scale: float) -> tuple[Real, Real, Real]:
-        """Return rows over the intervals: fractions of limits; bounded quantities and their bounds.
+    def _inequalities(
+        self, n: int, edges: NDArray[np.intp], scale: float
+    ) -> tuple[Real, Real, Real]:
+        """Return the inequalities of the linear programme for a move of n ticks.
+
+        They are linear maps from the acceleration in each interval: to fractions of the limits,
+        and to quantities with fixed bounds. The third array contains these bounds.
 
         A robust move from rest does not turn back: it goes directly to its end, and the friction
-        of the motor, whose sign the controller takes from the reference, does not reverse. One
-        that cancels a vibration has to go to and fro, as the shortest does, within the limit of
-        the angle.
+        of the motor, whose sign the controller takes from the reference, does not reverse. A move
+        that cancels a vibration, and the shortest move, go to and fro within the limit of the
+        angle.
         """
         plant = self._plant
         end = n + round(plant.settling_s * plant.rate_hz)
         # The ends of all intervals and the ticks between them: the solution exploits every gap.
-        middles = np.round((edges[:-1] + edges[1:]) / 2).astype(int)
-        tail = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MOST_INTERVALS // 2]
-        fine = np.unique(np.concatenate([edges, middles if n > 2 * len(edges) else [], tail]))
-        fine = fine.astype(int)
-        coarse = fine[::2]
-        unit = self._unit.up_to(end)
+        interval_middles = np.round((edges[:-1] + edges[1:]) / 2).astype(int)
+        settling_ticks = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MAX_INTERVALS // 2]
+        checked_ticks = np.unique(
+            np.concatenate([edges, interval_middles if n > 2 * len(edges) else [], settling_ticks])
+        )
+        checked_ticks = checked_ticks.astype(int)
+        every_second_tick = checked_ticks[::2]
+        unit_responses = self._unit_response.for_ticks(end)
         rows = [
-            _over_intervals(unit[name], edges, coarse if name == "coupling" else fine)
+            _interval_responses(
+                unit_responses[name],
+                edges,
+                every_second_tick if name == "coupling" else checked_ticks,
+            )
             * (scale / self._limits[name])
             for name in self._limits
         ]
         if self._order > 1 and self._ringing is None:
-            forward = np.copysign(scale, self._distance_rad)
-            backward = -forward * _over_intervals(unit["velocity"], edges, coarse)
+            forward_scale = np.copysign(scale, self._distance_rad)
+            backward_speed = -forward_scale * _interval_responses(
+                unit_responses["velocity"], edges, every_second_tick
+            )
             mean_rad_s = abs(self._distance_rad) * plant.rate_hz / n
-            return np.concatenate(rows), backward, np.full(len(coarse), _BACKWARD * mean_rad_s)
-        angle = scale * _over_intervals(unit["angle"], edges, coarse)
+            return (
+                np.concatenate(rows),
+                backward_speed,
+                np.full(len(every_second_tick), _MAX_BACKWARD_SPEED_FRACTION * mean_rad_s),
+            )
+        angle = scale * _interval_responses(unit_responses["angle"], edges, every_second_tick)
         free_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
-        return np.concatenate(rows), np.vstack([angle, -angle]), np.repeat(free_rad, len(coarse))
+        return (
+            np.concatenate(rows),
+            np.vstack([angle, -angle]),
+            np.repeat(free_rad, len(every_second_tick)),
+        )
 
     def limit_fraction(self, reference: Real) -> float:
-        """Return the largest fraction of a limit that a reference takes, over all ticks."""
+        """Return the largest fraction of a limit that the response to a reference reaches."""
         plant = self._plant
         held = round(plant.settling_s * plant.rate_hz)
-        whole = np.concatenate([[0.0], reference, np.full(held, reference[-1])])
-        response = plant.respond(whole)
+        whole_reference_rad = np.concatenate([[0.0], reference, np.full(held, reference[-1])])
+        response = plant.respond(whole_reference_rad)
         peaks = (
             (np.abs(response.torque_nm).max() + plant.friction_nm) / plant.peak_torque_nm,
             np.abs(response.velocity_rad_s).max() / plant.velocity_rad_s,
-            np.abs(whole - response.angle_rad).max() / plant.tracking_error_rad,
+            np.abs(whole_reference_rad - response.angle_rad).max() / plant.tracking_error_rad,
             np.abs(response.coupling_torque_nm).max() / plant.coupling_torque_nm,
             np.abs(self._start_rad + response.angle_rad).max() / plant.angle_rad,
         )
         return float(max(peaks))
 
 
-def _next(
+def _next_duration_ticks(
     too_short: int,
-    found: int,
+    sufficient: int,
     fraction_short: float,
-    fraction_found: float,
+    fraction_sufficient: float,
     n: int,
     fraction: float,
     order: int,
 ) -> int:
-    """Choose the number of ticks to try next, from the fractions of the limits on either side.
+    """Return the duration in ticks that the search for the shortest move tries next.
 
-    The fraction falls with a power of the time: about the third, and more where the modes, not the
-    distance, determine the time.
+    `too_short` and `sufficient` are the longest insufficient and the shortest sufficient duration,
+    with the fractions of the limits that they use. The fraction falls with a power of the duration:
+    about the third, and more if the modes, not the distance, determine the duration.
     """
-    if fraction_found == 0.0:  # none has sufficed yet
+    if fraction_sufficient == 0.0:  # none has sufficed yet
         return int(max(n + 2, round(1.03 * n * min(fraction, 4.0) ** 0.3)))
-    if fraction_short == inf and n == found:
+    if fraction_short == inf and n == sufficient:
         guess = round(n * max(fraction, 0.02) ** (0.08 if order > 1 else 0.22))
     elif fraction_short == inf:
-        guess = round((too_short * found) ** 0.5)
+        guess = round((too_short * sufficient) ** 0.5)
     else:
-        power = np.log(fraction_short / fraction_found) / np.log(found / too_short)
-        guess = round(1.004 * found * fraction_found ** (1.0 / power))
-    return int(min(max(guess, too_short + 1), found - 1))
+        power = np.log(fraction_short / fraction_sufficient) / np.log(sufficient / too_short)
+        guess = round(1.004 * sufficient * fraction_sufficient ** (1.0 / power))
+    return int(min(max(guess, too_short + 1), sufficient - 1))
 
 
 class _UnitResponse:
-    """Responses to a reference of acceleration 1, computed up to the needed length."""
+    """Responses of the closed loop to a constant acceleration of 1 rad/s², by quantity."""
 
     def __init__(self, plant: MovePlant) -> None:
         self._plant = plant
         self._rows: dict[str, Real] = {}
         self._ticks = 0
 
-    def up_to(self, ticks: int) -> dict[str, Real]:
-        """Return the rows at least up to the given number of ticks."""
+    def for_ticks(self, ticks: int) -> dict[str, Real]:
+        """Return the responses by quantity, each for at least the given number of ticks."""
         if ticks > self._ticks:
             self._ticks = max(2 * ticks, 1024)
             one = from_acceleration(np.ones(self._ticks), self._plant.rate_hz)
@@ -418,47 +464,55 @@ class _UnitResponse:
         return self._rows
 
 
-def _over_intervals(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]) -> Real:
-    """Return the response (ticks, intervals) to an acceleration of 1 in each interval."""
-    since = ticks[:, None] - edges
-    begun: Real = np.where(since >= 0, unit[np.maximum(since, 0)], 0.0)
-    return begun[:, :-1] - begun[:, 1:]
+def _interval_responses(
+    unit_responses: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]
+) -> Real:
+    """Return the response at some ticks to an acceleration of 1 in one interval only.
+
+    The shape is (ticks, intervals). `unit_responses` is the response to a constant acceleration of
+    1, and `edges` are the ticks at which the intervals begin and end.
+    """
+    ticks_since_edge = ticks[:, None] - edges
+    step_response: Real = np.where(
+        ticks_since_edge >= 0, unit_responses[np.maximum(ticks_since_edge, 0)], 0.0
+    )
+    return step_response[:, :-1] - step_response[:, 1:]
 
 
 # Braking
 
 
 def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
-    """Return the shortest braking path that stays within the torque limit from any tick.
+    """Return the shortest braking path that needs no more than the motor's peak torque.
 
     Parameters
     ----------
     plant
-        The rig.
+        Model of the rig.
     reference_rad
-        Shape (n,): reference from rest, which may have to be braked.
+        Reference angle from rest, shape (n,), which may have to be braked at any tick.
 
     Raises
     ------
     ExcitationError
-        If no braking path of at most 5 s does.
+        If every braking path of at most 5 s needs more torque.
 
     Notes
     -----
-    The closed loop is simulated from starts all along the reference. After them the torque is
-    linear in speed and acceleration of the reference at the start.
+    The closed loop is simulated with braking from ticks all along the reference. During braking the
+    torque is linear in speed and acceleration of the reference at the start.
     """
     held = np.zeros(round(plant.settling_s * plant.rate_hz))
     starts = np.unique(np.linspace(2, reference_rad.size - 1, _BRAKING_STARTS).astype(int))
-    free_nm = plant.peak_torque_nm - plant.friction_nm
-    duration_s, longest_s = _BRAKING_S
+    available_torque_nm = plant.peak_torque_nm - plant.friction_nm
+    duration_s, longest_s = _BRAKING_DURATIONS_S
     while duration_s <= longest_s:
         braking = braking_path(duration_s, plant.rate_hz)
         fraction = 0.0
         for tick in starts:
-            path = braked(reference_rad, int(tick), braking)
+            path = braked_reference(reference_rad, int(tick), braking)
             response = plant.respond(np.concatenate([path, held + path[-1]]))
-            fraction = max(fraction, float(np.abs(response.torque_nm).max()) / free_nm)
+            fraction = max(fraction, float(np.abs(response.torque_nm).max()) / available_torque_nm)
             if fraction > 1.0:
                 break
         if fraction <= 1.0:
@@ -478,17 +532,17 @@ class MoveRig(Protocol):
 
     @property
     def start_rad(self) -> float:
-        """Present angle of the motor, from the rig's zero."""
+        """Present angle of the motor from the rig's zero, in rad."""
 
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
-        """Return the rig for planning, with the beam of an analysis; without a path the profile's.
+        """Return the model of the rig for planning, with the beam of an analysis.
 
         Parameters
         ----------
         path
-            Document of ``analyze --json``, or empty.
+            Document of ``analyze --json`` with the beam; empty: the beam of the profile.
         use
-            Purpose of the beam.
+            Purpose for which the beam is used.
         """
 
 
@@ -503,26 +557,26 @@ def move(
     ring_down_s: float = 5.0,
     rig: MoveRig | None = None,
 ) -> Excitation:
-    """Move to an angle in the shortest time that leaves no vibration; the motor stays there.
+    """Return the shortest move to another angle that leaves no vibration; the motor stays there.
 
     Parameters
     ----------
     rate_hz
         Ticks a second.
     angle_rad
-        Final angle, from the rig's zero.
+        Final angle from the rig's zero.
     by_rad
-        Distance, instead of `angle_rad`; either sign.
+        Distance from the present angle, of either sign, instead of `angle_rad`.
     path
-        JSON written by ``analyze --json``, whose beam the move is planned for; empty: the
-        profile's.
+        JSON written by ``analyze --json`` with the beam for which the move is planned; empty: the
+        beam of the profile.
     robust
         1: the move tolerates a 1 % frequency error and does not turn back, but takes longer.
-        0: the shortest.
+        0: the move is the shortest.
     rest_s, ring_down_s
-        Time before and after the move.
+        Time in s before and after the move.
     rig
-        The rig.
+        Rig that is moved.
 
     Raises
     ------
@@ -537,50 +591,53 @@ def move(
         raise ExcitationError("Give either angle_rad or by_rad (rad): where to, or by how much.")
     for option, value_rad in (("angle_rad", angle_rad), ("by_rad", by_rad)):
         if value_rad is not None:
-            finite(option, value_rad, "rad")
+            require_finite(option, value_rad, "rad")
     if robust not in (0, 1):
         raise ExcitationError(f"robust = {robust} is neither 0 nor 1; choose one.")
     start_rad = rig.start_rad
     target_rad = start_rad + by_rad if angle_rad is None else angle_rad  # type: ignore[operator]
-    within_a_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
+    require_within_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
     plant = rig.move_plant(path, MOVE)
-    farthest_rad = _FARTHEST * plant.angle_rad
+    farthest_rad = _MAX_END_ANGLE_FRACTION * plant.angle_rad
     if not abs(target_rad) <= farthest_rad:
         raise ExcitationError(
             f"The move would end at {target_rad:.4g} rad, and limits.angle_rad = "
             f"{plant.angle_rad:g} rad allows {farthest_rad:.4g} rad from the zero to either side; "
-            f"choose at most that{'' if by_rad is None else _by_at_most(farthest_rad, start_rad)}."
+            "choose at most "
+            f"that{'' if by_rad is None else _allowed_range(farthest_rad, start_rad)}."
         )
     distance_rad = target_rad - start_rad
-    if abs(distance_rad) < _LEAST_RAD:
+    if abs(distance_rad) < _MIN_DISTANCE_RAD:
         raise ExcitationError(
-            f"The motor stands at {start_rad:.4g} rad already, and a move is of {_LEAST_RAD:g} rad "
-            "at least; choose another angle."
+            f"The motor stands at {start_rad:.4g} rad already, and a move is of "
+            f"{_MIN_DISTANCE_RAD:g} rad at least; choose another angle."
         )
-    planned = shortest_move(plant, distance_rad, start_rad=start_rad, robust=bool(robust))
-    segments = lay_out_segments(rate_hz, rest_s, planned.duration_s, ring_down_s)
-    end = predict_end(plant, planned.reference_rad, ring_down_s)
+    planned_move = shortest_move(plant, distance_rad, start_rad=start_rad, robust=bool(robust))
+    segments = lay_out_segments(rate_hz, rest_s, planned_move.duration_s, ring_down_s)
+    end = predict_move_end(plant, planned_move.reference_rad, ring_down_s)
     parameters: dict[str, float | int | str] = {
         "angle_rad": target_rad,
         "by_rad": distance_rad,
         "file": Path(path).name if path else "",
         "robust": robust,
-        "duration_s": planned.duration_s,
+        "duration_s": planned_move.duration_s,
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
-        "limits_share": planned.limit_fraction,
+        "limits_share": planned_move.limit_fraction,
         "residual_nm": end.residual_nm,
         "residual_floor_nm": end.floor_nm,
-        "frequency_residual_nm": planned.residual_nm,
-        "quintic_residual_nm": planned.quintic_residual_nm,
+        "frequency_residual_nm": planned_move.residual_nm,
+        "quintic_residual_nm": planned_move.quintic_residual_nm,
     }
     if end.arrival_s is not None:
         parameters["arrival_s"] = end.arrival_s
-    made = assemble("move", parameters, rate_hz, segments, planned.reference_rad)
-    return replace(made, stays=True, model=plant.model)
+    excitation = assemble_excitation(
+        "move", parameters, rate_hz, segments, planned_move.reference_rad
+    )
+    return replace(excitation, stays=True, model=plant.model)
 
 
-def _by_at_most(farthest_rad: float, start_rad: float) -> str:
-    """Describe the largest allowed distance from the present angle."""
+def _allowed_range(farthest_rad: float, start_rad: float) -> str:
+    """Return the end of a message that states the range of distances which a move may have."""
     low, high = -farthest_rad - start_rad, farthest_rad - start_rad
     return f", that is by {low:.4g} to {high:.4g} rad from {start_rad:.4g} rad"

@@ -21,20 +21,24 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 SAMPLES_PER_PERIOD = 4
-"""Fewest samples in a period of the reference: with fewer it is not a sine any more."""
+"""Smallest number of samples in a period of the reference; with fewer samples the reference is not
+a sine any more."""
 
 LIMIT_FRACTION = 0.9
-"""Fraction of every limit that an excitation for a rig may use in the prediction; the remainder is
-for a beam that differs from the predicted one."""
+"""Largest fraction of each of the rig's limits that the predicted motion may use. The remainder is
+for a beam that differs from the predicted beam."""
 
 
 class ExcitationError(UserError, ValueError):
-    """An option of an excitation is invalid; the message names option, value, unit and remedy."""
+    """Error of an invalid option of an excitation.
+
+    The message states option, value, unit and remedy.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class Excitation:
-    """A reference, tick by tick.
+    """Excitation of a session: the reference angle at each tick, with its options and segments.
 
     Attributes
     ----------
@@ -46,18 +50,19 @@ class Excitation:
     rate_hz
         Ticks a second.
     reference_rad
-        Shape (n,), relative to the start angle; read-only.
+        Reference angle at each tick, relative to the start angle; shape (n,), read-only.
     segments
-        ``rest``, ``sweep``, ``ring_down`` → first tick and end (exclusive); of a chirp there and
-        back also ``there`` and ``back``, the two sweeps in ``sweep``.
+        First tick and end (exclusive) of ``rest``, ``sweep`` and ``ring_down``. A chirp there and
+        back also has ``there`` and ``back``, the two sweeps in ``sweep``.
     stays
-        Whether the motor stays at the end of the reference; else it returns to the start angle.
+        Whether the motor stays at the end of the reference. Otherwise it returns to the start
+        angle.
     approach
         Reaction of the loop to a touch; None: the loop does not watch for touches.
     search
-        Targets of a session that ends when they are reached; None: its end is planned.
+        Target precisions of a session that ends when they are reached; None: its end is planned.
     model
-        Beam of an analysis for which it was planned; None: the profile's.
+        Beam of an analysis for which the excitation was planned; None: the profile's beam.
     """
 
     kind: str
@@ -72,12 +77,17 @@ class Excitation:
 
     @property
     def shows_modes(self) -> bool:
-        """Whether the record can show the beam's modes, unlike that of a move or a search."""
+        """Whether a record of the excitation can show the beam's modes.
+
+        The record of a move or of a search for an obstacle cannot.
+        """
         return not self.stays and self.approach is None
 
 
 def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
-    """Return the frequency of a chirp at a tick; None for other excitations, and outside the sweep.
+    """Return the frequency of a chirp in Hz at a tick, or None outside the sweep.
+
+    Return None for other excitations as well.
 
     Parameters
     ----------
@@ -102,8 +112,11 @@ def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
 # Checks of options
 
 
-def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
-    """Return a time as a number of ticks; raise unless it is a whole number of them."""
+def to_whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
+    """Convert a time in s to ticks; raise `ExcitationError` unless it is a whole number of ticks.
+
+    `option` is the name of the option in the message.
+    """
     ticks = round(value_s * rate_hz)
     if ticks < 2 or abs(ticks / rate_hz - value_s) > 1e-9 * value_s:
         raise ExcitationError(
@@ -113,8 +126,8 @@ def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
     return ticks
 
 
-def finite(option: str, value: float, unit: str) -> None:
-    """Raise if the value of an option is not finite, or too large for any rig."""
+def require_finite(option: str, value: float, unit: str) -> None:
+    """Raise `ExcitationError` if an option's value is not finite, or has no size of a real rig."""
     if not isfinite(value):
         raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
     if not is_usable_size(value):
@@ -123,22 +136,22 @@ def finite(option: str, value: float, unit: str) -> None:
         )
 
 
-def positive(option: str, value: float, unit: str) -> None:
-    """Raise unless a value is a finite number above 0."""
-    finite(option, value, unit)
+def require_positive(option: str, value: float, unit: str) -> None:
+    """Raise `ExcitationError` unless an option's value is a finite number above 0."""
+    require_finite(option, value, unit)
     if value <= 0.0:
         raise ExcitationError(f"{option} = {value:g} {unit} must be more than 0 {unit}.")
 
 
-def not_negative(option: str, value: float) -> None:
-    """Raise unless a time is finite and at least 0 s."""
-    finite(option, value, "s")
+def require_not_negative(option: str, value: float) -> None:
+    """Raise `ExcitationError` unless an option's time is finite and at least 0 s."""
+    require_finite(option, value, "s")
     if value < 0.0:
         raise ExcitationError(f"{option} = {value:g} s must not be negative.")
 
 
-def within_a_turn(option: str, value_rad: float) -> None:
-    """Raise if an angle is more than a full turn to either side."""
+def require_within_turn(option: str, value_rad: float) -> None:
+    """Raise `ExcitationError` if an option's angle is more than a full turn to either side."""
     if abs(value_rad) > 2.0 * pi:
         raise ExcitationError(
             f"{option} = {value_rad:g} rad is more than a full turn; give an angle in rad of at "
@@ -146,9 +159,14 @@ def within_a_turn(option: str, value_rad: float) -> None:
         )
 
 
-def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool = False) -> None:
-    """Raise unless a frequency is above 0 and has enough samples per period."""
-    finite(option, value, "Hz")
+def require_frequency(
+    option: str, value: float, rate_hz: float, *, zero_allowed: bool = False
+) -> None:
+    """Raise `ExcitationError` unless a frequency is above 0 Hz and at most a quarter of the rate.
+
+    With `zero_allowed`, 0 Hz is valid as well.
+    """
+    require_finite(option, value, "Hz")
     highest = rate_hz / SAMPLES_PER_PERIOD
     if not (value > 0.0 or (zero_allowed and value == 0.0)):
         bound = "must not be negative" if zero_allowed else "must be more than 0 Hz"
@@ -166,10 +184,13 @@ def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool =
 def lay_out_segments(
     rate_hz: float, rest_s: float, duration_s: float, ring_down_s: float
 ) -> dict[str, tuple[int, int]]:
-    """Return rest, sweep and ring-down in ticks; the ring-down absorbs the rounding."""
-    not_negative("rest_s", rest_s)
-    positive("duration_s", duration_s, "s")
-    not_negative("ring_down_s", ring_down_s)
+    """Return first tick and end of the segments rest, sweep and ring-down, by name.
+
+    The times are rounded to ticks, and the rounding changes the length of the ring-down only.
+    """
+    require_not_negative("rest_s", rest_s)
+    require_positive("duration_s", duration_s, "s")
+    require_not_negative("ring_down_s", ring_down_s)
     around_s = rest_s + ring_down_s
     check_ticks("The session", (duration_s + around_s) * rate_hz, rate_hz, around_s)
     first = round(rate_hz * rest_s)
@@ -184,22 +205,25 @@ def lay_out_segments(
 
 
 def check_ticks(what: str, ticks: float, rate_hz: float, around_s: float = 0.0) -> None:
-    """Raise if a record is too long to be analysed; `around_s` is rest plus ring-down."""
+    """Raise `ExcitationError` if a record has more ticks than can be analysed.
+
+    `what` begins the message, and `around_s` is the time of rest and ring-down together.
+    """
     if ticks > MAX_SAMPLES:
         longest_s = MAX_SAMPLES / rate_hz
-        between = (
+        limit_text = (
             f" ({longest_s - around_s:g} s between rest and ring-down)"
             if 0.0 < around_s < longest_s
             else ""
         )
         raise ExcitationError(
             f"{what} would take {ticks / rate_hz:g} s; {longest_s:g} s is the most at {rate_hz:g} "
-            f"Hz{between}, because no more than {MAX_SAMPLES} samples can be analysed, exported "
+            f"Hz{limit_text}, because no more than {MAX_SAMPLES} samples can be analysed, exported "
             "or replayed: shorten it or run several sessions."
         )
 
 
-def assemble(
+def assemble_excitation(
     kind: str,
     parameters: Mapping[str, float | int | str],
     rate_hz: float,
@@ -208,7 +232,7 @@ def assemble(
     *,
     approach: "Approach | None" = None,
 ) -> Excitation:
-    """Put a sweep (n,) between rest and ring-down."""
+    """Return an excitation with a sweep, shape (n,) in rad, between rest and ring-down."""
     reference = np.zeros(segments["ring_down"][1])
     reference[slice(*segments["sweep"])] = sweep
     reference[slice(*segments["ring_down"])] = sweep[-1]
@@ -231,10 +255,11 @@ def chirp(
     taper_s: float = 0.0,
     there_and_back: int = 0,
 ) -> Excitation:
-    """Return a linear sweep ``A sin 2π(f0 t + (f1 - f0) t²/(2 T))``, t from its first tick.
+    """Return a chirp: a sine whose frequency changes linearly with time.
 
-    The defaults are the paper's experiment (Section 5). With ``there_and_back`` the frequency
-    returns to f0 in the same time, with continuous angle and speed at the turn.
+    The sweep is ``A sin 2π(f0 t + (f1 - f0) t²/(2 T))``, with t from its first tick. The defaults
+    are the paper's experiment (Section 5). With ``there_and_back`` the frequency returns to f0 in
+    the same time, with continuous angle and speed at the turn.
 
     Parameters
     ----------
@@ -245,14 +270,15 @@ def chirp(
     start_hz, stop_hz
         Frequencies f0 at the sweep's first tick and f1 at its end; f1 < f0 sweeps downwards.
     duration_s
-        Length T of the sweep; there and back, of each of the two.
+        Duration T of a sweep in s; with ``there_and_back``, of each of the two sweeps.
     rest_s, ring_down_s
-        Time before and after the sweep.
+        Time in s before and after the sweep.
     taper_s
-        Raised-cosine fade at both ends of the sweep; 0, as in the paper, leaves it as it is.
+        Duration in s of the raised-cosine fade at both ends of the sweep; 0, as in the paper: no
+        fade.
     there_and_back
         1: two sweeps, the second from f1 to f0, so that each mode is passed twice and a change
-        over time is visible; 0: one.
+        over time is visible; 0: one sweep.
 
     Raises
     ------
@@ -266,10 +292,10 @@ def chirp(
     >>> sweep.segments
     {'rest': (0, 1000), 'sweep': (1000, 121000), 'ring_down': (121000, 136000)}
     """
-    positive("amplitude_rad", amplitude_rad, "rad")
-    within_a_turn("amplitude_rad", amplitude_rad)
-    frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
-    frequency("stop_hz", stop_hz, rate_hz)
+    require_positive("amplitude_rad", amplitude_rad, "rad")
+    require_within_turn("amplitude_rad", amplitude_rad)
+    require_frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
+    require_frequency("stop_hz", stop_hz, rate_hz)
     if there_and_back not in (0, 1):
         raise ExcitationError(
             f"there_and_back = {there_and_back} must be 0 (one sweep) or 1 (two sweeps)."
@@ -280,12 +306,20 @@ def chirp(
         segments = lay_out_segments(rate_hz, rest_s, 2.0 * duration_s, ring_down_s)
         back_ticks = there_ticks[1], segments["sweep"][1]
         segments |= {"there": there_ticks, "back": back_ticks}
-    t = _sweep_time(segments, rate_hz)
+    t = _sweep_times_s(segments, rate_hz)
     # Time on the way there and on the way back, where the phase goes on from the turn.
-    there, back = np.minimum(t, duration_s), np.maximum(t - duration_s, 0.0)
-    phase = 2.0 * pi * (start_hz * there + (stop_hz - start_hz) * there**2 / (2.0 * duration_s))
-    phase += 2.0 * pi * (stop_hz * back - (stop_hz - start_hz) * back**2 / (2.0 * duration_s))
-    sweep = amplitude_rad * np.sin(phase) * _taper(t, (1 + there_and_back) * duration_s, taper_s)
+    outward_s, return_s = np.minimum(t, duration_s), np.maximum(t - duration_s, 0.0)
+    phase = (
+        2.0 * pi * (start_hz * outward_s + (stop_hz - start_hz) * outward_s**2 / (2.0 * duration_s))
+    )
+    phase += (
+        2.0 * pi * (stop_hz * return_s - (stop_hz - start_hz) * return_s**2 / (2.0 * duration_s))
+    )
+    sweep = (
+        amplitude_rad
+        * np.sin(phase)
+        * _taper_factors(t, (1 + there_and_back) * duration_s, taper_s)
+    )
     parameters = {
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,
@@ -296,22 +330,22 @@ def chirp(
         "taper_s": taper_s,
         **({"there_and_back": 1} if there_and_back else {}),
     }
-    return assemble("chirp", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("chirp", parameters, rate_hz, segments, sweep)
 
 
 def hold(
     *, rate_hz: float, duration_s: float = 10.0, rest_s: float = 1.0, ring_down_s: float = 0.0
 ) -> Excitation:
-    """Hold the start angle, for noise and drift.
+    """Return an excitation that holds the start angle, to measure noise and drift.
 
     Parameters
     ----------
     rate_hz
         Ticks a second.
     duration_s
-        Time of the segment ``sweep``.
+        Duration of the segment ``sweep`` in s.
     rest_s, ring_down_s
-        Time before and after it.
+        Time in s before and after this segment.
 
     Raises
     ------
@@ -327,7 +361,7 @@ def hold(
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters = {"duration_s": duration_s, "rest_s": rest_s, "ring_down_s": ring_down_s}
     sweep = np.zeros(segments["sweep"][1] - segments["sweep"][0])
-    return assemble("hold", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("hold", parameters, rate_hz, segments, sweep)
 
 
 def step(
@@ -338,18 +372,18 @@ def step(
     rest_s: float = 1.0,
     ring_down_s: float = 15.0,
 ) -> Excitation:
-    """Step by ``amplitude_rad`` (either sign) at the sweep's first tick.
+    """Return an excitation with a step of the reference angle at the sweep's first tick.
 
     Parameters
     ----------
     rate_hz
         Ticks a second.
     amplitude_rad
-        Angle of the step, not 0.
+        Angle of the step, of either sign and not 0.
     duration_s
-        Time of the segment ``sweep``.
+        Duration of the segment ``sweep`` in s.
     rest_s, ring_down_s
-        Time before and after it.
+        Time in s before and after this segment.
 
     Raises
     ------
@@ -362,12 +396,12 @@ def step(
     >>> step(rate_hz=1000, amplitude_rad=0.01).reference_rad[[999, 1000, -1]]
     array([0.  , 0.01, 0.01])
     """
-    finite("amplitude_rad", amplitude_rad, "rad")
+    require_finite("amplitude_rad", amplitude_rad, "rad")
     if amplitude_rad == 0.0:
         raise ExcitationError(
             "amplitude_rad = 0 rad is not a step; give an angle other than zero, or use hold."
         )
-    within_a_turn("amplitude_rad", amplitude_rad)
+    require_within_turn("amplitude_rad", amplitude_rad)
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters = {
         "amplitude_rad": amplitude_rad,
@@ -376,7 +410,7 @@ def step(
         "ring_down_s": ring_down_s,
     }
     sweep = np.full(segments["sweep"][1] - segments["sweep"][0], amplitude_rad)
-    return assemble("step", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("step", parameters, rate_hz, segments, sweep)
 
 
 def multisine(
@@ -405,15 +439,16 @@ def multisine(
     amplitude_rad
         Largest magnitude of the reference.
     start_hz, stop_hz
-        The band.
+        Lowest and highest frequency of the band.
     period_s
-        Period; a whole number of ticks, and of it a whole number makes ``duration_s``.
+        Period in s, a whole number of ticks. ``duration_s`` is a whole number of periods.
     duration_s
-        Length of the sweep segment.
+        Duration of the segment ``sweep`` in s.
     rest_s, ring_down_s
-        Time before and after it.
+        Time in s before and after this segment.
     taper_s
-        Raised-cosine fade at both ends of the whole sweep; the periods in it are then not equal.
+        Duration in s of the raised-cosine fade at both ends of the whole sweep. The periods with a
+        fade differ from the others.
     seed
         Seed of the phases: equal seeds give equal references.
 
@@ -432,15 +467,15 @@ def multisine(
     >>> print(f"crest factor {signal.parameters['crest_factor']:.2f}")
     crest factor 3.30
     """
-    positive("amplitude_rad", amplitude_rad, "rad")
-    within_a_turn("amplitude_rad", amplitude_rad)
-    frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
-    frequency("stop_hz", stop_hz, rate_hz)
-    positive("period_s", period_s, "s")
+    require_positive("amplitude_rad", amplitude_rad, "rad")
+    require_within_turn("amplitude_rad", amplitude_rad)
+    require_frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
+    require_frequency("stop_hz", stop_hz, rate_hz)
+    require_positive("period_s", period_s, "s")
     if seed < 0:
         raise ExcitationError(f"seed = {seed} is negative; give a whole number from 0 on.")
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
-    ticks = whole_ticks("period_s", period_s, rate_hz)
+    ticks = to_whole_ticks("period_s", period_s, rate_hz)
     periods = round(duration_s / period_s)
     if periods < 1 or abs(periods * period_s - duration_s) > 1e-9 * duration_s:
         raise ExcitationError(
@@ -449,8 +484,8 @@ def multisine(
         )
     period = amplitude_rad * _random_phase_period(ticks, period_s, (start_hz, stop_hz), seed)
     crest_factor = amplitude_rad / float(np.sqrt(np.mean(period**2)))
-    t = _sweep_time(segments, rate_hz)
-    sweep = np.tile(period, periods) * _taper(t, duration_s, taper_s)
+    t = _sweep_times_s(segments, rate_hz)
+    sweep = np.tile(period, periods) * _taper_factors(t, duration_s, taper_s)
     parameters = {
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,
@@ -463,19 +498,19 @@ def multisine(
         "seed": seed,
         "crest_factor": crest_factor,
     }
-    return assemble("multisine", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("multisine", parameters, rate_hz, segments, sweep)
 
 
 def _random_phase_period(
     ticks: int, period_s: float, band_hz: tuple[float, float], seed: int
 ) -> FloatArray:
-    """Return one period of all harmonics, shape (ticks,), with peak 1 and a start near zero."""
+    """Return one period of the multisine with peak 1, shape (ticks,), which starts near zero."""
     frequency_hz = np.arange(1, ticks // 2) / period_s
     tolerance_hz = 1e-9 * band_hz[1]
-    inside = (frequency_hz >= band_hz[0] - tolerance_hz) & (
+    in_band = (frequency_hz >= band_hz[0] - tolerance_hz) & (
         frequency_hz <= band_hz[1] + tolerance_hz
     )
-    harmonics = 1 + np.flatnonzero(inside)
+    harmonics = 1 + np.flatnonzero(in_band)
     if harmonics.size == 0:
         raise ExcitationError(
             f"No harmonic of period_s = {period_s:g} s lies between start_hz = {band_hz[0]:g} Hz "
@@ -490,13 +525,15 @@ def _random_phase_period(
     return period
 
 
-def _sweep_time(segments: Mapping[str, tuple[int, int]], rate_hz: float) -> FloatArray:
+def _sweep_times_s(segments: Mapping[str, tuple[int, int]], rate_hz: float) -> FloatArray:
+    """Return the time in s of each tick of the sweep, from its first tick on."""
     first, end = segments["sweep"]
     return np.arange(end - first) / rate_hz
 
 
-def _taper(t: FloatArray, duration_s: float, taper_s: float) -> FloatArray | float:
-    not_negative("taper_s", taper_s)
+def _taper_factors(t: FloatArray, duration_s: float, taper_s: float) -> FloatArray | float:
+    """Return the factors at times `t` that fade a sweep in and out, each within `taper_s`."""
+    require_not_negative("taper_s", taper_s)
     if taper_s == 0.0:
         return 1.0
     if 2.0 * taper_s > duration_s:

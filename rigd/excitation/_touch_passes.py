@@ -1,9 +1,9 @@
-"""Passes in search of an obstacle: out at a constant speed until something is met, and back.
+"""Passes in search of an obstacle: out at a constant speed until the beam touches it, and back.
 
 Each pass has its own block of time: rest, way out, pause, way back without an obstacle. When the
-loop detects a touch, it leaves the reference for another one that fits into the same block
-(`after_touch`): it brakes, holds, and returns to the beginning of the pass. A session therefore
-has the same number of ticks with and without a touch. Neither way makes the beam ring.
+loop detects a touch, it replaces the rest of the reference in this block (`after_touch`): the motor
+brakes, holds, and returns to the beginning of the pass. A session therefore has the same number of
+ticks with and without a touch. Neither way excites a vibration.
 """
 
 from dataclasses import dataclass, replace
@@ -17,49 +17,50 @@ from rigd.excitation._shortest_move import MoveRig, shortest_braking
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
-    assemble,
+    assemble_excitation,
     check_ticks,
-    finite,
     lay_out_segments,
-    not_negative,
-    positive,
-    within_a_turn,
+    require_finite,
+    require_not_negative,
+    require_positive,
+    require_within_turn,
 )
 from rigd.excitation.moves import Braking, slew, still_path
 from rigd.identified_beam import TOUCH
 
 Real = NDArray[np.float64]
 
-_PEAK_SPEED = 2.0
-"""Largest speed of the way back over its mean: that of a minimum-jerk path, with a margin."""
+_PEAK_OVER_MEAN_SPEED = 2.0
+"""Ratio of the largest speed to the mean speed on the way back: that of a minimum-jerk path, with a
+margin."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchPass:
-    """Ticks of one pass."""
+    """Ticks at which the parts of one pass in search of an obstacle begin and end."""
 
     begins: int
-    """Start of the way out; the rest before it belongs to the pass."""
+    """Tick at which the way out begins; the rest before it belongs to the pass."""
     returns: int
-    """Start of the way back."""
+    """Tick at which the way back begins."""
     ends: int
     """First tick after the pass."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """Passes in search of an obstacle, as the control loop needs them."""
+    """Passes in search of an obstacle, and the control loop's reaction to a touch."""
 
     passes: tuple[TouchPass, ...]
-    """In their order."""
+    """Passes in the order of time."""
     braking: Braking
-    """Table of the braking path."""
+    """Path on which the motor brakes after a touch."""
     hold_ticks: int
-    """Ticks from a touch to the way back."""
+    """Number of ticks from a touch to the way back."""
     back: Real
-    """Way back from 0 to 1, at the ticks after its start."""
+    """Path of the way back from 0 to 1, at the ticks after its start."""
     force_limit_n: float
-    """Contact force above which the torque is switched off."""
+    """Contact force in N above which the torque is switched off."""
 
 
 def touch(
@@ -77,14 +78,14 @@ def touch(
     path: str | Path = "",
     rig: MoveRig | None = None,
 ) -> Excitation:
-    """Slew until something is met, then brake, hold and withdraw.
+    """Return an excitation that moves the beam until it touches an obstacle, and then back.
 
     Parameters
     ----------
     rate_hz
         Ticks a second.
     angle_rad
-        Farthest angle, from the rig's zero.
+        Farthest angle from the rig's zero.
     speed_rad_s
         Speed on the way out.
     acceleration_rad_s2
@@ -92,17 +93,17 @@ def touch(
     passes
         Number of passes.
     hold_s
-        Time from a touch to the way back, and at the farthest angle if there is none.
+        Time in s from a touch to the way back; without a touch, time at the farthest angle.
     settle_s
-        Rest before each pass.
+        Time in s at rest before each pass.
     force_limit_n
-        Contact force above which the torque is switched off and the session ends as a fault; it is
-        watched where the rig measures the base shear.
+        Contact force above which the torque is switched off and the session ends as a fault. It is
+        checked if the rig measures the base shear.
     rest_s, ring_down_s
-        Time before and after all passes.
+        Time in s before and after all passes.
     path
-        JSON written by ``analyze --json``, whose beam the torque is compared with; empty: the
-        profile's.
+        JSON written by ``analyze --json`` with the beam whose predicted torque is compared with the
+        measured torque; empty: the beam of the profile.
     rig
         Rig that is moved.
 
@@ -116,31 +117,31 @@ def touch(
     """
     if rig is None:
         raise ExcitationError("touch is made for a rig; none was given.")
-    finite("angle_rad", angle_rad, "rad")
-    within_a_turn("angle_rad", angle_rad)
+    require_finite("angle_rad", angle_rad, "rad")
+    require_within_turn("angle_rad", angle_rad)
     by_rad = angle_rad - rig.start_rad
     if by_rad == 0.0:
         raise ExcitationError(
             f"angle_rad = {angle_rad:g} rad is where the motor stands; give another angle."
         )
-    positive("speed_rad_s", speed_rad_s, "rad/s")
-    positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
-    positive("force_limit_n", force_limit_n, "N")
-    positive("hold_s", hold_s, "s")
-    not_negative("settle_s", settle_s)
+    require_positive("speed_rad_s", speed_rad_s, "rad/s")
+    require_positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
+    require_positive("force_limit_n", force_limit_n, "N")
+    require_positive("hold_s", hold_s, "s")
+    require_not_negative("settle_s", settle_s)
     if passes < 1:
         raise ExcitationError(f"passes = {passes} must be at least 1.")
     at_least_s = settle_s + abs(by_rad) / speed_rad_s + hold_s
     check_ticks("The session", passes * at_least_s * rate_hz, rate_hz)
     plant = rig.move_plant(path, TOUCH)
-    out = slew(
+    way_out_rad = slew(
         by_rad,
         speed_rad_s=speed_rad_s,
         acceleration_rad_s2=acceleration_rad_s2,
         rate_hz=rate_hz,
         poles_rad_s=plant.poles_rad_s,
     )
-    braking = shortest_braking(plant, np.concatenate([[0.0, 0.0], out]))
+    braking = shortest_braking(plant, np.concatenate([[0.0, 0.0], way_out_rad]))
     hold_ticks = ceil(hold_s * rate_hz)
     if hold_s < braking.duration_s:
         raise ExcitationError(
@@ -149,25 +150,29 @@ def touch(
         )
     slowest_rad_s = float(np.abs(plant.poles_rad_s).min(initial=np.inf))
     # At least one period of the slowest mode: a path that leaves it at rest is then gentle.
-    back_s = max(_PEAK_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s)
-    back = still_path(back_s, rate_hz, plant.poles_rad_s)
-    settle = np.zeros(ceil(settle_s * rate_hz))
-    single_pass = np.concatenate([settle, out, np.full(hold_ticks, by_rad), by_rad * (1.0 - back)])
+    return_duration_s = max(
+        _PEAK_OVER_MEAN_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s
+    )
+    return_path = still_path(return_duration_s, rate_hz, plant.poles_rad_s)
+    rest_rad = np.zeros(ceil(settle_s * rate_hz))
+    single_pass = np.concatenate(
+        [rest_rad, way_out_rad, np.full(hold_ticks, by_rad), by_rad * (1.0 - return_path)]
+    )
     check_ticks("The session", passes * single_pass.size, rate_hz)
     segments = lay_out_segments(rate_hz, rest_s, passes * single_pass.size / rate_hz, ring_down_s)
     first = segments["sweep"][0]
     approach = Approach(
         passes=tuple(
             TouchPass(
-                begins=start + settle.size,
-                returns=start + single_pass.size - back.size,
+                begins=start + rest_rad.size,
+                returns=start + single_pass.size - return_path.size,
                 ends=start + single_pass.size,
             )
             for start in range(first, first + passes * single_pass.size, single_pass.size)
         ),
         braking=braking,
         hold_ticks=hold_ticks,
-        back=back,
+        back=return_path,
         force_limit_n=force_limit_n,
     )
     parameters: dict[str, float | int | str] = {
@@ -185,8 +190,10 @@ def touch(
         "braking_s": braking.duration_s,
     }
     sweep = np.tile(single_pass, passes)
-    made = assemble("touch", parameters, rate_hz, segments, sweep, approach=approach)
-    return replace(made, model=plant.model)
+    excitation = assemble_excitation(
+        "touch", parameters, rate_hz, segments, sweep, approach=approach
+    )
+    return replace(excitation, model=plant.model)
 
 
 def after_touch(
@@ -196,37 +203,41 @@ def after_touch(
     recent_rad: tuple[float, float, float],
     start_rad: float,
 ) -> Real:
-    """Return the rest of a pass after a touch: brake, hold, go back to its start.
+    """Return the reference for the rest of a pass after a touch: brake, hold, and return.
 
     Parameters
     ----------
     approach
-        The search.
+        Passes and reaction to a touch.
     ends
         First tick after the pass.
     tick
-        Tick of the detection, before the way back begins.
+        Tick at which the touch was detected, before the way back begins.
     recent_rad
-        Reference two ticks before, one tick before, and at this tick.
+        Reference angles two ticks before `tick`, one tick before it, and at it.
     start_rad
-        Reference where the pass began.
+        Reference angle at the beginning of the pass.
 
     Returns
     -------
     ndarray of shape (ends - tick - 1,)
-        Reference of the ticks after this one, in rad.
+        Reference angles in rad at the ticks after `tick`.
     """
-    braking, back = approach.braking, approach.back
-    before, last, now = recent_rad
-    acceleration = (now - 2 * last + before) * braking.rate_hz**2
-    speed = (now - last) * braking.rate_hz + acceleration / (2 * braking.rate_hz)
+    braking, return_path = approach.braking, approach.back
+    angle_two_ticks_before, angle_one_tick_before, present_angle = recent_rad
+    acceleration = (
+        present_angle - 2 * angle_one_tick_before + angle_two_ticks_before
+    ) * braking.rate_hz**2
+    speed = (present_angle - angle_one_tick_before) * braking.rate_hz + acceleration / (
+        2 * braking.rate_hz
+    )
     reference = np.full(ends - tick - 1, start_rad)
-    stopping = braking.path(now, speed, acceleration)
-    returns = reference.size - back.size
-    hold = min(approach.hold_ticks, returns)
-    stays_rad = stopping[-1]
-    reference[:hold] = stays_rad
+    braking_rad = braking.path(present_angle, speed, acceleration)
+    return_index = reference.size - return_path.size
+    hold = min(approach.hold_ticks, return_index)
+    held_rad = braking_rad[-1]
+    reference[:hold] = held_rad
     # A touch during the pause needs no braking; the remaining pause follows.
-    reference[: min(hold, len(stopping))] = stopping[:hold]
-    reference[hold : hold + back.size] = stays_rad + (start_rad - stays_rad) * back
+    reference[: min(hold, len(braking_rad))] = braking_rad[:hold]
+    reference[hold : hold + return_path.size] = held_rad + (start_rad - held_rad) * return_path
     return reference

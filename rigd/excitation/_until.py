@@ -18,10 +18,10 @@ from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
     check_ticks,
-    frequency,
     lay_out_segments,
-    positive,
-    within_a_turn,
+    require_frequency,
+    require_positive,
+    require_within_turn,
 )
 from rigd.excitation.experiment_design import DesignRig, geometry_floors
 from rigd.excitation.moves import quintic
@@ -31,40 +31,46 @@ from rigd.units import with_percentage
 Real = NDArray[np.float64]
 
 PAUSE_S: Final = 0.5
-"""Pause for a fit, such as the first one: the record gains information while the beam rings."""
+"""Pause in s of the reference for a fit, such as the first. The record gains information meanwhile,
+because the beam still rings."""
 _FADE_S: Final = 0.25
-_SCAN_FRACTION: Final = 0.8
-"""Fraction of the limits that the scan uses: the beam may differ from the profile's."""
-_AT_MODES: Final = (0.2, 1.0, 2.3, 6.3, 12.0)
-_SIZES: Final = (1.0, 0.4, 0.19, 0.15, 1.0)
-"""Amplitude of the scan at some frequencies over that of mode 1.
+"""Duration in s of the scan's fade at either end."""
+_SCAN_LIMIT_FRACTION: Final = 0.8
+"""Largest fraction of the limits that the scan uses, since the beam may differ from the profile."""
+_SCAN_RELATIVE_FREQUENCIES: Final = (0.2, 1.0, 2.3, 6.3, 12.0)
+"""Frequencies over that of mode 1 at which the relative amplitude of the scan is given."""
+_SCAN_RELATIVE_AMPLITUDES: Final = (1.0, 0.4, 0.19, 0.15, 1.0)
+"""Relative amplitudes of the scan at these frequencies, with 1 for its largest amplitude.
 
-Where the slope of the tip is limited and passed modes still ring, these amplitudes determine the
-dampings of the first three modes equally well. For random beams within a fifth of the profile, the
-least certain damping then has 0.63 times the deviation of a scan whose amplitude rises linearly.
+If the slope of the tip is limited and modes passed earlier still ring, these amplitudes determine
+the dampings of the first three modes equally well. For random beams within a fifth of the profile,
+the least certain damping then has 0.63 times the deviation of a scan whose amplitude rises
+linearly.
 """
-_BEND: Final = 1.25
-"""Power of the time with which the frequency rises: low modes get more time."""
+_SCAN_FREQUENCY_POWER: Final = 1.25
+"""Power of the time with which the scan's frequency rises, so that low modes get more time."""
 _MAX_UNIFORMITY_PERCENT: Final = 10.0
-_EXAMPLE: Final = "--damping 1%"
+"""Largest valid value of the option `uniformity_percent`."""
+_EXAMPLE_TARGET: Final = "--damping 1%"
+"""Example of a target on the command line, for an error message."""
 
 
 class ScanRig(DesignRig, Protocol):
-    """Interface to a rig for which a scan is planned."""
+    """Interface to a rig's predicted behaviour, for which a scan is planned."""
 
     def fraction_of_limits(self, reference_rad: Real) -> float:
-        """Return the largest predicted fraction of a limit for a reference (n,)."""
+        """Return the largest fraction of a limit that a reference in rad is predicted to use."""
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
-        """Return the largest predicted slope of the free end for a reference (n,)."""
+        """Return the largest predicted slope in rad of the beam's free end for a reference."""
 
     @property
     def beam(self) -> Beam:
-        """The specimen according to the profile."""
+        """Beam of the rig's profile."""
 
     @property
     def stated_estimate(self) -> BeamEstimate:
-        """Specimen of the profile with the sensor's noise, all parameters free."""
+        """Beam of the rig's profile and the sensor's noise, with all parameters free."""
 
     @property
     def uniformity(self) -> float:
@@ -73,21 +79,21 @@ class ScanRig(DesignRig, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PrecisionSearch:
-    """Targets and planned beginning of a session that ends when a precision is reached.
+    """Target precisions of a session that ends when they are reached, and its planned beginning.
 
     Attributes
     ----------
     targets
         Standard deviations to be reached.
     planned_ticks
-        Ticks of the reference that are planned before the session: rest, scan and a pause.
+        Number of ticks of the reference that are planned before the session: rest, scan and pause.
     scan
-        First tick of the scan, and its reference, shape (n,).
+        First tick of the scan, and its reference angle at each tick, shape (n,).
     tip_slope_rad
         Largest slope of the beam's free end.
     uniformity_percent
-        Relative standard deviation of each mode's frequency from that of a uniform beam; None: that
-        of the profile.
+        Relative standard deviation of each mode's frequency from that of a uniform beam; None: the
+        value of the profile.
     """
 
     targets: tuple[Target, ...]
@@ -111,7 +117,10 @@ def until(
     uniformity_percent: float | None = None,
     rig: ScanRig | None = None,
 ) -> Excitation:
-    """Scan all modes quickly, then choose the most informative excitation until a precision is met.
+    """Return the excitation of a session that continues until target precisions are reached.
+
+    It begins with a quick scan of all modes. The segments after it are planned during the session:
+    each is the most informative excitation.
 
     Parameters
     ----------
@@ -121,24 +130,24 @@ def until(
         Standard deviations to be reached: one or several of ``QUANTITY STD``, such as
         ``damping 1%; frequency 1:0.002Hz``; see `rigd.excitation.targets.parse_target`.
     at_most_s
-        Longest record.
+        Longest duration of the record in s.
     tip_slope_rad
         Largest slope of the beam's free end, of which the scan uses 80 % and segments 90 %. Beyond
         the default, the linear model is not exact.
     amplitude_rad
-        Largest amplitude of the scan, at its end; a sixth of it at mode 2, two fifths at mode 1.
-        Lower where the rig's limits or the slope require it.
+        Largest amplitude of the scan, at its end. The amplitude is a sixth of it at mode 2 and two
+        fifths at mode 1. It is lower if the rig's limits or the slope require it.
     start_hz, stop_hz
-        Band of the scan.
+        Lowest and highest frequency of the scan.
     scan_s
-        Duration of the scan.
+        Duration of the scan in s.
     rest_s
-        Time before the scan.
+        Time in s before the scan.
     uniformity_percent
         Relative standard deviation of each mode's frequency from that of a uniform beam, for the
-        fits; None: that of the profile.
+        fits; None: the value of the profile.
     rig
-        Limits the amplitude and adapts it to the modes; None: one amplitude for all frequencies.
+        Rig whose limits and modes determine the amplitude; None: one amplitude for all frequencies.
 
     Raises
     ------
@@ -153,13 +162,13 @@ def until(
     >>> session.search.planned_ticks, session.reference_rad.size
     (6500, 60000)
     """
-    requested = _parsed(targets)
-    positive("at_most_s", at_most_s, "s")
-    positive("amplitude_rad", amplitude_rad, "rad")
-    within_a_turn("amplitude_rad", amplitude_rad)
-    positive("tip_slope_rad", tip_slope_rad, "rad")
-    frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
-    frequency("stop_hz", stop_hz, rate_hz)
+    requested = _parse_targets(targets)
+    require_positive("at_most_s", at_most_s, "s")
+    require_positive("amplitude_rad", amplitude_rad, "rad")
+    require_within_turn("amplitude_rad", amplitude_rad)
+    require_positive("tip_slope_rad", tip_slope_rad, "rad")
+    require_frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
+    require_frequency("stop_hz", stop_hz, rate_hz)
     if uniformity_percent is not None and not 0.0 <= uniformity_percent <= _MAX_UNIFORMITY_PERCENT:
         raise ExcitationError(
             f"uniformity_percent = {uniformity_percent:g} % must lie between 0 and "
@@ -182,16 +191,16 @@ def until(
         )
     scan_rad = np.zeros(end)
     beam = None if rig is None else rig.beam
-    scan_rad[first:] = amplitude_rad * _scan(end - first, rate_hz, start_hz, stop_hz, beam)
+    scan_rad[first:] = amplitude_rad * _unit_scan(end - first, rate_hz, start_hz, stop_hz, beam)
     if rig is not None:
         uniformity = rig.uniformity if uniformity_percent is None else uniformity_percent / 100.0
-        _refuse_below_floor(rig, requested, uniformity, at_most_s, tip_slope_rad)
+        _require_reachable_targets(rig, requested, uniformity, at_most_s, tip_slope_rad)
         fraction = max(
             rig.fraction_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad
         )
-        if fraction > _SCAN_FRACTION:
-            amplitude_rad *= _SCAN_FRACTION / fraction
-            scan_rad *= _SCAN_FRACTION / fraction
+        if fraction > _SCAN_LIMIT_FRACTION:
+            amplitude_rad *= _SCAN_LIMIT_FRACTION / fraction
+            scan_rad *= _SCAN_LIMIT_FRACTION / fraction
     reference_rad = np.zeros(ticks)
     reference_rad[: scan_rad.size] = scan_rad
     reference_rad.flags.writeable = False
@@ -222,26 +231,26 @@ def until(
     )
 
 
-def _refuse_below_floor(
+def _require_reachable_targets(
     rig: ScanRig,
     targets: tuple[Target, ...],
     uniformity: float,
     at_most_s: float,
     tip_slope_rad: float,
 ) -> None:
-    """Raise if the tolerance of the geometry leaves a parameter less precise than requested."""
+    """Raise `ExcitationError` if the tolerance of the geometry makes a target unreachable."""
     floors = geometry_floors(
         rig.stated_estimate, rig, targets, uniformity, at_most_s, tip_slope_rad
     )
-    below = [each for each in floors if each.below]
-    if not below:
+    unreachable_floors = [each for each in floors if each.makes_unreachable]
+    if not unreachable_floors:
         return
     floors_text = "; ".join(
         f"{each.target} (standard deviation) is below the floor of "
         f"{with_percentage(each.std, each.value)}, "
         f"{with_percentage(each.exact_std, each.value)} if the beam "
         "is exactly uniform"
-        for each in below
+        for each in unreachable_floors
     )
     raise ExcitationError(
         f"With modes that differ from those of a uniform beam by {100 * uniformity:g} % "
@@ -251,34 +260,51 @@ def _refuse_below_floor(
     )
 
 
-def _scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None) -> Real:
-    """Return a sweep (n,) of amplitude up to 1 suited to a beam, at rest at both ends."""
+def _unit_scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None) -> Real:
+    """Return the scan of n ticks with a largest amplitude of 1, at rest at both ends; shape (n,).
+
+    With a beam, the amplitude depends on the frequency relative to the beam's first mode.
+    """
     t = np.arange(n) / rate_hz
     u = t * (rate_hz / n)
-    frequency_hz = start_hz + (stop_hz - start_hz) * u**_BEND
-    phase = 2.0 * pi * t * (start_hz + (stop_hz - start_hz) * u**_BEND / (_BEND + 1.0))
-    size = np.ones(n)
+    frequency_hz = start_hz + (stop_hz - start_hz) * u**_SCAN_FREQUENCY_POWER
+    phase = (
+        2.0
+        * pi
+        * t
+        * (
+            start_hz
+            + (stop_hz - start_hz) * u**_SCAN_FREQUENCY_POWER / (_SCAN_FREQUENCY_POWER + 1.0)
+        )
+    )
+    amplitude = np.ones(n)
     if beam is not None:
         first_hz = undamped_frequencies_rad_s(beam, 1)[0] / (2.0 * pi)
-        at_mode = np.maximum(frequency_hz / first_hz, _AT_MODES[0])
-        size = np.exp(np.interp(np.log(at_mode), np.log(_AT_MODES), np.log(_SIZES)))
+        relative_frequency = np.maximum(frequency_hz / first_hz, _SCAN_RELATIVE_FREQUENCIES[0])
+        amplitude = np.exp(
+            np.interp(
+                np.log(relative_frequency),
+                np.log(_SCAN_RELATIVE_FREQUENCIES),
+                np.log(_SCAN_RELATIVE_AMPLITUDES),
+            )
+        )
     fade = quintic(_FADE_S, rate_hz)
-    size[: fade.size] *= fade
-    size[n - fade.size :] *= 1.0 - fade
-    sweep: Real = size * np.sin(phase)
+    amplitude[: fade.size] *= fade
+    amplitude[n - fade.size :] *= 1.0 - fade
+    sweep: Real = amplitude * np.sin(phase)
     return sweep
 
 
-def _parsed(targets: str) -> tuple[Target, ...]:
-    """Parse the targets."""
+def _parse_targets(targets: str) -> tuple[Target, ...]:
+    """Parse target precisions, separated by semicolons; raise `ExcitationError` without any."""
     requested = []
     for text in targets.split(";"):
         if text.strip():
-            quantity, _, size = text.strip().partition(" ")
-            requested.append(parse_target(quantity, size))
+            quantity, _, std_text = text.strip().partition(" ")
+            requested.append(parse_target(quantity, std_text))
     if not requested:
         raise ExcitationError(
             f"No precision is requested; give one or more of {', '.join(QUANTITIES)}, such "
-            f"as {_EXAMPLE}."
+            f"as {_EXAMPLE_TARGET}."
         )
     return tuple(requested)

@@ -1,10 +1,11 @@
 """Design of excitation while a session runs: the most informative segment comes next.
 
 A segment of a few seconds drives one or several modes, each by a narrow linear sweep. The phase of
-a sweep suits the present vibration. All candidates have the largest amplitude that the rig and the
-linear model allow. The chosen one reduces the standard deviations of the targets most per second,
-by the Fisher information of the whole record (`rigd.excitation._fisher_information`). Vibration
-after a segment counts as well, since it still gives information while other modes are driven.
+a sweep is chosen for the present vibration. All candidates have the largest amplitude that the rig
+and the linear model allow. The chosen candidate reduces the standard deviations of the targets most
+per second, by the Fisher information of the whole record (`rigd.excitation._fisher_information`).
+Vibration after a segment counts as well, since it still gives information while other modes are
+driven.
 
 References
 ----------
@@ -34,48 +35,49 @@ from rigd.excitation._segment_search import (
 )
 from rigd.excitation._shortest_move import MovePlant
 from rigd.excitation._signals import ExcitationError
-from rigd.excitation.targets import OF_MODES, Precision, Quantities, Target
+from rigd.excitation.targets import MODE_QUANTITIES, Precision, Quantities, Target
 
 Real = NDArray[np.float64]
 
 
-_BY_GEOMETRY: Final = 1.5
-"""Factor by which the tolerance of the geometry widens a deviation, from which it is the cause."""
+_GEOMETRY_DOMINANCE_RATIO: Final = 1.5
+"""Ratio of the smallest standard deviation with the tolerance of the geometry to that without it,
+above which the tolerance is the reason for missing a target."""
 
 
 class DesignRig(Protocol):
-    """Interface to a rig for which segments are designed."""
+    """Interface to a rig for which segments of excitation are designed."""
 
     @property
     def start_rad(self) -> float:
-        """Present angle of the motor, from the rig's zero."""
+        """Present angle of the motor from the rig's zero, in rad."""
 
     def plant_with(self, beam: LoadedBeam) -> MovePlant:
-        """Return closed loop and limits with a beam instead of the profile's.
+        """Return the rig's closed loop and limits with an estimated beam, not the profile's.
 
         Parameters
         ----------
         beam
-            The estimated beam, with tip mass and root compliance.
+            Estimated beam, with tip mass and root compliance.
         """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """A session of designed segments, one after the other."""
+    """Designed excitation of a whole session, segment after segment."""
 
     segments: tuple[Segment, ...]
-    """In the order of play."""
+    """Segments in the order of time."""
     reference_rad: Real
-    """Shape (n,): reference of all segments."""
+    """Reference angle of all segments at each tick, shape (n,)."""
     angle_rad: Real
-    """Shape (n,): predicted angle."""
+    """Predicted angle of the motor at each tick, shape (n,)."""
     names: tuple[str, ...]
-    """Free parameters, in the order of the covariance."""
+    """Names of the free parameters, in the order of the covariance."""
     covariance: Real
-    """Shape (k, k): expected at the end."""
+    """Covariance of the parameters that is expected at the end of the session, shape (k, k)."""
     expected: tuple[Precision, ...]
-    """Precision of each target expected at the end."""
+    """Precision of each target that is expected at the end of the session."""
 
 
 def next_segment(
@@ -88,26 +90,27 @@ def next_segment(
     tip_slope_rad: float = SMALL_SLOPE_RAD,
     through: Collection[int] = (),
 ) -> Segment:
-    """Design the segment that reduces the deviations of the targets most per second.
+    """Return the next segment, which reduces the targets' standard deviations most per second.
 
     Parameters
     ----------
     estimate
         Present estimate of beam, damping and noise.
     angle_rad_so_far
-        Shape (n,): angle from the beginning of the record to that of the segment, at the rig's
-        rate: measured, or predicted (`Segment.angle_rad`) for segments that are not played yet. The
-        beam is at rest at the first tick.
+        Angle of the motor from the beginning of the record to that of the segment, at the rig's
+        rate; shape (n,). It is measured, or predicted (`Segment.angle_rad`) for segments that are
+        not run yet. The beam is at rest at the first tick.
     targets
         Targets of the session.
     rig
         Closed loop and limits.
     time_left_s
-        Remaining time of the session; the segment is not longer.
+        Remaining time of the session in s; the segment is not longer.
     tip_slope_rad
-        Slope of the tip up to which the linear model is trusted.
+        Largest slope of the tip for which the linear model is valid.
     through
-        Modes one of which has to be driven; empty: the most informative ones.
+        Numbers of modes of which the segment must drive one; empty: the segment drives the most
+        informative modes.
 
     Raises
     ------
@@ -115,35 +118,35 @@ def next_segment(
         If there is no target, or no segment fits into the time or drives a mode.
     """
     driven = [mode.number for mode in estimate.modes() if mode.number in through]
-    quantities = Quantities.of(targets, estimate)
+    quantities = Quantities.linearised(targets, estimate)
     if not quantities.items:
         raise ExcitationError("No precision is requested; give for example --damping 1%.")
     plant = rig.plant_with(estimate.loaded_beam)
-    record = RecordSoFar.of(angle_rad_so_far, estimate, plant.rate_hz, HORIZON_S)
-    decision = SegmentSearch(
+    record = RecordSoFar.from_angle(angle_rad_so_far, estimate, plant.rate_hz, HORIZON_S)
+    search = SegmentSearch(
         estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
     )
-    return decision.segment(decision.best(time_left_s, driven), time_left_s)
+    return search.segment(search.best_candidate(time_left_s, driven), time_left_s)
 
 
 @dataclass(frozen=True, slots=True)
 class GeometryFloor:
-    """Least standard deviation of a quantity with a given tolerance of the geometry."""
+    """Smallest standard deviation that a quantity can have with a tolerance of the geometry."""
 
     target: Target
-    """The target."""
+    """Target of the quantity."""
     value: float
     """Value of the quantity."""
     std: float
-    """With the tolerance."""
+    """Smallest standard deviation with the tolerance of the geometry."""
     exact_std: float
-    """If the beam were exactly uniform."""
+    """Smallest standard deviation if the beam were exactly uniform."""
 
     @property
-    def below(self) -> bool:
-        """Whether the target is below the floor, and the geometry is the reason."""
+    def makes_unreachable(self) -> bool:
+        """Whether the tolerance of the geometry makes the target unreachable."""
         target_std = self.target.std * (abs(self.value) if self.target.relative else 1.0)
-        return target_std < self.std and self.std > _BY_GEOMETRY * self.exact_std
+        return target_std < self.std and self.std > _GEOMETRY_DOMINANCE_RATIO * self.exact_std
 
 
 def geometry_floors(
@@ -154,11 +157,11 @@ def geometry_floors(
     duration_s: float,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
 ) -> tuple[GeometryFloor, ...]:
-    """Compute how precisely the parameters of a nearly uniform beam can be determined.
+    """Return the smallest standard deviations of the parameters of a nearly uniform beam.
 
-    Each is that of the best mixture of steady sines for it alone, at the largest amplitudes that
-    the rig and the linear model allow. Modes have no floor: they are those of the antenna, uniform
-    or not.
+    Each is computed for the mixture of steady sines that is best for this parameter alone, at the
+    largest amplitudes that the rig and the linear model allow. Quantities of modes have no such
+    floor, because they are defined for a beam that is not uniform as well.
 
     Parameters
     ----------
@@ -171,32 +174,34 @@ def geometry_floors(
     uniformity
         Relative standard deviation of each mode's frequency from that of a uniform beam.
     duration_s
-        Longest record.
+        Longest duration of the record in s.
     tip_slope_rad
-        Slope of the tip up to which the linear model is trusted.
+        Largest slope of the tip for which the linear model is valid.
 
     Raises
     ------
     ExcitationError
         If no mode can be driven.
     """
-    targets = [target for target in targets if target.quantity not in OF_MODES]
+    targets = [target for target in targets if target.quantity not in MODE_QUANTITIES]
     if not targets or not uniformity:
         return ()
     plant = rig.plant_with(estimate.loaded_beam)
-    rest = RecordSoFar.of(np.zeros(1), estimate, plant.rate_hz, SHORTEST_S)
-    quantities = Quantities.of(targets, estimate)
-    decision = SegmentSearch(estimate, quantities, plant, rig.start_rad, rest, tip_slope_rad)
-    tolerant = estimate.with_tolerance(uniformity)
+    resting_record = RecordSoFar.from_angle(np.zeros(1), estimate, plant.rate_hz, SHORTEST_S)
+    quantities = Quantities.linearised(targets, estimate)
+    search = SegmentSearch(
+        estimate, quantities, plant, rig.start_rad, resting_record, tip_slope_rad
+    )
+    tolerant_estimate = estimate.with_tolerance(uniformity)
     floors = [
         least_deviations(
             np.zeros((len(each.names), len(each.names))),
             each,
-            Quantities.of(targets, each),
-            *decision.lines(),
+            Quantities.linearised(targets, each),
+            *search.steady_sines(),
             duration_s,
         )
-        for each in (tolerant, estimate)
+        for each in (tolerant_estimate, estimate)
     ]
     return tuple(
         GeometryFloor(item.target, item.value, std, exact_std)
@@ -210,12 +215,12 @@ def geometry_floors(
 def expected_precisions(
     angle_rad: Real, estimate: BeamEstimate, targets: Iterable[Target], rate_hz: float
 ) -> tuple[Precision, ...]:
-    """Compute how precisely a record is expected to determine the targets.
+    """Return the precision of each target that is expected from a record of the motor's angle.
 
     Parameters
     ----------
     angle_rad
-        Shape (n,): motor angle; the beam rested at the first.
+        Motor angle at each tick, shape (n,). The beam is at rest at the first tick.
     estimate
         Beam, damping and noise.
     targets
@@ -224,7 +229,7 @@ def expected_precisions(
         Rate of the angle.
     """
     covariance = covariance_of(information(angle_rad, estimate, rate_hz), estimate)
-    return Quantities.of(targets, estimate).precisions(covariance)
+    return Quantities.linearised(targets, estimate).precisions(covariance)
 
 
 def design_excitation(
@@ -236,7 +241,7 @@ def design_excitation(
     angle_rad_so_far: Real | None = None,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
 ) -> Design:
-    """Design a session: segments until all targets are reached or the time is over.
+    """Design the segments of a session until all targets are reached or the time is over.
 
     Parameters
     ----------
@@ -247,12 +252,12 @@ def design_excitation(
     targets
         Targets of the session.
     duration_s
-        Total time of all segments.
+        Longest total duration of all segments in s.
     angle_rad_so_far
-        Shape (n,): angle of the record before the segments; None: they begin with the beam at
-        rest.
+        Motor angle of the record before the segments, shape (n,); None: the beam is at rest before
+        the first segment.
     tip_slope_rad
-        Slope of the tip up to which the linear model is trusted.
+        Largest slope of the tip for which the linear model is valid.
 
     Raises
     ------

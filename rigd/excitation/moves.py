@@ -1,10 +1,11 @@
-"""Shapes of moves: quintic, paths that leave a beam at rest, slew, and braking.
+"""Paths of moves: quintic, paths that leave a beam at rest, slew, and braking.
 
-A reference is made of one acceleration a tick: ``r[k] = dt² Σ_{j<k} (k - j) a[j]``. The closed loop
-is linear, so that a mode with the pole s is left at rest where the accelerations' transform
-``Σ a[j] exp(-s j dt)`` is zero: the angle that follows the reference has the same zero. A zero of
-second order (its derivative by s is zero as well) leaves little where the pole is not well known.
-The poles are those of the closed loop with the motor held, since its modes continue to ring.
+A reference consists of one acceleration a tick: ``r[k] = dt² Σ_{j<k} (k - j) a[j]``. The closed
+loop is linear. A mode with the pole s is therefore at rest after the move if the accelerations'
+transform ``Σ a[j] exp(-s j dt)`` is zero, because the angle that follows the reference has the same
+zero. With a zero of second order (its derivative by s is zero as well) little vibration remains
+even if the pole is not well known. The poles are those of the closed loop with the motor held,
+since its modes continue to ring.
 """
 
 from collections.abc import Sequence
@@ -13,18 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._signals import positive
+from rigd.excitation._signals import require_positive
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 ROBUST_BELOW_HZ = 60.0
-"""A robust move has zeros of second order for the modes below; higher ones are too weak to matter
-after a change of 1 % in their frequency."""
+"""Frequency in Hz below which a robust move has zeros of second order for the modes. Higher modes
+are too weak to matter after a change of 1 % in their frequency."""
 
-_MOST_PEAK = 24.0
-"""Largest acceleration of a path over ``distance / duration²`` before zeros are given up for it:
-four times that of a quintic. A path shorter than about half a period of a mode needs more."""
+_MAX_PEAK_ACCELERATION = 24.0
+"""Largest acceleration of a path over ``distance / duration²``: four times that of a quintic. A
+path shorter than about half a period of a mode would exceed it, and then has fewer zeros."""
 
 
 def quintic(duration_s: float, rate_hz: float) -> Real:
@@ -33,14 +34,14 @@ def quintic(duration_s: float, rate_hz: float) -> Real:
     Parameters
     ----------
     duration_s
-        Time from the last tick at 0 to the first at 1.
+        Time in s from the last tick at 0 to the first tick at 1.
     rate_hz
         Ticks a second.
 
     Returns
     -------
     ndarray, shape (n,)
-        ``u³ (10 - 15 u + 6 u²)`` at the n ticks after the start; the last is 1.
+        ``u³ (10 - 15 u + 6 u²)`` at the n ticks after the start; the last value is 1.
 
     References
     ----------
@@ -61,30 +62,32 @@ def quintic(duration_s: float, rate_hz: float) -> Real:
 def still_path(duration_s: float, rate_hz: float, poles_rad_s: Complex) -> Real:
     """Return the path from 0 to 1 of least mean-square acceleration that leaves all modes at rest.
 
-    The zeros are of second order if the time suffices, else of first order; below about half a
-    period of the slowest mode the path is the quintic.
+    The path has zeros of second order at the poles if the time suffices, else zeros of first order.
+    If the duration is less than about half a period of the slowest mode, the path is the quintic.
 
     Parameters
     ----------
     duration_s
-        Time from the last tick at 0 to the first at 1.
+        Time in s from the last tick at 0 to the first tick at 1.
     rate_hz
         Ticks a second.
     poles_rad_s
-        Shape (m,): one pole of each pair.
+        Poles of the modes, shape (m,): one pole of each pair.
 
     Returns
     -------
     ndarray, shape (n,)
-        Path at the n ticks after the start; the last is 1.
+        Path at the n ticks after the start; the last value is 1.
     """
     n = max(1, round(duration_s * rate_hz))
     for order in (2, 1):
-        rows = np.concatenate([_motion_rows(n, rate_hz), zero_rows(n, rate_hz, poles_rad_s, order)])
+        rows = np.concatenate(
+            [_motion_map(n, rate_hz), residual_vibration_map(n, rate_hz, poles_rad_s, order)]
+        )
         if len(rows) > n:
             continue
-        acceleration, met = _least_norm(rows, np.array([0.0, 1.0]))
-        if met and np.abs(acceleration).max() * (n / rate_hz) ** 2 <= _MOST_PEAK:
+        acceleration, solved = _least_norm_solution(rows, np.array([0.0, 1.0]))
+        if solved and np.abs(acceleration).max() * (n / rate_hz) ** 2 <= _MAX_PEAK_ACCELERATION:
             return from_acceleration(acceleration, rate_hz)
     return quintic(duration_s, rate_hz)
 
@@ -97,7 +100,7 @@ def slew(
     rate_hz: float,
     poles_rad_s: Complex,
 ) -> Real:
-    """Return a reference at constant speed that leaves no mode ringing, on the way or at the end.
+    """Return a reference at constant speed that excites no vibration, on the way or at the end.
 
     A pulse of acceleration that leaves all modes at rest starts the motion, and the same pulse with
     the other sign ends it. A pulse takes at least half a period of the slowest mode.
@@ -105,15 +108,15 @@ def slew(
     Parameters
     ----------
     distance_rad
-        Angle from start to end; either sign.
+        Angle from start to end, of either sign.
     speed_rad_s
-        Speed on the way; lower where the distance is too short to reach it.
+        Speed on the way. It is lower if the distance is too short to reach it.
     acceleration_rad_s2
         Largest acceleration; the pulses are lengthened to stay below it.
     rate_hz
         Ticks a second.
     poles_rad_s
-        Shape (m,): one pole of each pair.
+        Poles of the modes, shape (m,): one pole of each pair.
 
     Returns
     -------
@@ -125,39 +128,44 @@ def slew(
     ExcitationError
         If speed or acceleration is not positive.
     """
-    positive("speed_rad_s", speed_rad_s, "rad/s")
-    positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
+    require_positive("speed_rad_s", speed_rad_s, "rad/s")
+    require_positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
     slowest_rad_s = float(np.abs(poles_rad_s.imag[poles_rad_s.imag != 0]).min(initial=np.inf))
     speed = speed_rad_s
     n = max(4 * len(poles_rad_s), round(rate_hz * np.pi / slowest_rad_s), 8)
     while True:
-        pulse = _pulse(n, rate_hz, poles_rad_s)
+        pulse = _speed_change_pulse(n, rate_hz, poles_rad_s)
         # Both pulses together cover the distance of one at full speed.
         speed = min(speed_rad_s, abs(distance_rad) * rate_hz / n)
         if pulse is not None and speed * np.abs(pulse).max() <= acceleration_rad_s2:
             break
         n = n + max(1, n // 20)
-    cruise = round(abs(distance_rad) / speed * rate_hz) - n
+    cruise_ticks = round(abs(distance_rad) / speed * rate_hz) - n
     # With a whole number of cruise ticks the speed is slightly lower than requested.
-    speed = abs(distance_rad) * rate_hz / (n + cruise)
-    acceleration = np.concatenate([pulse, np.zeros(cruise), -pulse])
+    speed = abs(distance_rad) * rate_hz / (n + cruise_ticks)
+    acceleration = np.concatenate([pulse, np.zeros(cruise_ticks), -pulse])
     return from_acceleration(np.copysign(speed, distance_rad) * acceleration, rate_hz)
 
 
-def _pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | None:
-    """Return accelerations (n,) of least norm that change the speed by 1; None: n is too short."""
-    rows = np.concatenate([_motion_rows(n, rate_hz)[:1], zero_rows(n, rate_hz, poles_rad_s, 1)])
-    pulse, met = _least_norm(rows, np.array([1.0]))
-    return pulse if met else None
+def _speed_change_pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | None:
+    """Return the accelerations (n,) of least norm that change the speed by 1 rad/s.
+
+    They leave all modes at rest. Return None if `n` ticks are too few.
+    """
+    rows = np.concatenate(
+        [_motion_map(n, rate_hz)[:1], residual_vibration_map(n, rate_hz, poles_rad_s, 1)]
+    )
+    pulse, solved = _least_norm_solution(rows, np.array([1.0]))
+    return pulse if solved else None
 
 
 def from_acceleration(acceleration_rad_s2: Real, rate_hz: float) -> Real:
-    """Sum up accelerations (n,) to the reference (n,) at the ticks after the start.
+    """Integrate accelerations twice to the reference angle in rad at the ticks after the start.
 
     Parameters
     ----------
     acceleration_rad_s2
-        Shape (n,).
+        Acceleration in each tick, shape (n,).
     rate_hz
         Ticks a second.
     """
@@ -165,72 +173,81 @@ def from_acceleration(acceleration_rad_s2: Real, rate_hz: float) -> Real:
     return reference
 
 
-def _motion_rows(n: int, rate_hz: float) -> Real:
-    """Return rows (2, n) for the change of speed and the distance of n accelerations."""
-    ticks_left = n - np.arange(n)
-    return np.stack([np.full(n, 1.0 / rate_hz), ticks_left / rate_hz**2])
+def _motion_map(n: int, rate_hz: float) -> Real:
+    """Return the linear map, shape (2, n), from n accelerations to change of speed and distance."""
+    remaining_ticks = n - np.arange(n)
+    return np.stack([np.full(n, 1.0 / rate_hz), remaining_ticks / rate_hz**2])
 
 
-def zero_rows(n: int, rate_hz: float, poles_rad_s: Complex, order: int) -> Real:
-    """Return rows (rows, n) for the real and imaginary part of the modes' state after n ticks.
+def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, order: int) -> Real:
+    """Return the linear map from n accelerations to the modes' residual vibration after them.
 
-    Each mode is referred to the end of the path. With ``order`` 2 the modes below
-    `ROBUST_BELOW_HZ` have rows for the derivative by the pole as well.
+    Its product with the accelerations is zero if the path leaves all modes at rest. Each mode has a
+    row for the real part and one for the imaginary part of its complex state at the end of the
+    path. With ``order`` 2 the modes below `ROBUST_BELOW_HZ` have rows for the derivative by the
+    pole as well. The shape is (rows, n).
 
     Parameters
     ----------
     n
-        Ticks of the path.
+        Number of ticks of the path.
     rate_hz
         Ticks a second.
     poles_rad_s
-        Shape (m,): one pole of each pair.
+        Poles of the modes, shape (m,): one pole of each pair.
     order
         Order of the zeros: 1 or 2.
     """
-    left_s = (n - np.arange(n)) / rate_hz
+    remaining_s = (n - np.arange(n)) / rate_hz
     rows: list[Real] = []
     for pole in poles_rad_s:
-        transform = np.exp(pole * left_s) / rate_hz
-        twice = order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
-        for row in (transform, transform * left_s / left_s[0]) if twice else (transform,):
+        transform = np.exp(pole * remaining_s) / rate_hz
+        second_order = order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
+        for row in (
+            (transform, transform * remaining_s / remaining_s[0]) if second_order else (transform,)
+        ):
             rows.append(row.real)
             if pole.imag != 0.0:
                 rows.append(row.imag)
     return np.array(rows).reshape(-1, n)
 
 
-def _least_norm(rows: Real, wanted: Real) -> tuple[Real, bool]:
-    """Solve ``rows @ a = wanted`` (0 for the other rows) by the least a, and check the solution."""
-    goal = np.zeros(len(rows))
-    goal[: wanted.size] = wanted
+def _least_norm_solution(rows: Real, wanted: Real) -> tuple[Real, bool]:
+    """Return the least-norm solution a of ``rows @ a = wanted``, and whether it is a solution.
+
+    Rows beyond the length of `wanted` have the right-hand side 0.
+    """
+    right_hand_side = np.zeros(len(rows))
+    right_hand_side[: wanted.size] = wanted
     scale = np.linalg.norm(rows, axis=1)
-    solution = np.linalg.lstsq(rows / scale[:, None], goal / scale, rcond=1e-12)[0]
-    missed = np.abs(rows @ solution - goal) / scale
-    return solution, bool(missed.max() <= 1e-9 * np.linalg.norm(solution))
+    solution = np.linalg.lstsq(rows / scale[:, None], right_hand_side / scale, rcond=1e-12)[0]
+    residuals = np.abs(rows @ solution - right_hand_side) / scale
+    return solution, bool(residuals.max() <= 1e-9 * np.linalg.norm(solution))
 
 
 def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Complex:
-    """Return the state of each mode at the end of a reference: its accelerations' transform.
+    """Return the complex state of each mode's vibration at the end of a reference.
+
+    It is the transform of the reference's accelerations at the mode's pole.
 
     Parameters
     ----------
     reference_rad
-        Shape (n,), from rest on.
+        Reference angle from rest on, shape (n,).
     rate_hz
         Ticks a second.
     poles_rad_s
-        Shape (m,).
+        Poles of the modes, shape (m,).
 
     Returns
     -------
     ndarray, shape (m,)
-        Complex, in rad/s. Zero: the mode is at rest.
+        Complex state in rad/s; 0 if the mode is at rest.
     """
     acceleration = np.diff(reference_rad, n=2, prepend=(reference_rad[0],) * 2) * rate_hz**2
     # r[k+1] - 2 r[k] + r[k-1] belongs to tick k: one before the sample in which it shows.
-    left_s = np.arange(acceleration.size, 0, -1) / rate_hz
-    state: Complex = np.exp(np.outer(poles_rad_s, left_s)) @ acceleration / rate_hz
+    remaining_s = np.arange(acceleration.size, 0, -1) / rate_hz
+    state: Complex = np.exp(np.outer(poles_rad_s, remaining_s)) @ acceleration / rate_hz
     return state
 
 
@@ -239,47 +256,52 @@ def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Co
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Braking:
-    """Table of a braking path: it starts at any tick, without planning.
+    """Precomputed braking path, which can start at any tick without further planning.
 
-    The speed falls on a cubic from its present value to zero, and so does its slope: neither
-    jumps. The path is linear in both: a tick takes two products.
+    Speed and acceleration follow polynomials of time from their present values to zero, so neither
+    jumps. The path is linear in speed and acceleration at the start, so a tick takes two products.
     """
 
     rate_hz: float
     """Ticks a second."""
     per_speed_s: tuple[float, ...]
-    """Distance at the ticks after the start, per speed at the start."""
+    """Angle covered at the ticks after the start, per speed at the start; in s."""
     per_acceleration_s2: tuple[float, ...]
-    """Distance at the ticks after the start, per acceleration at the start."""
+    """Angle covered at the ticks after the start, per acceleration at the start; in s²."""
 
     @property
     def duration_s(self) -> float:
-        """Time from the start to standstill."""
+        """Time in s from the start of braking to standstill."""
         return len(self.per_speed_s) / self.rate_hz
 
     def path(
         self, angle_rad: float, speed_rad_s: float, acceleration_rad_s2: float = 0.0
     ) -> list[float]:
-        """Return the reference at the ticks after the start; the last one stays.
+        """Return the reference angle in rad at the ticks after the start of braking.
+
+        The last angle is that at standstill.
 
         Parameters
         ----------
         angle_rad, speed_rad_s, acceleration_rad_s2
-            The reference at the start and its derivatives.
+            Reference angle, speed and acceleration at the start of braking.
         """
         return [
-            angle_rad + speed_rad_s * way_s + acceleration_rad_s2 * way_s2
-            for way_s, way_s2 in zip(self.per_speed_s, self.per_acceleration_s2, strict=True)
+            angle_rad + speed_rad_s * speed_factor_s + acceleration_rad_s2 * acceleration_factor_s2
+            for speed_factor_s, acceleration_factor_s2 in zip(
+                self.per_speed_s, self.per_acceleration_s2, strict=True
+            )
         ]
 
 
 def braking_path(duration_s: float, rate_hz: float) -> Braking:
-    """Return the table of a braking path.
+    """Return the braking path that stops the motor within a given time from any speed.
 
     Parameters
     ----------
     duration_s
-        Time to standstill: `braking_time_s` gives one within a rig's limits.
+        Time in s to standstill. `rigd.excitation.shortest_braking` finds the shortest one within a
+        rig's limits.
     rate_hz
         Ticks a second.
 
@@ -297,7 +319,7 @@ def braking_path(duration_s: float, rate_hz: float) -> Braking:
     >>> round(path_rad[-1], 6)  # half the way of a motor that goes on
     0.65
     """
-    positive("duration_s", duration_s, "s")
+    require_positive("duration_s", duration_s, "s")
     n = max(2, round(duration_s * rate_hz))
     time_s = n / rate_hz
     u = np.arange(1, n + 1) / n
@@ -306,25 +328,31 @@ def braking_path(duration_s: float, rate_hz: float) -> Braking:
     return Braking(rate_hz, tuple(per_speed.tolist()), tuple(per_acceleration.tolist()))
 
 
-def braked(reference_rad: Sequence[float] | Real, tick: int, braking: Braking) -> Real:
-    """Return a reference that is braked after a tick, as the control loop does it.
+def braked_reference(reference_rad: Sequence[float] | Real, tick: int, braking: Braking) -> Real:
+    """Return a reference up to a tick, followed by the braking path, as in the control loop.
 
     Parameters
     ----------
     reference_rad
-        Shape (n,).
+        Reference angle at each tick, shape (n,).
     tick
-        Last tick at which the reference is followed; at least 2, for speed and acceleration.
+        Last tick at which the reference is followed. It is at least 2, since speed and acceleration
+        are differences of three angles.
     braking
-        Table of the braking path.
+        Braking path.
 
     Returns
     -------
     ndarray, shape (tick + 1 + m,)
-        The last angle is the one at standstill.
+        Angles of the reference and of the m ticks of the braking path. The last angle is that at
+        standstill.
     """
-    before, last, now = (float(value) for value in reference_rad[tick - 2 : tick + 1])
+    angle_two_ticks_before, angle_one_tick_before, present_angle = (
+        float(value) for value in reference_rad[tick - 2 : tick + 1]
+    )
     rate_hz = braking.rate_hz
-    acceleration = (now - 2 * last + before) * rate_hz**2
-    speed = (now - last) * rate_hz + acceleration / (2 * rate_hz)
-    return np.concatenate([reference_rad[: tick + 1], braking.path(now, speed, acceleration)])
+    acceleration = (present_angle - 2 * angle_one_tick_before + angle_two_ticks_before) * rate_hz**2
+    speed = (present_angle - angle_one_tick_before) * rate_hz + acceleration / (2 * rate_hz)
+    return np.concatenate(
+        [reference_rad[: tick + 1], braking.path(present_angle, speed, acceleration)]
+    )

@@ -8,51 +8,68 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._beam_estimate import BAND_HZ, LOGARITHMIC, BeamEstimate, EstimatedMode
+from rigd.excitation._beam_estimate import (
+    BAND_HZ,
+    LOGARITHMIC_PARAMETERS,
+    BeamEstimate,
+    EstimatedMode,
+)
 from rigd.excitation._signals import ExcitationError
 
 Real = NDArray[np.float64]
 
-OF_MODES: Final = ("damping", "frequency")
-QUANTITIES: Final = (*OF_MODES, "zeta", "alpha", "gamma", "lambda")
-"""Quantities with a target: damping ratio and frequency of modes, or a parameter."""
+MODE_QUANTITIES: Final = ("damping", "frequency")
+"""Names of the target quantities that belong to a mode."""
+QUANTITIES: Final = (*MODE_QUANTITIES, "zeta", "alpha", "gamma", "lambda")
+"""Names of the quantities whose precision can be a target: damping ratio and frequency of modes,
+and the parameters of the damping."""
 
 _UNITS: Final = {"frequency": "Hz"}
-_NO_ANSWER: Final = {"damping": 0.01, "zeta": 0.5, "alpha": 0.5, "gamma": 0.5, "lambda": 0.5}
-"""Deviations, in units of the quantity, that are useless: such a request has lost its %."""
-_MOST_MODES: Final = 20
-_OF_COEFFICIENT: Final = {"alpha": "zeta", "lambda": "gamma"}
-_KIND: Final = {"zeta": "internal", "alpha": "internal", "gamma": "external", "lambda": "external"}
+"""Unit of each target quantity that has one."""
+_USELESS_STD: Final = {"damping": 0.01, "zeta": 0.5, "alpha": 0.5, "gamma": 0.5, "lambda": 0.5}
+"""Standard deviation of each quantity, in its unit, from which a target is useless: the percent
+sign was probably forgotten."""
+_MAX_MODE_NUMBER: Final = 20
+"""Largest number of a mode in a target."""
+_COEFFICIENT_OF_ORDER: Final = {"alpha": "zeta", "lambda": "gamma"}
+"""Coefficient of the damping to which each order belongs."""
+_DAMPING_KIND: Final = {
+    "zeta": "internal",
+    "alpha": "internal",
+    "gamma": "external",
+    "lambda": "external",
+}
+"""Kind of damping to which each parameter belongs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Requested standard deviation of a quantity."""
+    """Target precision of a session: the requested standard deviation of a quantity."""
 
     quantity: str
-    """One of `QUANTITIES`."""
+    """Name of the quantity, one of `QUANTITIES`."""
     std: float
-    """Standard deviation: a fraction of the value if `relative`, else in the unit of the quantity
-    (a ratio, Hz, s^alpha, s^lambda/m⁴)."""
+    """Requested standard deviation: a fraction of the value if `relative`, else in the unit of the
+    quantity (a ratio, Hz, s^alpha, s^lambda/m⁴)."""
     relative: bool
-    """Whether it is a fraction of the value."""
+    """Whether the standard deviation is a fraction of the value."""
     mode: int | None = None
     """Number of the mode, from 1; None: every mode in the band, or not a quantity of modes."""
 
     @property
     def name(self) -> str:
-        """Name of the quantity, for the operator."""
+        """Name of the quantity with the number of its mode, for the operator."""
         return self.quantity if self.mode is None else f"{self.quantity} of mode {self.mode}"
 
     def __str__(self) -> str:
-        """Return quantity and deviation, for the operator."""
+        """Return quantity and requested standard deviation as text, for the operator."""
         unit = _UNITS.get(self.quantity, "")
-        size = f"{100 * self.std:g} %" if self.relative else f"{self.std:g} {unit}".rstrip()
-        return f"{self.name} to {size}"
+        std_text = f"{100 * self.std:g} %" if self.relative else f"{self.std:g} {unit}".rstrip()
+        return f"{self.name} to {std_text}"
 
 
 def parse_target(quantity: str, text: str) -> Target:
-    """Parse the target precision of an option.
+    """Parse the target precision of a quantity from the text of an option, such as ``2:0.5%``.
 
     Parameters
     ----------
@@ -66,7 +83,7 @@ def parse_target(quantity: str, text: str) -> Target:
     Raises
     ------
     ExcitationError
-        If it is not such a text.
+        If quantity or text is invalid.
 
     Examples
     --------
@@ -83,27 +100,27 @@ def parse_target(quantity: str, text: str) -> Target:
     example = {"damping": "1% or 2:0.5%", "frequency": "0.01% or 1:0.002Hz"}.get(
         quantity, "5% or 0.01"
     )
-    before, colon, size = text.strip().rpartition(":")
+    mode_text, colon, std_text = text.strip().rpartition(":")
     mode = None
     if colon:
-        if quantity not in OF_MODES:
+        if quantity not in MODE_QUANTITIES:
             raise ExcitationError(
                 f"{option}: {quantity} is no quantity of a mode; give for example {example}."
             )
-        if not before.strip().isdecimal() or not 1 <= int(before) <= _MOST_MODES:
+        if not mode_text.strip().isdecimal() or not 1 <= int(mode_text) <= _MAX_MODE_NUMBER:
             raise ExcitationError(
-                f"{option}: {before.strip()!r} is no number of a mode, 1 to {_MOST_MODES}; give "
-                f"for example {example}."
+                f"{option}: {mode_text.strip()!r} is no number of a mode, 1 to {_MAX_MODE_NUMBER}; "
+                f"give for example {example}."
             )
-        mode = int(before)
-    size = size.strip()
-    relative = size.endswith("%")
-    number = size.removesuffix("%") if relative else size.removesuffix(unit)
+        mode = int(mode_text)
+    std_text = std_text.strip()
+    relative = std_text.endswith("%")
+    number = std_text.removesuffix("%") if relative else std_text.removesuffix(unit)
     try:
         std = float(number)
     except ValueError:
         raise ExcitationError(
-            f"{option}: {size!r} is no standard deviation; give a percentage of the value or a "
+            f"{option}: {std_text!r} is no standard deviation; give a percentage of the value or a "
             f"number{f' in {unit}' if unit else ''}, for example {example}."
         ) from None
     std = std / 100 if relative else std
@@ -112,82 +129,86 @@ def parse_target(quantity: str, text: str) -> Target:
             f"{option}: the standard deviation must be finite and more than 0; give for example "
             f"{example}."
         )
-    most = _NO_ANSWER.get(quantity, inf)
-    if not relative and std >= most:
+    useless_std = _USELESS_STD.get(quantity, inf)
+    if not relative and std >= useless_std:
         raise ExcitationError(
             f"{option}: a standard deviation of {std:g} is no precision of {quantity}, since it is "
-            f"not below {most:g}; for a percentage of the value write {text.strip()}%."
+            f"not below {useless_std:g}; for a percentage of the value write {text.strip()}%."
         )
     return Target(quantity, std, relative, mode)
 
 
 @dataclass(frozen=True, slots=True)
 class Precision:
-    """Present precision of one quantity, and its target."""
+    """Precision of one quantity in comparison with its target."""
 
     target: Target
-    """The target, of one mode if the quantity belongs to modes."""
+    """Target of the quantity, with the number of the mode if the quantity belongs to a mode."""
     value: float
-    """Estimated value."""
+    """Estimated value of the quantity."""
     std: float
-    """Its standard deviation."""
+    """Standard deviation of the estimated value."""
     target_std: float
     """Target standard deviation, in the same unit; 0 for a percentage of a value of 0."""
     impossible: str = ""
-    """Why no record can determine the quantity; empty if one can."""
+    """Reason why no record can determine the quantity; empty if a record can."""
 
     @property
     def ratio(self) -> float:
-        """Standard deviation over its target: reached at 1 and below."""
+        """Ratio of the standard deviation to its target, which is reached at 1 and below."""
         if self.impossible:
             return inf
         return self.std / self.target_std if self.target_std > 0.0 else inf
 
     @property
     def reached(self) -> bool:
-        """Whether the target is reached."""
+        """Whether the quantity's standard deviation has reached its target."""
         return self.ratio <= 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantities:
-    """All target quantities, linearised at an estimate."""
+    """Target quantities of a session as linear functions of the parameters near an estimate."""
 
     items: tuple[Precision, ...]
-    """One for each quantity; their deviations are still unknown."""
+    """Value and target of each quantity; the standard deviations are still unknown."""
     gradients: Real
-    """Shape (q, k): derivatives by the free parameters."""
+    """Derivatives of the quantities by the free parameters, shape (q, k)."""
 
     @classmethod
-    def of(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
-        """Linearise the target quantities.
+    def linearised(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
+        """Return the target quantities, linearised at an estimate of the beam.
 
         Parameters
         ----------
         targets
-            Targets; one without a mode number applies to every mode in the band.
+            Targets. A target without a mode number applies to every mode in the band.
         estimate
-            Point of linearisation.
+            Estimate at which the quantities are linearised.
         """
         modes = estimate.modes()
         items, gradients = [], []
         for target in targets:
-            for one in _of_single_modes(target, modes):
-                value, gradient, impossible = _linearised(one, estimate, modes)
-                target_std = one.std * abs(value) if one.relative else one.std
+            for single_target in _targets_of_modes(target, modes):
+                value, gradient, impossible = _linearise(single_target, estimate, modes)
+                target_std = (
+                    single_target.std * abs(value) if single_target.relative else single_target.std
+                )
                 if target_std == 0.0 and not impossible:
-                    impossible = f"{one.name} is 0: no percentage of it is a precision"
-                items.append(Precision(one, value, inf, target_std, impossible))
+                    impossible = f"{single_target.name} is 0: no percentage of it is a precision"
+                items.append(Precision(single_target, value, inf, target_std, impossible))
                 gradients.append(gradient)
         return cls(tuple(items), np.array(gradients).reshape(len(items), len(estimate.names)))
 
     def ratios(self, covariance: Real) -> Real:
-        """Return deviations over their targets, shape (q,); 0 for impossible ones.
+        """Return the ratio of each quantity's standard deviation to its target, shape (q,).
+
+        The ratio is 0 for a quantity that no record can determine.
 
         Parameters
         ----------
         covariance
-            Shape (k, k), of the free parameters.
+            Covariance of the free parameters, shape (k, k).
         """
         variance = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
         target_std = np.array([inf if each.impossible else each.target_std for each in self.items])
@@ -195,37 +216,45 @@ class Quantities:
         return ratios
 
     def precisions(self, covariance: Real) -> tuple[Precision, ...]:
-        """Return the precision of every target for a covariance (k, k)."""
+        """Return the precision of every target for a covariance of the parameters, shape (k, k)."""
         return tuple(
             replace(each, std=sqrt(max(float(slope @ covariance @ slope), 0.0)))
             for each, slope in zip(self.items, self.gradients, strict=True)
         )
 
 
-def _of_single_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
-    if target.quantity not in OF_MODES or target.mode is not None:
+def _targets_of_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
+    """Return a target for each mode, if the given target applies to every mode in the band."""
+    if target.quantity not in MODE_QUANTITIES or target.mode is not None:
         return [target]
     return [replace(target, mode=mode.number) for mode in modes]
 
 
-def _linearised(
+def _linearise(
     target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
 ) -> tuple[float, Real, str]:
-    """Return value, derivatives (k,) and, if it cannot be determined, the reason."""
+    """Return the value of a target quantity and its derivatives by the parameters, shape (k,).
+
+    The third result is the reason why no record can determine the quantity, or an empty text.
+    """
     gradient = np.zeros(len(estimate.names))
     name = target.quantity
-    if name in OF_MODES:
+    if name in MODE_QUANTITIES:
         mode = next((each for each in modes if each.number == target.mode), None)
         if mode is None:
-            seen = ", ".join(str(each.number) for each in modes) or "none"
-            return 0.0, gradient, f"mode {target.mode} is not below {BAND_HZ:g} Hz (seen: {seen})"
+            mode_numbers = ", ".join(str(each.number) for each in modes) or "none"
+            return (
+                0.0,
+                gradient,
+                f"mode {target.mode} is not below {BAND_HZ:g} Hz (seen: {mode_numbers})",
+            )
         if name == "damping":
             return mode.damping_ratio, mode.damping_gradient, ""
         return mode.frequency_hz, mode.frequency_gradient_hz, ""
     value = estimate.values[name]
-    coefficient = _OF_COEFFICIENT.get(name, name)
+    coefficient = _COEFFICIENT_OF_ORDER.get(name, name)
     if estimate.values[coefficient] == 0.0 or name not in estimate.names:
-        free = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
-        return value, gradient, f"{_KIND[name]} damping {free} in the estimate so far"
-    gradient[estimate.names.index(name)] = value if name in LOGARITHMIC else 1.0
+        reason = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
+        return value, gradient, f"{_DAMPING_KIND[name]} damping {reason} in the estimate so far"
+    gradient[estimate.names.index(name)] = value if name in LOGARITHMIC_PARAMETERS else 1.0
     return value, gradient, ""

@@ -1,4 +1,4 @@
-"""Touch: whether, where and how hard the beam has met something, from its torque and base shear.
+"""Detection and estimation of touches of the beam, from its torque and base shear.
 
 Offers the innovations of the free beam (`observed_beam`, `InnovationFilter`), which the control
 loop computes tick by tick, and the sequential test on them (`watched_beam`, `TouchDetector`).

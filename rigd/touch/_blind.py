@@ -1,8 +1,9 @@
 """Any force at one point: the likelihood of the point for any behaviour of the obstacle.
 
-The force is white of unknown size (hats of half a sample), so torque and shear are Gaussian with a
-covariance that depends on the point; the agreement of the two decides. This works for obstacles
-that move, yield or come from outside as well as for springs, with a larger uncertainty.
+The force is white noise of unknown size, on steps of half a sample. Torque and shear are then
+Gaussian with a covariance that depends on the point, and the likeliest point is the one at which
+both agree with the measurement. This works for obstacles that move, yield or come from outside as
+well as for springs, with a larger uncertainty.
 """
 
 from dataclasses import dataclass
@@ -15,82 +16,84 @@ from rigd.touch._physical import WhitenedWindow
 
 Real = NDArray[np.float64]
 
-_SIZES_N = np.array([0.1, 0.4, 1.6, 6.4])
-"""Candidate standard deviations of the force."""
+_FORCE_STDS_N = np.array([0.1, 0.4, 1.6, 6.4])
+"""Standard deviations of the force in N that are compared."""
 
 
 @dataclass(frozen=True, slots=True)
-class BlindScan:
-    """Likelihood over the positions."""
+class AnyForceLikelihood:
+    """Likelihood of a touch by any force, at each position along the beam."""
 
     x_m: Real
-    """Positions, shape (m,)."""
+    """Positions along the beam, shape (m,)."""
     log_likelihood: Real
-    """Log-likelihood at each, for the likeliest size of the force, shape (m,)."""
+    """Logarithm of the likelihood at each position, for the likeliest size of the force; shape
+    (m,)."""
     chi2: float
-    """Sum of squared residuals at the best position in units of its model's expectation."""
+    """Sum of squared whitened residuals at the likeliest position."""
     degrees: int
-    """Its expectation."""
+    """Expectation of this sum."""
     force_n: Real
-    """Force on the beam at the best position, shape (2 · samples,)."""
+    """Estimated force on the beam at the likeliest position, shape (2 · samples,)."""
     force_std_n: float
-    """Size of the force at that position."""
+    """Standard deviation of the force that is likeliest at this position."""
 
     def interval(self, drop: float = 1.92) -> tuple[float, float, float, float]:
-        """Return the best position, its standard deviation and the ends of the likely positions.
+        """Return the likeliest position, its standard deviation and the ends of its interval, in m.
 
         Parameters
         ----------
         drop
-            Difference in log-likelihood of the ends; 1.92 for 95 %.
+            Difference of the log-likelihood between the likeliest position and the ends; 1.92 for
+            an interval of 95 %.
         """
         fine = np.linspace(self.x_m[0], self.x_m[-1], 4000)
-        curve = np.interp(fine, self.x_m, self.log_likelihood)
+        log_likelihood = np.interp(fine, self.x_m, self.log_likelihood)
         best = int(np.argmax(self.log_likelihood))
         at = float(self.x_m[best])
         if 0 < best < self.x_m.size - 1:
             low, mid, high = self.log_likelihood[best - 1 : best + 2]
-            bend = low - 2 * mid + high
-            if bend < 0:
+            curvature = low - 2 * mid + high
+            if curvature < 0:
                 spacing = self.x_m[1] - self.x_m[0]
-                at += float(np.clip(0.5 * (low - high) / bend, -1, 1) * spacing)
-        likely = fine[curve >= curve.max() - drop]
-        weights = np.exp(curve - curve.max())
+                at += float(np.clip(0.5 * (low - high) / curvature, -1, 1) * spacing)
+        likely_m = fine[log_likelihood >= log_likelihood.max() - drop]
+        weights = np.exp(log_likelihood - log_likelihood.max())
         mean = np.sum(weights * fine) / np.sum(weights)
         std = float(np.sqrt(np.sum(weights * (fine - mean) ** 2) / np.sum(weights)))
-        return at, std, min(float(likely[0]), at), max(float(likely[-1]), at)
+        return at, std, min(float(likely_m[0]), at), max(float(likely_m[-1]), at)
 
 
-class Blind:
-    """Effects of any force, for the likelihood of records of one length.
+class AnyForceEstimator:
+    """Computation of the likelihood of a touch by any force, prepared for one length of records.
 
     Parameters
     ----------
     kernels
-        Contact kernels with two steps a sample.
-    every
-        One in so many of their positions is scanned.
+        Contact kernels with two time steps a sample.
+    stride
+        Number of the kernels' positions from one scanned position to the next.
     samples
-        Most samples.
+        Largest number of samples.
     """
 
     __slots__ = ("_effects", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, every: int, samples: int) -> None:
-        self._x_m = kernels.x_m[::every]
+    def __init__(self, kernels: ContactKernels, stride: int, samples: int) -> None:
+        self._x_m = kernels.x_m[::stride]
         lag = 2 * np.arange(samples)[:, None] - np.arange(2 * samples)
         self._effects = [
-            np.where(lag >= 0, table[::every][:, np.clip(lag, 0, table.shape[1] - 1)], 0.0)
+            np.where(lag >= 0, table[::stride][:, np.clip(lag, 0, table.shape[1] - 1)], 0.0)
             for table in (kernels.torque, kernels.shear)
         ]  # (positions, samples, forces)
 
-    def scan(self, window: WhitenedWindow) -> BlindScan:
-        """Return the likelihood over the positions.
+    def scan(self, window: WhitenedWindow) -> AnyForceLikelihood:
+        """Return the likelihood of a touch by any force at each position.
 
         Parameters
         ----------
         window
-            Whitened innovations, at most as many samples as prepared.
+            Whitened innovations of at most the prepared number of samples.
         """
         count = window.end - window.first
         noise = window.motion.noise
@@ -104,28 +107,28 @@ class Blind:
         effects = window.whitening @ effects
         data = window.data
         n = data.size
-        square = effects @ effects.transpose(0, 2, 1)
-        large = float(data @ data) + 1.0
-        found = np.empty((_SIZES_N.size, self._x_m.size))
-        quadratic = np.empty_like(found)
+        force_covariance = effects @ effects.transpose(0, 2, 1)
+        corner = float(data @ data) + 1.0
+        log_likelihoods = np.empty((_FORCE_STDS_N.size, self._x_m.size))
+        quadratic = np.empty_like(log_likelihoods)
         bordered = np.empty((self._x_m.size, n + 1, n + 1))
         bordered[:, n, :n] = bordered[:, :n, n] = data
-        bordered[:, n, n] = large
-        for i, size in enumerate(_SIZES_N):
-            bordered[:, :n, :n] = size**2 * square + np.eye(n)
+        bordered[:, n, n] = corner
+        for i, std_index in enumerate(_FORCE_STDS_N):
+            bordered[:, :n, :n] = std_index**2 * force_covariance + np.eye(n)
             factor = np.linalg.cholesky(bordered)
             diagonal = np.diagonal(factor, axis1=1, axis2=2)
-            quadratic[i] = large - diagonal[:, n] ** 2
-            found[i] = -0.5 * quadratic[i] - np.log(diagonal[:, :n]).sum(axis=1)
-        size, position = np.unravel_index(np.argmax(found), found.shape)
-        variance = _SIZES_N[size] ** 2
-        whole = variance * square[position] + np.eye(n)
-        force = variance * effects[position].T @ np.linalg.solve(whole, data)
-        return BlindScan(
+            quadratic[i] = corner - diagonal[:, n] ** 2
+            log_likelihoods[i] = -0.5 * quadratic[i] - np.log(diagonal[:, :n]).sum(axis=1)
+        std_index, position = np.unravel_index(np.argmax(log_likelihoods), log_likelihoods.shape)
+        variance = _FORCE_STDS_N[std_index] ** 2
+        covariance = variance * force_covariance[position] + np.eye(n)
+        force = variance * effects[position].T @ np.linalg.solve(covariance, data)
+        return AnyForceLikelihood(
             x_m=self._x_m,
-            log_likelihood=found.max(axis=0),
-            chi2=float(quadratic[size, position]),
+            log_likelihood=log_likelihoods.max(axis=0),
+            chi2=float(quadratic[std_index, position]),
             degrees=n,
             force_n=force,
-            force_std_n=float(_SIZES_N[size]),
+            force_std_n=float(_FORCE_STDS_N[std_index]),
         )

@@ -1,11 +1,12 @@
-"""Sequential test: whether the innovations have ceased to be noise.
+"""Sequential test that detects a touch in the innovations, which are white noise without a touch.
 
 The innovations of the last ticks are compared with the signatures of touches. Each comparison is a
-product with a unit vector: a normal deviate of standard deviation 1 in white noise, and the largest
-of any linear test for a touch of that position, shape and age. The tail of the normal distribution
-sets the threshold for a stated rate of false alarms. Two terms allow for the model's error: a
-fraction of the predicted torque and shear, and the recent size of the comparisons, which grow where
-a chirp passes a mode whose frequency is slightly wrong.
+product with a unit vector. In white noise the product is a normal deviate of standard deviation 1,
+and no linear test is more sensitive to a touch at that position, with that time course and age. The
+tail of the normal distribution sets the threshold for a stated rate of false alarms. Two terms
+allow for the model's error: a fraction of the predicted torque and shear, and the recent mean
+square of the comparisons, which grows while a chirp passes a mode whose frequency is slightly
+wrong.
 
 References
 ----------
@@ -26,33 +27,33 @@ from rigd.touch._signatures import WatchedBeam
 
 Real = NDArray[np.float64]
 
-_INDEPENDENT: Final = 0.5
-"""Fraction of independent comparisons among the overlapping signatures, measured at 4 to 5 standard
-deviations."""
-_AGE_TICKS: Final = 8
-"""Ticks over which an error of the model is assumed to add up."""
-_RECENT: Final = 1 / 600
-"""Weight of a tick in the recent mean square, which covers the longest time of a touch so far."""
+_INDEPENDENT_FRACTION: Final = 0.5
+"""Fraction of the comparisons with overlapping signatures that count as independent, measured at 4
+to 5 standard deviations."""
+_ERROR_ACCUMULATION_TICKS: Final = 8
+"""Number of ticks over which an error of the model is assumed to add up."""
+_RECENT_WEIGHT: Final = 1 / 600
+"""Weight of a tick in the recent mean square of the comparisons."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
-    """Sensitivity of the detector."""
+    """Settings of the touch detector's sensitivity."""
 
     false_alarms_per_hour: float = 0.02
-    """Expected number in white noise."""
+    """Expected number of false alarms in an hour of white noise."""
     model_tolerance: float = 0.01
-    """Fraction of the predicted torque and shear that is assumed as the model's error."""
+    """Assumed error of the model, as a fraction of the predicted torque and shear."""
 
     def threshold(self, rate_hz: float, signatures: int) -> float:
-        """Return the level, in standard deviations, that a comparison must exceed.
+        """Return the detection threshold in standard deviations, for the stated false alarms.
 
         Parameters
         ----------
         rate_hz
             Ticks a second.
         signatures
-            Number of comparisons in a tick.
+            Number of comparisons with signatures in a tick.
 
         Examples
         --------
@@ -60,31 +61,32 @@ class DetectorSettings:
         >>> round(DetectorSettings().threshold(1000.0, signatures=500), 2)
         6.69
         """
-        tests_per_hour = 3600.0 * rate_hz * max(1.0, _INDEPENDENT * signatures)
+        tests_per_hour = 3600.0 * rate_hz * max(1.0, _INDEPENDENT_FRACTION * signatures)
         return -NormalDist().inv_cdf(0.5 * self.false_alarms_per_hour / tests_per_hour)
 
 
 class TouchDetector:
-    """Watches a record for touches.
+    """Detector of a touch, which processes the readings of a record tick by tick.
 
-    Until the first `arm` it measures the innovations of the beam at rest. These, not the noise for
-    which the model was designed, are the reference afterwards.
+    Until the first `arm` it measures the innovations of the beam at rest. Afterwards innovations
+    are compared with their standard deviations, not with the noise for which the model was
+    designed.
 
     Parameters
     ----------
     beam
-        From `rigd.touch.watched_beam`.
+        Model and signatures of the beam, from `rigd.touch.watched_beam`.
     rate_hz
         Ticks a second.
     settings
-        Sensitivity.
+        Sensitivity of the detector.
 
     Attributes
     ----------
     level
-        Largest comparison over its limit, at the last tick; above 1: touched.
+        Largest comparison of the last tick over its threshold; above 1 there is a touch.
     noise
-        Standard deviations of the whitened innovations of torque and shear at rest, once armed.
+        Standard deviations of the whitened innovations of torque and shear at rest, after `arm`.
     """
 
     __slots__ = (
@@ -110,7 +112,7 @@ class TouchDetector:
         signatures = beam.signatures
         self._filter = InnovationFilter(beam.observed)
         self._threshold = settings.threshold(rate_hz, len(signatures))
-        self._tolerance2 = _AGE_TICKS * settings.model_tolerance**2
+        self._tolerance2 = _ERROR_ACCUMULATION_TICKS * settings.model_tolerance**2
         self._armed = False
         self._measuring = True
         self._squares = [0.0, 0.0]
@@ -129,7 +131,7 @@ class TouchDetector:
         self.level = 0.0
 
     def arm(self) -> None:
-        """Start the detection with the next tick."""
+        """Start to detect touches with the next tick."""
         if self._ticks:
             torque, shear = (sqrt(square / self._ticks) for square in self._squares)
             self.noise = torque or 1.0, shear or 1.0
@@ -142,17 +144,19 @@ class TouchDetector:
         self._recent = 1.0
 
     def disarm(self) -> None:
-        """Continue to follow the beam without detection."""
+        """Stop detecting touches, while the model continues to follow the beam's motion."""
         self._armed = False
         self.level = 0.0
 
     def contact_force_n(self, shear_n: float) -> float:
-        """Return the shear of the last tick minus that of the free beam: about the contact force.
+        """Return the approximate contact force in N at the last tick.
+
+        It is the measured base shear minus the shear predicted for the free beam.
 
         Parameters
         ----------
         shear_n
-            Base shear as measured in the last tick.
+            Base shear measured in the last tick.
         """
         return shear_n - self._filter.predicted_shear_n
 
@@ -166,7 +170,7 @@ class TouchDetector:
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> bool:
-        """Process the readings of a tick; return whether there is a touch.
+        """Process the readings of a tick, and return whether they show a touch.
 
         Parameters
         ----------
@@ -197,7 +201,7 @@ class TouchDetector:
         compared, mean_squares = self._compared, self._mean_squares
         self._compare(self._windows[slot], compared)
         # A touch must not raise its own threshold: comparisons that may include it wait.
-        self._recent += _RECENT * (mean_squares[slot] - self._recent)
+        self._recent += _RECENT_WEIGHT * (mean_squares[slot] - self._recent)
         mean_squares[slot] = float(compared.dot(compared)) / compared.size
         self._slot = slot + 1 if slot + 1 < len(self._windows) else 0
         u, v = filter_.predicted

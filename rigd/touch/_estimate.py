@@ -1,44 +1,47 @@
 """Position, instant and force of a touch, from its record.
 
-The touch began some time before its detection. The shortest possible time is tried first: the
-samples before it determine the motion of the free beam.
+The touch began some time before its detection. The shortest possible time is assumed first. The
+samples before the touch determine the motion of the free beam.
 """
 
 import numpy as np
 
-from rigd.touch._answer import answer
-from rigd.touch._explanations import Explainer
+from rigd.touch._answer import estimate_from_explanations
+from rigd.touch._explanations import ExplanationSearch
 from rigd.touch._free_motion import TouchRecord
 from rigd.touch._model import TouchModel
 from rigd.touch._results import TouchEstimate
-from rigd.touch._tables import NOTICED_S, Tables
+from rigd.touch._tables import DETECTION_DELAYS_S, TouchTables
 
-_LEAST_QUIET = 100
-"""Samples before a touch without which no estimate is possible."""
-_HOPELESS = 3.0
-"""Above this misfit per sample of an obstacle at rest, the touch may have begun earlier."""
+_MIN_SAMPLES_BEFORE = 100
+"""Smallest number of samples before a touch with which an estimate is possible."""
+_POOR_MISFIT = 3.0
+"""Mean square residual of an obstacle at rest, over noise, above which the touch may have begun
+earlier."""
 
 
 def estimate_touch(record: TouchRecord, model: TouchModel) -> TouchEstimate:
-    """Estimate one touch; for several with one model, prepare a `TouchEstimator`.
+    """Estimate position, instant, force and stiffness of one touch from its record.
+
+    For several touches with one model, prepare a `TouchEstimator`.
 
     Parameters
     ----------
     record
         Samples from 0.3 s or more before the touch.
     model
-        The beam.
+        Model of the beam.
     """
     return TouchEstimator(model, record.rate_hz).estimate(record)
 
 
 class TouchEstimator:
-    """Estimates touches with one model; its preparation takes a second.
+    """Estimator of touches with one model of the beam; its preparation takes a second.
 
     Parameters
     ----------
     model
-        The beam.
+        Model of the beam.
     rate_hz
         Samples a second.
     """
@@ -47,122 +50,137 @@ class TouchEstimator:
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
         self.model = model
-        self._tables = Tables(model, rate_hz)
+        self._tables = TouchTables(model, rate_hz)
 
     def estimate(self, record: TouchRecord, *, scan: bool = True) -> TouchEstimate:
-        """Estimate one touch from the samples so far.
+        """Return the estimate of one touch from the samples so far.
 
         Parameters
         ----------
         record
-            Samples from 0.3 s or more before the touch; more samples after the detection improve
-            the answer, up to 0.2 s.
+            Samples from 0.3 s or more before the touch. More samples after the detection, up to
+            0.2 s, improve the estimate.
         scan
-            Whether to return the likelihood of all positions; else it is empty.
+            Whether the estimate contains the likelihood of all positions; otherwise it is empty.
         """
         return self.follow().update(record, scan=scan)
 
     def follow(self) -> "GrowingEstimate":
-        """Return an estimate of one touch that is updated while its record grows."""
+        """Return an empty estimate of one touch, to be updated while its record grows."""
         return GrowingEstimate(self._tables)
 
 
 class GrowingEstimate:
-    """Successive estimates of one touch, each of which continues from the previous one.
+    """Estimation of one touch while its record grows; each estimate starts from the previous one.
 
-    All its records begin with the same sample.
+    All records begin with the same sample.
 
     Parameters
     ----------
     tables
-        Tables of the model at this rate.
+        Precomputed quantities of the model at the record's rate.
     """
 
-    __slots__ = ("_earlier", "_explained_by", "_tables")
+    __slots__ = ("_explaining_delay_s", "_searches", "_tables")
 
-    def __init__(self, tables: Tables) -> None:
+    def __init__(self, tables: TouchTables) -> None:
         self._tables = tables
-        self._earlier: dict[float, Explainer] = {}
-        self._explained_by: float | None = None
+        self._searches: dict[float, ExplanationSearch] = {}
+        self._explaining_delay_s: float | None = None
 
     def preview(self, record: TouchRecord) -> None:
-        """Search the possible positions in advance, as part of the first estimate.
+        """Search the likely positions of the touch in advance, so that the first estimate is fast.
 
         Parameters
         ----------
         record
             Samples until `PREVIEW_S` after the detection, or some more.
         """
-        for noticed_s in NOTICED_S[:-1]:  # the last one takes long, and is hardly ever needed
-            if not self._reaches(record, noticed_s):
+        for detection_delay_s in DETECTION_DELAYS_S[
+            :-1
+        ]:  # the last one takes long, and is hardly ever needed
+            if not self._has_enough_samples(record, detection_delay_s):
                 return
-            if not self._explainer(record, noticed_s).begins_too_late:
+            if not self._search(record, detection_delay_s).begins_before_window:
                 return
 
     def update(
         self, record: TouchRecord, *, scan: bool = True, first: bool = False
     ) -> TouchEstimate:
-        """Estimate the touch from the samples so far.
+        """Return the estimate of the touch from the samples so far.
 
         Parameters
         ----------
         record
             Samples from 0.3 s or more before the touch.
         scan
-            Whether to return the likelihood of all positions; else it is empty.
+            Whether the estimate contains the likelihood of all positions; otherwise it is empty.
         first
-            Whether this is the first answer: it tries one and two obstacles at rest only, and
-            reports any other touch as of unknown kind, since other kinds take a second.
+            Whether this is the first estimate. It then tries one and two obstacles at rest only,
+            because other kinds take a second, and reports any other touch as of unknown kind.
         """
         result = None
-        searched = record.angle_rad.size
+        searched_from = record.angle_rad.size
         # The start that explained the beginning comes first.
-        for noticed_s in sorted(NOTICED_S, key=lambda each: each != self._explained_by):
-            if not self._reaches(record, noticed_s):
+        for detection_delay_s in sorted(
+            DETECTION_DELAYS_S, key=lambda each: each != self._explaining_delay_s
+        ):
+            if not self._has_enough_samples(record, detection_delay_s):
                 continue
-            here = self._explainer(record, noticed_s)
-            if noticed_s != self._explained_by and (
+            search = self._search(record, detection_delay_s)
+            if detection_delay_s != self._explaining_delay_s and (
                 # After an unexplained one, only if the touch may have begun before.
-                here.seems_to_begin >= searched or self._began_earlier(record, noticed_s)
+                search.likely_first_sample >= searched_from
+                or self._began_earlier(record, detection_delay_s)
             ):
                 continue
-            found = answer(here, here.explain(first=first), scan=scan)
-            if result is None or found.explained:
-                result = found
-            if found.explained:
-                self._explained_by = noticed_s
-            if found.explained or first:
+            estimate = estimate_from_explanations(search, search.explain(first=first), scan=scan)
+            if result is None or estimate.explained:
+                result = estimate
+            if estimate.explained:
+                self._explaining_delay_s = detection_delay_s
+            if estimate.explained or first:
                 break
-            searched = here.first
-        return result or self._without_answer(record)
+            searched_from = search.first
+        return result or self._empty_estimate(record)
 
-    def _reaches(self, record: TouchRecord, noticed_s: float) -> bool:
-        """Return whether there are enough samples of the free beam."""
-        return record.detected - round(noticed_s * self._tables.rate_hz) >= _LEAST_QUIET
+    def _has_enough_samples(self, record: TouchRecord, detection_delay_s: float) -> bool:
+        """Return whether enough samples precede a touch `detection_delay_s` before detection."""
+        return (
+            record.detected - round(detection_delay_s * self._tables.rate_hz) >= _MIN_SAMPLES_BEFORE
+        )
 
-    def _explainer(self, record: TouchRecord, noticed_s: float) -> Explainer:
-        """Return the explainer of a record, which continues from that of the previous record."""
-        earlier = self._earlier.get(noticed_s)
-        if earlier is None or earlier.given is not record:
-            self._earlier[noticed_s] = Explainer(self._tables, record, noticed_s, earlier)
-        return self._earlier[noticed_s]
+    def _search(self, record: TouchRecord, detection_delay_s: float) -> ExplanationSearch:
+        """Return the search for explanations of a record, for one time from touch to detection.
 
-    def _began_earlier(self, record: TouchRecord, noticed_s: float) -> bool:
+        It starts from the results with the previous, shorter record.
+        """
+        previous_search = self._searches.get(detection_delay_s)
+        if previous_search is None or previous_search.given is not record:
+            self._searches[detection_delay_s] = ExplanationSearch(
+                self._tables, record, detection_delay_s, previous_search
+            )
+        return self._searches[detection_delay_s]
+
+    def _began_earlier(self, record: TouchRecord, detection_delay_s: float) -> bool:
         """Return whether the touch seems to begin before the samples that may contain it."""
-        if noticed_s == NOTICED_S[-1]:
+        if detection_delay_s == DETECTION_DELAYS_S[-1]:
             return False
-        here = self._explainer(record, noticed_s)
-        if here.begins_too_late:
+        search = self._search(record, detection_delay_s)
+        if search.begins_before_window:
             return True
-        longer_s = NOTICED_S[NOTICED_S.index(noticed_s) + 1]
-        if here.misfit < _HOPELESS or not self._reaches(record, longer_s):
+        longer_delay_s = DETECTION_DELAYS_S[DETECTION_DELAYS_S.index(detection_delay_s) + 1]
+        if search.misfit < _POOR_MISFIT or not self._has_enough_samples(record, longer_delay_s):
             return False
-        longer = self._explainer(record, longer_s)
-        return longer.seems_to_begin < here.first and longer.misfit < 0.5 * here.misfit
+        longer_search = self._search(record, longer_delay_s)
+        return (
+            longer_search.likely_first_sample < search.first
+            and longer_search.misfit < 0.5 * search.misfit
+        )
 
-    def _without_answer(self, record: TouchRecord) -> TouchEstimate:
-        """Return the empty estimate for too few samples before the touch."""
-        nothing = np.zeros(0)
+    def _empty_estimate(self, record: TouchRecord) -> TouchEstimate:
+        """Return the estimate without any result, for a record with too few samples."""
+        empty = np.zeros(0)
         channels = 1 if record.shear_n is None else 2
         return TouchEstimate(
             x_m=None,
@@ -174,10 +192,10 @@ class GrowingEstimate:
             channels=channels,
             samples=record.angle_rad.size - record.detected,
             chi2_per_degree=np.nan,
-            positions_m=nothing,
-            log_likelihood=nothing,
+            positions_m=empty,
+            log_likelihood=empty,
             innovations=np.zeros((channels, 0)),
-            innovation_times_s=nothing,
-            force_history_n=nothing,
-            force_times_s=nothing,
+            innovation_times_s=empty,
+            force_history_n=empty,
+            force_times_s=empty,
         )

@@ -1,8 +1,8 @@
 """Explanations of the record of one touch: candidates of each kind, and their residuals.
 
 A springy obstacle at rest, integrated in time through its bounces, explains the innovations of
-torque and base shear. Alternatives are two obstacles, those that move or yield, a knock, and any
-force at all. `_answer` decides which of them are reported.
+torque and base shear. Alternatives are two obstacles, an obstacle that moves or yields, a knock
+(one pulse of force), and any force at all. `_answer` decides which of them are reported.
 """
 
 from dataclasses import dataclass, replace
@@ -11,119 +11,137 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.touch._blind import BlindScan
+from rigd.touch._blind import AnyForceLikelihood
 from rigd.touch._free_motion import TouchRecord
 from rigd.touch._kernels import ContactKernels
-from rigd.touch._knock import Knocking
-from rigd.touch._pair import Pairing
+from rigd.touch._knock import KnockResponse
+from rigd.touch._pair import TwoObstacleContact
 from rigd.touch._physical import (
-    SOFTEST,
-    STIFFEST,
-    Descended,
+    MAX_LN_STIFFNESS,
+    MIN_LN_STIFFNESS,
+    Minima,
+    ObstacleContact,
+    ParameterRanges,
     Prediction,
-    Space,
-    Touching,
     WhitenedWindow,
     chi2_of,
-    descend,
+    find_minima,
 )
-from rigd.touch._posterior import Posterior, sampled
-from rigd.touch._tables import GRID_S, Tables
-from rigd.touch._uncertain import deviations
+from rigd.touch._posterior import Posterior, sample_posterior
+from rigd.touch._tables import GRID_COMPARISON_S, TouchTables
+from rigd.touch._uncertain import uncertainty_effects
 from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 
 Real = NDArray[np.float64]
 
 _STAGES_S = (FIRST_S, 0.1, FINAL_S)
-"""Times after the detection to be explained; the longest only if an obstacle at rest explains the
-shorter ones and the point is still uncertain."""
-_COVERED_S = 0.1
-"""Time after the detection up to which the effects of all uncertainties are included at once."""
-_WORTH = 1.2
-"""A further stage requires this factor in the number of samples."""
-_WELL_KNOWN_M = 2e-3
-_CLOUD = 96
-"""Starts for a longer part of the record, from the posterior of a shorter one."""
-NEAR_TIP = 0.8
-"""Fraction of the length beyond which contacts are shorter, and steps finer."""
-_NEARBY_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
-_AT_TIP = 0.95
-"""Beyond this fraction a longer record adds nothing: its many short contacts fit anywhere."""
+"""Times in s after the detection up to which the record is explained, in this order. The longest is
+used only if an obstacle at rest explains the shorter parts and the point is still uncertain."""
+_UNCERTAINTIES_S = 0.1
+"""Time in s after the detection up to which the effects of all uncertainties are included at
+once."""
+_MIN_STAGE_GROWTH = 1.2
+"""Smallest factor by which the number of samples must grow for a further stage."""
+_PRECISE_STD_M = 2e-3
+"""Standard deviation of the position in m below which a longer part of the record is not used."""
+_RANDOM_CANDIDATES = 96
+"""Number of candidates for a longer part of the record, drawn from the posterior of a shorter
+part."""
+NEAR_TIP_FRACTION = 0.8
+"""Fraction of the beam's length beyond which contacts are shorter, so that time steps are finer."""
+_NEARBY_OFFSETS_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
+"""Distances in m of additional candidates from the best ones near the tip."""
+_TIP_FRACTION = 0.95
+"""Fraction of the beam's length beyond which a longer record adds nothing, because its many short
+contacts fit anywhere."""
 
-_LEAST_SCALE = 1.2
-"""Least assumed variance of the residuals: the noise itself is estimated from few samples."""
-_DOUBT_OF_TWO = 4.0
-"""Where two obstacles clearly explain more than one, the sum of squared residuals is divided by
-this: the errors of the model decide which of the several minima is the lowest."""
-CLEAR = 16.0
-"""Difference in the sum of squared residuals that decides between two kinds."""
-DOUBTFUL = 9.0
-"""Reduction by a moving or yielding obstacle up to which one at rest stays possible: an obstacle at
-rest gains that much by chance in one of a hundred touches."""
-_POSSIBLE = 5.0
-"""Reduction by two obstacles up to which the point stays uncertain."""
-_HOPEFUL = 0.8
-"""Reduction after a few iterations from which two obstacles get more of them."""
-_WORSE = 3.5
-"""Standard deviations by which the sum of squared residuals may exceed its expectation."""
-POOR = 2.0
-"""Standard deviations beyond which the explanation may be wrong: other kinds are tried, and the
-interval of the point is that for any force."""
-_WORSE_LATER = 2.5
-"""The same for the addition of a longer record. Bounces amplify small errors of the model: where
-the later ones are explained less well, the first result is closer to the truth."""
+_MIN_RESIDUAL_VARIANCE = 1.2
+"""Smallest assumed variance of the whitened residuals, since the noise itself is estimated from few
+samples."""
+_TWO_OBSTACLES_VARIANCE = 4.0
+"""Divisor of the sum of squared residuals if two obstacles clearly explain more than one: errors of
+the model then decide which of several minima is the lowest."""
+DECISIVE_CHI2_DIFFERENCE = 16.0
+"""Difference in the sum of squared residuals that decides between two kinds of obstacle."""
+CHANCE_CHI2_REDUCTION = 9.0
+"""Reduction of the sum of squared residuals by a moving or yielding obstacle up to which an
+obstacle at rest is still possible. In one of a hundred touches of an obstacle at rest the reduction
+is that large by chance."""
+_MIN_TWO_OBSTACLES_GAIN = 5.0
+"""Reduction of the sum of squared residuals by two obstacles from which they are possible, so that
+the position is less certain."""
+_MIN_EARLY_GAIN = 0.8
+"""Reduction of the sum of squared residuals after a few iterations, from which the search for two
+obstacles continues."""
+_MAX_MISFIT_STDS = 3.5
+"""Number of standard deviations by which the sum of squared residuals may exceed its
+expectation."""
+POOR_FIT_STDS = 2.0
+"""Number of standard deviations of the sum of squared residuals beyond which the explanation may be
+wrong: other kinds are tried, and the interval of the point is that for any force."""
+_MAX_LATER_MISFIT_STDS = 2.5
+"""Number of standard deviations by which the sum of squared residuals of the later samples alone
+may exceed its expectation. Bounces amplify small errors of the model. If the later bounces are
+explained less well, the first result is closer to the truth."""
 
 _RATES_M_PER_S = np.array([-1.5, -0.7, -0.3, -0.1, 0.1, 0.25, 0.5])
+"""Speeds of moving obstacles with which the search starts."""
 _MOBILITIES = np.array([0.01, 0.04, 0.15, 0.6])
+"""Mobilities of yielding obstacles, in m/s per N, with which the search starts."""
 _STIFFNESSES = np.array([300.0, 3000.0, 30000.0])
-"""Starts of obstacles that move (m/s) or yield (m/s per N), and their stiffnesses."""
+"""Stiffnesses in N/m of moving or yielding obstacles with which the search starts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Best explanation of the record by obstacles of one kind."""
+    """Best explanation of a touch's record by obstacles of one kind."""
 
     kind: str
+    """Kind of obstacle: rigid, moving, yielding, two or knock."""
     posterior: Posterior
+    """Posterior distribution of the obstacle's parameters."""
     parameters: Real
+    """Likeliest parameters, shape (p,)."""
     chi2: float
+    """Sum of squared residuals of the likeliest parameters."""
 
 
 @dataclass(frozen=True, slots=True)
-class Explained:
-    """Possible explanations of a record, and their range."""
+class ExplainedRecord:
+    """Possible explanations of a touch's record, and the part of the record that they explain."""
 
     explanations: list[Explanation]
-    """An obstacle at rest comes first."""
+    """Explanations by kind; that by an obstacle at rest comes first."""
     window: WhitenedWindow
-    """The explained part of the record."""
-    later_doubtful: bool
+    """Part of the record that is explained."""
+    later_samples_contradict: bool
     """Whether the later samples, which are left out, contradict an obstacle at rest."""
-    untried: bool
-    """Whether another kind may be likelier, but none was tried."""
+    other_kinds_untried: bool
+    """Whether another kind of obstacle may be likelier, but was not tried."""
 
 
-class Explainer:
-    """Explains the record of one touch.
+class ExplanationSearch:
+    """Search for the obstacles that explain the record of one touch.
 
     Parameters
     ----------
     tables
-        Tables of the model at this rate.
+        Precomputed tables of the model at the record's rate.
     record
         Samples from 0.3 s or more before the touch.
-    noticed_s
-        Longest time from the touch to its detection.
-    earlier
-        Explainer of the beginning of the same record; its results are the starting point.
+    detection_delay_s
+        Longest time in s from the touch to its detection.
+    previous_search
+        Search with the beginning of the same record, from whose results this search starts; None:
+        it starts from a grid.
     """
 
     def __init__(
         self,
-        tables: Tables,
+        tables: TouchTables,
         record: TouchRecord,
-        noticed_s: float,
-        earlier: "Explainer | None" = None,
+        detection_delay_s: float,
+        previous_search: "ExplanationSearch | None" = None,
     ) -> None:
         rate = tables.rate_hz
         self.tables, self.rate, self.given = tables, rate, record
@@ -137,159 +155,195 @@ class Explainer:
             record.detected - self.begin,
         )
         self.detected = self.record.detected
-        self.quiet = self.detected - round(noticed_s * rate)
+        self.quiet = self.detected - round(detection_delay_s * rate)
         self.motion = tables.free.motion(self.record, self.quiet, self.quiet - 4)
         self.available = self.record.angle_rad.size - self.detected
         self.edges = (float(tables.x_m[0]) + 0.002, float(tables.x_m[-1]))
         self.deviations: Real | None = None
-        self._covered_s = 0.0
-        whole_grid = earlier is not None and earlier.available >= round(GRID_S * rate)
-        self._gridded: Real = earlier._gridded if earlier and whole_grid else self._best_of_grid()
+        self._uncertainties_s = 0.0
+        whole_grid = previous_search is not None and previous_search.available >= round(
+            GRID_COMPARISON_S * rate
+        )
+        self._grid_candidates: Real = (
+            previous_search._grid_candidates
+            if previous_search and whole_grid
+            else self._best_of_grid()
+        )
         self._at_rest: tuple[Explanation, float] | None
-        self._at_rest = None if earlier is None else earlier._at_rest
+        self._at_rest = None if previous_search is None else previous_search._at_rest
 
     @property
     def first(self) -> int:
-        """First sample of the record that may contain the touch."""
+        """Index of the first sample of the record that may contain the touch."""
         return self.begin + self.quiet
 
     @property
-    def begins_too_late(self) -> bool:
-        """Whether the touch seems to begin before the samples that may contain it."""
+    def begins_before_window(self) -> bool:
+        """Whether the likeliest touch begins before the samples that may contain it."""
         return bool(self.starts[0, 1] < self.motion.t[self.quiet] + 2.5 / self.rate)
 
     @property
-    def seems_to_begin(self) -> int:
-        """Sample before which the likeliest touch of the first grid search begins."""
+    def likely_first_sample(self) -> int:
+        """Index of the sample before which the likeliest touch of the grid search begins."""
         after_s = float(self.starts[0, 1] - self.motion.t[self.quiet])
         return self.first + round(after_s * self.rate)
 
     @property
     def misfit(self) -> float:
-        """Residual of an obstacle at rest in the first samples, relative to the noise's."""
-        return float(self._descended.chi2.min() / self._first_samples.data.size)
+        """Mean square of the residuals of an obstacle at rest in the first samples, over noise."""
+        return float(self._first_minima.chi2.min() / self._first_samples.data.size)
 
-    def explain(self, *, first: bool) -> Explained:
-        """Explain the record by obstacles at rest and, except the `first` time, by other kinds."""
-        rest, window, two, later_doubtful = self._over_stages()
-        explanations = [rest]
-        untried = False
-        if two is None:
-            other = not self.fits(rest, window, POOR) or self._changes(rest, window)
-            if other and first:
-                untried = True
-            elif other:
-                explanations += self._others(window)
-            if self.fits(rest, window):
-                two = self._two(rest, window)
-        if two is not None:
-            explanations.append(two)
-        return Explained(explanations, window, later_doubtful=later_doubtful, untried=untried)
+    def explain(self, *, first: bool) -> ExplainedRecord:
+        """Return the explanations of the record by one or two obstacles at rest and other kinds.
 
-    def _over_stages(self) -> tuple[Explanation, WhitenedWindow, Explanation | None, bool]:
+        With `first` set, other kinds than obstacles at rest are not tried, because that takes long.
+        """
+        at_rest, window, two_obstacles, later_samples_contradict = self._explain_in_stages()
+        explanations = [at_rest]
+        other_kinds_untried = False
+        if two_obstacles is None:
+            needs_other_kinds = not self.fits(
+                at_rest, window, POOR_FIT_STDS
+            ) or self._may_move_or_yield(at_rest, window)
+            if needs_other_kinds and first:
+                other_kinds_untried = True
+            elif needs_other_kinds:
+                explanations += self._explain_by_other_kinds(window)
+            if self.fits(at_rest, window):
+                two_obstacles = self._explain_by_two(at_rest, window)
+        if two_obstacles is not None:
+            explanations.append(two_obstacles)
+        return ExplainedRecord(
+            explanations,
+            window,
+            later_samples_contradict=later_samples_contradict,
+            other_kinds_untried=other_kinds_untried,
+        )
+
+    def _explain_in_stages(self) -> tuple[Explanation, WhitenedWindow, Explanation | None, bool]:
         """Explain longer and longer parts of the record by an obstacle at rest.
 
-        Returns the explanation of the longest explained part, or else the first failed one, and
-        that part; two obstacles, if they explain a part that a single one does not; and whether the
-        following samples contradict it.
+        Return four results: the explanation of the longest part that an obstacle at rest explains,
+        or of the first part that it does not explain; this part; the explanation by two obstacles,
+        or None unless they explain a part that a single obstacle does not; and whether the
+        following samples contradict the first explanation.
         """
         available_s = self.available / self.rate
-        stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
+        stages = [seconds for seconds in _STAGES_S if _MIN_STAGE_GROWTH * seconds <= available_s]
         stages.append(available_s)
-        before: tuple[Explanation, WhitenedWindow] | None = None
+        previous_stage: tuple[Explanation, WhitenedWindow] | None = None
         if self._at_rest is None:
-            starts = self._with_neighbours(_distinct(self._descended))
+            starts = self._add_neighbours(_distinct_minima(self._first_minima))
         else:
-            rest, explained_s = self._at_rest
+            at_rest, explained_s = self._at_rest
             stages = [seconds for seconds in stages if seconds > explained_s]
-            starts = self._further(rest)
-            self._take_along(starts, max([explained_s, *stages[:1]]))
+            starts = self._next_candidates(at_rest)
+            self._include_uncertainties(starts, max([explained_s, *stages[:1]]))
             window = self.window(explained_s)
-            [chi2] = chi2_of(self.predicting(starts[:1]), window, starts[:1])
-            before = replace(rest, chi2=float(chi2)), window
-            if self._enough(*before, explained_s):
+            [chi2] = chi2_of(self.predictor(starts[:1]), window, starts[:1])
+            previous_stage = replace(at_rest, chi2=float(chi2)), window
+            if self._is_sufficient(*previous_stage, explained_s):
                 stages = []
         for seconds in stages:
-            self._take_along(starts, seconds)
+            self._include_uncertainties(starts, seconds)
             window = self.window(seconds)
-            rest = self.explained("rigid", self.predicting(starts), window, starts, self.space(3))
-            if before is not None and self._later_is_worse(rest, window, *before):
-                two = self._two(rest, window)
-                if two is not None and self.fits(two, window, POOR):
-                    return rest, window, two, False
+            at_rest = self.explain_by_kind(
+                "rigid", self.predictor(starts), window, starts, self.space(3)
+            )
+            if previous_stage is not None and self._later_samples_fit_worse(
+                at_rest, window, *previous_stage
+            ):
+                two_obstacles = self._explain_by_two(at_rest, window)
+                if two_obstacles is not None and self.fits(two_obstacles, window, POOR_FIT_STDS):
+                    return at_rest, window, two_obstacles, False
                 # In still later bounces the search may miss the minimum: they decide no kind.
-                doubtful = seconds <= _COVERED_S and self._changes(rest, window)
-                return *before, None, doubtful
-            before = rest, window
-            self._at_rest = rest, seconds
-            if self._enough(rest, window, seconds):
+                contradicts = seconds <= _UNCERTAINTIES_S and self._may_move_or_yield(
+                    at_rest, window
+                )
+                return *previous_stage, None, contradicts
+            previous_stage = at_rest, window
+            self._at_rest = at_rest, seconds
+            if self._is_sufficient(at_rest, window, seconds):
                 break
-            starts = self._further(rest)
-        assert before is not None  # there is at least one stage, or an earlier one
-        return *before, None, False
+            starts = self._next_candidates(at_rest)
+        assert previous_stage is not None  # there is at least one stage, or an earlier one
+        return *previous_stage, None, False
 
-    def _enough(self, rest: Explanation, window: WhitenedWindow, seconds: float) -> bool:
-        """Return whether a longer part of the record would add nothing."""
-        x_m = rest.posterior.mean(0)
-        known = rest.posterior.std(0) < _WELL_KNOWN_M or x_m > _AT_TIP * self.edges[1]
-        return seconds > FIRST_S and bool(known or not self.fits(rest, window))
+    def _is_sufficient(self, at_rest: Explanation, window: WhitenedWindow, seconds: float) -> bool:
+        """Return whether a longer part of the record would not improve the estimate."""
+        x_m = at_rest.posterior.mean(0)
+        is_precise = (
+            at_rest.posterior.std(0) < _PRECISE_STD_M or x_m > _TIP_FRACTION * self.edges[1]
+        )
+        return seconds > FIRST_S and bool(is_precise or not self.fits(at_rest, window))
 
-    def _take_along(self, likeliest: Real, seconds: float) -> None:
-        """Include the uncertainties for this length of the record."""
-        if self._covered_s < seconds:
-            self._covered_s = min(max(seconds, _COVERED_S), self.available / self.rate)
-            whole = WhitenedWindow.of(self.motion, self.quiet, self.end(self._covered_s))
-            self.deviations = deviations(self.tables, self.record, likeliest[:1], whole)
+    def _include_uncertainties(self, likeliest: Real, seconds: float) -> None:
+        """Compute the effects of all uncertainties up to `seconds` after the detection.
 
-    def _further(self, rest: Explanation) -> Real:
-        """Return starts for a longer part of the record."""
-        return np.vstack([rest.parameters, self._cloud(rest.posterior)])
+        They are computed for the first candidate of `likeliest`, unless this was done before.
+        """
+        if self._uncertainties_s < seconds:
+            self._uncertainties_s = min(max(seconds, _UNCERTAINTIES_S), self.available / self.rate)
+            whole = WhitenedWindow.from_motion(
+                self.motion, self.quiet, self.end(self._uncertainties_s)
+            )
+            self.deviations = uncertainty_effects(self.tables, self.record, likeliest[:1], whole)
+
+    def _next_candidates(self, at_rest: Explanation) -> Real:
+        """Return candidates for a longer part of the record, from the result for a shorter part."""
+        return np.vstack([at_rest.parameters, self._draw_candidates(at_rest.posterior)])
 
     @cached_property
-    def blind(self) -> BlindScan:
-        """Likelihood of any force in the first samples; takes as long as the remaining estimate."""
-        return self.tables.blind.scan(self.window(FIRST_S))
+    def any_force(self) -> AnyForceLikelihood:
+        """Likelihood of a touch by any force at each position, from the first samples.
+
+        Its computation takes as long as the remaining estimate.
+        """
+        return self.tables.any_force.scan(self.window(FIRST_S))
 
     # Data for the comparison of candidates
 
     def window(self, seconds: float) -> WhitenedWindow:
-        """Return the samples from before the touch to a time after the detection."""
-        return WhitenedWindow.of(self.motion, self.quiet, self.end(seconds), self.deviations)
-
-    def end(self, seconds: float) -> int:
-        """Return the sample at a time after the detection, or the end of the record."""
-        return self.detected + min(self.available, round(seconds * self.rate))
-
-    def space(self, width: int) -> Space:
-        """Return the ranges of `PARAMETERS`."""
-        t = self.motion.t
-        return Space(
-            low=np.array([self.edges[0], t[self.quiet + 1], SOFTEST, -3.0, 0.0])[:width],
-            high=np.array([self.edges[1], t[self.detected], STIFFEST, 3.0, 50.0])[:width],
-            difference=np.array([2e-4, 2e-5, 2e-2, 2e-3, 2e-3])[:width],
-            scale=np.array([3e-3, 1e-3, 1.0, 0.1, 0.1])[:width],
-            smallest=np.array([1.5e-4, 1e-5, 2e-2, 5e-3, 5e-3])[:width],
-            loose=np.array([0.02, 2e-3, 1.0, 0.3, 0.3])[:width],
+        """Return the whitened innovations from before the touch to a time after the detection."""
+        return WhitenedWindow.from_motion(
+            self.motion, self.quiet, self.end(seconds), self.deviations
         )
 
-    def predicting(self, rows: Real, *, first: bool = False) -> Prediction:
-        """Return the prediction in short steps, half as long near the tip: contacts are shorter.
+    def end(self, seconds: float) -> int:
+        """Return the index of the sample at a time after the detection, or the record's end."""
+        return self.detected + min(self.available, round(seconds * self.rate))
 
-        `first`: elsewhere twice as long steps for the beginning.
+    def space(self, width: int) -> ParameterRanges:
+        """Return the ranges of the first `width` parameters of `OBSTACLE_PARAMETERS`."""
+        t = self.motion.t
+        return ParameterRanges(
+            low=np.array([self.edges[0], t[self.quiet + 1], MIN_LN_STIFFNESS, -3.0, 0.0])[:width],
+            high=np.array([self.edges[1], t[self.detected], MAX_LN_STIFFNESS, 3.0, 50.0])[:width],
+            difference=np.array([2e-4, 2e-5, 2e-2, 2e-3, 2e-3])[:width],
+            scale=np.array([3e-3, 1e-3, 1.0, 0.1, 0.1])[:width],
+            smallest_std=np.array([1.5e-4, 1e-5, 2e-2, 5e-3, 5e-3])[:width],
+            largest_std=np.array([0.02, 2e-3, 1.0, 0.3, 0.3])[:width],
+        )
+
+    def predictor(self, rows: Real, *, first: bool = False) -> Prediction:
+        """Return the function that predicts the effect of obstacles near the candidates `rows`.
+
+        Its time steps are half as long near the tip, where contacts are shorter. With `first` set,
+        they are twice as long elsewhere, for a first search.
         """
         tables = self.tables
-        tip = bool(np.median(rows[:, 0]) > NEAR_TIP * tables.model.beam.length_m)
+        tip = bool(np.median(rows[:, 0]) > NEAR_TIP_FRACTION * tables.model.beam.length_m)
         kernels = tables.finest if tip else tables.coarse if first else tables.middle
-        touching = Touching(kernels, tables.x_m, self.motion)
-        return lambda candidates, window: touching.predicted(candidates, window)[0]
+        contact = ObstacleContact(kernels, tables.x_m, self.motion)
+        return lambda candidates, window: contact.predict(candidates, window)[0]
 
     # Springy obstacle at rest
 
     def _best_of_grid(self) -> Real:
-        """Return the likeliest candidates of the grid, some of each position."""
-        window = self.window(GRID_S)
+        """Return the four likeliest candidates of the grid for each position."""
+        window = self.window(GRID_COMPARISON_S)
         grid = self.tables.starts(window.end - window.first)
-        starts, chi2 = grid.marched(self.motion, window, self.detected)
+        starts, chi2 = grid.integrate(self.motion, window, self.detected)
         starts = starts[np.lexsort((chi2, starts[:, 0]))]
         count = starts.shape[0] // np.unique(starts[:, 0]).size
         best: Real = starts.reshape(-1, count, 3)[:, :4].reshape(-1, 3)
@@ -297,209 +351,258 @@ class Explainer:
 
     @cached_property
     def _first_samples(self) -> WhitenedWindow:
-        """Samples for the candidates of the grid: their uncertainties are not included yet."""
-        return WhitenedWindow.of(self.motion, self.quiet, self.end(FIRST_S))
+        """Whitened innovations with which the grid's candidates are compared.
+
+        The effects of uncertainties through the contact are not included yet.
+        """
+        return WhitenedWindow.from_motion(self.motion, self.quiet, self.end(FIRST_S))
 
     @cached_property
     def starts(self) -> Real:
-        """The likeliest candidates of the grid, compared over more samples."""
-        coarse = Touching(self.tables.coarse, self.tables.x_m, self.motion)
-        again = chi2_of(
-            lambda rows, window: coarse.predicted(rows, window)[0],
+        """The 12 likeliest obstacles at rest of the grid, compared over more samples."""
+        coarse = ObstacleContact(self.tables.coarse, self.tables.x_m, self.motion)
+        chi2 = chi2_of(
+            lambda rows, window: coarse.predict(rows, window)[0],
             self._first_samples,
-            self._gridded,
+            self._grid_candidates,
         )
-        return self._gridded[np.argsort(again)[:12]]
+        return self._grid_candidates[np.argsort(chi2)[:12]]
 
     @cached_property
-    def _descended(self) -> Descended:
-        """Minima from these starts, in longer steps."""
-        predict = self.predicting(self.starts, first=True)
-        return descend(predict, self._first_samples, self.starts, self.space(3), rounds=7)
+    def _first_minima(self) -> Minima:
+        """Minima that least squares found from the likeliest candidates, in longer time steps."""
+        predict = self.predictor(self.starts, first=True)
+        return find_minima(predict, self._first_samples, self.starts, self.space(3), rounds=7)
 
-    def _with_neighbours(self, starts: Real) -> Real:
-        """Add starts near the best ones close to the tip, where the minima are close together."""
-        if np.median(starts[:, 0]) <= NEAR_TIP * self.tables.model.beam.length_m:
+    def _add_neighbours(self, starts: Real) -> Real:
+        """Return candidates, with further ones nearby if they are close to the beam's tip.
+
+        Minima are close together there.
+        """
+        if np.median(starts[:, 0]) <= NEAR_TIP_FRACTION * self.tables.model.beam.length_m:
             return starts
-        nearby = np.repeat(starts[None, :2], _NEARBY_M.size, axis=0)
-        nearby[:, :, 0] = np.clip(nearby[:, :, 0] + _NEARBY_M[:, None], *self.edges)
+        nearby = np.repeat(starts[None, :2], _NEARBY_OFFSETS_M.size, axis=0)
+        nearby[:, :, 0] = np.clip(nearby[:, :, 0] + _NEARBY_OFFSETS_M[:, None], *self.edges)
         return np.vstack([starts, nearby.reshape(-1, starts.shape[1])])
 
-    def _cloud(self, posterior: Posterior) -> Real:
-        """Return candidates for a longer window, from the posterior of a shorter one."""
+    def _draw_candidates(self, posterior: Posterior) -> Real:
+        """Return random candidates for a longer window, from the posterior of a shorter window."""
         rng = np.random.default_rng(1)
-        chosen = posterior.samples[rng.choice(posterior.weights.size, _CLOUD, p=posterior.weights)]
+        chosen = posterior.samples[
+            rng.choice(posterior.weights.size, _RANDOM_CANDIDATES, p=posterior.weights)
+        ]
         width = chosen.shape[1]
         space = self.space(width)
-        spread = np.array([max(posterior.std(i), space.smallest[i]) for i in range(width)])
+        spread = np.array([max(posterior.std(i), space.smallest_std[i]) for i in range(width)])
         return np.clip(
             chosen + 0.5 * spread * rng.standard_normal(chosen.shape), space.low, space.high
         )
 
-    def explained(
-        self, kind: str, predict: Prediction, window: WhitenedWindow, starts: Real, space: Space
-    ) -> Explanation:
-        """Find the minima from the starts, and sample around them."""
-        if starts.shape[0] > 12:
-            starts = starts[np.argsort(chi2_of(predict, window, starts))[:12]]
-        found = descend(predict, window, starts, space, rounds=9)
-        return self._sampled(kind, predict, window, found, space)
-
-    def _sampled(
+    def explain_by_kind(
         self,
         kind: str,
         predict: Prediction,
         window: WhitenedWindow,
-        found: Descended,
-        space: Space,
-        doubt: float = 1.0,
+        starts: Real,
+        space: ParameterRanges,
     ) -> Explanation:
-        """Sample around minima; `doubt` divides differences of chi²."""
-        width = found.parameters.shape[1]
-        near = np.flatnonzero(found.chi2 < found.chi2.min() + 30)
+        """Return the explanation by one kind of obstacle: search for minima, and sample around."""
+        if starts.shape[0] > 12:
+            starts = starts[np.argsort(chi2_of(predict, window, starts))[:12]]
+        minima = find_minima(predict, window, starts, space, rounds=9)
+        return self._explain_from_minima(kind, predict, window, minima, space)
+
+    def _explain_from_minima(
+        self,
+        kind: str,
+        predict: Prediction,
+        window: WhitenedWindow,
+        minima: Minima,
+        space: ParameterRanges,
+        variance_factor: float = 1.0,
+    ) -> Explanation:
+        """Return an explanation with samples of the posterior around the minima in `minima`.
+
+        `variance_factor` is a factor on the variance of the residuals.
+        """
+        width = minima.parameters.shape[1]
+        near_best = np.flatnonzero(minima.chi2 < minima.chi2.min() + 30)
         covariances = np.array(
             [
-                np.linalg.inv(found.jacobian[k].T @ found.jacobian[k] + np.diag(1 / space.loose**2))
-                + np.diag(space.smallest**2)
-                for k in near
+                np.linalg.inv(
+                    minima.jacobian[k].T @ minima.jacobian[k] + np.diag(1 / space.largest_std**2)
+                )
+                + np.diag(space.smallest_std**2)
+                for k in near_best
             ]
         )
         degrees = max(window.data.size - width, 1)
-        posterior = sampled(
+        posterior = sample_posterior(
             lambda rows: chi2_of(predict, window, rows),
-            found.parameters[near],
+            minima.parameters[near_best],
             covariances,
             (space.low, space.high),
-            scale=doubt * max(_LEAST_SCALE, found.chi2.min() / degrees),
+            scale=variance_factor * max(_MIN_RESIDUAL_VARIANCE, minima.chi2.min() / degrees),
             count=120,
             rounds=5,
-            enough=150.0,
-            smallest=space.smallest,
+            enough_samples=150.0,
+            smallest_std=space.smallest_std,
         )
         best = int(np.argmin(posterior.chi2))
         return Explanation(kind, posterior, posterior.samples[best], float(posterior.chi2[best]))
 
     # Other kinds
 
-    def fits(self, explanation: Explanation, window: WhitenedWindow, worse: float = _WORSE) -> bool:
-        """Return whether the residual is no larger than noise, estimated from few samples."""
-        return bool(explanation.chi2 < self.most(window.data.size, worse))
-
-    def most(self, degrees: int, worse: float = _WORSE) -> float:
-        """Return the greatest sum of squared residuals that noise explains."""
-        of_noise = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
-        return float(degrees + worse * np.sqrt(2 * degrees + of_noise))
-
-    def _later_is_worse(
-        self, longer: Explanation, over: WhitenedWindow, shorter: Explanation, until: WhitenedWindow
+    def fits(
+        self, explanation: Explanation, window: WhitenedWindow, max_stds: float = _MAX_MISFIT_STDS
     ) -> bool:
-        """Return whether the shorter of two windows is explained, but not the added part."""
-        added = over.data.size - until.data.size
-        more = longer.chi2 - shorter.chi2
-        return self.fits(shorter, until) and more > self.most(added, _WORSE_LATER)
+        """Return whether an explanation's residuals are no larger than noise.
 
-    def _changes(self, rest: Explanation, window: WhitenedWindow) -> bool:
-        """Return whether the obstacle at rest becomes likelier if it may move or yield."""
+        `max_stds` is the number of standard deviations by which they may exceed their expectation.
+        """
+        return bool(explanation.chi2 < self.max_chi2(window.data.size, max_stds))
+
+    def max_chi2(self, degrees: int, max_stds: float = _MAX_MISFIT_STDS) -> float:
+        """Return the largest sum of squared residuals that noise explains.
+
+        `degrees` is its expectation, and `max_stds` the allowed number of standard deviations.
+        """
+        of_noise = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
+        return float(degrees + max_stds * np.sqrt(2 * degrees + of_noise))
+
+    def _later_samples_fit_worse(
+        self,
+        longer_explanation: Explanation,
+        longer_window: WhitenedWindow,
+        shorter_explanation: Explanation,
+        shorter_window: WhitenedWindow,
+    ) -> bool:
+        """Return whether a shorter window is explained, but not the samples of a longer one."""
+        added_samples = longer_window.data.size - shorter_window.data.size
+        added_chi2 = longer_explanation.chi2 - shorter_explanation.chi2
+        return self.fits(shorter_explanation, shorter_window) and added_chi2 > self.max_chi2(
+            added_samples, _MAX_LATER_MISFIT_STDS
+        )
+
+    def _may_move_or_yield(self, at_rest: Explanation, window: WhitenedWindow) -> bool:
+        """Return whether a moving or yielding obstacle is clearly likelier than one at rest."""
         extra = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
-        starts = np.hstack([np.tile(rest.parameters, (len(extra), 1)), extra])
-        free = np.hstack([np.ones((len(extra), rest.parameters.size), dtype=bool), extra != 0])
-        touching = Touching(self.tables.middle, self.tables.x_m, self.motion)
-        side = touching.side(rest.parameters)
-        found = descend(
-            lambda candidates, window: touching.predicted(candidates, window, side)[0],
+        starts = np.hstack([np.tile(at_rest.parameters, (len(extra), 1)), extra])
+        free = np.hstack([np.ones((len(extra), at_rest.parameters.size), dtype=bool), extra != 0])
+        contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
+        side = contact.pressing_direction(at_rest.parameters)
+        minima = find_minima(
+            lambda candidates, window: contact.predict(candidates, window, side)[0],
             window,
             starts,
             self.space(5),
             rounds=5,
             free=free,
         )
-        return bool(found.chi2.min() < rest.chi2 - DOUBTFUL)
+        return bool(minima.chi2.min() < at_rest.chi2 - CHANCE_CHI2_REDUCTION)
 
-    def _others(self, window: WhitenedWindow) -> list[Explanation]:
-        """Explain the window by obstacles that move or yield, and by a knock."""
-        blind, side = self.blind, self.side()
-        likely = blind.x_m[np.argsort(-blind.log_likelihood)[:24]]
+    def _explain_by_other_kinds(self, window: WhitenedWindow) -> list[Explanation]:
+        """Return the explanations of the window by a moving or yielding obstacle, and a knock."""
+        any_force, side = self.any_force, self.pressing_direction()
+        likeliest_positions = any_force.x_m[np.argsort(-any_force.log_likelihood)[:24]]
         instants = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
-        found = []
+        explanations = []
         for kind, extra in (("moving", _RATES_M_PER_S), ("yielding", _MOBILITIES)):
-            grid = np.meshgrid(likely, instants, np.log(_STIFFNESSES), extra, indexing="ij")
+            grid = np.meshgrid(
+                likeliest_positions, instants, np.log(_STIFFNESSES), extra, indexing="ij"
+            )
             starts = np.stack([each.ravel() for each in grid], axis=1)
-            coarse = self._marching(kind, self.tables.coarse, side)
-            for span, count in ((GRID_S, 80), (FIRST_S, 10)):
+            coarse = self._moving_predictor(kind, self.tables.coarse, side)
+            for span, count in ((GRID_COMPARISON_S, 80), (FIRST_S, 10)):
                 chi2 = chi2_of(coarse, self.window(span), starts)
                 starts = starts[np.argsort(chi2)[:count]]
-            march, space = self._marching(kind, self.tables.middle, side), self._moving_space(kind)
+            predict, space = (
+                self._moving_predictor(kind, self.tables.middle, side),
+                self._moving_space(kind),
+            )
             if window.end > self.end(FIRST_S):
-                begun = descend(march, self.window(FIRST_S), starts, space, rounds=6)
-                starts = begun.parameters
-            found.append(self.explained(kind, march, window, starts, space))
-        touching = Touching(self.tables.middle, self.tables.x_m, self.motion)
-        knocking = Knocking(touching, self.tables.middle, 2)
-        starts = knocking.starts(self.window(FIRST_S), self.detected, 10)
-        rest = self.space(3)
-        space = knocking.space(self.edges, (rest.low[1], rest.high[1]))
-        found.append(self.explained("knock", knocking.predicted, window, starts, space))
-        return found
+                early_minima = find_minima(predict, self.window(FIRST_S), starts, space, rounds=6)
+                starts = early_minima.parameters
+            explanations.append(self.explain_by_kind(kind, predict, window, starts, space))
+        contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
+        knock = KnockResponse(contact, self.tables.middle, 2)
+        starts = knock.starts(self.window(FIRST_S), self.detected, 10)
+        ranges = self.space(3)
+        space = knock.space(self.edges, (ranges.low[1], ranges.high[1]))
+        explanations.append(self.explain_by_kind("knock", knock.predict, window, starts, space))
+        return explanations
 
-    def pairing(self) -> Pairing:
-        """Return the integration of two obstacles on this record."""
+    def pairing(self) -> TwoObstacleContact:
+        """Return the integration of the contact with two obstacles for this record."""
         tables = self.tables
-        touching = Touching(tables.coarse, tables.x_m, self.motion)
-        return Pairing(touching, tables.coarse, tables.crossing)
+        contact = ObstacleContact(tables.coarse, tables.x_m, self.motion)
+        return TwoObstacleContact(contact, tables.coarse, tables.crossing)
 
-    def _two(self, rest: Explanation, window: WhitenedWindow) -> Explanation | None:
-        """Explain the window by two obstacles, if they may explain more than one at rest does."""
+    def _explain_by_two(self, at_rest: Explanation, window: WhitenedWindow) -> Explanation | None:
+        """Return the explanation by two obstacles, or None if one obstacle explains as much."""
         pairing = self.pairing()
         space = pairing.space(self.space(3))
         # The first samples show in less time whether more iterations are worthwhile.
-        early = self.window(_COVERED_S) if window.end > self.end(_COVERED_S) else window
-        starts = pairing.starts(rest.parameters, early, space, 2)
-        found = descend(pairing.channels, early, starts, space, rounds=4)
-        one = rest.parameters[None]
-        if found.chi2.min() > chi2_of(self.predicting(one), early, one)[0] - _HOPEFUL:
+        early = self.window(_UNCERTAINTIES_S) if window.end > self.end(_UNCERTAINTIES_S) else window
+        starts = pairing.starts(at_rest.parameters, early, space, 2)
+        minima = find_minima(pairing.predict_channels, early, starts, space, rounds=4)
+        single_obstacle = at_rest.parameters[None]
+        if (
+            minima.chi2.min()
+            > chi2_of(self.predictor(single_obstacle), early, single_obstacle)[0] - _MIN_EARLY_GAIN
+        ):
             return None
-        likely = found.parameters[np.argsort(found.chi2)[:3]]
-        starts = np.vstack([likely, pairing.exchanged(likely[:1])])
-        found = descend(pairing.channels, window, starts, space, rounds=8)
-        gain = rest.chi2 - found.chi2.min()
-        if gain < _POSSIBLE:
+        likeliest = minima.parameters[np.argsort(minima.chi2)[:3]]
+        starts = np.vstack([likeliest, pairing.in_reverse_order(likeliest[:1])])
+        minima = find_minima(pairing.predict_channels, window, starts, space, rounds=8)
+        gain = at_rest.chi2 - minima.chi2.min()
+        if gain < _MIN_TWO_OBSTACLES_GAIN:
             return None
-        doubt = _DOUBT_OF_TWO if gain > CLEAR else 1.0
-        return self._sampled("two", pairing.channels, window, found, space, doubt)
+        variance_factor = _TWO_OBSTACLES_VARIANCE if gain > DECISIVE_CHI2_DIFFERENCE else 1.0
+        return self._explain_from_minima(
+            "two", pairing.predict_channels, window, minima, space, variance_factor
+        )
 
-    def side(self) -> float:
-        """Return the direction in which the beam presses: opposite to the force."""
-        return -1.0 if self.blind.force_n.sum() > 0 else 1.0
+    def pressing_direction(self) -> float:
+        """Return the direction in which the beam presses on the obstacle, 1 or -1.
 
-    def _marching(self, kind: str, kernels: ContactKernels, side: float) -> Prediction:
-        """Return the prediction of obstacles whose fourth parameter is their rate or mobility."""
-        touching = Touching(kernels, self.tables.x_m, self.motion)
+        It is opposite to the direction of the likeliest force on the beam.
+        """
+        return -1.0 if self.any_force.force_n.sum() > 0 else 1.0
 
-        def predicted(candidates: Real, window: WhitenedWindow) -> Real:
+    def _moving_predictor(self, kind: str, kernels: ContactKernels, side: float) -> Prediction:
+        """Return the function that predicts the effect of moving or yielding obstacles.
+
+        Their fourth parameter is the speed or the mobility.
+        """
+        contact = ObstacleContact(kernels, self.tables.x_m, self.motion)
+
+        def predict(candidates: Real, window: WhitenedWindow) -> Real:
             if kind == "yielding":
                 candidates = np.insert(candidates, 3, 0.0, axis=1)
-            return touching.predicted(candidates, window, side)[0]
+            return contact.predict(candidates, window, side)[0]
 
-        return predicted
+        return predict
 
-    def _moving_space(self, kind: str) -> Space:
+    def _moving_space(self, kind: str) -> ParameterRanges:
+        """Return the ranges of the four parameters of a moving or yielding obstacle."""
         ranges = self.space(5)
         columns = [0, 1, 2, 3 if kind == "moving" else 4]
-        return Space(
+        return ParameterRanges(
             ranges.low[columns],
             ranges.high[columns],
             ranges.difference[columns],
             ranges.scale[columns],
-            ranges.smallest[columns],
-            ranges.loose[columns],
+            ranges.smallest_std[columns],
+            ranges.largest_std[columns],
         )
 
 
-def _distinct(found: Descended) -> Real:
-    """Return the minima without those close to a better one, the best first."""
-    order = np.argsort(found.chi2)
+def _distinct_minima(minima: Minima) -> Real:
+    """Return the parameters of minima that are not close to a better minimum, the best first."""
+    order = np.argsort(minima.chi2)
     distinct: list[Real] = []
-    for row in found.parameters[order[found.chi2[order] < 2 * found.chi2.min() + 60]]:
+    for row in minima.parameters[order[minima.chi2[order] < 2 * minima.chi2.min() + 60]]:
         if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in distinct):
             distinct.append(row)
     return np.array(distinct)

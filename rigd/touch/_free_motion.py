@@ -2,7 +2,7 @@
 
 The measured angle drives the exact model from the record's beginning on. Earlier motion (the beam
 may be vibrating from its slew) adds free vibrations of unknown amplitude. They are fitted to the
-samples before the touch, together with an offset and a drift of each channel.
+samples before the touch, together with an offset and a drift of torque and base shear.
 """
 
 from copy import copy
@@ -24,24 +24,27 @@ from rigd.touch._model import TouchModel
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-FINER = 4
-"""Values of the angle per sample, interpolated by a spline."""
-_BAND = 0.5
-"""Fraction of these frequencies that the angle contains: its own Nyquist frequency, twice."""
-_HIGHEST_HZ = 330.0
-_SETTLE_S = 0.03
-"""Time after the record's end in which the angle comes to rest: no jump that rings before it."""
-_SPEED_S = 0.02
-"""Time over which the speed at the record's beginning is measured."""
-_NODES = 36
-"""Positions from which the displacement at all others is interpolated."""
-BEFORE = 24
-"""Samples over which the effect of one sample in a spline fades."""
+STEPS_PER_SAMPLE = 4
+"""Number of time steps of the free motion per sample, to which a spline interpolates the angle."""
+_BAND_FRACTION = 0.5
+"""Fraction of the frequencies up to the time steps' Nyquist frequency that are used: up to twice
+the Nyquist frequency of the samples."""
+_MAX_MODE_HZ = 330.0
+"""Highest frequency in Hz of a free vibration that is fitted."""
+_SETTLING_S = 0.03
+"""Time constant in s with which the angle comes to rest after the record's end. A jump there would
+cause vibrations before it."""
+_SPEED_WINDOW_S = 0.02
+"""Time in s over which the speed at the record's beginning is measured."""
+_NODE_COUNT = 36
+"""Number of positions from which the displacement at all other positions is interpolated."""
+SPLINE_FADE_SAMPLES = 24
+"""Number of samples over which the effect of one sample in a spline fades."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchRecord:
-    """Samples around a touch, from 0.3 s or more before it."""
+    """Samples of angle, torque and base shear around a touch, from 0.3 s or more before it."""
 
     rate_hz: float
     """Samples a second."""
@@ -55,7 +58,7 @@ class TouchRecord:
     """Index of the sample of the detection."""
 
     def until(self, samples: int) -> "TouchRecord":
-        """Return the first samples as a record.
+        """Return a record that contains only the first samples.
 
         Parameters
         ----------
@@ -69,18 +72,18 @@ class TouchRecord:
 
 
 class FreeBeam:
-    """Part of the free motion that depends on the model and the record's length only.
+    """Responses of the free beam to its angle, prepared for records of one length.
 
     Parameters
     ----------
     model
-        The beam.
+        Model of the beam.
     x_m
-        Positions of the displacement, shape (m,).
+        Positions at which the displacement is computed, shape (m,).
     rate_hz
         Samples a second.
     samples
-        Most samples of a record.
+        Largest number of samples in a record.
     """
 
     __slots__ = (
@@ -101,114 +104,130 @@ class FreeBeam:
         from scipy.fft import next_fast_len
 
         self.model, self.x_m, self.rate_hz = model, x_m, rate_hz
-        n = next_fast_len(FINER * round(1.6 * samples + 0.1 * rate_hz), real=True)
-        self.line = LaplaceLine(n, 1 / (FINER * rate_hz), _BAND)
+        n = next_fast_len(STEPS_PER_SAMPLE * round(1.6 * samples + 0.1 * rate_hz), real=True)
+        self.line = LaplaceLine(n, 1 / (STEPS_PER_SAMPLE * rate_hz), _BAND_FRACTION)
         s = self.line.s
         self._grid = grid = PointForceGrid(s, model.beam, model.damping)
-        late = model.sensor_filter.response(s)
-        late *= np.exp(-s * (model.wrench_delay_s - model.angle_delay_s))
+        filter_response = model.sensor_filter.response(s)
+        filter_response *= np.exp(-s * (model.wrench_delay_s - model.angle_delay_s))
         inertia = model.tool_inertia_kg_m2 * s * s
-        self._torque: Complex = late * (grid.torque_per_angle() + inertia)
-        self._shear: Complex = late * grid.shear_per_angle()
-        self.modes = FreeVibration.of(model, np.empty(0))
+        self._torque: Complex = filter_response * (grid.torque_per_angle() + inertia)
+        self._shear: Complex = filter_response * grid.shear_per_angle()
+        self.modes = FreeVibration.from_model(model, np.empty(0))
         self._set_positions(x_m)
-        unit = np.zeros(3 * BEFORE)
-        unit[BEFORE] = 1.0
-        self._sample = self.line.transformed(_finer(unit, rate_hz, self.line)[0])
+        unit = np.zeros(3 * SPLINE_FADE_SAMPLES)
+        unit[SPLINE_FADE_SAMPLES] = 1.0
+        self._sample = self.line.to_laplace(_interpolate_angle(unit, rate_hz, self.line)[0])
 
-    def at(self, x_m: Real) -> "FreeBeam":
-        """Return the same beam with other positions.
+    def at_positions(self, x_m: Real) -> "FreeBeam":
+        """Return the free beam with other positions of the displacement.
 
         Parameters
         ----------
         x_m
-            Positions of the displacement, shape (m,).
+            Positions at which the displacement is computed, shape (m,).
         """
         other = copy(self)
         other._set_positions(x_m)
         return other
 
     def _set_positions(self, x_m: Real) -> None:
-        """Set the positions; many are interpolated from few: to 1e-7 for waves of 1 kHz."""
+        """Set the positions at which the displacement is computed.
+
+        Many positions are interpolated from a few nodes, with an error of 1e-7 for waves of 1 kHz.
+        """
         self.x_m = x_m
         nodes_m, self._between = x_m, np.eye(x_m.size)
-        if x_m.size > _NODES:
-            nodes_m, self._between = chebyshev_nodes(x_m, _NODES)
+        if x_m.size > _NODE_COUNT:
+            nodes_m, self._between = chebyshev_nodes(x_m, _NODE_COUNT)
         self._displacement: Complex = self._grid.per_angle(nodes_m).T
-        self.modes = self.modes.at(x_m / self.model.beam.length_m)
+        self.modes = self.modes.at_positions(x_m / self.model.beam.length_m)
 
-    def per_sample(self, index: int, samples: int) -> Real:
-        """Return the displacement caused by one sample of the angle, in m/rad.
+    def displacement_per_sample(self, index: int, samples: int) -> Real:
+        """Return the displacement at a position that one sample of the angle causes, in m/rad.
 
         Parameters
         ----------
         index
             Index of the position.
         samples
-            Number of samples after it.
+            Number of samples after the sample of the angle.
 
         Returns
         -------
-        ndarray, shape (FINER · (BEFORE + samples),)
-            On the fine steps, from `BEFORE` samples before it: the spline acts ahead of a sample.
+        ndarray, shape (STEPS_PER_SAMPLE · (SPLINE_FADE_SAMPLES + samples),)
+            Displacement on the fine time steps, from `SPLINE_FADE_SAMPLES` samples before the
+            sample of the angle, because the spline through the samples acts ahead of each sample.
         """
         response = (self._between[index] @ self._displacement) * self._sample
-        return self.line.in_time(response, FINER * (BEFORE + samples))
+        return self.line.to_time(response, STEPS_PER_SAMPLE * (SPLINE_FADE_SAMPLES + samples))
 
     def motion(
-        self, record: TouchRecord, quiet: int, first: int, turned: "Turned | None" = None
+        self,
+        record: TouchRecord,
+        quiet: int,
+        first: int,
+        angle_transform: "AngleTransform | None" = None,
     ) -> "FreeMotion":
-        """Return the free motion of one record.
+        """Return the innovations of a record, and the motion of the beam without a touch.
 
         Parameters
         ----------
         record
-            The samples.
+            Samples around the touch.
         quiet
             Number of samples that are certainly before the touch.
         first
-            First sample of the displacement.
-        turned
-            Transform of the record's angle from another beam; None: it is computed.
+            Index of the sample from which the displacement is computed.
+        angle_transform
+            Transform of the record's angle, if it is known from another beam; None: it is computed.
         """
         n = record.angle_rad.size
         rate = self.rate_hz
-        turned = turned or Turned.of(record.angle_rad, rate, self.line)
-        spectrum, start, speed = turned.spectrum, turned.start_rad, turned.speed_rad_s
+        angle_transform = angle_transform or AngleTransform.from_samples(
+            record.angle_rad, rate, self.line
+        )
+        spectrum, start, speed = (
+            angle_transform.spectrum,
+            angle_transform.start_rad,
+            angle_transform.speed_rad_s,
+        )
         channels = [(record.torque_nm, self._torque)]
         if record.shear_n is not None:
             channels.append((record.shear_n, self._shear))
         t = np.arange(n) / rate
-        late = self.model.wrench_delay_s - self.model.angle_delay_s
-        columns = self.modes.channels(t - late)
+        delay_s = self.model.wrench_delay_s - self.model.angle_delay_s
+        vibration_columns = self.modes.channels(t - delay_s)
         innovations, designs = [], []
         for i, (measured, transfer) in enumerate(channels):
-            free = self.line.in_time(transfer * spectrum, FINER * n)[::FINER]
-            innovations.append(measured - free)
+            free_reading = self.line.to_time(transfer * spectrum, STEPS_PER_SAMPLE * n)[
+                ::STEPS_PER_SAMPLE
+            ]
+            innovations.append(measured - free_reading)
             drift = np.zeros((n, 2 * len(channels)))
             drift[:, 2 * i] = 1.0
             drift[:, 2 * i + 1] = t - t[quiet // 2]
-            designs.append(np.hstack([columns[i], drift]))
-        fitted = _Fitted.to(innovations, designs, quiet)
-        steps = FINER * n
-        at_nodes = self.line.in_time(self._displacement * spectrum, steps)
-        moved = self._between @ at_nodes[:, FINER * first :]
-        fine = np.arange(FINER * first, steps) / (FINER * rate)
-        moved += self.x_m[:, None] * (start + speed * fine)
+            designs.append(np.hstack([vibration_columns[i], drift]))
+        fitted = _FreeMotionFit.fit(innovations, designs, quiet)
+        steps = STEPS_PER_SAMPLE * n
+        at_nodes = self.line.to_time(self._displacement * spectrum, steps)
+        displacement_m = self._between @ at_nodes[:, STEPS_PER_SAMPLE * first :]
+        fine = np.arange(STEPS_PER_SAMPLE * first, steps) / (STEPS_PER_SAMPLE * rate)
+        displacement_m += self.x_m[:, None] * (start + speed * fine)
         amplitudes = fitted.values[: self.modes.shapes.shape[0] * 2]
-        moved += self.modes.displacement(fine, amplitudes)
+        displacement_m += self.modes.displacement(fine, amplitudes)
         return FreeMotion(
             t=t - self.model.wrench_delay_s,
             innovations=np.array(fitted.innovations),
             noise=np.array(fitted.noise),
             design=np.array(designs),
             spread=np.linalg.cholesky(fitted.covariance).astype(np.float64),
-            turned=turned,
+            angle_transform=angle_transform,
             ringing=self.modes,
             angle_noise_rad=_angle_noise(record.angle_rad[:quiet]),
-            displacement_m=moved,
+            displacement_m=displacement_m,
             first_s=first / rate - self.model.angle_delay_s,
-            step_s=1 / (FINER * rate),
+            step_s=1 / (STEPS_PER_SAMPLE * rate),
         )
 
 
@@ -221,98 +240,108 @@ class FreeMotion:
     innovations: Real
     """Innovations of torque and, if measured, shear, shape (c, n)."""
     noise: Real
-    """Standard deviation of each channel before the touch, shape (c,)."""
+    """Standard deviation of the innovations of torque and shear before the touch, shape (c,)."""
     design: Real
-    """Columns fitted before the touch, shape (c, n, q)."""
+    """Design matrix of the fit to the samples before the touch, shape (c, n, q): free vibrations,
+    offset and drift."""
     spread: Real
-    """Cholesky factor of the covariance of the q amplitudes."""
-    turned: "Turned"
-    """The angle that drives the beam."""
+    """Cholesky factor of the covariance of the q fitted amplitudes, shape (q, q)."""
+    angle_transform: "AngleTransform"
+    """Transform of the angle that drives the beam."""
     ringing: "FreeVibration"
-    """The free vibrations among them."""
+    """Free vibrations that were fitted."""
     angle_noise_rad: float
-    """Standard deviation of a sample of the angle."""
+    """Standard deviation of the noise in one sample of the angle."""
     displacement_m: Real
-    """Displacement at the positions, on fine steps, shape (m, k)."""
+    """Displacement of the beam at the positions on fine time steps, shape (m, k)."""
     first_s: float
-    """Instant of the first step."""
+    """Instant of the displacement's first time step."""
     step_s: float
-    """Time between two steps."""
+    """Time between two steps of the displacement."""
 
 
 def _angle_noise(angle: Real) -> float:
-    """Return the scatter of the samples, with encoder steps: fourth differences remove motion."""
+    """Return the standard deviation of the angle's noise in rad, including encoder steps.
+
+    Fourth differences of the samples remove the motion.
+    """
     return float(np.sqrt(np.mean(np.diff(angle, 4) ** 2) / 70))
 
 
 @dataclass(frozen=True, slots=True)
-class Turned:
-    """Transform of a record's angle: initial straight motion, and spectrum of the remainder."""
+class AngleTransform:
+    """Laplace transform of a record's angle, after subtraction of a motion at constant speed."""
 
     spectrum: Complex
-    """Remainder, at the frequencies of a Laplace line."""
+    """Transform of the angle minus the motion at constant speed."""
     start_rad: float
+    """Angle at the record's beginning."""
     speed_rad_s: float
+    """Speed at the record's beginning."""
 
     @classmethod
-    def of(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "Turned":
-        """Transform the samples of an angle."""
-        rest, start_rad, speed_rad_s = _finer(angle_rad, rate_hz, line)
-        return cls(line.transformed(rest), start_rad, speed_rad_s)
+    def from_samples(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "AngleTransform":
+        """Return the transform of an angle's samples at the frequencies of a Laplace line."""
+        rest, start_rad, speed_rad_s = _interpolate_angle(angle_rad, rate_hz, line)
+        return cls(line.to_laplace(rest), start_rad, speed_rad_s)
 
 
-def _finer(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float, float]:
-    """Return the angle on the line's steps minus its initial straight motion, and that motion."""
+def _interpolate_angle(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float, float]:
+    """Interpolate an angle to the line's time steps, and subtract a motion at constant speed.
+
+    Return the remaining angle, and angle and speed at the record's beginning.
+    """
     from scipy.interpolate import CubicSpline
 
     t = np.arange(angle.size) / rate_hz
-    some = max(4, round(_SPEED_S * rate_hz))
-    curve = np.polyfit(t[:some], angle[:some], 2)
+    window_samples = max(4, round(_SPEED_WINDOW_S * rate_hz))
+    curve = np.polyfit(t[:window_samples], angle[:window_samples], 2)
     start, speed = float(curve[2]), float(curve[1])
     relative = angle - start - speed * t
     spline = CubicSpline(t, relative)
-    fine = np.arange(FINER * angle.size) * line.step_s
-    inside = fine[fine <= t[-1]]
-    after = np.arange(1, line.n - inside.size + 1) * line.step_s
+    fine = np.arange(STEPS_PER_SAMPLE * angle.size) * line.step_s
+    record_steps_s = fine[fine <= t[-1]]
+    after = np.arange(1, line.n - record_steps_s.size + 1) * line.step_s
     end = np.polyfit(t[-6:] - t[-1], relative[-6:], 1)[0]
-    ending = relative[-1] + end * _SETTLE_S * (1 - np.exp(-after / _SETTLE_S))
+    ending = relative[-1] + end * _SETTLING_S * (1 - np.exp(-after / _SETTLING_S))
     fade = 0.5 + 0.5 * np.cos(np.pi * np.minimum(after / after[-1], 1.0))
-    return np.concatenate([spline(inside), ending * fade]), start, speed
+    return np.concatenate([spline(record_steps_s), ending * fade]), start, speed
 
 
 @dataclass(frozen=True, slots=True)
 class FreeVibration:
-    """Free vibrations of the first modes, as columns of cosines and sines that decay."""
+    """Free vibrations of the beam's first modes: decaying cosines and sines to be fitted."""
 
     poles: Complex
-    """Shape (modes,), in rad/s."""
+    """Poles of the modes in rad/s, shape (modes,)."""
     root: Complex
-    """Torque and shear per amplitude, shape (2, modes)."""
+    """Torque and base shear per amplitude of each mode, shape (2, modes)."""
     scale: Real
-    """Unit of the amplitudes, shape (modes,)."""
+    """Unit of each mode's amplitude, shape (modes,)."""
     shapes: Real
-    """Displacement at the positions per amplitude, shape (modes, positions)."""
+    """Displacement at the positions per amplitude of each mode, shape (modes, positions)."""
 
     @classmethod
-    def of(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
+    def from_model(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
+        """Return the free vibrations of a model, with the displacement at positions `x_m`."""
         beam, damping = model.beam, model.damping
-        most = 12
-        found = poles(beam, damping, most)[:, 0]
-        count = max(1, int(np.sum(found.imag < 2 * np.pi * _HIGHEST_HZ)))
-        found = found[:count]
+        candidate_modes = 12
+        mode_poles = poles(beam, damping, candidate_modes)[:, 0]
+        count = max(1, int(np.sum(mode_poles.imag < 2 * np.pi * _MAX_MODE_HZ)))
+        mode_poles = mode_poles[:count]
         wave = clamped_free_eigenvalues(count) / beam.length_m
         sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
-        stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * found**damping.alpha)
+        stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * mode_poles**damping.alpha)
         ratio = root_shear_ratio(count)
         root = stiffness * np.stack([-2 * sign * wave**2, -2 * sign * ratio * wave**3])
-        root *= model.sensor_filter.response(found)
+        root *= model.sensor_filter.response(mode_poles)
         # Units of the amplitudes that give about the same torque in each mode.
         scale = 1 / np.abs(root[0])
-        whole = cls(found.astype(np.complex128), root * scale, scale, np.empty((count, 0)))
-        return whole.at(x_m / beam.length_m)
+        unplaced = cls(mode_poles.astype(np.complex128), root * scale, scale, np.empty((count, 0)))
+        return unplaced.at_positions(x_m / beam.length_m)
 
-    def at(self, fractions: Real) -> "FreeVibration":
-        """Return the same vibrations at other positions.
+    def at_positions(self, fractions: Real) -> "FreeVibration":
+        """Return the free vibrations with the displacement at other positions.
 
         Parameters
         ----------
@@ -323,19 +352,21 @@ class FreeVibration:
         return replace(self, shapes=shapes * self.scale[:, None])
 
     def channels(self, t: Real) -> Real:
-        """Return torque and shear, shape (2, t, 2 · modes).
+        """Return torque and shear of each vibration at some times, shape (2, t, 2 · modes).
 
         Parameters
         ----------
         t
             Times from the record's beginning.
         """
-        swing = np.exp(np.multiply.outer(t, self.poles))
-        parts = [swing * root for root in self.root]
+        oscillation = np.exp(np.multiply.outer(t, self.poles))
+        parts = [oscillation * root for root in self.root]
         return np.array([np.hstack([part.real, -part.imag]) for part in parts])
 
     def displacement(self, t: NDArray[np.floating], amplitudes: Real) -> Real:
-        """Return displacements (positions, t, r) or, for r = 1 without its axis, (positions, t).
+        """Return the beam's displacement for given amplitudes of the free vibrations.
+
+        The shape is (positions, t, r), or (positions, t) for amplitudes without the axis r.
 
         Parameters
         ----------
@@ -345,24 +376,33 @@ class FreeVibration:
             Amplitudes of cosines and sines, shape (2 · modes, r) or (2 · modes,).
         """
         count = self.poles.size
-        swing = np.exp(np.multiply.outer(t, self.poles)).T
-        columns = amplitudes.reshape(2 * count, -1)
-        moved = np.multiply(swing.real[:, :, None], columns[:count, None])
-        moved -= np.multiply(swing.imag[:, :, None], columns[count:, None])
-        shown: Real = self.shapes.T @ moved.reshape(count, -1)
-        return shown.reshape(-1, t.size, *amplitudes.shape[1:])
+        oscillation = np.exp(np.multiply.outer(t, self.poles)).T
+        vibration_columns = amplitudes.reshape(2 * count, -1)
+        displacement_m = np.multiply(oscillation.real[:, :, None], vibration_columns[:count, None])
+        displacement_m -= np.multiply(oscillation.imag[:, :, None], vibration_columns[count:, None])
+        displacement: Real = self.shapes.T @ displacement_m.reshape(count, -1)
+        return displacement.reshape(-1, t.size, *amplitudes.shape[1:])
 
 
 @dataclass(frozen=True, slots=True)
-class _Fitted:
+class _FreeMotionFit:
+    """Fit of free vibrations, offset and drift to the samples before a touch."""
+
     values: Real
+    """Fitted amplitudes, shape (q,)."""
     covariance: Real
+    """Covariance of the amplitudes, shape (q, q)."""
     noise: list[float]
+    """Standard deviation of torque and shear around the fit."""
     innovations: list[Real]
+    """Torque and shear minus the fit at all samples."""
 
     @classmethod
-    def to(cls, innovations: list[Real], designs: list[Real], quiet: int) -> "_Fitted":
-        """Fit the quiet samples by weighted least squares; two rounds estimate the weights."""
+    def fit(cls, innovations: list[Real], designs: list[Real], quiet: int) -> "_FreeMotionFit":
+        """Fit the first `quiet` samples by weighted least squares.
+
+        Repeated fits estimate the noise of torque and shear, which gives the weights.
+        """
         noise = [1.0] * len(innovations)
         for _ in range(3):
             a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
@@ -371,10 +411,10 @@ class _Fitted:
             regularisation = 1e-9 * np.trace(normal) / normal.shape[0]
             covariance = np.linalg.inv(normal + regularisation * np.eye(normal.shape[0]))
             values = covariance @ (a.T @ b)
-            left = [e - d @ values for e, d in zip(innovations, designs, strict=True)]
-            free = max(quiet - values.size / len(left), quiet / 2)
-            noise = [float(np.sqrt(np.sum(e[:quiet] ** 2) / free)) for e in left]
+            residuals = [e - d @ values for e, d in zip(innovations, designs, strict=True)]
+            degrees_of_freedom = max(quiet - values.size / len(residuals), quiet / 2)
+            noise = [float(np.sqrt(np.sum(e[:quiet] ** 2) / degrees_of_freedom)) for e in residuals]
         a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
         normal = a.T @ a
         covariance = np.linalg.inv(normal + regularisation * np.eye(normal.shape[0]))
-        return cls(values, covariance, noise, left)
+        return cls(values, covariance, noise, residuals)

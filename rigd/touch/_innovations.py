@@ -3,9 +3,8 @@
 The exact model of the free beam predicts torque and base shear from the angle. The difference from
 the measurement is noise, earlier vibration of the beam, the model's own error, or a touch.
 Vibration and error are slow and at the beam's own frequencies: an observer (a stationary Kalman
-filter of the first modes and of the zeros of both channels) follows them. The innovations are the
-part that it cannot predict from one tick to the next: white noise without a touch.
-
+filter of the first modes and of the zeros of torque and shear) follows them. The innovations are
+the part that the observer cannot predict from one tick to the next: white noise without a touch.
 
 Filter and observer are linear, so that a tick is the product of one matrix with one vector:
 [state, angle, torque, shear] → [next state, whitened innovations, whitened prediction].
@@ -30,30 +29,38 @@ from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-_MOST_MODES = 40
-_FASTEST = 0.42
-"""Fastest mode of the filter, as a fraction of the rate; the taps approximate the others."""
-_LEAST_FRACTION = 0.5
-"""Least imaginary part of a pole over its magnitude; real poles approximate the others."""
-_LADDER = 10
-"""Real poles for the branch cut of the fractional orders."""
-_SLOWEST_RAD_S = 0.03
-_TAPS = 4
-_FIT_FROM_HZ, _FIT_TO = 0.02, 0.45
-_WEIGHTED_FROM_HZ, _KNEE_HZ = 0.3, 50.0
-"""Band in which the relative error has full weight. Motors hardly move above it, where a close fit
-would only amplify the encoder's steps."""
+_CANDIDATE_MODES = 40
+"""Number of modes of the beam from which the filter's modes are chosen."""
+_MAX_FREQUENCY_FRACTION = 0.42
+"""Highest frequency of a mode of the filter over the tick rate; delay taps approximate higher
+modes."""
+_MIN_IMAGINARY_FRACTION = 0.5
+"""Smallest ratio of imaginary part to magnitude for a pole of the filter; real poles approximate
+modes that are more strongly damped."""
+_REAL_POLE_COUNT = 10
+"""Number of real poles that approximate the branch cut of fractional orders."""
+_SLOWEST_REAL_POLE_RAD_S = 0.03
+"""Slowest of these real poles in rad/s."""
+_DELAY_TAPS = 4
+"""Number of delay taps of the filter: past angles with a coefficient each."""
+_FIT_START_HZ, _FIT_END_FRACTION = 0.02, 0.45
+"""Band in which the filter is fitted: lower end in Hz, and upper end over the tick rate."""
+_FULL_WEIGHT_START_HZ, _FULL_WEIGHT_END_HZ = 0.3, 50.0
+"""Lower and upper end in Hz of the band in which the relative error of the fit has full weight.
+Motors hardly move above it, where a close fit would only amplify the encoder's steps."""
 _OBSERVED_MODES = 4
-_OBSERVER_RAD_S = 6.0
-"""Bandwidth of the observer for vibration: slow against a touch (at 15 rad/s it absorbs a tenth of
-one within 10 ms), fast against the phase drift of a model with a 1 % frequency error."""
-_ZERO_RAD_S = 0.5
-"""The same for the zero of a channel."""
+"""Number of modes whose vibration the observer follows."""
+_VIBRATION_BANDWIDTH_RAD_S = 6.0
+"""Bandwidth in rad/s of the observer for vibration. It is slow compared with a touch (at 15 rad/s
+the observer absorbs a tenth of a touch within 10 ms), and fast compared with the phase drift of a
+model with a 1 % frequency error."""
+_ZERO_BANDWIDTH_RAD_S = 0.5
+"""Bandwidth in rad/s of the observer for the zeros of torque and shear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedBeam:
-    """Discrete model of the free beam with its observer, for one rate and sensor.
+    """Discrete model of the free beam with an observer, for one tick rate and sensor.
 
     Examples
     --------
@@ -67,27 +74,28 @@ class ObservedBeam:
     """
 
     matrix: Real
-    """(n + 4, n + 3), see above; without shear its row and column are zero."""
+    """Matrix of a tick from [state, angle, torque, shear] to [next state, whitened innovations,
+    whitened prediction], shape (n + 4, n + 3). Without shear its row and column are zero."""
     gain: Real
-    """(n, 2): effect of each whitened innovation on the next state."""
+    """Effect of each whitened innovation on the next state, shape (n, 2)."""
     whitening: Real
-    """(2, 2): from innovations to whitened ones."""
+    """Matrix from innovations of torque and shear to whitened innovations, shape (2, 2)."""
     states: int
-    """n."""
+    """Number n of states."""
     channels: int
-    """1: torque alone; 2: torque and base shear."""
+    """Number of measured quantities: 1 for torque alone, 2 for torque and base shear."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelNoise:
-    """Noise of one sample of each channel."""
+    """Standard deviations of the noise in one sample of torque, base shear and angle."""
 
     torque_nm: float
     """Standard deviation of the coupling torque."""
     shear_n: float | None
     """Standard deviation of the base shear; None: it is not measured."""
     angle_rad: float = 0.0
-    """Standard deviation of the angle; a resolution of 7e-5 rad gives 2e-5 rad."""
+    """Standard deviation of the angle; a resolution of 7e-5 rad corresponds to 2e-5 rad."""
 
 
 def observed_beam(
@@ -100,7 +108,7 @@ def observed_beam(
     torque_after_angle_s: float = 0.0,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> ObservedBeam:
-    """Design filter and observer.
+    """Design the filter and observer that compute the innovations of a beam's torque and shear.
 
     Parameters
     ----------
@@ -109,21 +117,24 @@ def observed_beam(
     rate_hz
         Ticks a second.
     noise
-        Noise of the channels.
+        Noise of torque, base shear and angle.
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     torque_after_angle_s
-        Delay of a tick's wrench relative to its angle, without the filters.
+        Delay of a tick's wrench relative to its angle, without the delay of the filters.
     sensor_filter
         Filters of the wrench.
 
     Returns
     -------
     ObservedBeam
+        Model for an `InnovationFilter`.
     """
-    filter_ = _fit(beam, damping, rate_hz, tool_inertia_kg_m2, torque_after_angle_s, sensor_filter)
-    both = noise.shear_n is not None
-    observer = _observer(beam, damping, rate_hz, noise, filter_.noise_gain)
+    filter_ = _fit_filter(
+        beam, damping, rate_hz, tool_inertia_kg_m2, torque_after_angle_s, sensor_filter
+    )
+    has_shear = noise.shear_n is not None
+    observer = _design_observer(beam, damping, rate_hz, noise, filter_.noise_gain)
     f, o = filter_.a.shape[0], observer.a.shape[0]
     n = f + o
     matrix = np.zeros((n + 4, n + 3))
@@ -138,7 +149,7 @@ def observed_beam(
     matrix[n : n + 2] = observer.whitening @ innovation
     matrix[n + 2 :] = observer.whitening @ prediction
     gain = np.zeros((n, 2))
-    channels = 2 if both else 1
+    channels = 2 if has_shear else 1
     gain[f:, :channels] = observer.gain[:, :channels] @ np.linalg.inv(
         observer.whitening[:channels, :channels]
     )
@@ -146,28 +157,31 @@ def observed_beam(
 
 
 class InnovationFilter:
-    """Runs an `ObservedBeam`; starts at rest at the first angle.
+    """Filter that computes the innovations of torque and shear tick by tick.
+
+    It starts with the beam at rest at the first angle.
 
     Parameters
     ----------
     model
-        From `observed_beam`.
+        Model from `observed_beam`.
 
     Attributes
     ----------
     whitened
-        Innovations of torque and shear, in their standard deviations and uncorrelated.
+        Innovations of torque and shear in the last tick, whitened: uncorrelated, in units of their
+        standard deviations.
     predicted
-        Torque and shear predicted from the angle alone, in the same unit.
+        Torque and shear predicted from the angle alone, in the same units.
     """
 
     __slots__ = (
-        "_angle_before_rad",
         "_angle_rad",
-        "_dot",
         "_gain",
-        "_n",
-        "_rest_rad",
+        "_multiply",
+        "_previous_angle_rad",
+        "_start_rad",
+        "_states",
         "_unwhitening",
         "_vectors",
         "predicted",
@@ -175,17 +189,17 @@ class InnovationFilter:
     )
 
     def __init__(self, model: ObservedBeam) -> None:
-        n = self._n = model.states
+        n = self._states = model.states
         self._gain = model.gain
         self._unwhitening = (0.0, 0.0)
         if model.channels == 2:
-            of_torque, of_shear = np.linalg.inv(model.whitening)[1].tolist()
-            self._unwhitening = of_torque, of_shear
-        self._dot = np.asfortranarray(model.matrix).dot
+            torque_coefficient, shear_coefficient = np.linalg.inv(model.whitening)[1].tolist()
+            self._unwhitening = torque_coefficient, shear_coefficient
+        self._multiply = np.asfortranarray(model.matrix).dot
         # In turn input [state, angle, torque, shear] and output [state, whitened, predicted].
         self._vectors = tuple(np.zeros((2, n + 4)))
-        self._rest_rad: float | None = None
-        self._angle_rad = self._angle_before_rad = 0.0
+        self._start_rad: float | None = None
+        self._angle_rad = self._previous_angle_rad = 0.0
         self.whitened = (0.0, 0.0)
         self.predicted = (0.0, 0.0)
 
@@ -199,58 +213,65 @@ class InnovationFilter:
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> None:
-        """Process the readings of a tick.
+        """Compute the innovations of a tick from its readings.
 
         Parameters
         ----------
         angle_rad, torque_nm, shear_n
-            Readings; the shear is without effect where the model has none.
+            Readings. The shear has no effect if the model has no shear.
         missed
-            Ticks that were missed before this one: their angle is interpolated.
+            Number of ticks that were missed before this tick; their angles are interpolated.
         angle_stale
-            Whether the angle is an old one: it is extrapolated instead.
+            Whether the angle is older than the tick; it is then extrapolated from earlier angles.
         wrench_stale
-            Whether torque and shear are old: they are ignored.
+            Whether torque and shear are older than the tick; they are then ignored.
         """
-        if self._rest_rad is None:
-            self._rest_rad = angle_rad
-        turned_rad = angle_rad - self._rest_rad
+        if self._start_rad is None:
+            self._start_rad = angle_rad
+        relative_angle_rad = angle_rad - self._start_rad
         if angle_stale:
-            turned_rad = 2.0 * self._angle_rad - self._angle_before_rad
+            relative_angle_rad = 2.0 * self._angle_rad - self._previous_angle_rad
         if missed:
             start_rad = self._angle_rad
             for tick in range(1, missed + 1):
                 fraction = tick / (missed + 1)
-                self._pass(start_rad + fraction * (turned_rad - start_rad), torque_nm, shear_n)
+                self._step_without_wrench(
+                    start_rad + fraction * (relative_angle_rad - start_rad), torque_nm, shear_n
+                )
         if wrench_stale:
-            self._pass(turned_rad, torque_nm, shear_n)
+            self._step_without_wrench(relative_angle_rad, torque_nm, shear_n)
         else:
-            self._run(turned_rad, torque_nm, shear_n)
+            self._step_with_wrench(relative_angle_rad, torque_nm, shear_n)
 
     @property
     def predicted_shear_n(self) -> float:
-        """Base shear predicted from the angle alone; 0 where the model has none."""
-        of_torque, of_shear = self._unwhitening
+        """Base shear in N predicted from the angle alone; 0 if the model has no shear."""
+        torque_coefficient, shear_coefficient = self._unwhitening
         torque, shear = self.predicted
-        return of_torque * torque + of_shear * shear
+        return torque_coefficient * torque + shear_coefficient * shear
 
-    def _run(self, turned_rad: float, torque_nm: float, shear_n: float) -> None:
-        n = self._n
+    def _step_with_wrench(
+        self, relative_angle_rad: float, torque_nm: float, shear_n: float
+    ) -> None:
+        """Compute one tick with the angle relative to rest, torque and shear."""
+        n = self._states
         input_, output = self._vectors
-        input_[n] = turned_rad
+        input_[n] = relative_angle_rad
         input_[n + 1] = torque_nm
         input_[n + 2] = shear_n
-        self._dot(input_[: n + 3], output)
+        self._multiply(input_[: n + 3], output)
         self._vectors = output, input_
         torque, shear, predicted_torque, predicted_shear = output[n:].tolist()
         self.whitened = torque, shear
         self.predicted = predicted_torque, predicted_shear
-        self._angle_before_rad, self._angle_rad = self._angle_rad, turned_rad
+        self._previous_angle_rad, self._angle_rad = self._angle_rad, relative_angle_rad
 
-    def _pass(self, turned_rad: float, torque_nm: float, shear_n: float) -> None:
-        """Step without a wrench: undo the effect of the old one on the state."""
-        self._run(turned_rad, torque_nm, shear_n)
-        self._vectors[0][: self._n] -= self._gain @ np.array(self.whitened)
+    def _step_without_wrench(
+        self, relative_angle_rad: float, torque_nm: float, shear_n: float
+    ) -> None:
+        """Compute one tick without a valid wrench, whose effect on the state is undone."""
+        self._step_with_wrench(relative_angle_rad, torque_nm, shear_n)
+        self._vectors[0][: self._states] -= self._gain @ np.array(self.whitened)
         self.whitened = 0.0, 0.0
 
 
@@ -258,101 +279,131 @@ class InnovationFilter:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Filter:
-    """``x' = a x + b θ``, ``[torque, shear] = c x + d θ``."""
+class _AngleFilter:
+    """State space that predicts torque and shear of the free beam from the angle θ.
+
+    The equations are ``x' = a x + b θ`` and ``[torque, shear] = c x + d θ``.
+    """
 
     a: Real
     b: Real
     c: Real
     d: Real
     noise_gain: Real
-    """(2,): rms of each channel for white noise of 1 rad in the angle."""
+    """Standard deviations of torque and shear per white noise of 1 rad in the angle, shape (2,)."""
 
 
-def _fit(
+def _fit_filter(
     beam: Beam,
     damping: Damping,
     rate_hz: float,
     tool_inertia_kg_m2: float,
-    later_s: float,
+    torque_after_angle_s: float,
     sensor_filter: SensorFilter,
-) -> _Filter:
-    """Fit discrete poles, at the exact ones, and some taps to the exact response."""
-    pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_MOST_MODES), beam, damping)
-    upper = pairs[_ringing(pairs[:, 0], rate_hz), 0]
-    turning: Complex = np.exp(upper / rate_hz)
-    decaying: Real = np.exp(-np.geomspace(_SLOWEST_RAD_S, rate_hz, _LADDER) / rate_hz)
+) -> _AngleFilter:
+    """Return the discrete filter whose response fits that of the exact model best.
 
-    half_width_hz = np.maximum(-upper.real, 1e-3 * upper.imag) / (2 * pi)
-    near_hz = upper.imag[:, None] / (2 * pi) + half_width_hz[:, None] * np.linspace(-3, 3, 11)
-    band_hz = np.geomspace(_FIT_FROM_HZ, _FIT_TO * rate_hz, 400)
+    Its poles are those of the exact model. Some real poles and delay taps approximate the remaining
+    response.
+    """
+    pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_CANDIDATE_MODES), beam, damping)
+    upper_poles = pairs[_is_represented_mode(pairs[:, 0], rate_hz), 0]
+    complex_poles: Complex = np.exp(upper_poles / rate_hz)
+    real_poles: Real = np.exp(
+        -np.geomspace(_SLOWEST_REAL_POLE_RAD_S, rate_hz, _REAL_POLE_COUNT) / rate_hz
+    )
+
+    half_width_hz = np.maximum(-upper_poles.real, 1e-3 * upper_poles.imag) / (2 * pi)
+    near_hz = upper_poles.imag[:, None] / (2 * pi) + half_width_hz[:, None] * np.linspace(-3, 3, 11)
+    band_hz = np.geomspace(_FIT_START_HZ, _FIT_END_FRACTION * rate_hz, 400)
     frequency_hz = np.concatenate([band_hz, near_hz.ravel()])
-    frequency_hz = frequency_hz[(frequency_hz > 0) & (frequency_hz < _FIT_TO * rate_hz)]
+    frequency_hz = frequency_hz[(frequency_hz > 0) & (frequency_hz < _FIT_END_FRACTION * rate_hz)]
     s = 2j * pi * frequency_hz
     exact = PointForceGrid(s, beam, damping)
     response = np.array([exact.torque_per_angle(), exact.shear_per_angle()])
     response[0] += tool_inertia_kg_m2 * s**2
-    response *= sensor_filter.response(s) * np.exp(-later_s * s)
+    response *= sensor_filter.response(s) * np.exp(-torque_after_angle_s * s)
 
-    weight = np.minimum(1.0, (_KNEE_HZ / frequency_hz) ** 3)
-    weight *= np.minimum(1.0, frequency_hz / _WEIGHTED_FROM_HZ)
-    columns = _columns(s / rate_hz, turning, decaying)
-    at_rest = _columns(np.zeros(1, dtype=complex), turning, decaying).real
+    weight = np.minimum(1.0, (_FULL_WEIGHT_END_HZ / frequency_hz) ** 3)
+    weight *= np.minimum(1.0, frequency_hz / _FULL_WEIGHT_START_HZ)
+    columns = _term_responses(s / rate_hz, complex_poles, real_poles)
+    rest_response = _term_responses(np.zeros(1, dtype=complex), complex_poles, real_poles).real
     coefficients = np.empty((2, columns.shape[1]))
     for row, target in zip(coefficients, response, strict=True):
         scale = weight / np.abs(target)
         weighted = columns * scale[:, None]
         # An angle at rest must give exactly no torque, not only a small one.
-        matrix = np.concatenate([weighted.real, weighted.imag, 1e4 * at_rest])
-        aim = np.concatenate([(target * scale).real, (target * scale).imag, [0.0]])
-        size = np.linalg.norm(matrix, axis=0)
-        row[:] = np.linalg.lstsq(matrix / size, aim, rcond=1e-12)[0] / size
+        matrix = np.concatenate([weighted.real, weighted.imag, 1e4 * rest_response])
+        right_hand_side = np.concatenate([(target * scale).real, (target * scale).imag, [0.0]])
+        column_norms = np.linalg.norm(matrix, axis=0)
+        row[:] = (
+            np.linalg.lstsq(matrix / column_norms, right_hand_side, rcond=1e-12)[0] / column_norms
+        )
 
-    everywhere = _columns(1j * np.linspace(0, pi, 4001), turning, decaying) @ coefficients.T
-    noise_gain = np.sqrt(np.mean(np.abs(everywhere) ** 2, axis=0))
-    return _state_space(turning, decaying, coefficients, noise_gain)
-
-
-def _ringing(upper: Complex, rate_hz: float) -> NDArray[np.bool_]:
-    """Return which modes ring, and slowly enough; a mode without a pole (NaN) does not."""
-    ringing: NDArray[np.bool_] = upper.imag > _LEAST_FRACTION * np.abs(upper)
-    return ringing & (upper.imag < 2 * pi * _FASTEST * rate_hz)
+    band_response = (
+        _term_responses(1j * np.linspace(0, pi, 4001), complex_poles, real_poles) @ coefficients.T
+    )
+    noise_gain = np.sqrt(np.mean(np.abs(band_response) ** 2, axis=0))
+    return _state_space(complex_poles, real_poles, coefficients, noise_gain)
 
 
-def _columns(s_ticks: Complex, turning: Complex, decaying: Real) -> Complex:
-    """Return the responses to combine: real and imaginary part of each pole, and taps."""
+def _is_represented_mode(upper_poles: Complex, rate_hz: float) -> NDArray[np.bool_]:
+    """Return which of the poles belong to modes that the filter represents, as a mask.
+
+    Such a mode oscillates at less than `_MAX_FREQUENCY_FRACTION` of the tick rate. A pole of NaN
+    belongs to no mode.
+    """
+    represented: NDArray[np.bool_] = upper_poles.imag > _MIN_IMAGINARY_FRACTION * np.abs(
+        upper_poles
+    )
+    return represented & (upper_poles.imag < 2 * pi * _MAX_FREQUENCY_FRACTION * rate_hz)
+
+
+def _term_responses(s_ticks: Complex, complex_poles: Complex, real_poles: Real) -> Complex:
+    """Return the frequency responses of the filter's terms, whose weighted sum is the response.
+
+    The terms are the real and the imaginary part of each complex pole, the real poles and the delay
+    taps. `s_ticks` is the Laplace variable times the period.
+    """
     delay = np.exp(-s_ticks)[:, None]
-    up, down = 1 / (1 - turning * delay), 1 / (1 - turning.conj() * delay)
-    cut = 1 / (1 - decaying * delay)
-    return np.concatenate([up + down, 1j * (up - down), cut, delay ** np.arange(_TAPS)], axis=1)
+    up, down = 1 / (1 - complex_poles * delay), 1 / (1 - complex_poles.conj() * delay)
+    real_terms = 1 / (1 - real_poles * delay)
+    return np.concatenate(
+        [up + down, 1j * (up - down), real_terms, delay ** np.arange(_DELAY_TAPS)], axis=1
+    )
 
 
-def _state_space(turning: Complex, decaying: Real, coefficients: Real, noise_gain: Real) -> _Filter:
-    """Return the state space of the fit; the states exclude the angle of the tick."""
-    m, k = turning.size, decaying.size
-    n = 2 * m + k + _TAPS - 1
+def _state_space(
+    complex_poles: Complex, real_poles: Real, coefficients: Real, noise_gain: Real
+) -> _AngleFilter:
+    """Return the fitted filter as a state space, whose state excludes the angle of the tick."""
+    m, k = complex_poles.size, real_poles.size
+    n = 2 * m + k + _DELAY_TAPS - 1
     a, b = np.zeros((n, n)), np.zeros(n)
-    even = np.arange(0, 2 * m, 2)
-    a[even, even] = a[even + 1, even + 1] = turning.real
-    a[even, even + 1], a[even + 1, even] = -turning.imag, turning.imag
-    b[even], b[even + 1] = turning.real, turning.imag
-    rest = np.arange(2 * m, 2 * m + k)
-    a[rest, rest] = b[rest] = decaying
+    even_states = np.arange(0, 2 * m, 2)
+    a[even_states, even_states] = a[even_states + 1, even_states + 1] = complex_poles.real
+    a[even_states, even_states + 1], a[even_states + 1, even_states] = (
+        -complex_poles.imag,
+        complex_poles.imag,
+    )
+    b[even_states], b[even_states + 1] = complex_poles.real, complex_poles.imag
+    real_states = np.arange(2 * m, 2 * m + k)
+    a[real_states, real_states] = b[real_states] = real_poles
     taps = np.arange(2 * m + k, n)
     b[taps[0]] = 1.0
     a[taps[1:], taps[:-1]] = 1.0
     # A state is the sum up to the previous tick, moved on by one tick: adding θ completes it.
     c = np.zeros((2, n))
-    c[:, even] = 2 * coefficients[:, :m]
-    c[:, even + 1] = -2 * coefficients[:, m : 2 * m]
-    c[:, rest] = coefficients[:, 2 * m : 2 * m + k]
-    c[:, taps] = coefficients[:, -_TAPS + 1 :]
+    c[:, even_states] = 2 * coefficients[:, :m]
+    c[:, even_states + 1] = -2 * coefficients[:, m : 2 * m]
+    c[:, real_states] = coefficients[:, 2 * m : 2 * m + k]
+    c[:, taps] = coefficients[:, -_DELAY_TAPS + 1 :]
     d = (
         2 * coefficients[:, :m].sum(axis=1)
         + coefficients[:, 2 * m : 2 * m + k].sum(axis=1)
-        + coefficients[:, -_TAPS]
+        + coefficients[:, -_DELAY_TAPS]
     )
-    return _Filter(a, b, c, d, noise_gain)
+    return _AngleFilter(a, b, c, d, noise_gain)
 
 
 # Observer of the motion that the angle does not explain
@@ -360,49 +411,59 @@ def _state_space(turning: Complex, decaying: Real, coefficients: Real, noise_gai
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Observer:
-    """``x' = a x + gain e``, ``e = y - c x``, and the whitening of e."""
+    """Observer of the motion that the angle does not explain, with the innovations e.
+
+    The equations are ``x' = a x + gain e`` and ``e = y - c x``.
+    """
 
     a: Real
     c: Real
     gain: Real
     whitening: Real
+    """Matrix from innovations to whitened innovations, shape (2, 2)."""
 
 
-def _observer(
+def _design_observer(
     beam: Beam, damping: Damping, rate_hz: float, noise: ChannelNoise, noise_gain: Real
 ) -> _Observer:
-    """Return the stationary Kalman filter of ringing modes and drifting zeros."""
+    """Return the stationary Kalman filter that follows vibrating modes and drifting zeros."""
     from scipy.linalg import solve_discrete_are
 
     z = clamped_free_eigenvalues(_OBSERVED_MODES)
-    upper = poles_for_eigenvalues(z, beam, damping)[:, 0]
-    ringing = _ringing(upper, rate_hz)
-    turning, wave_number = np.exp(upper[ringing] / rate_hz), z[ringing] / beam.length_m
-    both = noise.shear_n is not None
-    channels = 2 if both else 1
-    m = turning.size
+    upper_poles = poles_for_eigenvalues(z, beam, damping)[:, 0]
+    represented = _is_represented_mode(upper_poles, rate_hz)
+    complex_poles, wave_number = (
+        np.exp(upper_poles[represented] / rate_hz),
+        z[represented] / beam.length_m,
+    )
+    has_shear = noise.shear_n is not None
+    channels = 2 if has_shear else 1
+    m = complex_poles.size
     n = 2 * m + channels
     a, c = np.zeros((n, n)), np.zeros((2, n))
-    even = np.arange(0, 2 * m, 2)
-    a[even, even] = a[even + 1, even + 1] = turning.real
-    a[even, even + 1], a[even + 1, even] = -turning.imag, turning.imag
+    even_states = np.arange(0, 2 * m, 2)
+    a[even_states, even_states] = a[even_states + 1, even_states + 1] = complex_poles.real
+    a[even_states, even_states + 1], a[even_states + 1, even_states] = (
+        -complex_poles.imag,
+        complex_poles.imag,
+    )
     zeros = np.arange(2 * m, n)
     a[zeros, zeros] = 1.0
-    c[0, even] = 1.0
+    c[0, even_states] = 1.0
     c[np.arange(channels), zeros] = 1.0
-    sizes = np.array([noise.torque_nm, noise.shear_n or 0.0])
-    variance = sizes**2 + (noise_gain * noise.angle_rad) ** 2
+    noise_stds = np.array([noise.torque_nm, noise.shear_n or 0.0])
+    variance = noise_stds**2 + (noise_gain * noise.angle_rad) ** 2
     q = np.zeros(n)
     # A random walk of this size gives the observer its bandwidth.
-    q[even] = q[even + 1] = variance[0] * (_OBSERVER_RAD_S / rate_hz) ** 2
-    q[zeros] = variance[:channels] * (_ZERO_RAD_S / rate_hz) ** 2
-    if both:
-        c[1, even] = root_shear_ratio(_OBSERVED_MODES)[ringing] * wave_number
-    used = c[:channels]
+    q[even_states] = q[even_states + 1] = variance[0] * (_VIBRATION_BANDWIDTH_RAD_S / rate_hz) ** 2
+    q[zeros] = variance[:channels] * (_ZERO_BANDWIDTH_RAD_S / rate_hz) ** 2
+    if has_shear:
+        c[1, even_states] = root_shear_ratio(_OBSERVED_MODES)[represented] * wave_number
+    measured_rows = c[:channels]
     r = np.diag(variance[:channels])
-    covariance = solve_discrete_are(a.T, used.T, np.diag(q), r)
-    innovation = used @ covariance @ used.T + r
+    covariance = solve_discrete_are(a.T, measured_rows.T, np.diag(q), r)
+    innovation = measured_rows @ covariance @ measured_rows.T + r
     gain, whitening = np.zeros((n, 2)), np.zeros((2, 2))
-    gain[:, :channels] = a @ np.linalg.solve(innovation, used @ covariance).T
+    gain[:, :channels] = a @ np.linalg.solve(innovation, measured_rows @ covariance).T
     whitening[:channels, :channels] = np.linalg.inv(np.linalg.cholesky(innovation))
     return _Observer(a, c, gain, whitening)

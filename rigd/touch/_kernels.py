@@ -1,11 +1,10 @@
 """Effect of a force on the beam in time: displacement, torque and base shear, over the length.
 
-A force is a sum of triangles of unit height, one per step ("hats": linear between two steps). Every
-force history that begins at zero is such a sum. The response to one hat at each of the following
-steps is a kernel. Kernels are inverse Laplace transforms of the exact model, by an FFT along a line
-to the right of the origin: the wrap-around is smaller by ``exp(-sigma T)``. By reciprocity, torque
-and shear per force at x are minus the displacement there per angle and per displacement of the
-root.
+A force that is linear between two time steps is a sum of triangular pulses, here called hats, with
+one hat per step. The response to one hat of unit height at each of the following steps is a kernel.
+Kernels are inverse Laplace transforms of the exact model, by an FFT along a line to the right of
+the origin: the wrap-around is smaller by ``exp(-sigma T)``. By reciprocity, torque and shear per
+force at x are minus the displacement there per angle and per displacement of the root.
 """
 
 from dataclasses import dataclass
@@ -19,165 +18,174 @@ from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-WRAPPED = 14.0
-"""``sigma T``: the wrap-around is 1e-6 of the end of the period."""
+WRAP_AROUND_EXPONENT = 14.0
+"""Exponent ``sigma T`` of the wrap-around's decay, with which it is 1e-6 of the values at the end
+of the period."""
 
-_OVERSAMPLED = 2
-"""Steps of the inversion per step of the kernels: a hat is small above half the step's rate."""
+_OVERSAMPLING = 2
+"""Number of steps of the inverse transform per step of the kernels, since the spectrum of a hat is
+small above half the step's rate."""
 
-_MODES = 20
-"""Modes that transmit a force to another position."""
+_CROSS_MODE_COUNT = 20
+"""Number of modes that transmit a force to another position."""
 
-_EDGE_M = 0.003
-"""Distance of the first position from the root; the last one is the tip."""
+_FIRST_POSITION_M = 0.003
+"""Distance in m of the first position from the root; the last position is the tip."""
 
 
 class LaplaceLine:
-    """Line in the Laplace plane that represents functions of time on ``n`` steps.
+    """Laplace transform of functions of time on ``n`` steps, along a line parallel to the axis.
 
     Parameters
     ----------
     n
-        Number of steps of the period.
+        Number of time steps of the period.
     step_s
-        Time between two of them.
+        Time between two steps.
     band
-        Fraction of the frequencies below the Nyquist frequency in use; the others are zero.
+        Fraction of the frequencies below the Nyquist frequency that is used; the transform is zero
+        at the others.
     """
 
-    __slots__ = ("_grown", "n", "s", "step_s")
+    __slots__ = ("_growth", "n", "s", "step_s")
 
     def __init__(self, n: int, step_s: float, band: float = 1.0) -> None:
         self.n, self.step_s = n, step_s
-        shift = WRAPPED / (n * step_s)
-        used = round(band * (n // 2)) + 1
-        self.s = shift + 2j * np.pi * np.arange(used) / (n * step_s)
-        self._grown = np.exp(shift * step_s * np.arange(n))
+        shift = WRAP_AROUND_EXPONENT / (n * step_s)
+        used_frequencies = round(band * (n // 2)) + 1
+        self.s = shift + 2j * np.pi * np.arange(used_frequencies) / (n * step_s)
+        self._growth = np.exp(shift * step_s * np.arange(n))
 
-    def transformed(self, samples: Real) -> Complex:
-        """Return the transform of samples (…, at most n), as of a band-limited function.
+    def to_laplace(self, samples: Real) -> Complex:
+        """Return the Laplace transform of a function of time, along the last axis.
 
         Parameters
         ----------
         samples
-            The function at the steps from the first on; zero after them.
+            Values of the function at the time steps from the first on, at most `n` along the last
+            axis. The function is zero after them.
         """
         from scipy.fft import rfft
 
-        damped = samples / self._grown[: samples.shape[-1]]
+        damped = samples / self._growth[: samples.shape[-1]]
         spectrum: Complex = rfft(damped, self.n, axis=-1)[..., : self.s.size]
         return spectrum
 
-    def in_time(self, transform: Complex, steps: int) -> Real:
-        """Return the first `steps` samples of the inverse of `transformed`, along the last axis.
+    def to_time(self, transform: Complex, steps: int) -> Real:
+        """Return a function of time from its Laplace transform, along the last axis.
 
         Parameters
         ----------
         transform
-            At the frequencies of the line, last axis.
+            Laplace transform at the frequencies of the line, along the last axis.
         steps
-            Number of samples.
+            Number of time steps that are returned, from the first on.
         """
         from scipy.fft import irfft
 
         if transform.shape[-1] == self.n // 2 + 1:
             transform = transform.copy()
             transform[..., -1] = transform[..., -1].real
-        samples: Real = irfft(transform, self.n, axis=-1)[..., :steps] * self._grown[:steps]
+        samples: Real = irfft(transform, self.n, axis=-1)[..., :steps] * self._growth[:steps]
         return samples
 
 
-class Hat:
-    """Conversion of transforms of responses to responses in time to a hat of force.
+class ForcePulse:
+    """Triangular pulse of force, with which responses in the Laplace domain become kernels.
 
     Parameters
     ----------
     step_s
-        Half the width of the hat, and the time between two values of a kernel.
+        Half the width of the pulse, which is the time between two values of a kernel.
     steps
-        Number of values.
+        Number of values of a kernel.
     """
 
-    __slots__ = ("_late", "_steps", "line")
+    __slots__ = ("_delayed_pulse", "_steps", "line")
 
     def __init__(self, step_s: float, steps: int) -> None:
         from scipy.fft import next_fast_len
 
         self._steps = steps
-        fine = step_s / _OVERSAMPLED
-        self.line = LaplaceLine(next_fast_len(2 * _OVERSAMPLED * steps, real=True), fine)
+        fine_step_s = step_s / _OVERSAMPLING
+        self.line = LaplaceLine(next_fast_len(2 * _OVERSAMPLING * steps, real=True), fine_step_s)
         s = self.line.s
-        hat = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine
+        pulse = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine_step_s
         # Two steps later than the force, so that the hat begins within the period.
-        self._late = hat * np.exp(-s * step_s)
+        self._delayed_pulse = pulse * np.exp(-s * step_s)
 
     def kernels(self, response: Complex) -> Real:
-        """Return the responses in time, shape (k, steps).
+        """Return the kernels of responses: their values over time for one hat, shape (k, steps).
 
         Parameters
         ----------
         response
-            Response to a force, at the frequencies of the line, shape (k, frequencies).
+            Transfer functions from a force, at the frequencies of the line, shape (k, frequencies).
         """
-        values = self.line.in_time(self._late * response, _OVERSAMPLED * (self._steps + 1))
-        return values[:, _OVERSAMPLED::_OVERSAMPLED][:, : self._steps]
+        values = self.line.to_time(
+            self._delayed_pulse * response, _OVERSAMPLING * (self._steps + 1)
+        )
+        return values[:, _OVERSAMPLING::_OVERSAMPLING][:, : self._steps]
 
 
 @dataclass(frozen=True, slots=True)
 class ContactKernels:
-    """Responses to a hat of contact force at positions along the beam, on equal steps."""
+    """Responses over time to a triangular pulse of contact force, at positions along the beam."""
 
     x_m: Real
-    """Positions, shape (m,)."""
+    """Positions of the force along the beam, shape (m,)."""
     step_s: float
-    """Half the width of a hat, and the step of the kernels."""
+    """Time step of the kernels, which is half the width of the pulse."""
     displacement: Real
-    """At the position itself, per N, shape (m, n); the first column is the instant of the peak."""
+    """Displacement at the force's position in m/N, shape (m, n). The first column is the instant of
+    the pulse's peak."""
     torque: Real
-    """Motor's torque in m, likewise."""
+    """Torque on the motor in N·m/N, shape (m, n)."""
     shear: Real
-    """Base shear, likewise; per N."""
+    """Base shear in N/N, shape (m, n)."""
 
     @property
     def steps(self) -> int:
-        """Length of the kernels."""
+        """Number of time steps of the kernels."""
         return int(self.displacement.shape[1])
 
-    def at(self, x_m: Real, steps: int) -> "ContactKernels":
-        """Interpolate at other positions (cubic, four points).
+    def at_positions(self, x_m: Real, steps: int) -> "ContactKernels":
+        """Return the kernels at other positions, by cubic interpolation of four positions.
 
         Parameters
         ----------
         x_m
-            Within the range of the positions, shape (k,).
+            Positions within the range of those of the kernels, shape (k,).
         steps
-            Length of the result.
+            Number of time steps of the result.
         """
-        first, weights = lagrange(x_m, self.x_m)
+        first, weights = cubic_weights(x_m, self.x_m)
         tables = (self.displacement[:, :steps], self.torque[:, :steps], self.shear[:, :steps])
-        return ContactKernels(x_m, self.step_s, *(mixed(t, first, weights) for t in tables))
+        return ContactKernels(
+            x_m, self.step_s, *(interpolate_rows(t, first, weights) for t in tables)
+        )
 
-    def coarser(self, factor: int, steps: int) -> "ContactKernels":
-        """Return the kernels of wider hats.
+    def with_wider_pulses(self, factor: int, steps: int) -> "ContactKernels":
+        """Return the kernels of wider triangular pulses, with longer time steps.
 
         Parameters
         ----------
         factor
-            Steps of these kernels per wider one.
+            Ratio of the longer time step to the present one.
         steps
-            Length of the result.
+            Number of time steps of the result.
         """
-        hat = 1 - np.abs(np.arange(1 - factor, factor)) / factor
+        pulse = 1 - np.abs(np.arange(1 - factor, factor)) / factor
         tables = []
         for table in (self.displacement, self.torque, self.shear):
             padded = np.pad(table, ((0, 0), (factor - 1, factor - 1)))
             # A wide hat with its peak at 0 is a sum of narrow ones from 1 - factor to factor - 1.
-            wide = sum(
+            wide_response = sum(
                 weight
                 * padded[:, factor - 1 - i : factor - 1 - i + (steps - 1) * factor + 1 : factor]
-                for i, weight in zip(range(1 - factor, factor), hat, strict=True)
+                for i, weight in zip(range(1 - factor, factor), pulse, strict=True)
             )
-            tables.append(np.ascontiguousarray(wide))
+            tables.append(np.ascontiguousarray(wide_response))
         return ContactKernels(self.x_m, factor * self.step_s, *tables)
 
 
@@ -189,100 +197,111 @@ def contact_kernels(
     steps: int,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> ContactKernels:
-    """Return the kernels of the exact model at the positions `x_m`.
+    """Return the responses of the exact model to a triangular pulse of force at some positions.
 
     Parameters
     ----------
     beam, damping
         Parameters of the exact model.
     x_m
-        Positions along the beam, shape (m,).
+        Positions of the force along the beam, shape (m,).
     step_s
         Time between two values of a kernel.
     steps
-        Number of values.
+        Number of values of a kernel.
     sensor_filter
         Filters of torque and shear.
     """
-    hat = Hat(step_s, steps)
-    s = hat.line.s
+    pulse = ForcePulse(step_s, steps)
+    s = pulse.line.s
     grid = PointForceGrid(s, beam, damping)
-    seen = sensor_filter.response(s)
+    filter_response = sensor_filter.response(s)
     stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
     tables = np.empty((3, x_m.size, steps))
-    for i in range(0, x_m.size, _AT_ONCE):
-        x = x_m[i : i + _AT_ONCE]
+    for i in range(0, x_m.size, _POSITIONS_AT_ONCE):
+        x = x_m[i : i + _POSITIONS_AT_ONCE]
         responses = (
             grid.per_force(x, x).T,
-            -seen * grid.per_angle(x).T,
-            seen * stiffness * grid.per_force(np.zeros_like(x), x, 3).T,
+            -filter_response * grid.per_angle(x).T,
+            filter_response * stiffness * grid.per_force(np.zeros_like(x), x, 3).T,
         )
         for table, response in zip(tables, responses, strict=True):
-            table[i : i + _AT_ONCE] = hat.kernels(response)
+            table[i : i + _POSITIONS_AT_ONCE] = pulse.kernels(response)
     return ContactKernels(x_m, step_s, *tables)
 
 
 @dataclass(frozen=True, slots=True)
 class CrossKernels:
-    """Displacement at one position per hat of contact force at another, summed over the modes."""
+    """Displacement over time at one position per pulse of contact force at another position.
+
+    It is a sum over the modes.
+    """
 
     x_m: Real
-    """Positions of the shapes, shape (m,)."""
+    """Positions at which the mode shapes are given, shape (m,)."""
     shapes: Real
-    """Shape (m, modes)."""
+    """Mode shapes at the positions, shape (m, modes)."""
     kernels: Real
-    """Response of each mode to a hat of force, by the square of its shape, (modes, n)."""
+    """Displacement over time of each mode for a pulse of force, where its shape is 1; shape
+    (modes, n)."""
 
-    def between(self, x_m: Real, other_m: Real, steps: int) -> Real:
-        """Interpolate the kernels between pairs of positions, for a number of time steps.
+    def between_positions(self, x_m: Real, other_m: Real, steps: int) -> Real:
+        """Return the kernels between pairs of positions, by interpolation of the mode shapes.
 
         Parameters
         ----------
         x_m, other_m
-            Positions, shape (k,).
+            Positions of force and displacement, shape (k,); they may be exchanged.
         steps
-            Length of the result.
+            Number of time steps of the result.
         """
-        one, other = (mixed(self.shapes, *lagrange(x, self.x_m)) for x in (x_m, other_m))
-        crossing: Real = (one * other) @ self.kernels[:, :steps]
-        return crossing
+        first_shapes, second_shapes = (
+            interpolate_rows(self.shapes, *cubic_weights(x, self.x_m)) for x in (x_m, other_m)
+        )
+        cross_kernels_of_pairs: Real = (first_shapes * second_shapes) @ self.kernels[:, :steps]
+        return cross_kernels_of_pairs
 
 
 def cross_kernels(
     beam: Beam, damping: Damping, x_m: Real, step_s: float, steps: int
 ) -> CrossKernels:
-    """Return the kernels between positions; the arguments are those of `contact_kernels`."""
-    hat = Hat(step_s, steps)
-    s = hat.line.s
+    """Return the kernels from a force at one position to the displacement at another position.
+
+    The arguments are those of `contact_kernels`.
+    """
+    pulse = ForcePulse(step_s, steps)
+    s = pulse.line.s
     inertial = beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
     internal = 1 + damping.zeta * s**damping.alpha
-    wave = clamped_free_eigenvalues(_MODES) / beam.length_m
+    wave = clamped_free_eigenvalues(_CROSS_MODE_COUNT) / beam.length_m
     stiffness = beam.bending_stiffness_n_m2 * beam.length_m
     per_force = 1 / (stiffness * (inertial + internal * wave[:, None] ** 4))
-    shapes = np.stack([mode_shape(i + 1, x_m / beam.length_m) for i in range(_MODES)], axis=1)
-    return CrossKernels(x_m, shapes, hat.kernels(per_force))
+    shapes = np.stack(
+        [mode_shape(i + 1, x_m / beam.length_m) for i in range(_CROSS_MODE_COUNT)], axis=1
+    )
+    return CrossKernels(x_m, shapes, pulse.kernels(per_force))
 
 
-_AT_ONCE = 8
-"""Positions evaluated at once: temporaries stay in cache."""
+_POSITIONS_AT_ONCE = 8
+"""Number of positions that are evaluated at once, so that temporary arrays stay in the cache."""
 
 
 def positions(length_m: float, spacing_m: float) -> Real:
-    """Return positions along the beam up to its tip, equally spaced.
+    """Return equally spaced positions along the beam up to its tip, in m.
 
     Parameters
     ----------
     length_m
         Length of the beam.
     spacing_m
-        Greatest distance between two of them.
+        Largest distance between two neighbouring positions.
     """
-    n = int(np.ceil((length_m - _EDGE_M) / spacing_m)) + 1
-    return np.linspace(_EDGE_M, length_m, n)
+    n = int(np.ceil((length_m - _FIRST_POSITION_M) / spacing_m)) + 1
+    return np.linspace(_FIRST_POSITION_M, length_m, n)
 
 
 def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
-    """Return nodes from which a smooth function is interpolated at the positions.
+    """Return Chebyshev nodes, and the matrix that interpolates from them to given positions.
 
     Parameters
     ----------
@@ -294,8 +313,9 @@ def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
     Returns
     -------
     nodes_m : ndarray, shape (count,)
+        Positions of the nodes.
     between : ndarray, shape (m, count)
-        Maps values at the nodes to those at the positions.
+        Matrix that interpolates values at the nodes to the given positions.
     """
     from numpy.polynomial import chebyshev
 
@@ -306,20 +326,22 @@ def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
     return x_m[0] + (x_m[-1] - x_m[0]) * (nodes + 1) / 2, between
 
 
-def lagrange(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
-    """Return first of four points and weights of a cubic interpolation on an equally spaced grid.
+def cubic_weights(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
+    """Return the indices and weights of a cubic interpolation on an equally spaced grid.
 
     Parameters
     ----------
     at
-        Points of interpolation, shape (k,).
+        Points to which is interpolated, shape (k,).
     grid
-        At least four increasing points.
+        At least four equally spaced, increasing points.
 
     Returns
     -------
     first : ndarray of int, shape (k,)
+        Index of the first of four grid points for each point.
     weights : ndarray, shape (k, 4)
+        Weights of these four grid points.
     """
     position = (np.asarray(at) - grid[0]) / (grid[1] - grid[0])
     first = np.clip(np.floor(position).astype(np.intp) - 1, 0, grid.size - 4)
@@ -336,8 +358,8 @@ def lagrange(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
     return first, weights
 
 
-def mixed(table: Real, first: NDArray[np.intp], weights: Real) -> Real:
-    """Interpolate the rows of a table (m, n) with the result of `lagrange`; shape (k, n)."""
+def interpolate_rows(table: Real, first: NDArray[np.intp], weights: Real) -> Real:
+    """Interpolate between the rows of a table (m, n) with the result of `cubic_weights`: (k, n)."""
     total = weights[:, 0, None] * table[first]
     for i in range(1, 4):
         total += weights[:, i, None] * table[first + i]

@@ -1,67 +1,70 @@
-"""A knock from outside: one pulse of force, independent of the antenna's motion."""
+"""A knock from outside: one pulse of force that is independent of the antenna's motion."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.touch._kernels import ContactKernels
-from rigd.touch._physical import Space, Touching, WhitenedWindow
+from rigd.touch._physical import ObstacleContact, ParameterRanges, WhitenedWindow
 
 Real = NDArray[np.float64]
 
 _DURATIONS_S = np.array([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
+"""Durations of the pulse in s with which the search starts."""
 
 
-class Knocking:
-    """Half-sine pulses of force: position, instant, logarithm of the duration, and peak.
+class KnockResponse:
+    """Effect of a knock on the record of a touch: a half-sine pulse of force.
+
+    A candidate has four columns: position, instant, logarithm of the duration, and peak.
 
     Parameters
     ----------
-    touching
-        Integration on the record's steps.
+    contact
+        Integration of the contact for the record.
     kernels
-        Contact kernels of those steps.
-    every
-        One in so many of their positions is a start.
+        Contact kernels on the time steps of the integration.
+    stride
+        Number of the kernels' positions from one starting position of the search to the next.
     """
 
-    __slots__ = ("_every", "_kernels", "_touching")
+    __slots__ = ("_contact", "_kernels", "_stride")
 
-    def __init__(self, touching: Touching, kernels: ContactKernels, every: int) -> None:
-        self._touching, self._kernels, self._every = touching, kernels, every
+    def __init__(self, contact: ObstacleContact, kernels: ContactKernels, stride: int) -> None:
+        self._contact, self._kernels, self._stride = contact, kernels, stride
 
-    def predicted(self, parameters: Real, window: WhitenedWindow) -> Real:
-        """Return the effect on the channels, shape (k, c, samples).
+    def predict(self, parameters: Real, window: WhitenedWindow) -> Real:
+        """Return the effect of knocks on torque and base shear, shape (k, c, samples).
 
         Parameters
         ----------
         parameters
-            Rows of position, instant, ln of the duration and peak, shape (k, 4).
+            Position, instant, logarithm of the duration and peak of each knock, shape (k, 4).
         window
-            The samples.
+            Samples for which the effect is predicted.
         """
         motion = window.motion
         last = motion.t[window.end - 1]
         steps = int(np.ceil((last - parameters[:, 1].min()) / self._kernels.step_s)) + 3
         steps = min(steps, self._kernels.steps)
-        local = self._kernels.at(parameters[:, 0], steps)
+        local_kernels = self._kernels.at_positions(parameters[:, 0], steps)
         phase = np.arange(steps) * self._kernels.step_s / np.exp(parameters[:, 2:3])
         force = parameters[:, 3:4] * np.sin(np.pi * np.minimum(phase, 1.0))
-        tables = (local.torque, local.shear)[: motion.noise.size]
-        return self._touching.effects(tables, force, parameters[:, 1], window)
+        tables = (local_kernels.torque, local_kernels.shear)[: motion.noise.size]
+        return self._contact.effects(tables, force, parameters[:, 1], window)
 
     def starts(self, window: WhitenedWindow, latest: int, count: int) -> Real:
-        """Return the likeliest candidates of a grid, each with its best peak, shape (count, 4).
+        """Return the likeliest knocks of a grid, each with its best peak, shape (count, 4).
 
         Parameters
         ----------
         window
-            The samples.
+            Whitened innovations with which the knocks are compared.
         latest
-            Last sample at which the knock may begin.
+            Index of the last sample at which the knock may begin.
         count
-            Number of candidates.
+            Number of knocks that are returned.
         """
-        positions = self._kernels.x_m[:: self._every]
+        positions = self._kernels.x_m[:: self._stride]
         grid = np.stack(
             [
                 each.ravel()
@@ -70,18 +73,18 @@ class Knocking:
             axis=1,
         )
         first = window.motion.t[window.first]
-        unit = self.predicted(np.insert(grid, 1, first, axis=1), window)
-        found = []
+        unit = self.predict(np.insert(grid, 1, first, axis=1), window)
+        candidates = []
         for sample in range(window.first, latest + 1):
-            late = sample - window.first
-            shifted = np.zeros_like(unit)
-            shifted[:, :, late:] = unit[:, :, : unit.shape[2] - late]
-            effect = window.data - window.residuals(shifted)
+            delay_samples = sample - window.first
+            delayed_effect = np.zeros_like(unit)
+            delayed_effect[:, :, delay_samples:] = unit[:, :, : unit.shape[2] - delay_samples]
+            effect = window.data - window.residuals(delayed_effect)
             power = np.einsum("kn,kn->k", effect, effect) + 1e-300
             peak = effect @ window.data / power
             gain = peak**2 * power
             rows = np.argsort(-gain)[:count]
-            found.append(
+            candidates.append(
                 np.column_stack(
                     [
                         -gain[rows],
@@ -92,23 +95,23 @@ class Knocking:
                     ]
                 )
             )
-        together = np.concatenate(found)
-        return together[np.argsort(together[:, 0])[:count], 1:]
+        all_candidates = np.concatenate(candidates)
+        return all_candidates[np.argsort(all_candidates[:, 0])[:count], 1:]
 
     @staticmethod
-    def space(x_m: tuple[float, float], instants: tuple[float, float]) -> Space:
-        """Return the ranges of the parameters.
+    def space(x_m: tuple[float, float], instants: tuple[float, float]) -> ParameterRanges:
+        """Return the ranges of a knock's four parameters.
 
         Parameters
         ----------
         x_m, instants
             Ends of the ranges of position and instant.
         """
-        return Space(
+        return ParameterRanges(
             low=np.array([x_m[0], instants[0], np.log(3e-4), -100.0]),
             high=np.array([x_m[1], instants[1], np.log(0.1), 100.0]),
             difference=np.array([2e-4, 2e-5, 1e-2, 1e-3]),
             scale=np.array([3e-3, 1e-3, 0.3, 0.5]),
-            smallest=np.array([1.5e-4, 1e-5, 2e-2, 5e-3]),
-            loose=np.array([0.02, 2e-3, 1.0, 0.3]),
+            smallest_std=np.array([1.5e-4, 1e-5, 2e-2, 5e-3]),
+            largest_std=np.array([0.02, 2e-3, 1.0, 0.3]),
         )

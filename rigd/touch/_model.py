@@ -9,7 +9,7 @@ from rigd.beam import Beam, Damping
 from rigd.identified_beam import TOUCH, read_identified_beam
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
-UNCERTAIN: Final = (
+UNCERTAIN_PARAMETERS: Final = (
     "bending_stiffness_n_m2",
     "density_over_stiffness",
     "zeta",
@@ -19,54 +19,55 @@ UNCERTAIN: Final = (
     "tool_inertia_kg_m2",
     "delay_s",
 )
-"""Parameters whose standard deviations are taken into account."""
+"""Names of the model's parameters whose uncertainty is taken into account."""
 
-_ASSUMED: Final = {
+_ASSUMED_RELATIVE_STD: Final = {
     "bending_stiffness_n_m2": 0.01,
     "density_over_stiffness": 0.01,
     "zeta": 0.2,
     "gamma": 0.2,
 }
-"""Relative standard deviations of a beam without an identification."""
+"""Relative standard deviations that are assumed for the parameters of a beam that was not
+identified."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchModel:
-    """Exact model of the antenna, from an identification or the profile."""
+    """Exact model of the beam for the estimation of touches, with its uncertainty."""
 
     beam: Beam
-    """Length, density and stiffness."""
+    """Length, density and stiffness of the beam."""
     damping: Damping
-    """Damping."""
+    """Damping of the beam."""
     tool_inertia_kg_m2: float = 0.0
     """Inertia between sensor and beam."""
     angle_delay_s: float = 0.0
     """Age of the angle at the time of its sample."""
     torque_delay_s: float = 0.0
-    """Age of torque and shear at the time of their sample, including that of the averaged records
-    as a whole, without that of the low-pass filter."""
+    """Age of torque and shear at the time of their sample. It includes the delay of the weighted
+    mean of records, but not that of the low-pass filter."""
     sensor_filter: SensorFilter = NO_FILTER
     """Filters of torque and shear."""
     source: str = "profile"
     """Source of the model, for the operator."""
     std: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviations of the uncertain ones of `UNCERTAIN`, in their units. The density depends
-    on both others: the mass per length is their product."""
+    """Standard deviation of each uncertain parameter of `UNCERTAIN_PARAMETERS` in its unit, by
+    name. The mass per length is the product of bending stiffness and density over stiffness."""
 
     @property
     def wrench_delay_s(self) -> float:
-        """Age of torque and shear after the response of the filters."""
+        """Age of torque and shear in s without the delay of the weighted mean of records."""
         return self.torque_delay_s - self.sensor_filter.weights_delay_s
 
-    def changed(self, name: str, by: float) -> "TouchModel":
-        """Return the model with one parameter of `UNCERTAIN` changed.
+    def with_changed_parameter(self, name: str, by: float) -> "TouchModel":
+        """Return the model with one parameter changed by a given difference.
 
         Parameters
         ----------
         name
-            Name of the parameter.
+            Name of the parameter, one of `UNCERTAIN_PARAMETERS`.
         by
-            Difference in its unit.
+            Difference in the unit of the parameter.
         """
         beam, damping = self.beam, self.damping
         match name:
@@ -91,7 +92,7 @@ class TouchModel:
             case "delay_s":
                 return replace(self, torque_delay_s=self.torque_delay_s + by)
             case _:
-                raise ValueError(f"{name!r} is not one of {UNCERTAIN}.")
+                raise ValueError(f"{name!r} is not one of {UNCERTAIN_PARAMETERS}.")
         return replace(self, beam=beam, damping=damping)
 
     @classmethod
@@ -105,7 +106,9 @@ class TouchModel:
         torque_delay_s: float = 0.0,
         sensor_filter: SensorFilter = NO_FILTER,
     ) -> "TouchModel":
-        """Return the model of a profile: 1 % uncertainty of stiffness and density, 20 % of damping.
+        """Return the model of a beam that was not identified, with assumed uncertainties.
+
+        They are 1 % for stiffness and density, and 20 % for the damping.
 
         Parameters
         ----------
@@ -114,7 +117,7 @@ class TouchModel:
         tool_inertia_kg_m2
             Inertia between sensor and beam.
         angle_delay_s, torque_delay_s
-            Ages of the readings.
+            Ages of the angle, and of torque and shear, at the time of their sample.
         sensor_filter
             Filters of torque and shear.
         """
@@ -131,7 +134,7 @@ class TouchModel:
             angle_delay_s,
             torque_delay_s,
             sensor_filter,
-            std={name: factor * values[name] for name, factor in _ASSUMED.items()},
+            std={name: factor * values[name] for name, factor in _ASSUMED_RELATIVE_STD.items()},
         )
 
     @classmethod
@@ -145,16 +148,16 @@ class TouchModel:
         tool_inertia_kg_m2: float = 0.0,
         sensor_filter: SensorFilter = NO_FILTER,
     ) -> "TouchModel":
-        """Read the model from a document of ``analyze … --json FILE``.
+        """Return the model of an identified beam from a document of ``analyze … --json FILE``.
 
-        The arguments give the tool inertia and the delay if the document does not.
+        Tool inertia and delay of the torque are those of the arguments if the document has none.
 
         Parameters
         ----------
         path
-            The JSON document.
+            Path of the JSON document.
         length_m
-            Length of the beam, which no session shows.
+            Length of the beam, which cannot be identified from a session.
         angle_delay_s, torque_delay_s, tool_inertia_kg_m2, sensor_filter
             Values of the profile.
 
@@ -164,15 +167,15 @@ class TouchModel:
             If the file cannot be read, lacks the beam's stiffness or density, has an effect that a
             uniform beam on a rigid clamp does not have, or flags a required number.
         """
-        found = read_identified_beam(path, length_m, TOUCH)
-        tool = found.tool_inertia_kg_m2
+        identified = read_identified_beam(path, length_m, TOUCH)
+        tool = identified.tool_inertia_kg_m2
         return cls(
-            found.beam,
-            found.damping,
+            identified.beam,
+            identified.damping,
             tool_inertia_kg_m2 if tool is None else tool,
             angle_delay_s,
-            torque_delay_s if found.delay_s is None else found.delay_s + angle_delay_s,
+            torque_delay_s if identified.delay_s is None else identified.delay_s + angle_delay_s,
             sensor_filter,
             source=str(path),
-            std=found.std,
+            std=identified.std,
         )

@@ -1,76 +1,84 @@
 """Two obstacles at rest, the second touched with or after the first.
 
 Each force bends the beam also at the other position, so both contacts are integrated together. Two
-soft obstacles that are touched at about the same time are similar to one between them: every touch
-that one obstacle explains is therefore tested for a second one.
+soft obstacles that are touched at about the same time have a similar effect as one obstacle between
+them. Every touch that one obstacle explains is therefore tested for a second obstacle.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.touch._contact import march_two
+from rigd.touch._contact import integrate_two_contacts
 from rigd.touch._kernels import ContactKernels, CrossKernels
-from rigd.touch._physical import SOFTEST, Space, Touching, WhitenedWindow
+from rigd.touch._physical import MIN_LN_STIFFNESS, ObstacleContact, ParameterRanges, WhitenedWindow
 
 Real = NDArray[np.float64]
 
-_AFTER_S = np.array([0.0, 0.008, 0.025, 0.06])
-"""Times in starts after which a free beam would touch the second obstacle."""
-_POSITIONS = 12
-_TRIED_N_PER_M = 100.0
-"""Stiffness from whose effect others follow in starts: that of soft ones is proportional to it."""
-_SHARED = np.array([[0.6, 1.6], [0.8, 1.3], [0.6, 2.5]])
-"""Two obstacles equivalent to one: their positions relative to it, each with half of the moment."""
-_FARTHEST_M = 0.3
+_SECOND_TOUCH_DELAYS_S = np.array([0.0, 0.008, 0.025, 0.06])
+"""Times in s from the first touch to that of the second obstacle by a free beam, with which the
+search starts."""
+_POSITION_COUNT = 12
+"""Number of positions of the second obstacle with which the search starts."""
+_TRIAL_STIFFNESS_N_PER_M = 100.0
+"""Stiffness of the second obstacle whose effect is computed; the effect of other soft obstacles is
+proportional to their stiffness."""
+_EQUIVALENT_POSITIONS = np.array([[0.6, 1.6], [0.8, 1.3], [0.6, 2.5]])
+"""Positions of two obstacles that are equivalent to one obstacle, over its position. Each of the
+two has half of the moment."""
+_MAX_DISTANCE_M = 0.3
+"""Largest distance in m of the free beam from the second obstacle at the first touch."""
 
 
-class Pairing:
-    """Integrates the contact with two obstacles.
+class TwoObstacleContact:
+    """Integration in time of the contact with two obstacles, for the record of one touch.
 
-    Candidates have six columns: position, instant and logarithm of the stiffness of the first, then
-    the position of the second, the free beam's distance from it at that instant in m, and the
-    logarithm of its stiffness.
+    Candidates have six columns: position, instant and logarithm of the stiffness of the first
+    obstacle, then the position of the second obstacle, the free beam's distance from it at that
+    instant in m, and the logarithm of its stiffness.
 
     Parameters
     ----------
-    touching
-        Integration on the record's steps.
+    contact
+        Integration of the contact with one obstacle.
     kernels
-        Contact kernels of those steps.
+        Contact kernels on the time steps of the integration.
     crossing
-        Kernels between the positions, likewise.
+        Kernels from a force at one position to the displacement at another, on the same steps.
     """
 
-    __slots__ = ("_crossing", "_kernels", "_touching")
+    __slots__ = ("_contact", "_crossing", "_kernels")
 
-    def __init__(self, touching: Touching, kernels: ContactKernels, crossing: CrossKernels) -> None:
-        self._touching, self._kernels, self._crossing = touching, kernels, crossing
+    def __init__(
+        self, contact: ObstacleContact, kernels: ContactKernels, crossing: CrossKernels
+    ) -> None:
+        self._contact, self._kernels, self._crossing = contact, kernels, crossing
 
-    def predicted(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
-        """Return the effect on the channels in the window, and the force of the first obstacle.
+    def predict(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
+        """Return the effect of two obstacles on torque and shear, and the force of the first.
 
         Parameters
         ----------
         parameters
             Candidates, shape (k, 6).
         window
-            The samples.
+            Samples for which the effect is predicted.
 
         Returns
         -------
         channels : ndarray, shape (k, c, samples)
+            Effect on torque and base shear.
         force : ndarray, shape (k, n)
-            On the beam, at the steps from the touch on, in N.
+            Force of the first obstacle on the beam in N, at the steps from the touch on.
         """
-        touching, instant = self._touching, parameters[:, 1]
-        steps = touching.steps(instant, window)
+        contact, instant = self._contact, parameters[:, 1]
+        steps = contact.step_count(instant, window)
         positions = parameters[:, 0], parameters[:, 3]
-        kernels = [self._kernels.at(x, steps) for x in positions]
+        kernels = [self._kernels.at_positions(x, steps) for x in positions]
         (beyond, side), (beyond_other, side_other) = (
-            touching.approach(x, instant, steps) for x in positions
+            contact.motion_beyond_obstacle(x, instant, steps) for x in positions
         )
-        cross = self._crossing.between(*positions, steps) * (side * side_other)[:, None]
-        pressing = march_two(
+        cross = self._crossing.between_positions(*positions, steps) * (side * side_other)[:, None]
+        pressing = integrate_two_contacts(
             (kernels[0].displacement, kernels[1].displacement),
             cross,
             (beyond, beyond_other - parameters[:, 4:5]),
@@ -79,93 +87,122 @@ class Pairing:
         forces = -side[:, None] * pressing[0], -side_other[:, None] * pressing[1]
         channels = window.motion.noise.size
         first, second = (
-            touching.effects((local.torque, local.shear)[:channels], force, instant, window)
+            contact.effects((local.torque, local.shear)[:channels], force, instant, window)
             for local, force in zip(kernels, forces, strict=True)
         )
         return first + second, forces[0]
 
-    def channels(self, parameters: Real, window: WhitenedWindow) -> Real:
-        """Return the effect on the channels alone; the arguments are those of `predicted`."""
-        return self.predicted(parameters, window)[0]
+    def predict_channels(self, parameters: Real, window: WhitenedWindow) -> Real:
+        """Return the effect of two obstacles on torque and shear, shape (k, c, samples).
 
-    def starts(self, one: Real, window: WhitenedWindow, space: Space, count: int) -> Real:
-        """Return candidates that are like one obstacle, or have a second one, shape (k, 6).
+        The arguments are those of `predict`.
+        """
+        return self.predict(parameters, window)[0]
+
+    def starts(
+        self, single_obstacle: Real, window: WhitenedWindow, space: ParameterRanges, count: int
+    ) -> Real:
+        """Return pairs of obstacles from which the search starts, shape (k, 6).
+
+        Some have a similar effect as one obstacle, others have a second obstacle in addition to it.
 
         Parameters
         ----------
-        one
-            Position, instant and logarithm of the stiffness of the one that explains the record.
+        single_obstacle
+            Position, instant and logarithm of the stiffness of the single obstacle that explains
+            the record best.
         window
-            The samples.
+            Whitened innovations with which the pairs are compared.
         space
-            Ranges of the candidates.
+            Ranges of the parameters.
         count
-            Number of positions of a second one, the likeliest by its first-order effect.
+            Number of positions of a second obstacle: those with the largest reduction of the
+            residuals, by first-order effects.
         """
-        shared = np.tile(np.concatenate([one, one]), (len(_SHARED), 1))
-        shared[:, [0, 3]] *= _SHARED
-        shared[:, [2, 5]] -= np.log(2 * _SHARED**2)
-        shared[:, 4] = 0.0
-        return np.vstack([shared, self._with_another(one, window, space, count)])
+        equivalent_pairs = np.tile(
+            np.concatenate([single_obstacle, single_obstacle]), (len(_EQUIVALENT_POSITIONS), 1)
+        )
+        equivalent_pairs[:, [0, 3]] *= _EQUIVALENT_POSITIONS
+        equivalent_pairs[:, [2, 5]] -= np.log(2 * _EQUIVALENT_POSITIONS**2)
+        equivalent_pairs[:, 4] = 0.0
+        return np.vstack(
+            [equivalent_pairs, self._with_second_obstacle(single_obstacle, window, space, count)]
+        )
 
-    def _with_another(self, one: Real, window: WhitenedWindow, space: Space, count: int) -> Real:
-        """Return the likeliest second obstacles by their first-order effect."""
-        x_m = np.linspace(space.low[3], space.high[3], _POSITIONS)
-        instants = np.full(_POSITIONS, one[1])
-        steps = self._touching.steps(instants, window)
-        after = np.round(_AFTER_S / self._kernels.step_s).astype(np.intp)
-        beyond, _ = self._touching.approach(x_m, instants, steps)
-        away_m = np.maximum(beyond[:, np.minimum(after, steps - 1)], 0.0)
-        pair = np.concatenate([one, [0.0, 0.0, np.log(_TRIED_N_PER_M)]])
-        second = np.tile(pair, (_POSITIONS * after.size, 1))
-        second[:, 3], second[:, 4] = np.repeat(x_m, after.size), away_m.ravel()
-        alone = np.concatenate([one, [x_m[-1], space.high[4], SOFTEST]])
-        changed = alone + np.diag(space.difference)[:3]
-        rows = np.vstack([alone, changed, second])
-        residual = window.residuals(self.channels(rows, window))
-        now, effect = residual[0], residual[4:] - residual[0]
+    def _with_second_obstacle(
+        self, single_obstacle: Real, window: WhitenedWindow, space: ParameterRanges, count: int
+    ) -> Real:
+        """Return one obstacle with each of the likeliest second obstacles, shape (count, 6).
+
+        Their likelihood is computed from the first-order effect of the second obstacle.
+        """
+        x_m = np.linspace(space.low[3], space.high[3], _POSITION_COUNT)
+        instants = np.full(_POSITION_COUNT, single_obstacle[1])
+        steps = self._contact.step_count(instants, window)
+        delay_steps = np.round(_SECOND_TOUCH_DELAYS_S / self._kernels.step_s).astype(np.intp)
+        beyond, _ = self._contact.motion_beyond_obstacle(x_m, instants, steps)
+        distances_m = np.maximum(beyond[:, np.minimum(delay_steps, steps - 1)], 0.0)
+        pair = np.concatenate([single_obstacle, [0.0, 0.0, np.log(_TRIAL_STIFFNESS_N_PER_M)]])
+        with_second = np.tile(pair, (_POSITION_COUNT * delay_steps.size, 1))
+        with_second[:, 3], with_second[:, 4] = np.repeat(x_m, delay_steps.size), distances_m.ravel()
+        without_second = np.concatenate(
+            [single_obstacle, [x_m[-1], space.high[4], MIN_LN_STIFFNESS]]
+        )
+        changed_first = without_second + np.diag(space.difference)[:3]
+        rows = np.vstack([without_second, changed_first, with_second])
+        residual = window.residuals(self.predict_channels(rows, window))
+        residual_without_second, effect = residual[0], residual[4:] - residual[0]
         # Effects that changes of the first could have are projected out of both.
-        q, triangle = np.linalg.qr(((residual[1:4] - now) / space.difference[:3, None]).T)
-        own = effect - (effect @ q) @ q.T
-        power = np.einsum("kn,kn->k", own, own) + 1e-300
-        factor = np.maximum(-(own @ now) / power, 0.0)
-        gain = (factor**2 * power).reshape(_POSITIONS, -1)
-        likely = np.argsort(-gain.max(axis=1))[:count]
-        chosen = likely * after.size + gain[likely].argmax(axis=1)
-        starts: Real = second[chosen]
+        q, triangle = np.linalg.qr(
+            ((residual[1:4] - residual_without_second) / space.difference[:3, None]).T
+        )
+        projected_effect = effect - (effect @ q) @ q.T
+        power = np.einsum("kn,kn->k", projected_effect, projected_effect) + 1e-300
+        factor = np.maximum(-(projected_effect @ residual_without_second) / power, 0.0)
+        gain = (factor**2 * power).reshape(_POSITION_COUNT, -1)
+        likeliest = np.argsort(-gain.max(axis=1))[:count]
+        chosen = likeliest * delay_steps.size + gain[likeliest].argmax(axis=1)
+        starts: Real = with_second[chosen]
         starts[:, 5] += np.log(np.clip(factor[chosen], 0.1, 100.0))
-        follows = (now + factor[chosen, None] * effect[chosen]) @ q
+        follows = (residual_without_second + factor[chosen, None] * effect[chosen]) @ q
         moves = -np.linalg.solve(triangle, follows.T).T
         starts[:, :3] += np.clip(moves, -4 * space.scale[:3], 4 * space.scale[:3])
         return starts
 
     @staticmethod
-    def exchanged(parameters: Real) -> Real:
-        """Return candidates in which the second is touched first and the first right after it.
+    def in_reverse_order(parameters: Real) -> Real:
+        """Return pairs in which the second obstacle is touched first, the other right after it.
 
         Parameters
         ----------
         parameters
             Candidates, shape (k, 6).
         """
-        others: Real = parameters[:, [3, 1, 5, 0, 4, 2]]
-        others[:, 4] = 0.0
-        return others
+        reversed_pairs: Real = parameters[:, [3, 1, 5, 0, 4, 2]]
+        reversed_pairs[:, 4] = 0.0
+        return reversed_pairs
 
     @staticmethod
-    def space(one: Space) -> Space:
-        """Return the ranges of the candidates.
+    def space(single_obstacle: ParameterRanges) -> ParameterRanges:
+        """Return the ranges of the six parameters of two obstacles.
 
         Parameters
         ----------
-        one
-            Ranges of one obstacle at rest.
+        single_obstacle
+            Ranges of the parameters of one obstacle at rest.
         """
-        return Space(
-            low=np.concatenate([one.low, [one.low[0], 0.0, one.low[2]]]),
-            high=np.concatenate([one.high, [one.high[0], _FARTHEST_M, one.high[2]]]),
-            difference=np.concatenate([one.difference, [2e-4, 2e-5, 2e-2]]),
+        return ParameterRanges(
+            low=np.concatenate(
+                [single_obstacle.low, [single_obstacle.low[0], 0.0, single_obstacle.low[2]]]
+            ),
+            high=np.concatenate(
+                [
+                    single_obstacle.high,
+                    [single_obstacle.high[0], _MAX_DISTANCE_M, single_obstacle.high[2]],
+                ]
+            ),
+            difference=np.concatenate([single_obstacle.difference, [2e-4, 2e-5, 2e-2]]),
             scale=np.array([6e-3, 1e-3, 1.0, 6e-3, 1e-3, 1.0]),
-            smallest=np.concatenate([one.smallest, [1e-3, 2e-5, 2e-2]]),
-            loose=np.array([0.05, 5e-3, 1.0, 0.2, 0.05, 2.0]),
+            smallest_std=np.concatenate([single_obstacle.smallest_std, [1e-3, 2e-5, 2e-2]]),
+            largest_std=np.array([0.05, 5e-3, 1.0, 0.2, 0.05, 2.0]),
         )

@@ -11,26 +11,29 @@ Real = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Estimated:
-    """An estimated number with its uncertainty."""
+    """Estimated number with its uncertainty."""
 
     value: float
-    """Mean."""
+    """Estimated value."""
     std: float
-    """Standard deviation."""
+    """Standard deviation of the estimated value."""
     interval_95: tuple[float, float]
     """Interval that contains the true value in 95 of 100 records."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the estimate as a document of JSON types."""
+        """Return value, standard deviation and interval as a document of JSON types."""
         return {"value": self.value, "std": self.std, "interval_95": list(self.interval_95)}
 
 
 @dataclass(frozen=True, slots=True)
 class TouchEstimate:
-    """Estimate of one touch."""
+    """Estimate of one touch: point, instant, force and stiffness, and the kind of obstacle.
+
+    A quantity is None if the record does not determine it.
+    """
 
     x_m: Estimated | None
-    """Distance of the point from the motor's axis."""
+    """Distance of the touched point from the motor's axis."""
     time_s: Estimated | None
     """Instant of the first contact, from the record's first sample."""
     force_n: Estimated | None
@@ -38,35 +41,36 @@ class TouchEstimate:
     stiffness_n_per_m: Estimated | None
     """Stiffness of the obstacle."""
     kind: str
-    """rigid (at rest, springy or not) | yielding | moving | knock | unknown."""
+    """Kind of obstacle: rigid (at rest, springy or not) | yielding | moving | knock | unknown."""
     model: str
     """Source of the beam's model."""
     channels: int
-    """1: torque alone; 2: with base shear."""
+    """Number of measured quantities: 1 for torque alone, 2 with base shear."""
     samples: int
-    """Number of samples used after the detection."""
+    """Number of samples after the detection that were used."""
     chi2_per_degree: float
-    """Sum of squared residuals over that of noise: about 1 if explained."""
+    """Sum of squared residuals over its expectation from noise: about 1 if the touch is
+    explained."""
     positions_m: Real
-    """Positions of the likelihood, shape (m,); empty if not requested."""
+    """Positions at which the likelihood is given, shape (m,); empty if it was not requested."""
     log_likelihood: Real
-    """Log-likelihood at each position for any force, shape (m,)."""
+    """Logarithm of the likelihood of a touch at each position by any force, shape (m,)."""
     innovations: Real
     """Innovations of torque and shear in standard deviations, shape (channels, n)."""
     innovation_times_s: Real
-    """Their instants, from the record's first sample, shape (n,)."""
+    """Instants of the innovations, from the record's first sample; shape (n,)."""
     force_history_n: Real
-    """Magnitude of the contact force, shape (k,)."""
+    """Magnitude of the contact force over time, shape (k,)."""
     force_times_s: Real
-    """Its instants, shape (k,)."""
+    """Instants of the contact force, from the record's first sample; shape (k,)."""
 
     @property
     def explained(self) -> bool:
-        """Whether some obstacle or knock explains the record except for noise."""
+        """Whether an obstacle or a knock explains the record except for noise."""
         return self.time_s is not None
 
     def as_dict(self, start_s: float = 0.0) -> dict[str, Any]:
-        """Return the estimate as a document of JSON types.
+        """Return the estimate of the touch as a document of JSON types.
 
         Parameters
         ----------
@@ -79,13 +83,13 @@ class TouchEstimate:
             time = replace(
                 time, value=time.value + start_s, interval_95=(low + start_s, high + start_s)
             )
-        named = {
+        quantities = {
             "x_m": self.x_m,
             "time_s": time,
             "force_n": self.force_n,
             "stiffness_n_per_m": self.stiffness_n_per_m,
         }
-        return {name: each and each.as_dict() for name, each in named.items()} | {
+        return {name: each and each.as_dict() for name, each in quantities.items()} | {
             "kind": self.kind,
             "model": self.model,
         }

@@ -25,13 +25,13 @@ class SensorFilter:
     """
 
     corner_hz: float = 0.0
-    """Corner of the sensor's low-pass filter; 0: it has none."""
+    """Corner frequency in Hz of the sensor's low-pass filter; 0: the sensor has no filter."""
     order: int = 1
-    """Order of that filter: 1, or 2 (Butterworth)."""
+    """Order of the low-pass filter: 1, or 2 (Butterworth)."""
     weights: tuple[float, ...] = (1.0,)
     """Weight of each of the sensor's records in a sample, oldest first, with the sum 1."""
     spacing_s: float = 0.0
-    """Time between two records."""
+    """Time between two of the sensor's records."""
 
     @classmethod
     def of_records(
@@ -42,11 +42,12 @@ class SensorFilter:
         Parameters
         ----------
         corner_hz, order
-            Its low-pass filter.
+            Corner frequency and order of the sensor's low-pass filter.
         kind
-            How the records form a sample: their "mean" over a tick, or a "triangle" over two.
+            How the records form a sample: "mean" of those in one tick, or weighted by a "triangle"
+            over two ticks.
         records
-            Records a tick.
+            Number of records a tick.
         spacing_s
             Time between two records.
         """
@@ -57,16 +58,16 @@ class SensorFilter:
 
     @property
     def weights_delay_s(self) -> float:
-        """Group delay of the weights, which is part of the stated age of a sample."""
+        """Group delay in s of the weighted mean of records, part of the stated age of a sample."""
         return 0.5 * (len(self.weights) - 1) * self.spacing_s
 
     def response(self, s: ArrayLike) -> Complex:
-        """Return the frequency response, delays included.
+        """Return the frequency response of the sensor's filters, delays included.
 
         Parameters
         ----------
         s
-            Laplace variable in rad/s, any shape.
+            Laplace variable in rad/s, of any shape.
         """
         points = np.asarray(s, dtype=np.complex128)
         ages = self.spacing_s * np.arange(len(self.weights))[::-1]

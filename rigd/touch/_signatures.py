@@ -1,10 +1,11 @@
 """Signatures of touches: the innovations in the first ticks after a contact.
 
-A touch far from the root appears late and with many sign changes, one of a soft obstacle rises
-slowly, and a hard one releases the beam at once. The contact is linear except for the release, so
-that its shape does not depend on the speed. With the motor held, the contact is computed for
-obstacles of a grid of positions and stiffnesses; the filter of the innovations turns torque and
-base shear into the signatures for the detector. One of several similar signatures suffices.
+A touch far from the root appears late and with many sign changes. The torque of a soft obstacle
+rises slowly, and a hard obstacle releases the beam at once. The contact is linear except for the
+release, so that its time course does not depend on the speed. With the motor held, the contact is
+computed for obstacles of a grid of positions and stiffnesses. The filter of the innovations turns
+torque and base shear into the signatures for the detector. Of several similar signatures one is
+enough.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping
-from rigd.touch._contact import march, responses
+from rigd.touch._contact import contact_responses, integrate_contact
 from rigd.touch._innovations import ChannelNoise, InnovationFilter, ObservedBeam, observed_beam
 from rigd.touch._kernels import contact_kernels
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
@@ -24,17 +25,20 @@ if TYPE_CHECKING:  # the control loop does not import models
 
 Real = NDArray[np.float64]
 
-_POSITIONS = np.linspace(0.04, 1.0, 33)
-"""As fractions of the length."""
+_POSITION_FRACTIONS = np.linspace(0.04, 1.0, 33)
+"""Positions of the signatures' obstacles, as fractions of the beam's length."""
 _STIFFNESSES_N_PER_M = np.array([1e2, 2e2, 4e2, 1e3, 3e3, 1e4, 3e4, 1e5])
-_AGES_S = np.array([2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20, 24]) * 1e-3
-"""Time from the contact to the tested tick."""
-_PHASES = 2
-"""Instants of the contact within a tick: bending waves change their sign from tick to tick."""
-_FINER = 16
-"""Steps of the calculation in a tick."""
-_ALIKE = 0.9
-"""Correlation with a signature above which another one is redundant: of 6864 remain 500."""
+"""Stiffnesses of the signatures' obstacles."""
+_CONTACT_AGES_S = np.array([2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20, 24]) * 1e-3
+"""Times in s from the contact to the tick at which a signature is compared."""
+_CONTACT_PHASES = 2
+"""Number of instants of the contact within a tick, since bending waves change their sign from tick
+to tick."""
+_STEPS_PER_TICK = 16
+"""Number of time steps of the calculation in a tick."""
+_REDUNDANT_CORRELATION = 0.9
+"""Correlation of two signatures above which one of them is redundant: of 6864 signatures 500
+remain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,22 +46,22 @@ class WatchedBeam:
     """Model and signatures of a beam for a `TouchDetector`."""
 
     observed: ObservedBeam
-    """Model of the free beam, with its noise."""
+    """Model of the free beam, with the noise of its readings."""
     signatures: Real
-    """Signatures of touches, from `signatures`."""
+    """Signatures of touches from the function `signatures`, shape (signatures, 2 · ticks)."""
 
 
 def watched_beam(model: "TouchModel", rate_hz: float, noise: ChannelNoise) -> WatchedBeam:
-    """Prepare the detection of touches.
+    """Return the model and the signatures of a beam, with which touches are detected.
 
     Parameters
     ----------
     model
-        The beam.
+        Model of the beam.
     rate_hz
         Ticks a second.
     noise
-        Noise of the channels.
+        Noise of torque, base shear and angle.
     """
     observed = observed_beam(
         model.beam,
@@ -79,7 +83,9 @@ def signatures(
     model: ObservedBeam,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> Real:
-    """Return unit vectors of the last innovations after contacts at any position, of any age.
+    """Return the signatures of touches: the innovations in the last ticks after a contact.
+
+    They are unit vectors for contacts of several positions, stiffnesses and ages.
 
     Parameters
     ----------
@@ -95,36 +101,48 @@ def signatures(
     Returns
     -------
     ndarray of shape (signatures, 2 · ticks)
-        Torque and shear of the oldest tick first.
+        Innovations of torque and shear for each tick, the oldest tick first.
     """
-    ages = np.maximum(1, np.round(_AGES_S * rate_hz)).astype(int)
+    ages = np.maximum(1, np.round(_CONTACT_AGES_S * rate_hz)).astype(int)
     ticks = int(ages.max())
-    step_s = 1 / (_FINER * rate_hz)
-    positions = beam.length_m * _POSITIONS
-    kernels = contact_kernels(beam, damping, positions, step_s, _FINER * ticks + 1, sensor_filter)
+    step_s = 1 / (_STEPS_PER_TICK * rate_hz)
+    positions = beam.length_m * _POSITION_FRACTIONS
+    kernels = contact_kernels(
+        beam, damping, positions, step_s, _STEPS_PER_TICK * ticks + 1, sensor_filter
+    )
     approach = positions[:, None] * step_s * np.arange(kernels.steps)
     per_tick = _impulse_responses(model, ticks)
 
-    found = []
+    signature_blocks = []
     for stiffness in _STIFFNESSES_N_PER_M:
-        force = march(kernels.displacement, approach, np.full(positions.size, stiffness), step_s)
-        readings = responses(
-            (kernels.torque, kernels.shear), force, _FINER // _PHASES, _PHASES * ticks + 1
+        force = integrate_contact(
+            kernels.displacement, approach, np.full(positions.size, stiffness), step_s
         )
-        for phase in range(1, _PHASES + 1):
-            at_ticks = readings[:, :, phase::_PHASES].transpose(0, 2, 1).reshape(-1, 2 * ticks)
-            white = at_ticks @ per_tick
+        readings = contact_responses(
+            (kernels.torque, kernels.shear),
+            force,
+            _STEPS_PER_TICK // _CONTACT_PHASES,
+            _CONTACT_PHASES * ticks + 1,
+        )
+        for phase in range(1, _CONTACT_PHASES + 1):
+            at_ticks = (
+                readings[:, :, phase::_CONTACT_PHASES].transpose(0, 2, 1).reshape(-1, 2 * ticks)
+            )
+            innovations = at_ticks @ per_tick
             for age in ages:
-                rows = np.zeros_like(white)
-                rows[:, 2 * (ticks - age) :] = white[:, : 2 * age]
-                found.append(rows)
-    every = np.concatenate(found)
-    size = np.linalg.norm(every, axis=1)
-    return _distinct(every[size > 0] / size[size > 0, None])
+                rows = np.zeros_like(innovations)
+                rows[:, 2 * (ticks - age) :] = innovations[:, : 2 * age]
+                signature_blocks.append(rows)
+    all_signatures = np.concatenate(signature_blocks)
+    norms = np.linalg.norm(all_signatures, axis=1)
+    return _select_dissimilar(all_signatures[norms > 0] / norms[norms > 0, None])
 
 
 def _impulse_responses(model: ObservedBeam, ticks: int) -> Real:
-    """Return the matrix (2 · ticks, 2 · ticks) from [torque, shear] of each tick to innovations."""
+    """Return the matrix from torque and shear of each tick to the innovations of each tick.
+
+    The shape is (2 · ticks, 2 · ticks).
+    """
     table = np.zeros((2 * ticks, 2 * ticks))
     for channel, impulse in enumerate(((1.0, 0.0), (0.0, 1.0))):
         filter_ = InnovationFilter(model)
@@ -136,15 +154,15 @@ def _impulse_responses(model: ObservedBeam, ticks: int) -> Real:
     return table
 
 
-def _distinct(rows: Real) -> Real:
-    """Return unit vectors such that each of the others is similar to one of them.
+def _select_dissimilar(rows: Real) -> Real:
+    """Return a selection of unit vectors such that every other vector is similar to one of them.
 
-    The next one is always the least similar to those before.
+    Each selected vector is the one that is least similar to those selected before.
     """
-    chosen = [0]
-    likeness = np.abs(rows @ rows[0])
-    while likeness.min() < _ALIKE:
-        farthest = int(likeness.argmin())
-        chosen.append(farthest)
-        np.maximum(likeness, np.abs(rows @ rows[farthest]), out=likeness)
-    return rows[chosen]
+    selected = [0]
+    similarity = np.abs(rows @ rows[0])
+    while similarity.min() < _REDUNDANT_CORRELATION:
+        farthest = int(similarity.argmin())
+        selected.append(farthest)
+        np.maximum(similarity, np.abs(rows @ rows[farthest]), out=similarity)
+    return rows[selected]

@@ -1,60 +1,70 @@
-"""Quantities for touches that depend on the beam and the rate only, computed once."""
+"""Quantities for the estimation of touches that depend on beam and rate only, computed once."""
 
 from typing import Final
 
 import numpy as np
 
-from rigd.touch._blind import Blind
+from rigd.touch._blind import AnyForceEstimator
 from rigd.touch._free_motion import FreeBeam
 from rigd.touch._kernels import contact_kernels, cross_kernels, positions
 from rigd.touch._model import TouchModel
-from rigd.touch._physical import Starts
+from rigd.touch._physical import CandidateGrid
 from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 
-NOTICED_S: Final = (0.013, 0.04, 0.12)
-"""Longest times from a touch to its detection: longer ones are tried if the shorter fail."""
-GRID_S: Final = 0.022
-"""Time after the detection for the comparison with the grid of starts."""
+DETECTION_DELAYS_S: Final = (0.013, 0.04, 0.12)
+"""Longest times in s from a touch to its detection that are assumed. Longer times are tried if
+shorter times fail."""
+GRID_COMPARISON_S: Final = 0.022
+"""Time in s after the detection whose samples are compared with the grid of candidates."""
 _SPACING_M = 0.007
+"""Largest distance in m between two positions of the contact kernels."""
 
 
-class Tables:
-    """Quantities that depend on the model and the rate only."""
+class TouchTables:
+    """Precomputed quantities for the estimation of touches with one model at one rate."""
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
         self.model, self.rate_hz = model, rate_hz
         self.x_m = positions(model.beam.length_m, _SPACING_M)
-        finer = 4 * max(1, round(4000 / rate_hz))
-        steps = round((FINAL_S + NOTICED_S[-1] + 0.01) * rate_hz * finer)
+        steps_per_sample = 4 * max(1, round(4000 / rate_hz))
+        steps = round((FINAL_S + DETECTION_DELAYS_S[-1] + 0.01) * rate_hz * steps_per_sample)
         self.finest = contact_kernels(
             model.beam,
             model.damping,
             self.x_m,
-            1 / (finer * rate_hz),
+            1 / (steps_per_sample * rate_hz),
             steps,
             model.sensor_filter,
         )
-        self.middle = self.finest.coarser(2, steps // 2)
-        self.coarse = self.finest.coarser(finer // 4, steps // (finer // 4))
-        half = self.finest.coarser(finer // 2, steps // (finer // 2))
+        self.middle = self.finest.with_wider_pulses(2, steps // 2)
+        self.coarse = self.finest.with_wider_pulses(
+            steps_per_sample // 4, steps // (steps_per_sample // 4)
+        )
+        half_sample_kernels = self.finest.with_wider_pulses(
+            steps_per_sample // 2, steps // (steps_per_sample // 2)
+        )
         self.crossing = cross_kernels(
             model.beam, model.damping, self.x_m, self.coarse.step_s, self.coarse.steps
         )
-        self.blind = Blind(half, 2, round((FIRST_S + NOTICED_S[-1]) * rate_hz) + 1)
-        self.most = round((HISTORY_S + FINAL_S) * rate_hz) + 1
-        self.free = FreeBeam(model, self.x_m, rate_hz, self.most)
-        self._starts: dict[int, Starts] = {}
-        self.starts(round(NOTICED_S[0] * rate_hz) + round(GRID_S * rate_hz))
-        nowhere = np.empty(0)
+        self.any_force = AnyForceEstimator(
+            half_sample_kernels, 2, round((FIRST_S + DETECTION_DELAYS_S[-1]) * rate_hz) + 1
+        )
+        self.max_samples = round((HISTORY_S + FINAL_S) * rate_hz) + 1
+        self.free = FreeBeam(model, self.x_m, rate_hz, self.max_samples)
+        self._grids: dict[int, CandidateGrid] = {}
+        self.starts(round(DETECTION_DELAYS_S[0] * rate_hz) + round(GRID_COMPARISON_S * rate_hz))
+        no_positions = np.empty(0)
         self.changed = [
-            FreeBeam(model.changed(name, std), nowhere, rate_hz, self.most)
+            FreeBeam(
+                model.with_changed_parameter(name, std), no_positions, rate_hz, self.max_samples
+            )
             for name, std in model.std.items()
             if std > 0
         ]
-        """Beams with one uncertain parameter changed by one standard deviation each."""
+        """Beams in each of which one uncertain parameter is changed by its standard deviation."""
 
-    def starts(self, samples: int) -> Starts:
-        """Return the grid of starts for a number of samples."""
-        if samples not in self._starts:
-            self._starts[samples] = Starts(self.coarse, 2, self.rate_hz, samples)
-        return self._starts[samples]
+    def starts(self, samples: int) -> CandidateGrid:
+        """Return the grid of candidates for a comparison over a number of samples."""
+        if samples not in self._grids:
+            self._grids[samples] = CandidateGrid(self.coarse, 2, self.rate_hz, samples)
+        return self._grids[samples]

@@ -10,32 +10,32 @@ from rigd.session.layout import WRENCH_FIELDS
 from rigd.touch._free_motion import TouchRecord
 
 HISTORY_S: Final = 1.5
-"""Time before a detection that an estimate uses."""
+"""Time in s before a detection whose samples an estimate uses."""
 CONTACT_S: Final = 0.8
-"""Time after a detection for which the beam of a search may still touch the obstacle."""
+"""Time in s after a detection for which the beam may still touch the obstacle."""
 PREVIEW_S: Final = 0.025
-"""Time after a detection for the advance search of the position."""
+"""Time in s after a detection whose samples the preliminary search of the position uses."""
 FIRST_S: Final = 0.05
-"""Time after a detection that the first estimate uses."""
+"""Time in s after a detection whose samples the first estimate uses."""
 FINAL_S: Final = 0.2
-"""Time after a detection that the last estimate uses."""
+"""Time in s after a detection whose samples the last estimate uses."""
 
 
 def around_touch(
     samples: NDArray[np.void], tick: int, rate_hz: float, free_from: int = 0
 ) -> NDArray[np.void]:
-    """Return the samples of an estimate: 1.5 s before the detection, 0.2 s after it.
+    """Return the samples from 1.5 s before the detection of a touch to 0.2 s after it.
 
     Parameters
     ----------
     samples
-        Shape (n,), with a field ``tick``.
+        Samples of a session with a field ``tick``, shape (n,).
     tick
         Tick of the detection.
     rate_hz
         Ticks a second.
     free_from
-        Tick before which the beam was in contact: nothing earlier is used.
+        Tick before which the beam was in contact, so that earlier samples are not used.
     """
     ticks = samples["tick"].astype(np.int64)
     first = max(tick - round(HISTORY_S * rate_hz), free_from)
@@ -49,30 +49,30 @@ def touch_record(
     rate_hz: float,
     shear_projection: Sequence[float] | None,
 ) -> TouchRecord:
-    """Return the record around a detection for the estimator, with missed ticks interpolated.
+    """Return the record of a touch for the estimator, with missed ticks interpolated.
 
     Parameters
     ----------
     samples
-        Shape (n,) of `rigd.session.layout.SAMPLE_DTYPE`, in the order of their ticks.
+        Samples of `rigd.session.layout.SAMPLE_DTYPE` in the order of their ticks, shape (n,).
     tick
         Tick of the detection.
     rate_hz
         Ticks a second.
     shear_projection
-        Base shear = projection · wrench; None: it is not measured.
+        Coefficients of the base shear, shear = projection · wrench; None: it is not measured.
     """
     ticks = samples["tick"].astype(np.int64)
-    every = np.arange(ticks[0], ticks[-1] + 1)
+    all_ticks = np.arange(ticks[0], ticks[-1] + 1)
 
-    def filled(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.interp(every, ticks, values)
+    def interpolated(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.interp(all_ticks, ticks, values)
 
     return TouchRecord(
         rate_hz,
-        filled(samples["angle_rad"]),
-        filled(samples["coupling_torque_nm"]),
-        None if shear_projection is None else filled(base_shear_n(samples, shear_projection)),
+        interpolated(samples["angle_rad"]),
+        interpolated(samples["coupling_torque_nm"]),
+        None if shear_projection is None else interpolated(base_shear_n(samples, shear_projection)),
         int(tick - ticks[0]),
     )
 
@@ -80,14 +80,14 @@ def touch_record(
 def base_shear_n(
     samples: NDArray[np.void], shear_projection: Sequence[float]
 ) -> NDArray[np.float64]:
-    """Return the base shear of samples, shape (n,).
+    """Return the base shear force of samples in N, shape (n,).
 
     Parameters
     ----------
     samples
-        Shape (n,) of `rigd.session.layout.SAMPLE_DTYPE`.
+        Samples of `rigd.session.layout.SAMPLE_DTYPE`, shape (n,).
     shear_projection
-        Six numbers: base shear = projection · wrench.
+        Six coefficients of the base shear, shear = projection · wrench.
     """
     wrench = np.array([samples[axis] for axis in WRENCH_FIELDS])
     shear: NDArray[np.float64] = np.array(shear_projection) @ wrench

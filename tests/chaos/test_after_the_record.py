@@ -43,7 +43,7 @@ def test_a_recorder_alone_knows_a_whole_record(channels, tmp_path, ticks, outcom
     segments = {"rest": (0, 100), "sweep": (100, 300)}
     recorder.header = FileHeader({"rate_hz": "1000.0"}, segments, attachments={})
     for tick in range(ticks):
-        pack_sample_into(ring.buffer, ring.slot(), tick * 10**6, tick, *[0.0] * 10, 0, 0, 0)
+        pack_sample_into(ring.buffer, ring.next_slot(), tick * 10**6, tick, *[0.0] * 10, 0, 0, 0)
         ring.publish()
     shared_state[StateField.START_UTC_NS] = 10**18
     shared_state[StateField.SCHEDULED] = ticks

@@ -7,7 +7,7 @@ import pytest
 
 from rigd.devices.contracts import LineHealth
 from rigd.engine import shared_memory_fd
-from rigd.engine._publish import Display
+from rigd.engine._publish import ReadingPublisher
 from rigd.engine.shared_state import SharedState, StateField
 
 CYCLE = SimpleNamespace(angle_rad=0.1, coupling_torque_nm=float("nan"), torque_command_nm=-0.2)
@@ -29,9 +29,9 @@ def shared_state():
 
 
 def shown(shared_state, drive, sensor, *times_ns):
-    display = Display(shared_state, SimpleNamespace(drive=drive, sensor=sensor))
+    display = ReadingPublisher(shared_state, SimpleNamespace(drive=drive, sensor=sensor))
     for now_ns in times_ns:
-        display.show(CYCLE, now_ns)
+        display.publish(CYCLE, now_ns)
     words = (StateField.BUS_LOAD_PPM, StateField.BUS_ERRORS, StateField.SENSOR_STATUS)
     return tuple(shared_state[word] for word in words)
 

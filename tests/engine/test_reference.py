@@ -31,8 +31,8 @@ class InUnits:
 
     def __init__(self, writer, reader):
         self.append = lambda angles: writer.append(angles * UNIT_RAD)
-        self.at = lambda tick: round(reader.at(tick) / UNIT_RAD)
-        self.waits, self.over = reader.waits, reader.over
+        self.at = lambda tick: round(reader.reference_at(tick) / UNIT_RAD)
+        self.waits, self.over = reader.must_wait, reader.is_after_end
 
 
 def growing(planned=3, room=40):

@@ -21,7 +21,7 @@ def ring():
 
 
 def put(ring, number):
-    offset = ring.slot()
+    offset = ring.next_slot()
     if offset < 0:
         return False
     RECORD.pack_into(ring.buffer, offset, number)

@@ -547,7 +547,7 @@ def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session)
 
 
 def test_a_supervisor_that_does_nothing_does_not_keep_the_torque_on(make_session, monkeypatch):
-    monkeypatch.setattr("rigd.engine._session_sequence._GO_PATIENCE_S", 0.2)
+    monkeypatch.setattr("rigd.engine._session_sequence._START_TIMEOUT_S", 0.2)
     session = make_session()
     session.shared_state[StateField.GO] = 0
     session.run()

@@ -10,7 +10,7 @@ from rigd import excitation
 from rigd.beam import PARAMETERS, Beam, transfer_and_gradient
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation import KINDS, ExcitationError, make_excitation
-from rigd.excitation._narrow_sweeps import Band, FoundMode, damping_of, time_fractions
+from rigd.excitation._narrow_sweeps import Band, FoundMode, first_order_damping, time_fractions
 from rigd.runner import with_tip_slope
 from rigd.runner.planning import RigPreview, excitation_for, plan_session
 
@@ -76,10 +76,10 @@ def test_each_sweep_covers_its_band_and_little_else(document):
 
 
 def test_a_band_is_half_power_widths_and_the_uncertainty_to_either_side():
-    band = Band.of_mode(FoundMode(16.0, 0.005, 0.1), widths=2.0)
+    band = Band.around_mode(FoundMode(16.0, 0.005, 0.1), widths=2.0)
     assert (band.start_hz, band.stop_hz) == pytest.approx((16 - 0.42, 16 + 0.42))
     assert band.decay_s == pytest.approx(1 / (2 * np.pi * 16 * 0.005))
-    heavy = Band.of_mode(FoundMode(2.0, 0.6, 0.0), widths=2.0)
+    heavy = Band.around_mode(FoundMode(2.0, 0.6, 0.0), widths=2.0)
     assert 0 < heavy.start_hz < heavy.stop_hz
 
 
@@ -134,10 +134,10 @@ def test_the_split_is_the_best_there_is(rig):
         FoundMode(16.01, 0.0042, 0.0),
         FoundMode(44.8, 0.0099, 0.0),
     ]
-    bands = [Band.of_mode(mode, 1.0) for mode in modes]
+    bands = [Band.around_mode(mode, 1.0) for mode in modes]
     shares = time_fractions(bands, [0.025] * 3, rig)
     assert shares.sum() == pytest.approx(1.0)
-    damping = damping_of(modes, LINK)
+    damping = first_order_damping(modes, LINK)
     rates = []
     for band in bands:
         f = np.linspace(band.start_hz, band.stop_hz, 301)
@@ -172,10 +172,10 @@ def test_damping_that_gives_the_modes_their_ratios():
     for zeta, gamma in ((5.4e-5, 0.02), (5.4e-5, 0.0), (0.0, 0.03)):
         ratio = 0.5 * (zeta * omega + gamma / (LINK.density_over_stiffness * omega))
         modes = [FoundMode(w / (2 * np.pi), r, 0.0) for w, r in zip(omega, ratio, strict=True)]
-        found = damping_of(modes, LINK)
+        found = first_order_damping(modes, LINK)
         assert (found.zeta, found.gamma) == pytest.approx((zeta, gamma), rel=1e-9, abs=1e-12)
     rising = [FoundMode(2.57, 1e-4, 0.0), FoundMode(16.01, 5e-3, 0.0)]
-    assert damping_of(rising, LINK).gamma == 0.0
+    assert first_order_damping(rising, LINK).gamma == 0.0
 
 
 @pytest.mark.parametrize("count", [1, 2])

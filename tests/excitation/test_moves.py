@@ -8,7 +8,14 @@ import pytest
 from rigd.beam import participation, transfer
 from rigd.control import close_loop
 from rigd.excitation import ExcitationError, shortest_braking, shortest_move
-from rigd.excitation.moves import braked, braking_path, modal_state, quintic, slew, still_path
+from rigd.excitation.moves import (
+    braked_reference,
+    braking_path,
+    modal_state,
+    quintic,
+    slew,
+    still_path,
+)
 from rigd.identified_beam import MOVE
 
 RATE_HZ = 1000.0
@@ -213,7 +220,7 @@ def test_braking_keeps_the_torque_from_everywhere_on_a_slew(plant, profile):
     def peak_nm(table):
         peaks = []
         for tick in range(2, path.size, 7):
-            reference = braked(path, tick, table)
+            reference = braked_reference(path, tick, table)
             response = loop.simulate(np.concatenate([reference, np.full(300, reference[-1])]))
             peaks.append(np.abs(response.torque_nm).max())
             assert abs(response.velocity_rad_s[-1]) < 0.02

@@ -85,7 +85,7 @@ def test_a_mode_moves_as_the_model_says(name, step, grown):
 
 def test_every_mode_in_the_band_is_asked_for_unless_one_is_named():
     asked = [parse_target("damping", "1%"), parse_target("frequency", "2:0.1%")]
-    quantities = Quantities.of([*asked, parse_target("zeta", "5%")], ESTIMATE)
+    quantities = Quantities.linearised([*asked, parse_target("zeta", "5%")], ESTIMATE)
     names = [each.target.name for each in quantities.items]
     assert names == [*(f"damping of mode {n}" for n in (1, 2, 3)), "frequency of mode 2", "zeta"]
     covariance = np.diag(np.full(len(UNIFORM), 1e-4))
@@ -97,7 +97,9 @@ def test_every_mode_in_the_band_is_asked_for_unless_one_is_named():
 
 def test_a_share_of_nothing_is_impossible():
     none = replace(ESTIMATE, damping=Damping(), names=("density_over_stiffness",))
-    found = Quantities.of([parse_target("damping", "1%"), parse_target("alpha", "0.1")], none)
+    found = Quantities.linearised(
+        [parse_target("damping", "1%"), parse_target("alpha", "0.1")], none
+    )
     precisions = found.precisions(np.eye(1))
     assert "is 0" in precisions[0].impossible
     assert "internal damping is absent" in precisions[-1].impossible

@@ -97,9 +97,9 @@ class Producer(threading.Thread):
     def _write(self) -> None:
         t_ns, t_s = self.tick * 1_000_000, self.tick / RATE_HZ
         timings, samples = self.channels.timings, self.channels.samples
-        pack_timing_into(timings.buffer, timings.slot(), t_ns, self.tick, 0.5e-3, 1.5e-3)
+        pack_timing_into(timings.buffer, timings.next_slot(), t_ns, self.tick, 0.5e-3, 1.5e-3)
         timings.publish()
-        offset = samples.slot()
+        offset = samples.next_slot()
         if offset < 0:
             self.refused += 1
         else:

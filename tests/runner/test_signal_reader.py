@@ -55,7 +55,7 @@ def put(channels, ticks, angle_rad=0.0, *, command_nm=0.0, wrench=(0.0,) * 6):
     ring = channels.samples
     for tick, angle in zip(ticks, np.broadcast_to(angle_rad, len(ticks)), strict=True):
         pack_sample_into(
-            ring.buffer, ring.slot(), tick * 10**6, tick, 0.01, float(angle), command_nm, 0.5,
+            ring.buffer, ring.next_slot(), tick * 10**6, tick, 0.01, float(angle), command_nm, 0.5,
             *wrench, 0, 0, 0,
         )  # fmt: skip
         ring.publish()

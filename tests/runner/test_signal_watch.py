@@ -20,8 +20,8 @@ def ring():
 def put(ring, ticks, *, error_rad=0.0, coupling_nm=0.0, command_nm=0.0, lateness_ns=50_000):
     for tick in ticks:
         pack_sample_into(
-            ring.buffer, ring.slot(), tick * 10**6, tick, error_rad, 0.0, command_nm, coupling_nm,
-            *[0.0] * 6, 0, lateness_ns, 80_000,
+            ring.buffer, ring.next_slot(), tick * 10**6, tick, error_rad, 0.0, command_nm,
+            coupling_nm, *[0.0] * 6, 0, lateness_ns, 80_000,
         )  # fmt: skip
         ring.publish()
     ring.discard()

@@ -18,7 +18,7 @@ from rigd.touch import (
     observed_beam,
     signatures,
 )
-from rigd.touch._innovations import _fit
+from rigd.touch._innovations import _fit_filter
 
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 DAMPING = Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
@@ -111,7 +111,7 @@ def detection(model, readings):
     ],
 )
 def test_the_filter_follows_the_exact_response(sensor_filter):
-    fitted = _fit(BEAM, DAMPING, RATE_HZ, 1e-5, 4e-4, sensor_filter)
+    fitted = _fit_filter(BEAM, DAMPING, RATE_HZ, 1e-5, 4e-4, sensor_filter)
     for frequency_hz in (0.5, 2.0, 8.0, 30.0, 50.0):
         s = 2j * pi * frequency_hz
         z = np.exp(s / RATE_HZ)

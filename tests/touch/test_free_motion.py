@@ -15,9 +15,9 @@ def motions(model, struck):
     beam = FreeBeam(model, x_m, record.rate_hz, record.angle_rad.size)
     some = [0, 70, -1]
     quiet = record.detected - 13
-    alone = beam.at(x_m[some])
+    alone = beam.at_positions(x_m[some])
     of_many = beam.motion(record, quiet, quiet)
-    return some, of_many, alone.motion(record, quiet, quiet, of_many.turned), record
+    return some, of_many, alone.motion(record, quiet, quiet, of_many.angle_transform), record
 
 
 def test_places_between_the_nodes_move_as_they_do_alone(motions):

@@ -9,12 +9,12 @@ from touch_records import DAMPED, LINK
 from rigd.beam import Damping, PointForceGrid, clamped_free_eigenvalues, mode_shape
 from rigd.touch import SensorFilter
 from rigd.touch._kernels import (
-    Hat,
+    ForcePulse,
     LaplaceLine,
     chebyshev_nodes,
     contact_kernels,
     cross_kernels,
-    lagrange,
+    cubic_weights,
     positions,
 )
 
@@ -60,11 +60,11 @@ def test_displacement_is_the_sum_of_the_modes(at_point):
 def test_kernels_between_places_are_those_of_the_exact_model():
     x, other = np.array([0.1, 0.3, 0.8]), np.array([0.25, 0.62, 0.7])
     crossing = cross_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), 2 * STEP_S, 400)
-    told = crossing.between(x, other, 300)
-    hat = Hat(2 * STEP_S, 400)
+    told = crossing.between_positions(x, other, 300)
+    hat = ForcePulse(2 * STEP_S, 400)
     exact = hat.kernels(PointForceGrid(hat.line.s, LINK, DAMPED).per_force(x, other).T)
     assert told == pytest.approx(exact[:, :300], abs=1e-3 * np.abs(exact).max())
-    assert crossing.between(other, x, 300) == pytest.approx(told)
+    assert crossing.between_positions(other, x, 300) == pytest.approx(told)
 
 
 def test_a_force_that_stays_is_carried_by_the_root_at_last():
@@ -78,7 +78,7 @@ def test_a_force_that_stays_is_carried_by_the_root_at_last():
 
 
 def test_between_places_kernels_are_interpolated(kernels, at_point):
-    between = kernels.at(np.array([0.62]), 400)
+    between = kernels.at_positions(np.array([0.62]), 400)
     for name in ("displacement", "torque", "shear"):
         exact = getattr(at_point, name)
         assert np.abs(getattr(between, name) - exact).max() < 1e-4 * np.abs(exact).max()
@@ -86,7 +86,7 @@ def test_between_places_kernels_are_interpolated(kernels, at_point):
 
 def test_wider_hats_are_sums_of_narrow_ones(at_point):
     wide = contact_kernels(LINK, DAMPED, np.array([0.62]), 4 * STEP_S, 90)
-    summed = at_point.coarser(4, 90)
+    summed = at_point.with_wider_pulses(4, 90)
     for name in ("displacement", "torque", "shear"):
         exact = getattr(wide, name)
         assert np.abs(getattr(summed, name) - exact).max() < 2e-4 * np.abs(exact).max()
@@ -96,13 +96,13 @@ def test_a_line_gives_back_what_it_was_given():
     line = LaplaceLine(4096, 1e-3)
     t = np.arange(1000) * 1e-3
     wave = np.exp(-((t - 0.5) ** 2) / 2e-3)
-    assert line.in_time(line.transformed(wave), 1000) == pytest.approx(wave, abs=1e-6)
+    assert line.to_time(line.to_laplace(wave), 1000) == pytest.approx(wave, abs=1e-6)
 
 
 def test_cubic_interpolation_is_exact_for_cubics():
     grid = np.linspace(0.1, 0.9, 9)
     at = np.array([0.1, 0.23, 0.5, 0.88, 0.9])
-    first, weights = lagrange(at, grid)
+    first, weights = cubic_weights(at, grid)
     values = sum(weights[:, i] * (grid[first + i] ** 3 - grid[first + i]) for i in range(4))
     assert values == pytest.approx(at**3 - at)
 

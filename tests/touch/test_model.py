@@ -66,15 +66,17 @@ def test_what_a_structure_does_not_have_is_absent(written):
 
 def test_changes_leave_the_rest():
     model = TouchModel.assumed(Beam(LENGTH_M, 4.7e-3, 0.09), Damping(zeta=7e-5, gamma=0.05))
-    stiffer = model.changed("bending_stiffness_n_m2", 0.009)
+    stiffer = model.with_changed_parameter("bending_stiffness_n_m2", 0.009)
     assert stiffer.beam.bending_stiffness_n_m2 == pytest.approx(0.099)
     assert stiffer.beam.density_over_stiffness == pytest.approx(model.beam.density_over_stiffness)
-    heavier = model.changed("density_over_stiffness", 0.01 * model.beam.density_over_stiffness)
+    heavier = model.with_changed_parameter(
+        "density_over_stiffness", 0.01 * model.beam.density_over_stiffness
+    )
     assert heavier.beam.density_kg_per_m == pytest.approx(1.01 * 4.7e-3)
     assert heavier.beam.bending_stiffness_n_m2 == 0.09
-    assert model.changed("zeta", -1.0).damping.zeta == 0.0
-    assert model.changed("alpha", 0.2).damping.alpha == pytest.approx(1.2)
-    assert model.changed("delay_s", 1e-4).torque_delay_s == pytest.approx(1e-4)
+    assert model.with_changed_parameter("zeta", -1.0).damping.zeta == 0.0
+    assert model.with_changed_parameter("alpha", 0.2).damping.alpha == pytest.approx(1.2)
+    assert model.with_changed_parameter("delay_s", 1e-4).torque_delay_s == pytest.approx(1e-4)
     assert set(model.std) == {"bending_stiffness_n_m2", "density_over_stiffness", "zeta", "gamma"}
     with pytest.raises(ValueError, match="is not one of"):
-        model.changed("length", 0.1)
+        model.with_changed_parameter("length", 0.1)

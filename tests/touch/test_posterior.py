@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from rigd.touch._posterior import sampled
+from rigd.touch._posterior import sample_posterior
 
 BOUNDS = (np.array([-20.0, -20.0]), np.array([20.0, 20.0]))
 
 
 def drawn(chi2_of, centres, width):
-    return sampled(
+    return sample_posterior(
         chi2_of,
         np.array(centres, dtype=float),
         np.broadcast_to(width**2 * np.eye(2), (len(centres), 2, 2)),
@@ -17,8 +17,8 @@ def drawn(chi2_of, centres, width):
         scale=1.0,
         count=400,
         rounds=6,
-        enough=1500.0,
-        smallest=np.array([0.01, 0.01]),
+        enough_samples=1500.0,
+        smallest_std=np.array([0.01, 0.01]),
     )
 
 
@@ -30,7 +30,7 @@ def test_a_normal_distribution_has_its_moments_and_quantiles():
     assert posterior.std(0) == pytest.approx(0.5, rel=0.1)
     assert posterior.std(1) == pytest.approx(2.0, rel=0.1)
     assert posterior.quantiles(0, (0.025, 0.975)) == pytest.approx([0.02, 1.98], abs=0.15)
-    assert posterior.effective > 300
+    assert posterior.effective_samples > 300
 
 
 def test_two_minima_share_the_weight_by_their_depth():
