@@ -40,7 +40,7 @@ TRAIL: Final = f"{ANTENNA}/trail"
 LABEL: Final = f"{ANTENNA}/label"
 TOUCH: Final = f"{ANTENNA}/touch"
 
-FACTOR: Final = 2.0
+ENLARGEMENT: Final = 2.0
 """Factor by which the motor angle and the beam's deflection are enlarged in the drawing.
 
 The reference paper's chirp turns the motor by 25 mrad, and at the first resonance the tip swings by
@@ -266,8 +266,8 @@ def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
     x = np.linspace(0.0, 1.0, deflection.size)
     drawn = np.zeros((2, x.size, 3), dtype=np.float32)
     drawn[:, :, 0] = x
-    drawn[0, :, 1] = FACTOR * angle_rad * x
-    drawn[1, :, 1] = FACTOR * (angle_rad * x + deflection)
+    drawn[0, :, 1] = ENLARGEMENT * angle_rad * x
+    drawn[1, :, 1] = ENLARGEMENT * (angle_rad * x + deflection)
     return drawn
 
 
@@ -289,7 +289,7 @@ def label(tip_m: float, *, to_scale: bool = False) -> str:
     """Return the label with the tip's deflection in mm, rounded to two digits or to 0.1 mm."""
     tip_mm = 1e3 * tip_m
     text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
-    return f"tip deflection ± {text} mm, drawn {'to scale' if to_scale else f'× {FACTOR:g}'}"
+    return f"tip deflection ± {text} mm, drawn {'to scale' if to_scale else f'× {ENLARGEMENT:g}'}"
 
 
 def touch_label(touch: Mapping[str, Any]) -> str:

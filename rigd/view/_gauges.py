@@ -12,7 +12,7 @@ from rigd.session.layout import WRENCH_FIELDS, Status
 
 Records = npt.NDArray[Any]
 
-NEAR: Final = 0.8
+WARNING_FRACTION: Final = 0.8
 """Fraction of a limit above which a gauge turns orange, as for the interlocks' warnings."""
 
 

@@ -392,11 +392,11 @@ def _log() -> "rrb.TextLogView":
 
 # Axis labels
 
-LEAST_SPACING: Final = 24.0
+LEAST_LABEL_SPACING_PT: Final = 24.0
 """Least distance between axis labels, in points.
 
 Rerun omits labels nearer than 20 points, and fades those at 21."""
-MARGINS: Final = 1.1
+AXIS_TO_RANGE_RATIO: Final = 1.1
 """Ratio of an axis's length to the range of the plotted values: Rerun leaves a margin at both ends.
 """
 
@@ -431,7 +431,7 @@ class Scale:
         ]
 
     def frame(self) -> list["Drawing"]:
-        """Return the first drawings: a view reports missing components as errors."""
+        """Return functions that send an empty first point, without which Rerun reports an error."""
         nothing = {axis.view.ticks: np.array([[np.nan]]) for axis in self._axes}
         start_ns = np.array([0])
         return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=nothing)]
@@ -474,7 +474,7 @@ class Scale:
 
 
 class _AxisExtremes:
-    """Extremes within the window of one view, and the last points that were added."""
+    """Extremes of a plot within its time window, and the invisible points added last."""
 
     def __init__(self, view: "TimeView") -> None:
         self.view = view
@@ -505,7 +505,7 @@ class _AxisExtremes:
         return new_points
 
     def _must_send(self, last_point: _CurvePoint | None, value: float, t_ns: int) -> bool:
-        """Return whether a value is missing because the last one differs or leaves the window."""
+        """Return whether to send an invisible point: its value changes, or it leaves the window."""
         return (
             last_point is None
             or last_point[1] != value
@@ -570,7 +570,7 @@ def missing_ticks(
             end if tick is None else tick for end, tick in zip(ends, ticks, strict=True)
         )
         return below if below < low else None, above if above > high else None
-    spacing = MARGINS * (high - low) / height * LEAST_SPACING
+    spacing = AXIS_TO_RANGE_RATIO * (high - low) / height * LEAST_LABEL_SPACING_PT
     # Rerun shows a single value with one unit on either side.
     if not _LEAST_LABEL_SPACING < spacing < _MOST_LABEL_SPACING:
         return None, None

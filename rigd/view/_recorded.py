@@ -118,7 +118,7 @@ _PROFILE_KEYS_OF_LIMITS: Final = {
 
 
 def _stated_limits(profile: bytes) -> dict[str, float]:
-    """Return the usable limits in a profile of any version."""
+    """Return the positive limits that a profile of any version states, by gauge name."""
     try:
         table = parse_toml(decode_text(profile))
     except (UnicodeDecodeError, DocumentError):
