@@ -1,7 +1,4 @@
-"""Tables of a campaign for the terminal, its page, CSV and JSON: which there are, and the lists.
-
-Lists are those of the sessions and of the predictions.
-"""
+"""Tables of a campaign for terminal, page, CSV and JSON: which are shown, and lists of sessions."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ import numpy as np
 
 from analysis.campaigns import by_model
 from analysis.campaigns.sentences import label, lost_trials
-from analysis.report._paper_tables import NAMES, paper_tables
+from analysis.report._paper_tables import FIT_NAME_COLUMNS, paper_tables
 from analysis.report._pooled_tables import (
     homogeneity_table,
     likely_estimates,
@@ -33,19 +30,19 @@ if TYPE_CHECKING:
 
 def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     """Return the tables of the whole records for terminal and page, the most important first."""
-    found = campaign.homogeneity
+    homogeneity = campaign.homogeneity
     estimates = likely_estimates(campaign)
-    scatter = [homogeneity_table(campaign)] if found.quantities else []
+    scatter_tables = [homogeneity_table(campaign)] if homogeneity.quantities else []
     return (
         session_list_table(campaign),
-        *([specimens_table(campaign)] if len(found.specimens) > 1 else []),
-        *(scatter if found.mixed else []),
+        *([specimens_table(campaign)] if len(homogeneity.specimens) > 1 else []),
+        *(scatter_tables if homogeneity.mixed else []),
         *headline_tables(campaign),
         *([uniform_beam_table(campaign)] if campaign.modal else []),
         *(pooled_table(campaign, each) for each in estimates[1:]),
         *([structures_table(campaign)] if campaign.structures else []),
         *([validation_summary(campaign)] if campaign.validation else []),
-        *([] if found.mixed else scatter),
+        *([] if homogeneity.mixed else scatter_tables),
     )
 
 
@@ -55,18 +52,18 @@ def main_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 
 def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
-    """Return the main tables: modes, parameters with a tolerance of the geometry, pooled fit."""
-    made = (
+    """Return the tables of modes, of parameters with a tolerance, and of the pooled fit."""
+    candidates = (
         modes_table(campaign),
         tolerant_table(campaign),
         *(pooled_table(campaign, each) for each in likely_estimates(campaign)[:1]),
     )
-    return tuple(table for table in made if table.rows)
+    return tuple(table for table in candidates if table.rows)
 
 
 def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Table]:
-    """Return every table of the files by its name, without empty ones."""
-    made = (
+    """Return the tables that are written to files, by name, without empty ones."""
+    candidates = (
         *paper_tables(campaign, with_paper=with_paper),
         session_list_table(campaign),
         sessions_welch_table(campaign),
@@ -80,62 +77,68 @@ def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[st
         modes_table(campaign),
         validation_table(campaign),
     )
-    return {table.name: table for table in made if table.rows}
+    return {table.name: table for table in candidates if table.rows}
 
 
 def session_list_table(campaign: CampaignResult) -> Table:
-    """Return the table of all files, excluded ones last."""
+    """Return the table of all files with the metadata that they state, excluded files last."""
 
     def text_cell(text: str) -> Cell:
         return Cell(text, text or ABSENT)
 
     headings = ("file", "recorded (UTC)", "specimen", "operator", "note")
     keys = ("file", "start_utc", "specimen", "operator", "note")
-    stated = (
-        *(each.experiment for each in campaign.sessions),
-        *(each.experiment for each in campaign.failures),
+    experiments = (
+        *(session.experiment for session in campaign.sessions),
+        *(session.experiment for session in campaign.failures),
     )
-    added = dict.fromkeys(name for its in stated if its for name in its.added)
+    added_names = dict.fromkeys(
+        name for experiment in experiments if experiment for name in experiment.added
+    )
     return Table.of(
         "session_list",
         "Sessions, as their files state them",
         (
             *(Column(heading, key, WORDS) for heading, key in zip(headings, keys, strict=True)),
-            *map(_added_column, added),
+            *map(_added_column, added_names),
             Column("used", "used", WORDS),
         ),
         (
             (
-                Cell(str(each.path), each.name),
-                text_cell(its.start_utc if its else ""),
-                text_cell(its.label if its else ""),
-                text_cell(its.operator if its else ""),
-                text_cell(its.note if its else ""),
-                *(_added_cell(its.added.get(name) if its else None) for name in added),
+                Cell(str(session.path), session.name),
+                text_cell(experiment.start_utc if experiment else ""),
+                text_cell(experiment.label if experiment else ""),
+                text_cell(experiment.operator if experiment else ""),
+                text_cell(experiment.note if experiment else ""),
+                *(
+                    _added_cell(experiment.added.get(name) if experiment else None)
+                    for name in added_names
+                ),
                 used,
             )
             for used, group in ((True, campaign.sessions), (False, campaign.failures))
-            for each in group
-            for its in (each.experiment,)
+            for session in group
+            for experiment in (session.experiment,)
         ),
     )
 
 
 def _added_column(name: str) -> Column:
-    """Column of metadata that users added, with the unit that its name ends in."""
+    """Return the column of metadata that users added, with the unit from its name."""
     unit = unit_of(name)
-    words = name.removesuffix(suffix_of(name)).replace("_", " ")
-    return Column(f"{words} ({unit})" if unit else words, f"{META_PREFIX}{name}", WORDS)
+    heading = name.removesuffix(suffix_of(name)).replace("_", " ")
+    return Column(f"{heading} ({unit})" if unit else heading, f"{META_PREFIX}{name}", WORDS)
 
 
 def _added_cell(value: float | str | None) -> Cell:
+    """Return the cell of a metadata value that users added; a dash if there is none."""
     if value is None:
         return Cell(None, ABSENT)
     return Cell(value, value if isinstance(value, str) else f"{value:g}")
 
 
 def sessions_welch_table(campaign: CampaignResult) -> Table:
-    """Every session's Welch fits, and the distance of the nominal models."""
+    """Return every session's Welch fits, and its distance from the nominal models."""
     rows = [
         {
             "file": str(session.path),
@@ -149,11 +152,11 @@ def sessions_welch_table(campaign: CampaignResult) -> Table:
         for index, session in enumerate(campaign.sessions)
         for fit, model in zip(session.welch_fits, campaign.nominal, strict=True)
     ]
-    return _for_programs("sessions_welch", rows)
+    return _file_only_table("sessions_welch", rows)
 
 
 def sessions_record_table(campaign: CampaignResult) -> Table:
-    """Every session's whole-record fits."""
+    """Return every session's whole-record fits."""
     rows = [
         {
             "file": str(session.path),
@@ -171,22 +174,22 @@ def sessions_record_table(campaign: CampaignResult) -> Table:
         for session in campaign.sessions
         for each in session.record_estimates
     ]
-    return _for_programs("sessions_record", rows)
+    return _file_only_table("sessions_record", rows)
 
 
 def _std_key(parameter: str) -> str:
-    """Return the name of a parameter's standard deviation, with the unit last: ``delay_std_s``."""
+    """Return the key of a parameter's standard deviation, with the unit last: ``delay_std_s``."""
     unit = suffix_of(parameter)
     return f"{parameter.removesuffix(unit)}_std{unit}"
 
 
-def _for_programs(name: str, rows: list[dict[str, Any]]) -> Table:
-    """Make a table of files only."""
+def _file_only_table(name: str, rows: list[dict[str, Any]]) -> Table:
+    """Return a table that is written to files only."""
     return Table(name, "", (), tuple(rows))
 
 
 def validation_table(campaign: CampaignResult) -> Table:
-    """Return the errors of each session predicted from the others, then the lost trials."""
+    """Return each session's prediction errors from the other sessions, and the lost trials."""
     rows: list[dict[str, Any]] = [
         {
             "file": str(each.path),
@@ -201,23 +204,27 @@ def validation_table(campaign: CampaignResult) -> Table:
         for each in campaign.validation
     ]
     rows += [{"file": str(each.path), "lost": each.reason} for each in campaign.lost_trials]
-    return _for_programs("validation", rows)
+    return _file_only_table("validation", rows)
 
 
 def validation_summary(campaign: CampaignResult) -> Table:
-    """Fit, and leave-one-out error, of each model over the sessions, the best model first."""
+    """Return the fit and the leave-one-out error of each model, the best model first."""
     rows: list[Row] = []
     for method, name, weighting, errors in by_model(campaign.validation):
-        values = [each.error for each in errors]
-        own = [each.own_error for each in errors if each.own_error is not None]
+        values = [session_error.error for session_error in errors]
+        own_errors = [
+            session_error.own_error
+            for session_error in errors
+            if session_error.own_error is not None
+        ]
         rows.append(
             {
                 "method": method,
                 "type": name,
                 "weighting": weighting or "",
                 "sessions": f"{len(values)} of {campaign.trials}",
-                "nrmse_percent": 100 * (1 - float(np.mean(own))) if own else None,
-                "own_error": float(np.mean(own)) if own else None,
+                "nrmse_percent": 100 * (1 - float(np.mean(own_errors))) if own_errors else None,
+                "own_error": float(np.mean(own_errors)) if own_errors else None,
                 "error": float(np.mean(values)),
                 "worst": max(values),
             }
@@ -226,7 +233,7 @@ def validation_summary(campaign: CampaignResult) -> Table:
         "validation",
         "Leave-one-out validation: rms error of the torque, mean over the sessions",
         (
-            Column("method", "method", WORDS), *NAMES, Column("sessions", "sessions"),
+            Column("method", "method", WORDS), *FIT_NAME_COLUMNS, Column("sessions", "sessions"),
             Column("fit (NRMSE, %)", "nrmse_percent", ".2f"),
             Column("in-sample error (%)", "own_error", ".2f", 100.0),
             Column("leave-one-out error (%)", "error", ".2f", 100.0),
@@ -242,40 +249,40 @@ def validation_summary(campaign: CampaignResult) -> Table:
 
 
 def sessions_table(campaign: CampaignResult) -> Table:
-    """Return the table of sessions with their own verdicts, then those left out."""
+    """Return the verdict on each session by itself, then the files that were left out."""
     leading = campaign.homogeneity.leading
     groups = leading.groups if leading else ()
     group_of = {name: f"{index}" for index, names in enumerate(groups, 1) for name in names}
     name = campaign.headline.name if campaign.headline else None
-    tried = {
-        each.path: each
-        for each in campaign.validation
-        if (each.method, each.name) == ("record", name)
+    trials_by_path = {
+        item.path: item
+        for item in campaign.validation
+        if (item.method, item.name) == ("record", name)
     }
 
     def row(session: SessionAnalysis) -> tuple[Entry, ...]:
-        verdict, trial = session.verdict, tried.get(session.path)
-        own = trial.own_error if trial else None
-        found = [each.kind for each in verdict.findings] if verdict else []
+        verdict, trial = session.verdict, trials_by_path.get(session.path)
+        own_error = trial.own_error if trial else None
+        finding_kinds = [item.kind for item in verdict.findings] if verdict else []
         return (
             session.name,
             f"type {session.selected}" if session.selected else ABSENT,
-            None if own is None else 100 * (1 - own),
+            None if own_error is None else 100 * (1 - own_error),
             trial.error if trial else None,
             ABSENT if verdict is None else "noise" if verdict.adequate else "more than noise",
-            ", ".join(dict.fromkeys(found)) or ABSENT,
+            ", ".join(dict.fromkeys(finding_kinds)) or ABSENT,
         )
 
     left_out: list[tuple[Entry, ...]] = [
-        (each.name, "left out", None, None, ABSENT, each.message) for each in campaign.failures
+        (item.name, "left out", None, None, ABSENT, item.message) for item in campaign.failures
     ]
     return Table.of(
         "sessions",
         "Sessions, each by itself",
         (
             Column("file", "file", WORDS), Column("selects", "selected", WORDS),
-            Column("fit (NRMSE, %)" if tried else "", "nrmse_percent", ".2f"),
-            Column("leave-one-out error (%)" if tried else "", "error", ".2f", 100.0),
+            Column("fit (NRMSE, %)" if trials_by_path else "", "nrmse_percent", ".2f"),
+            Column("leave-one-out error (%)" if trials_by_path else "", "error", ".2f", 100.0),
             Column("residual", "left", WORDS),
             Column("other effects", "findings", WORDS),
             Column("group" if groups else "", "group", WORDS),
@@ -285,7 +292,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
             for cells in (*map(row, campaign.sessions), *left_out)
         ),
         (
-            *((f"Fit and error: of type {name}.",) if tried else ()),
+            *((f"Fit and error: of type {name}.",) if trials_by_path else ()),
             *((f"Group: by the {label(leading.quantity)[0]}.",) if leading and groups else ()),
         ),
     )  # fmt: skip

@@ -1,13 +1,12 @@
 """Figures of a whole record: frequency response, uniformity, loss factor, residual.
 
-Loss factor against frequency with its 95 % band: the damping as a function, not as parameters.
+The loss factor over frequency, with its 95 % band, shows the damping as a function. The parameters
+of a fractional damping are correlated and hard to compare, but their joint effect at one frequency
+is not.
 
-The parameters of a fractional damping are correlated and hard to compare; their combined effect at
-one frequency is neither.
-
-Residual of the torque: its spectrum, whether it is white, and when it is large. A correct model
-leaves noise. A residual at a resonance, or while the sweep passes one, shows a deficiency of the
-model.
+The residual of the torque is shown by its spectrum, by a test for whiteness and over time. A
+correct model leaves noise. A residual at a resonance, or while the sweep passes a resonance, shows
+a deficiency of the model.
 """
 
 from __future__ import annotations
@@ -43,10 +42,10 @@ if TYPE_CHECKING:
     from rigd.spectral import FrequencyResponse
 
 
-_LABEL_IN: Final = 0.15
-"""Height of a label with the space that it needs."""
-_LABELS_CLOSE: Final = 1 / math.log10(2.0)
-"""Labels for which a decade must have room to be labelled at 1, 2 and 5."""
+_LABEL_HEIGHT_IN: Final = 0.15
+"""Height of a tick label with the space around it, in inches."""
+_LEAST_LABELS_PER_DECADE: Final = 1 / math.log10(2.0)
+"""Number of labels per decade for which there must be room, so that 1, 2 and 5 are labelled."""
 
 
 def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
@@ -57,55 +56,70 @@ def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
         axes.yaxis.set_major_locator(MaxNLocator(4))
     else:
         height_in = axes.bbox.height / axes.figure.dpi
-        room = height_in / (_LABEL_IN * math.log10(high / low))
-        digits = (1.0, 2.0, 5.0) if high < 1000 * low and room > _LABELS_CLOSE else (1.0,)
+        labels_per_decade = height_in / (_LABEL_HEIGHT_IN * math.log10(high / low))
+        digits = (
+            (1.0, 2.0, 5.0)
+            if high < 1000 * low and labels_per_decade > _LEAST_LABELS_PER_DECADE
+            else (1.0,)
+        )
         axes.yaxis.set_major_locator(LogLocator(subs=digits, numticks=12))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _position: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-_BAND: Final = "#8CC4E8"
-_PALE: Final = "#BDBDBD"
-_POINTS: Final = 900
+_BAND_COLOR: Final = "#8CC4E8"
+"""Colour of the 95 % band of a response."""
+_MEASURED_COLOR: Final = "#BDBDBD"
+"""Colour of the measured response behind the model."""
+_RESPONSE_POINTS: Final = 900
+"""Number of columns or points of the measured response in the panel of the whole band."""
 _DETAIL_POINTS: Final = 161
-_DETAIL_WIDTHS: Final = 6.0
-"""Half-widths of a resonance that its detail shows to either side."""
+"""Number of points of the model's response in the detail of a mode."""
+_DETAIL_TO_HALF_WIDTH: Final = 6.0
+"""Range of a mode's detail to either side of the mode, relative to the resonance's half-width."""
 
-_NARROWEST: Final = 0.006
-"""Least half of a detail, relative to the mode's frequency."""
+_LEAST_RELATIVE_DETAIL: Final = 0.006
+"""Least range of a mode's detail to either side of the mode, relative to the mode's frequency."""
 
 
 def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
-    """Draw magnitude, phase, the band's width, and a detail of every mode.
+    """Draw magnitude, phase and relative width of the 95 % band, and a detail of every mode.
 
     Parameters
     ----------
     measured : FrequencyResponse
-        Empirical transfer function estimate, with the delay between the channels in it.
+        Empirical transfer function estimate, which includes the delay between the channels.
     model : ShownModel
     """
     first_hz, last_hz = float(measured.frequency_hz[0]), float(measured.frequency_hz[-1])
-    shown = [mode for mode in model.modes if first_hz < mode.frequency_hz < last_hz]
-    grid_hz = dense_grid(first_hz, last_hz, [mode.frequency_hz for mode in shown])
+    visible_modes = [mode for mode in model.modes if first_hz < mode.frequency_hz < last_hz]
+    grid_hz = dense_grid(first_hz, last_hz, [mode.frequency_hz for mode in visible_modes])
     band = model.band(grid_hz)
-    seen = measured.response * np.exp(2j * np.pi * model.delay_s * measured.frequency_hz)
+    measured_without_delay = measured.response * np.exp(
+        2j * np.pi * model.delay_s * measured.frequency_hz
+    )
     figure = style.new_figure(9.0, 6.4)
-    count = max(len(shown), 1)
+    count = max(len(visible_modes), 1)
     grid = figure.add_gridspec(
         2, count, left=0.085, right=0.985, top=0.95, bottom=0.075, hspace=0.27, wspace=0.22,
         height_ratios=(3.4, 1.0),
     )  # fmt: skip
     whole = grid[0, :].subgridspec(3, 1, height_ratios=(2.4, 1.0, 0.8), hspace=0.1)
     magnitude, phase, width = (figure.add_subplot(whole[row]) for row in range(3))
-    _magnitude(magnitude, measured.frequency_hz, seen, band, _PALE)
+    _draw_magnitude(magnitude, measured.frequency_hz, measured_without_delay, band, _MEASURED_COLOR)
     modelled_db = magnitude_db(band.response)
-    bottom = min(
-        float(np.quantile(magnitude_db(seen), 0.005)), float(np.quantile(modelled_db, 0.05))
+    lowest_db = min(
+        float(np.quantile(magnitude_db(measured_without_delay), 0.005)),
+        float(np.quantile(modelled_db, 0.05)),
     )
-    magnitude.set_ylim(bottom - 5, float(modelled_db.max()) + 5)
-    few = style.spread(measured.frequency_hz, _POINTS)
+    magnitude.set_ylim(lowest_db - 5, float(modelled_db.max()) + 5)
+    point_indices = style.spread(measured.frequency_hz, _RESPONSE_POINTS)
     style.dots(
-        phase, measured.frequency_hz[few], phase_deg(seen[few]), size_pt=2.0, color=style.GREY
+        phase,
+        measured.frequency_hz[point_indices],
+        phase_deg(measured_without_delay[point_indices]),
+        size_pt=2.0,
+        color=style.GREY,
     )
     phase.plot(band.frequency_hz, phase_deg(band.response), color=style.BLUE)
     style.response_axes(magnitude, phase)
@@ -116,14 +130,24 @@ def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
     width.set_xlabel("Frequency (Hz)", labelpad=1)
     for axes in (magnitude, phase, width):
         style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width)
-    for column, mode in enumerate(shown):
+    for column, mode in enumerate(visible_modes):
         detail = figure.add_subplot(grid[1, column])
-        limits = _detail(mode, measured.frequency_hz)
-        near = (measured.frequency_hz >= limits[0]) & (measured.frequency_hz <= limits[1])
-        close = model.band(np.linspace(*limits, _DETAIL_POINTS))
-        _magnitude(detail, measured.frequency_hz[near], seen[near], close, style.GREY)
+        limits = _detail_range_hz(mode, measured.frequency_hz)
+        in_detail = (measured.frequency_hz >= limits[0]) & (measured.frequency_hz <= limits[1])
+        detail_band = model.band(np.linspace(*limits, _DETAIL_POINTS))
+        _draw_magnitude(
+            detail,
+            measured.frequency_hz[in_detail],
+            measured_without_delay[in_detail],
+            detail_band,
+            style.GREY,
+        )
         detail.set_xlim(limits)
-        detail.set_ylim(style.limits(magnitude_db(seen[near]), magnitude_db(close.response)))
+        detail.set_ylim(
+            style.limits(
+                magnitude_db(measured_without_delay[in_detail]), magnitude_db(detail_band.response)
+            )
+        )
         detail.set_title(f"Mode {mode.number}", fontweight="normal", fontsize=8.5)
         detail.set_facecolor("#FCFAF4")
         detail.set_xlabel("Frequency (Hz)", labelpad=1)
@@ -136,21 +160,21 @@ def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
     return figure
 
 
-def _magnitude(
+def _draw_magnitude(
     axes: Axes,
     frequency_hz: NDArray[np.float64],
     measured: NDArray[np.complex128],
     band: ResponseBand,
     color: str,
 ) -> None:
-    """Draw the measured magnitude, the model's over it, and its band."""
+    """Draw the measured magnitude, the model's magnitude over it, and the model's 95 % band."""
     axes.plot(
-        *style.envelope(frequency_hz, magnitude_db(measured), _POINTS, logarithmic=True),
+        *style.envelope(frequency_hz, magnitude_db(measured), _RESPONSE_POINTS, logarithmic=True),
         color=color, linewidth=0.8, label="measured",
     )  # fmt: skip
-    low, high = (magnitude_db(each.astype(complex)) for each in band.magnitude_limits())
+    low, high = (magnitude_db(limit.astype(complex)) for limit in band.magnitude_limits())
     axes.fill_between(
-        band.frequency_hz, low, high, color=_BAND, linewidth=0, alpha=0.6,
+        band.frequency_hz, low, high, color=_BAND_COLOR, linewidth=0, alpha=0.6,
         label="95 % band of the model",
     )  # fmt: skip
     axes.plot(
@@ -159,23 +183,27 @@ def _magnitude(
     )  # fmt: skip
 
 
-def _detail(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the range shown of a mode, at least one bin of a short record."""
+def _detail_range_hz(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the frequency range of a mode's detail, which includes at least one bin."""
     spacing_hz = float(np.diff(frequency_hz).max())
-    relative_width = max(_DETAIL_WIDTHS * mode.damping_ratio, _NARROWEST)
+    relative_width = max(_DETAIL_TO_HALF_WIDTH * mode.damping_ratio, _LEAST_RELATIVE_DETAIL)
     half_hz = max(relative_width * mode.frequency_hz, spacing_hz)
     lowest_hz = float(frequency_hz[0]) / 2
     return max(mode.frequency_hz - half_hz, lowest_hz), mode.frequency_hz + half_hz
 
 
 _LOSS_POINTS: Final = 400
+"""Number of frequencies at which the loss factors are drawn."""
 _CURVE_STYLES: Final = {
     "internal (material)": (style.VERMILION, (0, (4, 2))),
     "external (surroundings)": (style.GREEN, (0, (1, 1.2))),
     "total": (style.BLUE, "-"),
 }
-_SPAN: Final = 300.0
-"""Largest ratio of the axis's ends: still smaller values do not matter for the total."""
+"""Colour and dash of each loss factor's curve by its label."""
+_MOST_LOSS_AXIS_RATIO: Final = 300.0
+"""Largest ratio of the ends of the loss factor's axis.
+
+Smaller loss factors do not matter for the total."""
 
 
 def loss_figure(
@@ -192,40 +220,44 @@ def loss_figure(
     Parameters
     ----------
     modes : sequence of ModeEstimate
-        Those that are drawn.
+        Modes to draw as points.
     beam : Estimate or None
-        Beam of the curves; None: no beam explains the losses.
+        Beam whose loss factors are drawn; None: no beam explains the losses, and no curve is drawn.
     axis_hz : tuple of float
-        First and last frequency of the axis, positive.
+        Lowest and highest frequency of the axis, positive.
     supported_hz : tuple of float or None
-        Band in which the data support the curves: there are none beyond. None: nowhere.
+        Frequency band in which the data support the curves. No curve is drawn outside it. None: the
+        data nowhere support the curves.
     withheld : collection of str
-        Orders that the data do not support: then the total is not split into its parts.
+        Orders that the data do not support. If there is one, the total is not split into its parts.
     doubtful : collection of int
-        Modes whose damping ratio carries a flag: their points are hollow.
+        Numbers of the modes whose damping ratio is flagged. Their points are hollow.
     """
     figure = style.new_figure(9.0, 3.6)
     axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))
-    drawn = _curves(axes, beam, axis_hz, supported_hz, withheld)
+    drawn_values = _draw_loss_factors(axes, beam, axis_hz, supported_hz, withheld)
     for label, filled in (("modes", True), ("modes, doubtful", False)):
-        few = [mode for mode in modes if (mode.number not in doubtful) is filled]
-        if few:
+        drawn_modes = [mode for mode in modes if (mode.number not in doubtful) is filled]
+        if drawn_modes:
             axes.errorbar(
-                [mode.frequency_hz for mode in few], [2 * mode.damping_ratio for mode in few],
-                [2 * NORMAL_95 * mode.damping_ratio_std for mode in few],
+                [mode.frequency_hz for mode in drawn_modes],
+                [2 * mode.damping_ratio for mode in drawn_modes],
+                [2 * NORMAL_95 * mode.damping_ratio_std for mode in drawn_modes],
                 fmt="o", color=style.INK, markersize=4.0, capsize=3.0, elinewidth=1.0,
                 markerfacecolor=style.INK if filled else "white", label=label, zorder=5,
             )  # fmt: skip
     modes_hz = [mode.frequency_hz for mode in modes]
-    beyond = [] if beam is None else _beyond(axis_hz, supported_hz, modes_hz)
-    for edge_hz, end_hz in beyond:
+    grey_bands_hz = [] if beam is None else _unsupported_ranges_hz(axis_hz, supported_hz, modes_hz)
+    for edge_hz, end_hz in grey_bands_hz:
         axes.axvspan(edge_hz, end_hz, color="#F4F4F4", linewidth=0, zorder=0)
     style.frequency_axis(axes, axis_hz)
     points = [2 * mode.damping_ratio for mode in modes]
     # Of curves what they mostly are: a total may rise without bound towards an end.
-    top = max([*points, *(float(np.nanquantile(value, 0.98)) for value in drawn)], default=1.0)
-    low = min([*points, *(float(np.nanmin(value)) for value in drawn)], default=top)
-    plain_logarithmic(axes, max(low / 2, 3 * top / _SPAN), 3 * top)
+    top = max(
+        [*points, *(float(np.nanquantile(value, 0.98)) for value in drawn_values)], default=1.0
+    )
+    low = min([*points, *(float(np.nanmin(value)) for value in drawn_values)], default=top)
+    plain_logarithmic(axes, max(low / 2, 3 * top / _MOST_LOSS_AXIS_RATIO), 3 * top)
     axes.set_ylabel("Loss factor (1)")
     axes.set_xlabel("Frequency (Hz)", labelpad=1)
     handles, labels = axes.get_legend_handles_labels()
@@ -237,14 +269,14 @@ def loss_figure(
     return figure
 
 
-def _curves(
+def _draw_loss_factors(
     axes: Axes,
     beam: Estimate | None,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     withheld: Collection[str],
 ) -> list[NDArray[np.float64]]:
-    """Draw the loss factors where the data support them; return the values drawn."""
+    """Draw the loss factors where the data support them, and return the drawn values."""
     if supported_hz is None or beam is None:
         return []
     first_hz, last_hz = max(axis_hz[0], supported_hz[0]), min(axis_hz[1], supported_hz[1])
@@ -254,27 +286,27 @@ def _curves(
     curves = dict(
         zip(_CURVE_STYLES, (factors.internal, factors.external, factors.total), strict=True)
     )
-    both = None not in curves.values()
-    drawn = []
+    has_both_parts = None not in curves.values()
+    drawn_values = []
     for (label, factor), order in zip(curves.items(), ("alpha", "lambda", None), strict=True):
         # If one part is unknown, the parts are not distinguished; alone, a part is the total.
-        if factor is None or (order is not None and (not both or withheld)):
+        if factor is None or (order is not None and (not has_both_parts or withheld)):
             continue
         color, dash = _CURVE_STYLES[label]
         axes.fill_between(
             factors.frequency_hz, *factor.limits(), color=color, alpha=0.2, linewidth=0
         )
         axes.plot(factors.frequency_hz, factor.value, color=color, linestyle=dash, label=label)
-        drawn.append(factor.value)
-    return drawn
+        drawn_values.append(factor.value)
+    return drawn_values
 
 
-def _beyond(
+def _unsupported_ranges_hz(
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     modes_hz: list[float],
 ) -> list[tuple[float, float]]:
-    """Parts of the axis outside the modes, or outside of what is drawn if that is less."""
+    """Return the ranges of the axis outside the modes or outside the supported band."""
     if not modes_hz:
         return [axis_hz]
     first_hz, last_hz = modes_hz[0], modes_hz[-1]
@@ -283,47 +315,52 @@ def _beyond(
     return [(axis_hz[0], first_hz), (last_hz, axis_hz[1])]
 
 
-_BINS_A_POINT: Final = 24
-_SMOOTH_POINTS: Final = 600
-_STRETCHES: Final = 120
-"""At most: a short record has fewer independent values."""
+_BINS_PER_POINT: Final = 24
+"""Number of bins whose mean is one point of the residual's spectrum."""
+_NOISE_MODEL_POINTS: Final = 600
+"""Number of points of the noise model's curve."""
+_MOST_INTERVALS: Final = 120
+"""Largest number of intervals in which the residual's power over time is shown.
+
+A short record has fewer independent values."""
 
 
 def residual_figure(model: ShownModel, analysis: RecordAnalysis) -> Figure:
-    """Draw the residual's spectrum, its cumulative periodogram, and its power in time.
+    """Draw the residual's spectrum, its cumulative periodogram, and its power over time.
 
     Parameters
     ----------
     model : ShownModel
     analysis : RecordAnalysis
-        With the noise and the bins of its residual.
+        Analysis of the record, with the noise and the bins of the model's residual.
     """
     figure = style.new_figure(9.0, 4.8)
     grid = figure.add_gridspec(
         2, 2, left=0.085, right=0.985, top=0.94, bottom=0.095, hspace=0.45, wspace=0.19,
     )  # fmt: skip
-    _spectrum(figure.add_subplot(grid[0, :]), model, analysis)
-    _cumulative(figure.add_subplot(grid[1, 0]), model, analysis)
-    _in_time(figure.add_subplot(grid[1, 1]), model, analysis)
+    _draw_spectrum(figure.add_subplot(grid[0, :]), model, analysis)
+    _draw_cumulative_periodogram(figure.add_subplot(grid[1, 0]), model, analysis)
+    _draw_power_over_time(figure.add_subplot(grid[1, 1]), model, analysis)
     return figure
 
 
-def _spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+    """Draw the spectrum of the residual with the noise model, the modes and the hum."""
     frequency_hz = analysis.frequency_hz
     density = analysis.noise_nm2_per_hz * np.abs(model.residual) ** 2 / 2
-    counted = analysis.compared
-    bins = np.flatnonzero(counted)
-    blocks = np.array_split(bins, max(bins.size // _BINS_A_POINT, 1))
+    is_compared = analysis.compared
+    bins = np.flatnonzero(is_compared)
+    blocks = np.array_split(bins, max(bins.size // _BINS_PER_POINT, 1))
     middle_hz = [float(frequency_hz[block].mean()) for block in blocks]
     rms = [1e3 * float(np.sqrt(density[block].mean())) for block in blocks]
     axes.plot(
         middle_hz, rms, ".", color=style.VERMILION, markersize=3.5,
-        label=f"residual, mean of {_BINS_A_POINT} bins",
+        label=f"residual, mean of {_BINS_PER_POINT} bins",
     )  # fmt: skip
-    few = slice(None, None, max(frequency_hz.size // _SMOOTH_POINTS, 1))
+    point_slice = slice(None, None, max(frequency_hz.size // _NOISE_MODEL_POINTS, 1))
     axes.plot(
-        frequency_hz[few], 1e3 * np.sqrt(analysis.noise_nm2_per_hz[few]), color=style.BLUE,
-        label="noise model",
+        frequency_hz[point_slice], 1e3 * np.sqrt(analysis.noise_nm2_per_hz[point_slice]),
+        color=style.BLUE, label="noise model",
     )  # fmt: skip
     for mode in model.modes:
         axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
@@ -342,21 +379,29 @@ def _spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
 
 
-def _cumulative(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
-    counted = analysis.compared
-    power = np.abs(model.residual[counted]) ** 2
+def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+    """Draw the residual's cumulative periodogram less that of white noise, with its 95 % range."""
+    is_compared = analysis.compared
+    power = np.abs(model.residual[is_compared]) ** 2
     cumulative = np.cumsum(power) / power.sum()
     uniform = np.arange(1, power.size + 1) / power.size
-    frequency_hz = analysis.frequency_hz[counted]
-    half = 100 * KOLMOGOROV_95 / np.sqrt(power.size)
-    axes.axhspan(-half, half, color=style.SHADE, linewidth=0, zorder=0, label="95 % of white noise")
+    frequency_hz = analysis.frequency_hz[is_compared]
+    half_range_percent = 100 * KOLMOGOROV_95 / np.sqrt(power.size)
+    axes.axhspan(
+        -half_range_percent,
+        half_range_percent,
+        color=style.SHADE,
+        linewidth=0,
+        zorder=0,
+        label="95 % of white noise",
+    )
     difference = 100 * (cumulative - uniform)
     axes.plot(*style.envelope(frequency_hz, difference, 400), color=style.VERMILION)
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7)
     for mode in model.modes:
         axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
-    reach = 1.25 * max(half, float(np.abs(difference).max()))
-    axes.set_ylim(-reach, reach)
+    axis_limit = 1.25 * max(half_range_percent, float(np.abs(difference).max()))
+    axes.set_ylim(-axis_limit, axis_limit)
     axes.set_xlim(0.0, frequency_hz[-1])
     axes.set_title("Cumulative periodogram less that of white noise")
     axes.set_ylabel("Difference (% of power)")
@@ -364,16 +409,17 @@ def _cumulative(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None
     axes.legend(loc="lower right", borderaxespad=0.1)
 
 
-def _in_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+def _draw_power_over_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+    """Draw the power of the whitened residual over time, with the 95 % range of white noise."""
     times_s, power = residual_power(analysis, model.residual)
-    half = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
+    half_range = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
     axes.axhspan(
-        max(1 - half, 0.0), 1 + half, color=style.SHADE, linewidth=0, zorder=0,
+        max(1 - half_range, 0.0), 1 + half_range, color=style.SHADE, linewidth=0, zorder=0,
         label="95 % of white noise",
     )  # fmt: skip
     axes.plot(times_s, power, ".-", color=style.VERMILION, linewidth=0.7, markersize=3.0)
     axes.set_xlim(0.0, times_s[-1] + times_s[0])
-    axes.set_ylim(0.0, 1.15 * max(float(power.max()), 1 + half))
+    axes.set_ylim(0.0, 1.15 * max(float(power.max()), 1 + half_range))
     axes.set_title("Power in time, whitened")
     axes.set_ylabel("Over the mean of noise (1)")
     axes.set_xlabel("Time from the record's start (s)", labelpad=1)
@@ -383,31 +429,32 @@ def _in_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
 def residual_power(
     analysis: RecordAnalysis, residual: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the power of the whitened residual in intervals of the record, 1 for pure noise.
+    """Return the whitened residual's power in intervals of the record; it is 1 for pure noise.
 
-    The residual's spectrum in the band, transformed back, is the complex envelope of the whitened
-    residual; K bins give K independent values over the record.
+    The inverse transform of the residual's spectrum in the band is the complex envelope of the
+    whitened residual. K bins give K independent values over the record.
 
     Returns
     -------
     times_s, power : ndarray, shape (intervals,)
-        Middles of the intervals from the first sample compared on, and mean power in them.
+        Time of the middle of each interval since the first compared sample, and mean power in the
+        interval.
     """
     spacing_hz = float(analysis.frequency_hz[1] - analysis.frequency_hz[0])
     bins = residual.size
     envelope = np.abs(np.fft.ifft(residual)) ** 2 * bins / 2
     envelope *= bins / np.count_nonzero(analysis.compared)
-    stretches = min(_STRETCHES, bins)
+    interval_count = min(_MOST_INTERVALS, bins)
     power: NDArray[np.float64] = np.array(
-        [part.mean() for part in np.array_split(envelope, stretches)]
+        [interval.mean() for interval in np.array_split(envelope, interval_count)]
     )
-    times_s = (np.arange(stretches, dtype=np.float64) + 0.5) / (stretches * spacing_hz)
+    times_s = (np.arange(interval_count, dtype=np.float64) + 0.5) / (interval_count * spacing_hz)
     return times_s, power
 
 
 @dataclass(frozen=True, slots=True)
 class Illustration:
-    """A figure, the name of its files, and its description."""
+    """Figure of a report with the name of its files and its description."""
 
     name: str
     figure: Figure
@@ -415,11 +462,13 @@ class Illustration:
 
 
 FIGURES: Final = ("record_frf", UNIFORMITY, "loss_factor", "residual", "record_signals")
-"""Names of the figures; the second is left out where too few modes show for the test."""
+"""File names of a whole record's figures.
+
+The second figure is omitted if too few modes are visible for the test."""
 
 
 def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
-    """Draw the figures one after the other; within `style.styled`."""
+    """Yield the figures of a whole record, drawn one after the other; call it within `styled`."""
     from analysis.report._signal_figures import signals_figure
 
     highest_hz, headline = whole.band_hz[1], whole.headline
@@ -474,29 +523,33 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
 
 
 def _loss_description(whole: WholeRecord, *, drawn: bool) -> str:
+    """Return the description of the loss factor's figure."""
     points = "twice the damping ratio of each mode with its 95 % interval"
-    reasons = _reasons(whole.headline)
+    reasons = _reasons_of_hollow_points(whole.headline)
     if not drawn:
         return (
             f"Loss factor over frequency: {points}. There is no curve, because no beam with one "
             f"internal and one external order explains the losses.{reasons}"
         )
-    shown = f"Loss factor over frequency with 95 % bands, {_curve(whole)}; points: {points}. "
+    beginning = (
+        f"Loss factor over frequency with 95 % bands, {_describe_curve_model(whole)}; "
+        f"points: {points}. "
+    )
     if whole.withheld:
-        return shown + (
+        return beginning + (
             "It is of all damping, not split into internal and external, and drawn between the "
             "modes that show only: elsewhere (grey), and for either part, an order that the data "
             f"do not support would decide.{reasons}"
         )
-    return shown + (
+    return beginning + (
         "At a mode the loss factor is about twice the damping ratio. Between the modes the model "
         "interpolates, outside them (grey) it extrapolates; where the torque does not stand out of "
         f"the noise nothing is drawn.{reasons}"
     )
 
 
-def _curve(whole: WholeRecord) -> str:
-    """Name the beam of the loss factors."""
+def _describe_curve_model(whole: WholeRecord) -> str:
+    """Return which beam the loss factors' curves belong to, for the figure's description."""
     tolerant = whole.headline.tolerant
     if tolerant is None:
         return f"type {whole.headline.name}"
@@ -506,8 +559,8 @@ def _curve(whole: WholeRecord) -> str:
     return f"of a beam whose modes lie where those of a uniform one do, to {percent:g} %"
 
 
-def _reasons(headline: Headline) -> str:
-    """Describe why points are hollow."""
+def _reasons_of_hollow_points(headline: Headline) -> str:
+    """Return why points are hollow, for the figure's description; empty if none are."""
     reasons = dict.fromkeys(
         mode.damping_ratio.flag for mode in headline.modes if mode.shown and mode.damping_ratio.flag
     )
@@ -515,9 +568,9 @@ def _reasons(headline: Headline) -> str:
 
 
 def measured_response(whole: WholeRecord) -> FrequencyResponse:
-    """Empirical transfer function estimate, from well below the first mode to the band's end.
+    """Return the empirical transfer function estimate from below the first mode to the band's end.
 
-    The delay between the channels is still in it.
+    It still includes the delay between the channels.
     """
     record = whole.record
     angle = record.angle_rad - (record.rest_angle_rad or 0.0)
@@ -525,9 +578,9 @@ def measured_response(whole: WholeRecord) -> FrequencyResponse:
     first_mode_hz = float(undamped_frequencies_rad_s(whole.fit.plant.beam, 1)[0]) / (2 * np.pi)
     first_hz, last_hz = whole.band_hz
     response = response.band(max(first_hz, min(first_mode_hz / 4, last_hz / 4)), last_hz)
-    known = np.isfinite(response.response)
+    is_finite = np.isfinite(response.response)
     return replace(
         response,
-        frequency_hz=response.frequency_hz[known],
-        response=response.response[known],
+        frequency_hz=response.frequency_hz[is_finite],
+        response=response.response[is_finite],
     )

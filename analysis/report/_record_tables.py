@@ -16,11 +16,11 @@ from analysis.report.table import (
     Column,
     Entry,
     Table,
-    count,
-    estimate,
-    greyed,
-    marked,
-    number,
+    count_cell,
+    estimate_cells,
+    grey_cell,
+    mark_cell,
+    number_cell,
 )
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
@@ -54,7 +54,7 @@ def modes_table(whole: WholeRecord) -> Table:
         if mode.damping_ratio.flag is None:
             rows.append((mode.number, *cells, mode.source))
         else:
-            rows.append((marked(count(mode.number)), *map(greyed, cells), mode.source))
+            rows.append((mark_cell(count_cell(mode.number)), *map(grey_cell, cells), mode.source))
     return Table.of(
         "modes",
         f"Modes with locked hub (clamped–free): {_modes_source(headline)}",
@@ -122,7 +122,7 @@ def _modes_source(headline: Headline) -> str:
 
 def _inertia(participation: ReportedValue | None) -> tuple[Cell, Cell]:
     if participation is None:
-        return number(None), number(None)
+        return number_cell(None), number_cell(None)
     value, std, *_ = _quantity_cells(participation, _SQUARE_MM)
     return value, std
 
@@ -284,11 +284,11 @@ def condition_table(whole: WholeRecord) -> Table | None:
             (
                 Cell(name, symbol),
                 _unit_cell(unit),
-                *estimate((each.value, *_ends(each)), each.std, factor),
+                *estimate_cells((each.value, *_ends(each)), each.std, factor),
                 *(
-                    [number(None)] * 3
+                    [number_cell(None)] * 3
                     if free is None
-                    else estimate((free.value, *_ends(free)), free.std, factor)
+                    else estimate_cells((free.value, *_ends(free)), free.std, factor)
                 ),
             )
         )
@@ -338,13 +338,13 @@ def _parameter_row(
     name: str, each: ReportedValue, combined: Mapping[str, ReportedValue], *, fixed: bool
 ) -> tuple[Entry, ...]:
     symbol, meaning, unit, factor = _described(name)
-    shown = estimate((each.value, each.std or None, *_ends(each)), each.std, factor)
+    shown = estimate_cells((each.value, each.std or None, *_ends(each)), each.std, factor)
     if combined:
         # A parameter that goes with no scale has the same interval with them.
         both = combined.get(name, each)
-        shown += estimate((both.std or None, *_ends(both)), both.std, factor)
+        shown += estimate_cells((both.std or None, *_ends(both)), both.std, factor)
     if each.flag is not None:
-        shown = (marked(shown[0]), *map(greyed, shown[1:]))
+        shown = (mark_cell(shown[0]), *map(grey_cell, shown[1:]))
     return (
         Cell(name, symbol),
         meaning,
@@ -372,16 +372,16 @@ def _size_row(headline: Headline, each: ReportedLossFactor) -> tuple[Entry, ...]
         flag = flag or headline.parameters["zeta" if internal else "gamma"].flag
         symbol = symbol[0]
     value, std, low, high = _quantity_cells(size)
-    relative = number(None if size.std is None else size.std / size.value, "#.2g", 100.0)
+    relative = number_cell(None if size.std is None else size.std / size.value, "#.2g", 100.0)
     others: tuple[Cell, ...] = (std, relative, low, high)
     if flag is not None:
-        value, others = marked(value), tuple(map(greyed, others))
+        value, others = mark_cell(value), tuple(map(grey_cell, others))
     return (each.damping, symbol, each.omega_rad_s, value, *others)
 
 
 def _quantity_cells(each: ReportedValue, factor: float = 1.0) -> tuple[Cell, ...]:
     """Return the cells of a quantity, its standard deviation and the ends of its interval."""
-    return estimate((each.value, each.std, *_ends(each)), each.std, factor)
+    return estimate_cells((each.value, each.std, *_ends(each)), each.std, factor)
 
 
 def _ends(quantity: ReportedValue) -> tuple[float | None, float | None]:
@@ -406,7 +406,7 @@ def _symbol(name: str) -> str:
 
 
 def _correlation(own: bool, value: float) -> Cell:
-    shown = number(value, ".3f")
+    shown = number_cell(value, ".3f")
     if own or abs(value) < _STRONG_CORRELATION:
         return shown
     return replace(shown, strong=True)
@@ -420,7 +420,7 @@ def amplitude_tables(whole: WholeRecord) -> tuple[Table, ...]:
     rows: list[tuple[Entry, ...]] = []
     for at in found:
         ratio, std, half = at.damping_ratio, at.std, NORMAL_95 * at.std
-        shown = estimate((ratio, std, ratio - half, ratio + half), std, 100.0)
+        shown = estimate_cells((ratio, std, ratio - half, ratio + half), std, 100.0)
         rows.append((at.mode, at.tip_amplitude_m, *shown))
     return (
         Table.of(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from analysis.identify.scales import SCALE_EXPONENTS, density_check, scales_absorbed
 from analysis.models import QUANTITIES
-from analysis.report.table import estimate
+from analysis.report.table import estimate_cells
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -52,7 +52,7 @@ def scale_notes(whole: WholeRecord) -> Iterator[str]:
         (found.found_kg_per_m, found.found_std_kg_per_m),
         (found.stated_kg_per_m, found.stated_std_kg_per_m),
     )
-    (value, std), (other, its) = (estimate(pair, pair[1], 1e3) for pair in pairs)
+    (value, std), (other, its) = (estimate_cells(pair, pair[1], 1e3) for pair in pairs)
     yield (
         f"Mass per length from the record, ρ/EI times EI: {value.text} ± {std.text} g/m (std); "
         f"stated: {other.text} ± {its.text} g/m. "

@@ -13,7 +13,7 @@ from rich.text import Text
 from analysis.identify.headline import EXACT_CONDITION, MISREAD
 from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
-from analysis.report.table import MARK, estimate, terminal_table
+from analysis.report.table import MARK, estimate_cells, terminal_table
 from analysis.suited import LEFT_OUT
 from rigd.printable import listed
 
@@ -232,7 +232,7 @@ def _mode(mode: ReportedMode) -> str:
 
 
 def _percent(ratio: ReportedValue) -> str:
-    value, low, high = estimate(
+    value, low, high = estimate_cells(
         (ratio.value, *(ratio.interval_95 or (None, None))), ratio.std, 100.0
     )
     if ratio.flag is not None:
@@ -244,7 +244,9 @@ def _size(each: ReportedLossFactor) -> str:
     coefficient, unit, *_names = _SYMBOLS[each.damping]
     size = each.size
     factor, tenth = (1e5, " · 10⁻⁵") if size.value < _SMALL else (1.0, "")
-    value, low, high = estimate((size.value, *(size.interval_95 or (None, None))), size.std, factor)
+    value, low, high = estimate_cells(
+        (size.value, *(size.interval_95 or (None, None))), size.std, factor
+    )
     bounds = f"{value.text} ({low.text} to {high.text}){tenth}"
     if each.omega_rad_s is None:
         return f"is {coefficient}\u00a0=\u00a0{bounds}{unit}"
@@ -265,7 +267,7 @@ def _order(headline: Headline, each: ReportedLossFactor) -> str:
         return f"; its order {symbol} is not known"
     if headline.tolerant is not None:
         return ""  # the verdict has the slope of the loss, with its condition
-    value, low, high = estimate((order.value, *order.interval_95), order.std)
+    value, low, high = estimate_cells((order.value, *order.interval_95), order.std)
     condition = f", {EXACT_CONDITION}" if headline.modal is not None else ""
     return (
         f" and the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text}{condition})"

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.identify import CONSTANTS
 from analysis.report import _style as style
-from analysis.report.table import WORDS, Cell, Column, Table, estimate, number
+from analysis.report.table import WORDS, Cell, Column, Table, estimate_cells, number_cell
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
@@ -125,11 +125,11 @@ def uniformity_table(test: UniformBeamTest) -> Table:
     ):  # fmt: skip
         name = CONSTANTS[index % len(CONSTANTS)]
         words = Cell(name, name.removesuffix("_rad").replace("_", " "))
-        shown = estimate((measured, std, predicted), std)
+        shown = estimate_cells((measured, std, predicted), std)
         rows.append(
             (
                 test.modes[index // len(CONSTANTS)], words, *shown,
-                number(off / std, "+.1f"), number(off, "+#.2g", _PER_CENT),
+                number_cell(off / std, "+.1f"), number_cell(off, "+#.2g", _PER_CENT),
             )
         )  # fmt: skip
     return Table.of(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.report._document import document_text, versions
 from analysis.report.folder import write_new
-from analysis.report.table import WORDS, Cell, Column, Entry, Table, csv_text, number
+from analysis.report.table import WORDS, Cell, Column, Entry, Table, csv_text, number_cell
 from analysis.results import DEFAULT_FORMATS, finite
 from rigd.units import decimals, with_half_width
 
@@ -85,7 +85,7 @@ def _row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
 
 def _cell(found: Estimated | None, start: float) -> Cell:
     if found is None:
-        return number(None)
+        return number_cell(None)
     value = found.value + start
     low, high = (each + start for each in found.interval_95)
     if abs(value - (low + high) / 2) > _LOPSIDED * (high - low):

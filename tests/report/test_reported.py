@@ -14,7 +14,7 @@ from analysis.models import STRUCTURES
 from analysis.report import document, illustrations, result_text
 from analysis.report.bands import excited_band_hz, supported_band_hz
 from analysis.report.record_report import record_page, report_tables
-from analysis.report.table import MARK, Cell, csv_text, unreported
+from analysis.report.table import MARK, Cell, csv_text, unreported_parameters
 
 ALPHA = frozenset({"alpha"})
 PICTURES = tuple(
@@ -34,12 +34,12 @@ def careful(record_result, retold):
 
 
 def test_an_order_takes_its_coefficient_with_it():
-    assert unreported(STRUCTURES["VI"], ALPHA) == {"alpha", "zeta"}
-    assert unreported(STRUCTURES["III"], {"lambda", "alpha"}) == {
+    assert unreported_parameters(STRUCTURES["VI"], ALPHA) == {"alpha", "zeta"}
+    assert unreported_parameters(STRUCTURES["III"], {"lambda", "alpha"}) == {
         "zeta", "alpha", "gamma", "lambda"
     }  # fmt: skip
-    assert unreported(STRUCTURES["II"], ALPHA) == frozenset()
-    assert unreported(STRUCTURES["VI"], ()) == frozenset()
+    assert unreported_parameters(STRUCTURES["II"], ALPHA) == frozenset()
+    assert unreported_parameters(STRUCTURES["VI"], ()) == frozenset()
 
 
 def test_tables_mark_every_such_number_and_no_other(careful):

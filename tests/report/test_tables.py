@@ -13,7 +13,7 @@ from analysis.report.table import (
     Column,
     Table,
     csv_text,
-    estimate,
+    estimate_cells,
     json_rows,
     terminal_table,
 )
@@ -36,7 +36,7 @@ from rigd.beam import modes
 )
 def test_a_value_shows_the_digits_its_spread_leaves(value, std, text, as_text):
     columns = (Column("value", "value"), Column("std", "std", spread=True))
-    table = Table.of("name", "", columns, [estimate((value, std), std)])
+    table = Table.of("name", "", columns, [estimate_cells((value, std), std)])
     assert as_text(terminal_table(table)).split("\n")[2].strip() == text
 
 
