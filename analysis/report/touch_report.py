@@ -1,4 +1,4 @@
-"""Report of touches: table, document and lines, and a folder with page and figures."""
+"""Report of touches: table, JSON document and text lines, and a folder with page and figures."""
 
 from __future__ import annotations
 
@@ -19,20 +19,22 @@ if TYPE_CHECKING:
     from analysis.touch import Touch, TouchedSession
     from rigd.touch import Estimated
 
-_LOPSIDED = 0.25
-"""Distance of a value from the middle of its interval, relative to the interval, above which the
-ends are shown instead."""
-_KINDS = {
+_MOST_INTERVAL_ASYMMETRY = 0.25
+"""Asymmetry of an interval above which its ends are shown instead of value and half-width.
+
+It is the distance of the value from the middle, relative to the interval's length."""
+_KIND_DESCRIPTIONS = {
     "rigid": "obstacle at rest",
     "yielding": "obstacle that gives way",
     "moving": "moving obstacle",
     "knock": "knock",
     "unknown": "cannot tell",
 }
+"""Descriptions of the kinds of contact, by key."""
 
 
 def touches_table(sessions: Sequence[TouchedSession]) -> Table:
-    """Put the touches of all sessions into a table.
+    """Return the table of the touches of all sessions.
 
     Parameters
     ----------
@@ -49,7 +51,7 @@ def touches_table(sessions: Sequence[TouchedSession]) -> Table:
         Column("Stiffness (N/m)", "stiffness_n_per_m"),
         Column("Kind", "kind", WORDS),
     )
-    rows = [_row(session, touch) for session in sessions for touch in session.touches]
+    rows = [_touch_row(session, touch) for session in sessions for touch in session.touches]
     return Table(
         "touches",
         "Touches",
@@ -60,13 +62,16 @@ def touches_table(sessions: Sequence[TouchedSession]) -> Table:
     )
 
 
-def _row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
+def _touch_row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
+    """Return the table row of a touch: time, position, angle, peak force, stiffness and kind."""
     estimate = touch.estimate
     row: dict[str, Entry] = {
         "session": session.path.stem,
         "number": touch.number,
         "angle_rad": touch.angle_rad,
-        "kind": "not estimated" if estimate is None else _KINDS.get(estimate.kind, estimate.kind),
+        "kind": "not estimated"
+        if estimate is None
+        else _KIND_DESCRIPTIONS.get(estimate.kind, estimate.kind),
     }
     estimates: dict[str, tuple[Estimated | None, float]] = {}
     if estimate is not None:
@@ -77,43 +82,45 @@ def _row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
             "stiffness_n_per_m": (estimate.stiffness_n_per_m, 0.0),
         }
     for key in ("time_s", "x_m", "force_n", "stiffness_n_per_m"):
-        found, start = estimates.get(key, (None, 0.0))
-        row[key] = _cell(found, start)
-        row[f"{key}_std"] = None if found is None else found.std
+        quantity, offset = estimates.get(key, (None, 0.0))
+        row[key] = _estimate_cell(quantity, offset)
+        row[f"{key}_std"] = None if quantity is None else quantity.std
     return row
 
 
-def _cell(found: Estimated | None, start: float) -> Cell:
-    if found is None:
+def _estimate_cell(quantity: Estimated | None, offset: float) -> Cell:
+    """Return the cell of an estimate with its 95 % interval; a dash without an estimate."""
+    if quantity is None:
         return number_cell(None)
-    value = found.value + start
-    low, high = (each + start for each in found.interval_95)
-    if abs(value - (low + high) / 2) > _LOPSIDED * (high - low):
+    value = quantity.value + offset
+    low, high = (limit + offset for limit in quantity.interval_95)
+    if abs(value - (low + high) / 2) > _MOST_INTERVAL_ASYMMETRY * (high - low):
         digits = decimals((high - low) / 2)
         return Cell(value, f"{low:.{digits}f} to {high:.{digits}f}".replace("-", "−"))
     return Cell(value, with_half_width(value, (low, high)).replace("-", "−"))
 
 
 def session_lines(session: TouchedSession) -> list[str]:
-    """Return the lines on a session's touches, and on the model.
+    """Return text lines on a session: number of touches, source of the model, and warnings.
 
     Parameters
     ----------
     session : TouchedSession
     """
     count = len(session.touches)
-    what = "no touch" if count == 0 else "1 touch" if count == 1 else f"{count} touches"
+    touch_count_text = "no touch" if count == 0 else "1 touch" if count == 1 else f"{count} touches"
     by = "during the session" if session.found == "loop" else "in the record"
     detected = f", detected {by}" if count else ""
     validity = f" {session.validity.sentence}" if count else ""
     return [
-        f"{session.path.name}: {what}{detected}. Model: {model_words(session)}.{validity}",
+        f"{session.path.name}: {touch_count_text}{detected}. "
+        f"Model: {model_words(session)}.{validity}",
         *(f"Warning: {sentence}" for sentence in session.warnings),
     ]
 
 
 def model_words(session: TouchedSession) -> str:
-    """Describe the source of the beam model."""
+    """Return the source of the beam model as text."""
     source = session.model.source
     return "the nominal beam of the attached profile" if source == "profile" else source
 
@@ -121,7 +128,7 @@ def model_words(session: TouchedSession) -> str:
 def touches_document(
     sessions: Sequence[TouchedSession], errors: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Collect the touches of all sessions.
+    """Return the touches of all sessions as one JSON document.
 
     Parameters
     ----------
@@ -161,21 +168,23 @@ def write_touch_report(
     errors: Mapping[str, str],
     folder: Path,
 ) -> None:
-    """Write ``report.html``, ``figures/``, ``tables/touches.csv`` and ``touches.json``.
+    """Write the report of touches into a folder.
+
+    It consists of ``report.html``, ``figures/``, ``tables/touches.csv`` and ``touches.json``.
 
     Parameters
     ----------
     sessions : sequence of TouchedSession
-        One or more.
+        At least one session.
     errors : mapping of str to str
         Message for each file that could not be analysed.
     folder : Path
-        An existing folder without these files.
+        Existing folder that contains none of these files.
 
     Raises
     ------
     OutputExistsError, OutputError
-        If a file exists, or cannot be written.
+        If a file exists or cannot be written.
     """
     from analysis.report import _page as pages
     from analysis.report import _style as style
@@ -183,9 +192,11 @@ def write_touch_report(
 
     pictures = []
     with style.styled():
-        for shown in touch_illustrations(sessions):
-            stem = folder / "figures" / shown.name
-            picture = style.save_picture(shown.figure, stem, shown.description, DEFAULT_FORMATS)
+        for illustration in touch_illustrations(sessions):
+            stem = folder / "figures" / illustration.name
+            picture = style.save_picture(
+                illustration.figure, stem, illustration.description, DEFAULT_FORMATS
+            )
             pictures.append(picture)
     table = touches_table(sessions)
     write_new(folder / "tables" / "touches.csv", csv_text(table))
@@ -205,13 +216,13 @@ def write_touch_report(
         tables=(table,) if table.rows else (),
         paper_pictures=(),
         paper_tables=(),
-        how=[*_how(sessions), pages.versions(datetime.now().astimezone())],
+        how=[*_collect_facts(sessions), pages.versions(datetime.now().astimezone())],
     )
     write_new(folder / "report.html", text)
 
 
-def _how(sessions: Sequence[TouchedSession]) -> list[Facts]:
-    """Collect the facts on sessions, model and estimator."""
+def _collect_facts(sessions: Sequence[TouchedSession]) -> list[Facts]:
+    """Return the facts on sessions, model and estimator."""
     return [
         (
             "Sessions",
@@ -224,7 +235,7 @@ def _how(sessions: Sequence[TouchedSession]) -> list[Facts]:
                 for each in sessions
             ],
         ),
-        ("Model", sorted({(model_words(each), _beam(each)) for each in sessions})),
+        ("Model", sorted({(model_words(each), _beam_text(each)) for each in sessions})),
         (
             "Estimate",
             [
@@ -245,7 +256,8 @@ def _how(sessions: Sequence[TouchedSession]) -> list[Facts]:
     ]
 
 
-def _beam(session: TouchedSession) -> str:
+def _beam_text(session: TouchedSession) -> str:
+    """Return length, density and bending stiffness of a session's beam model as text."""
     beam = session.model.beam
     return (
         f"length {beam.length_m:g} m, density {beam.density_kg_per_m:.5g} kg/m, bending stiffness "
