@@ -24,8 +24,8 @@ def scale_notes(whole: WholeRecord) -> Iterator[str]:
     if not scales_absorbed(whole.fit):
         held_parameters = ", ".join(QUANTITIES[name][0] for name in whole.fixed)
         yield (
-            f"Intervals are statistical only: the file's values of {held_parameters}, which were held, "
-            "the torque scale and the length are assumed exact."
+            f"Intervals are statistical only: the file's values of {held_parameters}, "
+            "which were held, the torque scale and the length are assumed exact."
         )
         return
     stated_uncertainty = whole.record.uncertainty
@@ -44,8 +44,8 @@ def scale_notes(whole: WholeRecord) -> Iterator[str]:
         )
     if unknown_scales:
         yield (
-            f"{'Not included' if known_scales else 'Intervals are statistical only. Not included'}: "
-            f"the uncertainty of {' and '.join(unknown_scales)}, which the file does not state."
+            f"{'Not included' if known_scales else 'Intervals are statistical only. Not included'}"
+            f": the uncertainty of {' and '.join(unknown_scales)}, which the file does not state."
         )
     yield (
         f"A wrong scale shows as {_scale_dependence(whole)}; no other parameter depends on these, "
