@@ -350,8 +350,8 @@ def _layout_below_titles(
             raise _NotThisTableError(
                 _RANK_ALL_TITLES,
                 TableError(
-                    f"{titles.count(name)} columns are named '{name}' (line {titles_row.line}); give "
-                    f"the number, such as #{titles.index(name) + 1} for the first of them."
+                    f"{titles.count(name)} columns are named '{name}' (line {titles_row.line}); "
+                    f"give the number, such as #{titles.index(name) + 1} for the first of them."
                 ),
             )
         number = _column_number(name)

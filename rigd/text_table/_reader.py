@@ -340,8 +340,8 @@ class _NumberRows:
             if thousands_check.grouped_line and doubtful:
                 sign = "commas" if self.decimal_sign == COMMA else "points"
                 raise TableError(
-                    f"line {thousands_check.grouped_line}: the {sign} in '{self.title(column)}' may "
-                    "be decimal signs or separators between thousands, as each has three digits "
+                    f"line {thousands_check.grouped_line}: the {sign} in '{self.title(column)}' "
+                    "may be decimal signs or separators between thousands, as each has three digits "
                     "behind it; save the file with decimal points and without separators between "
                     "thousands."
                 )
