@@ -50,13 +50,13 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
             "settings": asdict(campaign.settings) | {"record_band_hz": campaign.record_band_hz},
             "files": [
                 {
-                    "file": str(each.path),
-                    "validity": each.validity.as_json(),
-                    "warnings": each.warnings,
-                    "welch_segments": each.segments or None,
-                    "verdict": None if each.verdict is None else each.verdict.as_json(),
+                    "file": str(session.path),
+                    "validity": session.validity.as_json(),
+                    "warnings": session.warnings,
+                    "welch_segments": session.segments or None,
+                    "verdict": None if session.verdict is None else session.verdict.as_json(),
                 }
-                for each in campaign.sessions
+                for session in campaign.sessions
             ],
             "one_specimen": campaign.homogeneity.one_specimen,
             "groups": leading and {"quantity": leading.quantity, "files": leading.groups},
@@ -64,25 +64,27 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
                 "asked": campaign.trials,
                 "done": campaign.trials - len(campaign.lost_trials),
                 "lost": [
-                    {"file": str(each.path), "reason": each.reason} for each in campaign.lost_trials
+                    {"file": str(trial.path), "reason": trial.reason}
+                    for trial in campaign.lost_trials
                 ],
             },
             "errors": [
-                {"file": str(each.path), "message": each.message} for each in campaign.failures
+                {"file": str(failure.path), "message": failure.message}
+                for failure in campaign.failures
             ],
             "fits": [
                 fit
-                for each in campaign.sessions
+                for session in campaign.sessions
                 for fit in (
-                    *(_welch_fit_json(each, welch) for welch in each.welch_fits),
-                    *(_record_fit_json(each, estimate) for estimate in each.record_estimates),
+                    *(_welch_fit_json(session, welch) for welch in session.welch_fits),
+                    *(_record_fit_json(session, estimate) for estimate in session.record_estimates),
                 )
             ],
             "modes": [
-                _mode_json(each, estimate, mode)
-                for each in campaign.sessions
-                for estimate in each.record_estimates
-                if estimate.name == each.selected
+                _mode_json(session, estimate, mode)
+                for session in campaign.sessions
+                for estimate in session.record_estimates
+                if estimate.name == session.selected
                 for mode in estimate.modes
             ],
             **{

@@ -116,10 +116,10 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
 
     estimate = campaign.headline
     assert estimate is not None
-    withheld = campaign.verdict.withheld if campaign.verdict else ()
-    not_reported = unreported_parameters(STRUCTURES[estimate.structure], withheld)
+    unsupported_orders = campaign.verdict.withheld if campaign.verdict else ()
+    not_reported = unreported_parameters(STRUCTURES[estimate.structure], unsupported_orders)
     note = f"  ·  {MARK} not reported: not supported by the data" if not_reported else ""
-    if any(campaign.homogeneity.is_mixed(each.name) for each in estimate.parameters):
+    if any(campaign.homogeneity.is_mixed(parameter.name) for parameter in estimate.parameters):
         note += f"  ·  {MIXTURE_MARK} mean of a mixture"
     rows = -(-len(estimate.parameters) // _PANELS_PER_ROW)
     width_in, height_in = 13.0, 2.6 * rows + 1.35
@@ -329,7 +329,7 @@ def draw_session(
         *_decimated_line(frequency_hz, magnitude_db(response), columns), color=SESSION_COLOR,
         linewidth=0.5, alpha=alpha, rasterized=True,
     )  # fmt: skip
-    point_indices = style.spread(frequency_hz, dots)
+    point_indices = style.log_spaced_indices(frequency_hz, dots)
     # Dots: a line would run up and down wherever noise wraps the phase.
     phase.plot(
         frequency_hz[point_indices], phase_deg(response[point_indices]), ".", markersize=0.8,

@@ -39,7 +39,7 @@ def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
         *(scatter_tables if homogeneity.mixed else []),
         *headline_tables(campaign),
         *([uniform_beam_table(campaign)] if campaign.modal else []),
-        *(pooled_table(campaign, each) for each in estimates[1:]),
+        *(pooled_table(campaign, estimate) for estimate in estimates[1:]),
         *([structures_table(campaign)] if campaign.structures else []),
         *([validation_summary(campaign)] if campaign.validation else []),
         *([] if homogeneity.mixed else scatter_tables),
@@ -56,7 +56,7 @@ def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     candidates = (
         modes_table(campaign),
         tolerant_table(campaign),
-        *(pooled_table(campaign, each) for each in likely_estimates(campaign)[:1]),
+        *(pooled_table(campaign, estimate) for estimate in likely_estimates(campaign)[:1]),
     )
     return tuple(table for table in candidates if table.rows)
 
@@ -160,19 +160,19 @@ def sessions_record_table(campaign: CampaignResult) -> Table:
     rows = [
         {
             "file": str(session.path),
-            "type": each.structure,
-            **each.parameters,
+            "type": estimate.structure,
+            **estimate.parameters,
             **{
-                _std_key(name): value if name in each.free else None
-                for name, value in each.std.items()
+                _std_key(name): value if name in estimate.free else None
+                for name, value in estimate.std.items()
             },
-            "cost": each.cost,
-            "degrees_of_freedom": each.degrees_of_freedom,
-            "bic": each.bic,
-            "at_bounds": " ".join(each.at_bounds),
+            "cost": estimate.cost,
+            "degrees_of_freedom": estimate.degrees_of_freedom,
+            "bic": estimate.bic,
+            "at_bounds": " ".join(estimate.at_bounds),
         }
         for session in campaign.sessions
-        for each in session.record_estimates
+        for estimate in session.record_estimates
     ]
     return _file_only_table("sessions_record", rows)
 
@@ -192,18 +192,20 @@ def validation_table(campaign: CampaignResult) -> Table:
     """Return each session's prediction errors from the other sessions, and the lost trials."""
     rows: list[dict[str, Any]] = [
         {
-            "file": str(each.path),
-            "method": each.method,
-            "type": each.name,
-            "weighting": each.weighting,
-            "error": each.error,
-            "own_error": each.own_error,
-            "nrmse_percent": None if each.own_error is None else 100 * (1 - each.own_error),
+            "file": str(prediction.path),
+            "method": prediction.method,
+            "type": prediction.name,
+            "weighting": prediction.weighting,
+            "error": prediction.error,
+            "own_error": prediction.own_error,
+            "nrmse_percent": None
+            if prediction.own_error is None
+            else 100 * (1 - prediction.own_error),
             "lost": None,
         }
-        for each in campaign.validation
+        for prediction in campaign.validation
     ]
-    rows += [{"file": str(each.path), "lost": each.reason} for each in campaign.lost_trials]
+    rows += [{"file": str(trial.path), "lost": trial.reason} for trial in campaign.lost_trials]
     return _file_only_table("validation", rows)
 
 
@@ -255,15 +257,15 @@ def sessions_table(campaign: CampaignResult) -> Table:
     group_of = {name: f"{index}" for index, names in enumerate(groups, 1) for name in names}
     name = campaign.headline.name if campaign.headline else None
     trials_by_path = {
-        item.path: item
-        for item in campaign.validation
-        if (item.method, item.name) == ("record", name)
+        prediction.path: prediction
+        for prediction in campaign.validation
+        if (prediction.method, prediction.name) == ("record", name)
     }
 
     def row(session: SessionAnalysis) -> tuple[Entry, ...]:
         verdict, trial = session.verdict, trials_by_path.get(session.path)
         own_error = trial.own_error if trial else None
-        finding_kinds = [item.kind for item in verdict.findings] if verdict else []
+        finding_kinds = [finding.kind for finding in verdict.findings] if verdict else []
         return (
             session.name,
             f"type {session.selected}" if session.selected else ABSENT,
@@ -274,7 +276,8 @@ def sessions_table(campaign: CampaignResult) -> Table:
         )
 
     left_out: list[tuple[Entry, ...]] = [
-        (item.name, "left out", None, None, ABSENT, item.message) for item in campaign.failures
+        (failure.name, "left out", None, None, ABSENT, failure.message)
+        for failure in campaign.failures
     ]
     return Table.of(
         "sessions",

@@ -107,7 +107,7 @@ _CURVE_POINTS = 200
 """Number of frequencies at which the document states response and loss factors."""
 
 
-def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str, Any]:
+def record_entries(whole_record: WholeRecord, welch: WelchAnalysis | None) -> dict[str, Any]:
     """Return the entries of the JSON document for one whole record.
 
     Returns
@@ -126,29 +126,29 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
     names = [
         (
             {
-                "file": str(whole.record.path),
+                "file": str(whole_record.record.path),
                 "estimator": "record",
                 "type": fit.structure.name,
                 "weighting": None,
                 "candidate": name,
-                "selected": name == whole.headline.name,
+                "selected": name == whole_record.headline.name,
             },
             fit,
         )
-        for name, fit in whole.fits.items()
+        for name, fit in whole_record.fits.items()
     ]
     indices = [
         (NOT_COMPARED, NOT_COMPARED) if welch is None else indices_of_record_fit(fit, welch)
         for _, fit in names
     ]
     return {
-        "headline": whole.headline_json(),
+        "headline": whole_record.headline_json(),
         "fits": [
             {
                 **name,
                 "free": [*fit.interval],
                 "parameters": dict(fit.parameters),
-                "withheld": sorted(unreported_parameters(fit.structure, whole.unsupported)),
+                "withheld": sorted(unreported_parameters(fit.structure, whole_record.unsupported)),
                 "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
                 "interval_95": {
                     key: None if ends is None else list(ends) for key, ends in fit.interval.items()
@@ -156,7 +156,7 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
                 "cost": fit.cost,
                 "degrees_of_freedom": fit.degrees_of_freedom,
                 "at_bounds": list(fit.at_bounds),
-                "nrmse_percent": whole.analysis.fit_percent(fit),
+                "nrmse_percent": whole_record.analysis.fit_percent(fit),
                 "determined": list(fit.determined),
                 "covariance": fit.covariance.tolist(),
                 "internal_size": _damping_size_json(fit.internal),
@@ -181,27 +181,27 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
             # Those reported first: they are what narrow sweeps are planned by.
             for name, _ in names
             if name["selected"]
-            for mode in whole.headline.modes
+            for mode in whole_record.headline.modes
         ],
         "records": [
             {
-                "file": str(whole.record.path),
-                "selected": whole.headline.name,
-                "verdict": list(whole.verdict.sentences),
-                "experiments": list(whole.verdict.experiments),
-                "withheld": sorted(whole.withheld),
+                "file": str(whole_record.record.path),
+                "selected": whole_record.headline.name,
+                "verdict": list(whole_record.verdict.sentences),
+                "experiments": list(whole_record.verdict.experiments),
+                "withheld": sorted(whole_record.withheld),
                 "orders": {
-                    each.order: {
-                        "status": each.status,
-                        "value": each.value,
-                        "interval_95": None if each.interval is None else list(each.interval),
+                    order.order: {
+                        "status": order.status,
+                        "value": order.value,
+                        "interval_95": None if order.interval is None else list(order.interval),
                     }
-                    for each in whole.orders
+                    for order in whole_record.orders
                 },
-                "band_hz": list(whole.band_hz),
-                "fixed": list(whole.fixed),
-                "hum": [asdict(line) for line in whole.analysis.lines],
-                "curves": _curves_json(whole),
+                "band_hz": list(whole_record.band_hz),
+                "fixed": list(whole_record.fixed),
+                "hum": [asdict(line) for line in whole_record.analysis.lines],
+                "curves": _curves_json(whole_record),
             }
         ],
     }
@@ -212,15 +212,18 @@ def _damping_size_json(size: DampingSize | None) -> dict[str, Any] | None:
     return None if size is None else asdict(size)
 
 
-def _curves_json(whole: WholeRecord) -> dict[str, Any]:
+def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
     """Return the displayed model's response and the loss factors over the band, as JSON lists."""
-    first_hz, last_hz = whole.band_hz
+    first_hz, last_hz = whole_record.band_hz
     frequency_hz = np.geomspace(max(first_hz, last_hz / 200), last_hz, _CURVE_POINTS)
-    model, beam = ShownModel.of(whole.headline, whole.record), loss_estimate(whole)
+    model, beam = (
+        ShownModel.of(whole_record.headline, whole_record.record),
+        loss_estimate(whole_record),
+    )
     band = model.band(frequency_hz)
     low, high = band.magnitude_limits()
     factors_over_frequency = None if beam is None else loss_factors(beam, frequency_hz)
-    supported_hz = supported_band_hz(whole)
+    supported_hz = supported_band_hz(whole_record)
     return {
         "model": "beam" if model.modal is None else "modal",
         "frequency_hz": frequency_hz.tolist(),
@@ -295,8 +298,8 @@ def document(
             "fits": [
                 *(
                     fit
-                    for analysis, withheld in welch_analyses
-                    for fit in _welch_fits_json(analysis, withheld)
+                    for analysis, unsupported_orders in welch_analyses
+                    for fit in _welch_fits_json(analysis, unsupported_orders)
                 ),
                 *(fit for entries in record_entries_by_file for fit in entries["fits"]),
             ],
@@ -381,17 +384,22 @@ def _record_facts(record: Record, warnings: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _welch_fits_json(analysis: WelchAnalysis, withheld: Collection[str]) -> list[dict[str, Any]]:
+def _welch_fits_json(
+    analysis: WelchAnalysis, unsupported_orders: Collection[str]
+) -> list[dict[str, Any]]:
     """Return the JSON objects of a record's Welch fits."""
     indices = whole_record_indices(analysis)
     return [
-        {**_welch_fit_json(analysis, model, withheld), "indices_whole_record": indices_of_record}
+        {
+            **_welch_fit_json(analysis, model, unsupported_orders),
+            "indices_whole_record": indices_of_record,
+        }
         for model, indices_of_record in zip(analysis.models, indices, strict=True)
     ]
 
 
 def _welch_fit_json(
-    analysis: WelchAnalysis, model: FittedModel, withheld: Collection[str]
+    analysis: WelchAnalysis, model: FittedModel, unsupported_orders: Collection[str]
 ) -> dict[str, Any]:
     """Return the JSON object of one Welch fit."""
     fit = model.fit
@@ -400,7 +408,7 @@ def _welch_fit_json(
         "frf": analysis.settings.estimator,
         "free": list(fit.structure.free),
         "parameters": dict(fit.parameters),
-        "withheld": sorted(unreported_parameters(fit.structure, withheld)),
+        "withheld": sorted(unreported_parameters(fit.structure, unsupported_orders)),
         # Fixed parameters have no standard deviation: they were not estimated.
         "std": None
         if fit.std is None

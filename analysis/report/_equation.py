@@ -197,7 +197,7 @@ def _conjugate_variable(letter: str) -> Formula:
     return Formula(f"<mover><mi>{letter}</mi><mo>¯</mo></mover>", rf"\bar{{{letter}}}")
 
 
-def equations(whole: WholeRecord) -> tuple[Formula, ...]:
+def equations(whole_record: WholeRecord) -> tuple[Formula, ...]:
     """Return the equations of a record's models: of the modal model, if there is one, and the beam.
 
     Returns
@@ -206,20 +206,22 @@ def equations(whole: WholeRecord) -> tuple[Formula, ...]:
         Modal model, if there is one; measured response of a beam; Eq. 25 of the reference paper,
         and its beta. They contain the terms of the structure.
     """
-    modal_equations = () if whole.headline.modal is None else (_modal_equation(),)
+    modal_equations = () if whole_record.headline.modal is None else (_modal_equation(),)
     return (
         *modal_equations,
-        _measured_equation(whole.fit),
-        *_beam_equations(_reported_structure(whole)),
+        _measured_equation(whole_record.fit),
+        *_beam_equations(_reported_structure(whole_record)),
     )
 
 
-def _reported_structure(whole: WholeRecord) -> Structure:
+def _reported_structure(whole_record: WholeRecord) -> Structure:
     """Return the structure of the reported parameters.
 
     With a tolerance of the geometry it is the structure with both orders free.
     """
-    return whole.fit.structure if whole.headline.tolerant is None else STRUCTURES["VI"]
+    return (
+        whole_record.fit.structure if whole_record.headline.tolerant is None else STRUCTURES["VI"]
+    )
 
 
 _EFFECT_DEFINITIONS: Final = {
@@ -232,24 +234,24 @@ _EFFECT_DEFINITIONS: Final = {
 """Definitions of the symbols of additional effects, by parameter name."""
 
 
-def definitions(whole: WholeRecord) -> str:
+def definitions(whole_record: WholeRecord) -> str:
     """Return a text that defines the symbols of the equations that no table explains."""
     statements = [
         "On the left coupling torque over motor angle, as Laplace transforms",
-        f"L = {whole.record.beam.length_m:g} m is the length from the axis to the tip",
+        f"L = {whole_record.record.beam.length_m:g} m is the length from the axis to the tip",
         "powers of s are principal values",
     ]
-    if whole.headline.modal is not None:
+    if whole_record.headline.modal is not None:
         statements[1:1] = [
             "first the modal model with a pole p and a residue R of each mode, which the modes are "
             "of, below it the beam's, which the parameters are of",
         ]
-    names = whole.headline.parameters
+    names = whole_record.headline.parameters
     statements += [words for name, words in _EFFECT_DEFINITIONS.items() if name in names]
     return f"{'; '.join(statements)}. The numbers are in the table of the parameters."
 
 
-def types_table(whole: WholeRecord) -> Table:
+def types_table(whole_record: WholeRecord) -> Table:
     """Return the table of the damping types with their internal and external terms."""
     order_words = {False: "fractional", True: "integer"}
 
@@ -285,7 +287,7 @@ def types_table(whole: WholeRecord) -> Table:
             'ρ/EI s². I to VI as in the paper, VII as its conclusions propose. "Modes free": each '
             "mode with its own stiffness. The marked type is that of the numbers reported.",
         ),
-        selected=list(STRUCTURES).index(_reported_structure(whole).name),
+        selected=list(STRUCTURES).index(_reported_structure(whole_record).name),
     )
 
 
@@ -299,6 +301,6 @@ def mathml(formula: Formula) -> str:
 
 def latex(formulas: tuple[Formula, ...]) -> str:
     r"""Return formulas as an ``align`` environment of LaTeX's amsmath."""
-    lines = (each.tex.replace(" = ", " &= ", 1) for each in formulas)
+    lines = (formula.tex.replace(" = ", " &= ", 1) for formula in formulas)
     body = " \\\\\n  ".join(lines)
     return f"\\begin{{align}}\n  {body}\n\\end{{align}}\n"

@@ -39,17 +39,21 @@ _AT_LIMIT_NOTE: Final = "* at the limit of the search range: not determined by t
 """Note on estimates at the limit of the search range."""
 
 
-def structures_table(whole: WholeRecord) -> Table:
+def structures_table(whole_record: WholeRecord) -> Table:
     """Return the comparison of all whole-record fits; orders without support are marked."""
-    lowest_cost = min(fit.cost for fit in whole.fits.values())
-    withheld = whole.unsupported
-    delta_bic = whole.delta_bic
-    status_by_name = dict(whole.headline.structures)
+    lowest_cost = min(fit.cost for fit in whole_record.fits.values())
+    unsupported_orders = whole_record.unsupported
+    delta_bic = whole_record.delta_bic
+    status_by_name = dict(whole_record.headline.structures)
     rows: list[tuple[Entry, ...]] = []
-    for name, fit in whole.fits.items():
+    for name, fit in whole_record.fits.items():
         fit_status = status_by_name.get(name, "")
         damping_cells = _damping_cells(
-            fit.structure, fit.parameters, fit.std, withheld=withheld, at_bounds=fit.at_bounds
+            fit.structure,
+            fit.parameters,
+            fit.std,
+            unsupported_orders=unsupported_orders,
+            at_bounds=fit.at_bounds,
         )
         rows.append(
             (
@@ -57,13 +61,13 @@ def structures_table(whole: WholeRecord) -> Table:
                 fit_status,
                 *(map(_hidden_cell, damping_cells) if fit_status == "excluded" else damping_cells),
                 *([delta_bic[name]] if delta_bic else []),
-                whole.analysis.fit_percent(fit),
+                whole_record.analysis.fit_percent(fit),
                 fit.cost / fit.degrees_of_freedom,
                 fit.free_parameters,
                 fit.cost,
                 fit.cost - lowest_cost,
                 fit.degrees_of_freedom,
-                " ".join(sorted(unreported_parameters(fit.structure, withheld))),
+                " ".join(sorted(unreported_parameters(fit.structure, unsupported_orders))),
             )
         )
     return Table.of(
@@ -84,22 +88,24 @@ def structures_table(whole: WholeRecord) -> Table:
         ),
         rows,
         (
-            *footnotes(withheld),
+            *footnotes(unsupported_orders),
             "ΔBIC: Bayesian information criterion above the lowest; 10 = decisive. Fit: NRMSE "
             "of the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power "
             "over that of the noise, 1 if nothing but noise is left. Free: number of free "
             "parameters, those of rig and beam included. * rests on the edge of the range "
-            f"searched. The marked row is {_marked_row(whole)}. What the record excludes "
+            f"searched. The marked row is {_marked_row(whole_record)}. What the record excludes "
             "has numbers in the CSV file only, beside the sums of squares.",
         ),
-        selected=list(whole.fits).index(whole.headline.name),
+        selected=list(whole_record.fits).index(whole_record.headline.name),
     )
 
 
-def _marked_row(whole: WholeRecord) -> str:
+def _marked_row(whole_record: WholeRecord) -> str:
     """Return to which values the marked row belongs, for the note of the table."""
     return (
-        "the one reported" if whole.headline.exact is None else f"of the values {EXACT_CONDITION}"
+        "the one reported"
+        if whole_record.headline.exact is None
+        else f"of the values {EXACT_CONDITION}"
     )
 
 
@@ -114,7 +120,8 @@ def _damping_columns() -> list[Column]:
         column
         for name in _DAMPING_PARAMETERS
         for column in (
-            Column(_parameter_heading(name), name), Column("std", f"{name}_std", spread=True),
+            Column(_parameter_heading(name), name),
+            Column("std", f"{name}_std", std_of_previous=True),
         )
     ]  # fmt: skip
 
@@ -124,14 +131,14 @@ def _damping_cells(
     parameters: Mapping[str, float],
     std: Mapping[str, float | None] | None,
     *,
-    withheld: Collection[str] = (),
+    unsupported_orders: Collection[str] = (),
     at_bounds: Collection[str] = (),
 ) -> list[Cell]:
     """Return the cells of the damping parameters' values and standard deviations.
 
     Fixed values have no standard deviation. Parameters that the structure does not have are dashes.
     """
-    not_reported = unreported_parameters(structure, withheld)
+    not_reported = unreported_parameters(structure, unsupported_orders)
     cells: list[Cell] = []
     for name in _DAMPING_PARAMETERS:
         if not structure.has(name):
@@ -166,13 +173,13 @@ _INDEX_UNITS: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
 """Note on the units of the indices."""
 
 
-def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> Table:
+def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str] = ()) -> Table:
     """Return the parameters and indices of every Welch fit of a record.
 
     Parameters
     ----------
     analysis : WelchAnalysis
-    withheld : collection of str
+    unsupported_orders : collection of str
         Orders that the whole record does not support. They are marked.
     """
     fits = [model.fit for model in analysis.models]
@@ -189,7 +196,7 @@ def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) ->
             (
                 *_type_and_weighting(model),
                 *_damping_cells(
-                    fit.structure, fit.parameters, fit.std, withheld=withheld,
+                    fit.structure, fit.parameters, fit.std, unsupported_orders=unsupported_orders,
                     at_bounds=fit.at_bounds,
                 ),
                 response_fit_percent(analysis, model),
@@ -198,7 +205,7 @@ def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) ->
             for fit, model in zip(fits, analysis.models, strict=True)
         ),
         (
-            *footnotes(withheld),
+            *footnotes(unsupported_orders),
             f"Fit: NRMSE of the complex response in the band. {_INDEX_UNITS} std (±): one standard "
             "deviation, from the scatter of the response about the model. The bias of Welch's "
             "estimate on a chirp, which the window smears at the resonances, is not in it and is "
@@ -248,7 +255,7 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
                 column
                 for name in _INDEX_NAMES
                 for column in (
-                    Column(name.upper(), name), Column("std", f"{name}_std", spread=True),
+                    Column(name.upper(), name), Column("std", f"{name}_std", std_of_previous=True),
                 )
             ),
         ),
@@ -314,11 +321,11 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     if not modes:
         return None
 
-    def cells(model: FittedModel, name: str, form: str, factor: float = 1.0) -> list[Cell]:
+    def cells(model: FittedModel, name: str, number_format: str, factor: float = 1.0) -> list[Cell]:
         mode_cells = []
         for mode, is_followed in zip(model.modes, model.followed, strict=True):
             cell = number_cell(
-                getattr(mode, name) if mode.damping_ratio < 1 else None, form, factor
+                getattr(mode, name) if mode.damping_ratio < 1 else None, number_format, factor
             )
             if cell.value is not None and not is_followed:
                 cell = grey_cell(replace(cell, text=cell.text + _FAR_MODE_MARK))

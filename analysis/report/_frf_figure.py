@@ -133,7 +133,7 @@ def _draw_type_panel(
         )
         if label.startswith("measured"):
             # Dots: a line would run up and down wherever noise wraps the phase.
-            point_indices = style.spread(at_hz, 2 * _CURVE_COLUMNS)
+            point_indices = style.log_spaced_indices(at_hz, 2 * _CURVE_COLUMNS)
             style.dots(
                 phase,
                 at_hz[point_indices],

@@ -57,7 +57,7 @@ def paper_tables(campaign: CampaignResult, *, with_paper: bool = False) -> tuple
 def welch_text(campaign: CampaignResult) -> str:
     """Return how the sessions' frequency responses were estimated, as text."""
     settings = campaign.settings
-    counts = [each.segments for each in campaign.sessions]
+    counts = [session.segments for session in campaign.sessions]
     low, high = min(counts), max(counts)
     segments = f"{low}" if low == high else f"{low} to {high}"
     # Of the settings as used, no length is left open to depend on the rate.
@@ -137,10 +137,10 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
     types = list(dict.fromkeys(model.structure for model in campaign.nominal))
     weightings = list(dict.fromkeys(model.weighting for model in campaign.nominal))
     deviations = {
-        (quantity, item.mode, model.weighting, model.structure): getattr(item, quantity)
+        (quantity, deviation.mode, model.weighting, model.structure): getattr(deviation, quantity)
         for quantity in _PEAK_HEADINGS
         for model in campaign.nominal
-        for item in model.deviations
+        for deviation in model.deviations
     }
     rows: list[Row] = []
     for quantity, mode, weighting in sorted(
@@ -148,9 +148,9 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
     ):
         row_key = (quantity, mode, weighting)
         cells = {
-            item: number_cell(deviations[*row_key, item], ".3g")
-            for item in types
-            if (*row_key, item) in deviations
+            type_name: number_cell(deviations[*row_key, type_name], ".3g")
+            for type_name in types
+            if (*row_key, type_name) in deviations
         }
         paper_values = {
             item: papers_table4().get((item, weighting, quantity, mode))
@@ -176,7 +176,7 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
         (
             Column("peak", "quantity", WORDS),
             Column("weights", "weighting", WORDS),
-            *(Column(f"type {item}", item) for item in types),
+            *(Column(f"type {type_name}", type_name) for type_name in types),
         ),
         tuple(rows),
         (
@@ -195,7 +195,8 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
     """Return the parameters and the WMSE of the two best nominal models (Table 5)."""
     rows: list[Row] = []
     std = {
-        (item.structure, item.weighting, item.parameter): item.std for item in campaign.statistics
+        (statistics.structure, statistics.weighting, statistics.parameter): statistics.std
+        for statistics in campaign.statistics
     }
     for model in best_models(campaign.nominal):
         paper_wmse = papers_wmse().get((model.structure, model.weighting))
@@ -217,10 +218,10 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
                 ),
                 **{
                     name: value
-                    for item in model.deviations
+                    for deviation in model.deviations
                     for name, value in (
-                        (f"mdr_omega_{item.mode}_rad_s", item.frequency_rad_s),
-                        (f"mdr_magnitude_{item.mode}_db", item.magnitude_db),
+                        (f"mdr_omega_{deviation.mode}_rad_s", deviation.frequency_rad_s),
+                        (f"mdr_magnitude_{deviation.mode}_db", deviation.magnitude_db),
                     )
                 },
                 **_paper_entries(paper_values),
@@ -271,7 +272,7 @@ def indices_table(campaign: CampaignResult) -> Table:
                 column
                 for index, heading in _INDEX_HEADINGS.items()
                 for column in (
-                    Column(heading, index), Column("std", f"{index}_std", spread=True)
+                    Column(heading, index), Column("std", f"{index}_std", std_of_previous=True)
                 )
             ),
         ),
@@ -283,10 +284,10 @@ def indices_table(campaign: CampaignResult) -> Table:
 
 def bias_table(campaign: CampaignResult) -> Table:
     """Return the bias of the Welch fits relative to the pooled whole-record estimates."""
-    withheld = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
+    unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
     rows: list[Row] = []
     for fit_bias in campaign.welch_biases:
-        not_reported = unreported_parameters(STRUCTURES[fit_bias.structure], withheld)
+        not_reported = unreported_parameters(STRUCTURES[fit_bias.structure], unsupported_orders)
         for parameter in fit_bias.parameters:
             symbol, factor = _TABLE_3_HEADINGS[parameter.parameter]
             welch = estimate_cells(
@@ -320,15 +321,15 @@ def bias_table(campaign: CampaignResult) -> Table:
         title("Bias of the Welch fits against the whole records", campaign.homogeneity),
         (
             *FIT_NAME_COLUMNS, Column("parameter", "parameter", WORDS),
-            Column("Welch, mean", "welch"), Column("std", "welch_std", spread=True),
-            Column("whole records", "record"), Column("std", "record_std", spread=True),
+            Column("Welch, mean", "welch"), Column("std", "welch_std", std_of_previous=True),
+            Column("whole records", "record"), Column("std", "record_std", std_of_previous=True),
             Column("difference", "bias"), Column("significant", "significant", WORDS),
         ),
         tuple(rows),
         (
             "Types whose whole-record residual is noise. Significant: other than zero at the 0.1 % "
             "level. A bias is the same in every session: it does not show in the std of Table 3.",
-            *footnotes(withheld),
+            *footnotes(unsupported_orders),
         ),
         grouped=True,
     )  # fmt: skip

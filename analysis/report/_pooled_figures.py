@@ -163,14 +163,16 @@ def _session_estimates_of_mode(
 ) -> list[ModeEstimate]:
     """Return the estimates of one mode from every session, by the pooled mode's model."""
     if mode.source == "modal":
-        shown = (each.modal for each in campaign.sessions)
-        return [each.mode(mode.number) for each in shown if each and mode.number in each.visible]
+        modal_fits = (session.modal for session in campaign.sessions)
+        return [
+            each.mode(mode.number) for each in modal_fits if each and mode.number in each.visible
+        ]
     return [
-        own
+        mode_estimate
         for session in campaign.sessions
-        for each in session.record_estimates
-        for own in each.modes
-        if each.name == pooled.name and own.number == mode.number
+        for estimate in session.record_estimates
+        for mode_estimate in estimate.modes
+        if estimate.name == pooled.name and mode_estimate.number == mode.number
     ]
 
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 _INERTIA_COLUMNS: Final = (
     Column("inertia (10⁻⁶ kg·m²)", "participation_kg_m2"),
-    Column("std", "participation_std_kg_m2", spread=True),
+    Column("std", "participation_std_kg_m2", std_of_previous=True),
 )
 """Columns of a mode's effective inertia and its standard deviation."""
 NOT_POOLED: Final = (
@@ -122,11 +122,11 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
         Estimate to show. Without it, as in the files, all estimates are in the table, followed by
         the structures that are not pooled, without values.
     """
-    withheld = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
+    unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
     homogeneity, headline = campaign.homogeneity, campaign.headline
     columns = (
         Column("parameter", "parameter", WORDS),
-        Column("pooled", "value"), Column("std", "std", spread=True),
+        Column("pooled", "value"), Column("std", "std", std_of_previous=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
         Column("one session's std", "within_std"), Column("between sessions", "between_std"),
         Column("p", "p_value"),
@@ -134,23 +134,23 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
     if only is None:
         ordered_estimates = sorted(campaign.pooled, key=lambda item: item is not headline)
         rows = [
-            _pooled_row(estimate, item, campaign, withheld)
+            _pooled_row(estimate, parameter, campaign, unsupported_orders)
             for estimate in ordered_estimates
-            for item in estimate.parameters
+            for parameter in estimate.parameters
         ]
         rows += [
             {
-                "type": item.structure,
-                "name": item.name,
+                "type": structure.structure,
+                "name": structure.name,
                 "headline": False,
-                "sessions": item.determined,
-                "misfit": item.misfit,
+                "sessions": structure.determined,
+                "misfit": structure.misfit,
                 "parameter": parameter,
                 "reported": False,
             }
-            for item in campaign.structures
-            if not item.pooled
-            for parameter in STRUCTURES[item.structure].free
+            for structure in campaign.structures
+            if not structure.pooled
+            for parameter in STRUCTURES[structure.structure].free
         ]
         return Table("pooled", "Pooled whole-record estimates", columns, tuple(rows))
     role = "freest structure"
@@ -162,9 +162,9 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
         "standard deviation between sessions beyond that (τ). p: p-value of Cochran's Q. "
         f"Residual {only.misfit:.4g} times the noise."
     ]
-    if unreported_parameters(STRUCTURES[only.structure], withheld):
-        notes += footnotes(withheld)
-    if any(homogeneity.is_mixed(item.name) for item in only.parameters):
+    if unreported_parameters(STRUCTURES[only.structure], unsupported_orders):
+        notes += footnotes(unsupported_orders)
+    if any(homogeneity.is_mixed(parameter.name) for parameter in only.parameters):
         notes.append(MIXTURE_NOTE)
     return Table(
         f"pooled_{only.name.replace(', ', '_').replace(' ', '_')}",
@@ -173,7 +173,10 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
             homogeneity,
         ),
         columns,
-        tuple(_pooled_row(only, item, campaign, withheld) for item in only.parameters),
+        tuple(
+            _pooled_row(only, parameter, campaign, unsupported_orders)
+            for parameter in only.parameters
+        ),
         tuple(notes),
     )
 
@@ -182,7 +185,7 @@ def _pooled_row(
     pooled: PooledEstimate,
     parameter: PooledParameter,
     campaign: CampaignResult,
-    withheld: Collection[str],
+    unsupported_orders: Collection[str],
 ) -> Row:
     """Return the row of a parameter in the table of pooled estimates."""
     homogeneity = campaign.homogeneity
@@ -191,7 +194,7 @@ def _pooled_row(
         (parameter.value, parameter.std, *parameter.interval), parameter.std, factor
     )
     is_reported = parameter.name not in unreported_parameters(
-        STRUCTURES[pooled.structure], withheld
+        STRUCTURES[pooled.structure], unsupported_orders
     )
     if not is_reported:
         value = mark_cell(value)
@@ -235,9 +238,9 @@ def tolerant_table(campaign: CampaignResult) -> Table:
     tolerant = modal.tolerant if modal else None
     columns = (
         Column("parameter", "parameter", WORDS), Column("value", "value"),
-        Column("std", "std", spread=True),
+        Column("std", "std", std_of_previous=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
-        Column(EXACT_CONDITION, "exact"), Column("std", "exact_std", spread=True),
+        Column(EXACT_CONDITION, "exact"), Column("std", "exact_std", std_of_previous=True),
     )  # fmt: skip
     if modal is None or tolerant is None or numbers is None:
         return Table("parameters", "", columns, ())
@@ -266,7 +269,9 @@ def tolerant_table(campaign: CampaignResult) -> Table:
                 "flag": quantity.flag,
             }
         )
-    flags = dict.fromkeys(each.flag for each in numbers.parameters.values() if each.flag)
+    flags = dict.fromkeys(
+        parameter.flag for parameter in numbers.parameters.values() if parameter.flag
+    )
     return Table(
         "parameters",
         title(
@@ -311,7 +316,7 @@ def uniform_beam_table(campaign: CampaignResult) -> Table:
         title("Modal constants, and those of the uniform beam that fits best", homogeneity),
         (
             Column("mode", "mode"), Column("constant", "constant", WORDS),
-            Column("measured", "measured"), Column("std", "std", spread=True),
+            Column("measured", "measured"), Column("std", "std", std_of_previous=True),
             Column("uniform beam", "predicted"), Column("difference (std)", "deviation", ".1f"),
         ),
         tuple(rows),
@@ -353,10 +358,10 @@ def modes_table(campaign: CampaignResult) -> Table:
         (
             Column("mode", "mode"),
             Column("frequency (Hz)", "frequency_hz"),
-            Column("std", "frequency_std_hz", spread=True),
+            Column("std", "frequency_std_hz", std_of_previous=True),
             Column("between sessions", "frequency_between_std_hz"),
             Column("damping ratio (%)", "damping_ratio"),
-            Column("std", "damping_ratio_std", spread=True),
+            Column("std", "damping_ratio_std", std_of_previous=True),
             Column("between sessions", "damping_ratio_between_std"),
             *(_INERTIA_COLUMNS if any(row["source"] == "modal" for row in rows) else ()),
         ),

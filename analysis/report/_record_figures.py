@@ -113,7 +113,7 @@ def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
         float(np.quantile(modelled_db, 0.05)),
     )
     magnitude.set_ylim(lowest_db - 5, float(modelled_db.max()) + 5)
-    point_indices = style.spread(measured.frequency_hz, _RESPONSE_POINTS)
+    point_indices = style.log_spaced_indices(measured.frequency_hz, _RESPONSE_POINTS)
     style.dots(
         phase,
         measured.frequency_hz[point_indices],
@@ -212,7 +212,7 @@ def loss_figure(
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     *,
-    withheld: Collection[str] = (),
+    unsupported_orders: Collection[str] = (),
     doubtful: Collection[int] = (),
 ) -> Figure:
     """Draw internal, external and total loss factor, and twice the damping ratio of each mode.
@@ -228,14 +228,14 @@ def loss_figure(
     supported_hz : tuple of float or None
         Frequency band in which the data support the curves. No curve is drawn outside it. None: the
         data nowhere support the curves.
-    withheld : collection of str
+    unsupported_orders : collection of str
         Orders that the data do not support. If there is one, the total is not split into its parts.
     doubtful : collection of int
         Numbers of the modes whose damping ratio is flagged. Their points are hollow.
     """
     figure = style.new_figure(9.0, 3.6)
     axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))
-    drawn_values = _draw_loss_factors(axes, beam, axis_hz, supported_hz, withheld)
+    drawn_values = _draw_loss_factors(axes, beam, axis_hz, supported_hz, unsupported_orders)
     for label, filled in (("modes", True), ("modes, doubtful", False)):
         drawn_modes = [mode for mode in modes if (mode.number not in doubtful) is filled]
         if drawn_modes:
@@ -274,7 +274,7 @@ def _draw_loss_factors(
     beam: Estimate | None,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
-    withheld: Collection[str],
+    unsupported_orders: Collection[str],
 ) -> list[NDArray[np.float64]]:
     """Draw the loss factors where the data support them, and return the drawn values."""
     if supported_hz is None or beam is None:
@@ -290,7 +290,7 @@ def _draw_loss_factors(
     drawn_values = []
     for (label, factor), order in zip(curves.items(), ("alpha", "lambda", None), strict=True):
         # If one part is unknown, the parts are not distinguished; alone, a part is the total.
-        if factor is None or (order is not None and (not has_both_parts or withheld)):
+        if factor is None or (order is not None and (not has_both_parts or unsupported_orders)):
             continue
         color, dash = _CURVE_STYLES[label]
         axes.fill_between(
@@ -467,16 +467,16 @@ FIGURES: Final = ("record_frf", UNIFORMITY, "loss_factor", "residual", "record_s
 The second figure is omitted if too few modes are visible for the test."""
 
 
-def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
+def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     """Yield the figures of a whole record, drawn one after the other; call it within `styled`."""
     from analysis.report._signal_figures import signals_figure
 
-    highest_hz, headline = whole.band_hz[1], whole.headline
-    model = ShownModel.of(headline, whole.record)
-    analysis = model.compared(whole.analysis)
+    highest_hz, headline = whole_record.band_hz[1], whole_record.headline
+    model = ShownModel.of(headline, whole_record.record)
+    analysis = model.compared(whole_record.analysis)
     modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
     frf, _, loss, residual, signals = FIGURES
-    measured = measured_response(whole)
+    measured = measured_response(whole_record)
     delay = "delay" if model.modal is None else "the delay that the file states"
     yield Illustration(
         frf,
@@ -489,7 +489,7 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
     test = headline.uniform_beam
     if test is not None and test.p_value is not None:
         yield Illustration(UNIFORMITY, uniformity_figure(test), uniformity_description(test))
-    beam = loss_estimate(whole)
+    beam = loss_estimate(whole_record)
     doubtful = [mode.number for mode in headline.modes if mode.damping_ratio.flag is not None]
     yield Illustration(
         loss,
@@ -497,11 +497,11 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
             model.modes,
             beam,
             (float(measured.frequency_hz[0]), highest_hz),
-            supported_band_hz(whole),
-            withheld=whole.withheld,
+            supported_band_hz(whole_record),
+            unsupported_orders=whole_record.withheld,
             doubtful=doubtful,
         ),
-        _loss_description(whole, drawn=beam is not None),
+        _loss_description(whole_record, drawn=beam is not None),
     )
     power = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
     yield Illustration(
@@ -515,27 +515,28 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
     )
     yield Illustration(
         signals,
-        signals_figure(whole.record, model, highest_hz),
+        signals_figure(whole_record.record, model, highest_hz),
         f"Motor angle; coupling torque from 0 to {highest_hz:g} Hz, measured and as {model.name} "
-        f"predicts it from the measured angle (fit {model.fit_percent(whole.analysis):.2f} % "
-        "NRMSE); residual; below, where each mode rings most.",
+        "predicts it from the measured angle "
+        f"(fit {model.fit_percent(whole_record.analysis):.2f} % NRMSE); residual; below, "
+        "where each mode rings most.",
     )
 
 
-def _loss_description(whole: WholeRecord, *, drawn: bool) -> str:
+def _loss_description(whole_record: WholeRecord, *, drawn: bool) -> str:
     """Return the description of the loss factor's figure."""
     points = "twice the damping ratio of each mode with its 95 % interval"
-    reasons = _reasons_of_hollow_points(whole.headline)
+    reasons = _reasons_of_hollow_points(whole_record.headline)
     if not drawn:
         return (
             f"Loss factor over frequency: {points}. There is no curve, because no beam with one "
             f"internal and one external order explains the losses.{reasons}"
         )
     beginning = (
-        f"Loss factor over frequency with 95 % bands, {_describe_curve_model(whole)}; "
+        f"Loss factor over frequency with 95 % bands, {_describe_curve_model(whole_record)}; "
         f"points: {points}. "
     )
-    if whole.withheld:
+    if whole_record.withheld:
         return beginning + (
             "It is of all damping, not split into internal and external, and drawn between the "
             "modes that show only: elsewhere (grey), and for either part, an order that the data "
@@ -548,11 +549,11 @@ def _loss_description(whole: WholeRecord, *, drawn: bool) -> str:
     )
 
 
-def _describe_curve_model(whole: WholeRecord) -> str:
+def _describe_curve_model(whole_record: WholeRecord) -> str:
     """Return which beam the loss factors' curves belong to, for the figure's description."""
-    tolerant = whole.headline.tolerant
+    tolerant = whole_record.headline.tolerant
     if tolerant is None:
-        return f"type {whole.headline.name}"
+        return f"type {whole_record.headline.name}"
     if tolerant.basis == "losses":
         return "of both dampings by damping ratios and residue phases alone"
     percent = 100 * tolerant.uniformity
@@ -567,16 +568,18 @@ def _reasons_of_hollow_points(headline: Headline) -> str:
     return f" Hollow points are doubtful: {'; '.join(map(str, reasons))}." if reasons else ""
 
 
-def measured_response(whole: WholeRecord) -> FrequencyResponse:
+def measured_response(whole_record: WholeRecord) -> FrequencyResponse:
     """Return the empirical transfer function estimate from below the first mode to the band's end.
 
     It still includes the delay between the channels.
     """
-    record = whole.record
+    record = whole_record.record
     angle = record.angle_rad - (record.rest_angle_rad or 0.0)
     response = fft_response(angle, record.torque_nm, record.rate_hz, fast_length(len(angle)))
-    first_mode_hz = float(undamped_frequencies_rad_s(whole.fit.plant.beam, 1)[0]) / (2 * np.pi)
-    first_hz, last_hz = whole.band_hz
+    first_mode_hz = float(undamped_frequencies_rad_s(whole_record.fit.plant.beam, 1)[0]) / (
+        2 * np.pi
+    )
+    first_hz, last_hz = whole_record.band_hz
     response = response.band(max(first_hz, min(first_mode_hz / 4, last_hz / 4)), last_hz)
     is_finite = np.isfinite(response.response)
     return replace(

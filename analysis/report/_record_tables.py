@@ -46,12 +46,12 @@ _MARK_NOTE: Final = (
 """Note that explains the mark of flagged parameters."""
 
 
-def modes_table(whole: WholeRecord) -> Table:
+def modes_table(whole_record: WholeRecord) -> Table:
     """Return the modes' frequencies, damping ratios and effective inertias.
 
     Modes with a doubtful damping ratio are marked.
     """
-    headline = whole.headline
+    headline = whole_record.headline
     has_inertias = any(mode.participation is not None for mode in headline.modes)
     rows: list[tuple[Entry, ...]] = []
     for mode in headline.modes:
@@ -73,15 +73,15 @@ def modes_table(whole: WholeRecord) -> Table:
         (
             "Intervals are statistical only; no torque scale, length or density acts on "
             "frequencies and damping ratios.",
-            *_modal_notes(whole),
+            *_modal_notes(whole_record),
             *_reason_notes(mode.damping_ratio for mode in headline.modes),
         ),
     )
 
 
-def exact_modes_table(whole: WholeRecord) -> Table | None:
+def exact_modes_table(whole_record: WholeRecord) -> Table | None:
     """Return the modes of the uniform beam that explains the modal constants; None if none does."""
-    headline = whole.headline
+    headline = whole_record.headline
     test, exact = headline.uniform_beam, headline.exact
     if test is None or exact is None or test.status != "passed":
         return None
@@ -135,16 +135,18 @@ def _inertia_cells(participation: ReportedValue | None) -> tuple[Cell, Cell]:
     return value, std
 
 
-def _modal_notes(whole: WholeRecord) -> Iterator[str]:
+def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
     """Yield notes on the fit of the modal model and on its resonances that are not the beam's."""
-    modal = whole.headline.modal
+    modal = whole_record.headline.modal
     if modal is None:
         return
     yield (
         "Inertia: effective inertia about the motor axis that takes part in the mode; it is "
         "proportional to the torque scale."
     )
-    percent = ShownModel.of(whole.headline, whole.record).fit_percent(whole.analysis)
+    percent = ShownModel.of(whole_record.headline, whole_record.record).fit_percent(
+        whole_record.analysis
+    )
     yield f"Fit of the modal model {percent:.2f} % (NRMSE)."
     further_hz = [
         f"{frequency_hz:.4g}"
@@ -158,14 +160,14 @@ def _modal_notes(whole: WholeRecord) -> Iterator[str]:
         )
 
 
-def parameters_table(whole: WholeRecord) -> Table:
+def parameters_table(whole_record: WholeRecord) -> Table:
     """Return all parameters with their uncertainties; flagged ones are marked, with the reason.
 
     If the file states the uncertainties of the scales, the table also contains intervals that
     include them.
     """
-    headline = whole.headline
-    values_with_scales = whole.combined
+    headline = whole_record.headline
+    values_with_scales = whole_record.combined
     including_scales = (
         Column("", "combined_std"),
         Column("with scales: from", "combined_low_95"),
@@ -173,7 +175,7 @@ def parameters_table(whole: WholeRecord) -> Table:
     )
     fit_note = ""
     if headline.tolerant is None:
-        fit_note = f" Fit {whole.analysis.fit_percent(headline.fit):.2f} % (NRMSE)."
+        fit_note = f" Fit {whole_record.analysis.fit_percent(headline.fit):.2f} % (NRMSE)."
     return Table.of(
         "parameters",
         f"Parameters{_condition_text(headline)}",
@@ -189,7 +191,7 @@ def parameters_table(whole: WholeRecord) -> Table:
         ),
         (
             f"{_UNCERTAINTY_NOTE}{fit_note}",
-            *scale_notes(whole),
+            *scale_notes(whole_record),
             *((_MARK_NOTE,) if headline.flags else ()),
         ),
     )
@@ -235,9 +237,9 @@ def _condition_text(headline: Headline) -> str:
     return " of the beam that fits the losses best: it does not explain them"
 
 
-def exact_geometry_table(whole: WholeRecord) -> Table | None:
+def exact_geometry_table(whole_record: WholeRecord) -> Table | None:
     """Return the parameters of an exactly uniform beam; None if the main table shows them."""
-    exact = whole.headline.exact
+    exact = whole_record.headline.exact
     if exact is None:
         return None
     flags = [parameter.flag for parameter in exact.parameters.values() if parameter.flag]
@@ -247,13 +249,13 @@ def exact_geometry_table(whole: WholeRecord) -> Table | None:
         (*_PARAMETER_COLUMNS, _REMARK_COLUMN),
         (
             _parameter_row(
-                name, parameter, {}, is_fixed=_is_fixed(whole.headline, name, exact=True)
+                name, parameter, {}, is_fixed=_is_fixed(whole_record.headline, name, exact=True)
             )
             for name, parameter in exact.parameters.items()
         ),
         (
             "A condition, not a result: no antenna is known to be uniform to 1e-5. "
-            f"Fit {whole.analysis.fit_percent(whole.fit):.2f} % (NRMSE).",
+            f"Fit {whole_record.analysis.fit_percent(whole_record.fit):.2f} % (NRMSE).",
             *((_MARK_NOTE,) if flags else ()),
         ),
     )
@@ -266,12 +268,12 @@ def _is_fixed(headline: Headline, name: str, *, exact: bool = False) -> bool:
     return name not in headline.fit.interval and name != "drag"
 
 
-def sizes_table(whole: WholeRecord) -> Table:
+def sizes_table(whole_record: WholeRecord) -> Table:
     """Return the loss factors of internal and external damping at their pivot frequencies.
 
     There, the loss factor is not correlated with the order of the damping.
     """
-    headline = whole.headline
+    headline = whole_record.headline
     return Table.of(
         "damping_sizes",
         "Loss factor of either damping at its pivot frequency",
@@ -294,9 +296,9 @@ def sizes_table(whole: WholeRecord) -> Table:
     )
 
 
-def condition_table(whole: WholeRecord) -> Table | None:
+def condition_table(whole_record: WholeRecord) -> Table | None:
     """Return the reported values next to those of a simpler structure; None if none suffices."""
-    headline: Estimates = whole.headline.exact or whole.headline
+    headline: Estimates = whole_record.headline.exact or whole_record.headline
     simpler = headline.simpler
     if simpler is None:
         return None
@@ -337,18 +339,19 @@ def condition_table(whole: WholeRecord) -> Table | None:
         rows,
         (
             "The intervals on the left hold only if the assumption is true"
-            + (f", and both {EXACT_CONDITION}." if whole.headline.exact else "."),
+            + (f", and both {EXACT_CONDITION}." if whole_record.headline.exact else "."),
         ),
     )
 
 
-def correlations_table(whole: WholeRecord) -> Table:
+def correlations_table(whole_record: WholeRecord) -> Table:
     """Return the correlations between the determined parameters of the selected fit."""
-    fit = whole.fit
+    fit = whole_record.fit
     symbols = [_parameter_symbol(name) for name in fit.determined]
     return Table.of(
         "correlations",
-        f"Correlations of the parameters on an exactly uniform beam, type {whole.headline.name}",
+        "Correlations of the parameters on an exactly uniform beam, "
+        f"type {whole_record.headline.name}",
         (
             Column("Parameter", "parameter", WORDS),
             *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
@@ -458,9 +461,9 @@ def _correlation_cell(is_diagonal: bool, value: float) -> Cell:
     return replace(cell, strong=True)
 
 
-def amplitude_tables(whole: WholeRecord) -> tuple[Table, ...]:
+def amplitude_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
     """Return a table of the damping ratio in free vibration by amplitude; nothing without data."""
-    damping_by_amplitude = whole.verdict.damping_with_amplitude
+    damping_by_amplitude = whole_record.verdict.damping_with_amplitude
     if not damping_by_amplitude:
         return ()
     rows: list[tuple[Entry, ...]] = []

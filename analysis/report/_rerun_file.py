@@ -429,7 +429,7 @@ _PLOTS_OVER_TIME: Final = (
 """Plots over time: torque, measured and modelled, and residual."""
 
 
-def record_page(whole: WholeRecord) -> ChartPage:
+def record_page(whole_record: WholeRecord) -> ChartPage:
     """Return the page with the response and residual of the whole record's displayed model.
 
     The measured response is the ratio of the whole record's transforms, without the model's delay.
@@ -437,8 +437,8 @@ def record_page(whole: WholeRecord) -> ChartPage:
     from analysis.report._record_figures import measured_response
 
     measured_with_delay, shown_model = (
-        measured_response(whole),
-        ShownModel.of(whole.headline, whole.record),
+        measured_response(whole_record),
+        ShownModel.of(whole_record.headline, whole_record.record),
     )
     grid_hz = measured_with_delay.frequency_hz
     delay_phasor = np.exp(2j * np.pi * shown_model.delay_s * grid_hz)
@@ -502,13 +502,13 @@ def record_page(whole: WholeRecord) -> ChartPage:
 
 
 def draw_record(
-    whole: WholeRecord, torque: TorqueInBand, tables: str, stream: RecordingStream
+    whole_record: WholeRecord, torque: TorqueInBand, tables: str, stream: RecordingStream
 ) -> None:
     """Draw the results of the whole record: verdict, response, and torque over time.
 
     Parameters
     ----------
-    whole
+    whole_record
         Whole record with its fits.
     torque
         Measured torque, and the torque of the displayed model.
@@ -518,25 +518,25 @@ def draw_record(
         Recording to draw into.
     """
     sentences = [
-        *(f"**{sentence}**" for sentence in damping_sentences(whole.headline)),
-        *whole.verdict.sentences,
-        *(f"* {advice}" for advice in whole.verdict.experiments),
+        *(f"**{sentence}**" for sentence in damping_sentences(whole_record.headline)),
+        *whole_record.verdict.sentences,
+        *(f"* {advice}" for advice in whole_record.verdict.experiments),
     ]
     _draw_text(VERDICT, "\n\n".join((*sentences, f"```\n{tables}\n```")), stream)
-    _draw_page(record_page(whole), stream)
-    t_ns = np.round(1e9 * whole.record.time_s).astype(np.int64)
+    _draw_page(record_page(whole_record), stream)
+    t_ns = np.round(1e9 * whole_record.record.time_s).astype(np.int64)
     for lines in _PLOTS_OVER_TIME:
         send_columns(stream, lines.entity, t_ns, {_SCALARS_COMPONENT: lines.values(torque)})
 
 
-def record_tab(whole: WholeRecord, torque: TorqueInBand) -> rrb.Container:
+def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container:
     """Return the tab of the whole record, which contains tabs for verdict, response and torque."""
     import rerun.blueprint as rrb
 
-    end_s = float(whole.record.time_s[-1])
+    end_s = float(whole_record.record.time_s[-1])
     return rrb.Tabs(
         rrb.TextDocumentView(name=VERDICT_PAGE, origin=VERDICT),
-        _page_view(record_page(whole)),
+        _page_view(record_page(whole_record)),
         rrb.Vertical(
             *(
                 _lines_view(lines, end_s, float(np.abs(lines.values(torque)).max()))
@@ -612,14 +612,16 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     """
     from rigd.view import draw_session
 
-    whole, welch, tabs = result.whole, result.welch, []
-    if whole is not None:
+    whole_record, welch, tabs = result.whole, result.welch, []
+    if whole_record is not None:
         from analysis.report._signal_figures import torque_in_band
 
         torque = torque_in_band(
-            whole.record, ShownModel.of(whole.headline, whole.record).transfer, whole.band_hz[1]
+            whole_record.record,
+            ShownModel.of(whole_record.headline, whole_record.record).transfer,
+            whole_record.band_hz[1],
         )
-        tabs.append(record_tab(whole, torque))
+        tabs.append(record_tab(whole_record, torque))
     if welch is not None:
         tabs.append(tab(welch))
     session = read_session(result.record.path)
@@ -627,8 +629,8 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     try:
         with new_rrd_file(path) as stream:
             draw_session(stream, session, timings, front=tabs)
-            if whole is not None:
-                draw_record(whole, torque, as_text(record_tables(whole)), stream)
+            if whole_record is not None:
+                draw_record(whole_record, torque, as_text(record_tables(whole_record)), stream)
             if welch is not None:
                 draw(welch, as_text(analysis_tables(result)), stream)
     except RrdFileError as error:

@@ -19,16 +19,16 @@ _SUPERSCRIPTS: Final = str.maketrans("-123456789", "⁻¹²³⁴⁵⁶⁷⁸⁹"
 """Translation table from digits and the minus sign to superscripts."""
 
 
-def scale_notes(whole: WholeRecord) -> Iterator[str]:
+def scale_notes(whole_record: WholeRecord) -> Iterator[str]:
     """Yield notes on the scales: which uncertainties the intervals include, and which not."""
-    if not scales_absorbed(whole.fit):
-        held_parameters = ", ".join(QUANTITIES[name][0] for name in whole.fixed)
+    if not scales_absorbed(whole_record.fit):
+        held_parameters = ", ".join(QUANTITIES[name][0] for name in whole_record.fixed)
         yield (
             f"Intervals are statistical only: the file's values of {held_parameters}, "
             "which were held, the torque scale and the length are assumed exact."
         )
         return
-    stated_uncertainty = whole.record.uncertainty
+    stated_uncertainty = whole_record.record.uncertainty
     known_scales = [
         f"{scale_name} {100 * stated_uncertainty[name]:.3g} %"
         for name, scale_name in _SCALE_NAMES.items()
@@ -48,10 +48,12 @@ def scale_notes(whole: WholeRecord) -> Iterator[str]:
             f": the uncertainty of {' and '.join(unknown_scales)}, which the file does not state."
         )
     yield (
-        f"A wrong scale shows as {_scale_dependence(whole)}; no other parameter depends on these, "
-        "and none on the stated density."
+        f"A wrong scale shows as {_scale_dependence(whole_record)}; no other parameter depends on "
+        "these, and none on the stated density."
     )
-    density = density_check(whole.fit, whole.record.beam.density_kg_per_m, stated_uncertainty)
+    density = density_check(
+        whole_record.fit, whole_record.record.beam.density_kg_per_m, stated_uncertainty
+    )
     if density is None:
         return
     pairs = (
@@ -72,11 +74,11 @@ def scale_notes(whole: WholeRecord) -> Iterator[str]:
     )
 
 
-def _scale_dependence(whole: WholeRecord) -> str:
+def _scale_dependence(whole_record: WholeRecord) -> str:
     """Return how each parameter depends on the scales, as a list of powers."""
     return ", ".join(
         f"{QUANTITIES[name][0]} ∝ {_product_text(SCALE_EXPONENTS[name])}"
-        for name in whole.headline.parameters
+        for name in whole_record.headline.parameters
         if name in SCALE_EXPONENTS
     )
 

@@ -290,7 +290,7 @@ def envelope(
     return np.repeat(x[starts], 2), pairs.ravel()
 
 
-def spread(x: NDArray[np.float64], count: int) -> NDArray[np.intp]:
+def log_spaced_indices(x: NDArray[np.float64], count: int) -> NDArray[np.intp]:
     """Return the indices of at most `count` values of x that are evenly spaced in log x.
 
     x is positive and increasing.

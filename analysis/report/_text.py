@@ -48,14 +48,14 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
         Whether all tables are included. Otherwise the text contains the verdict, the modes and the
         parameters of damping and beam, or without a whole-record fit the Welch fits.
     """
-    whole, welch = result.whole, result.welch
+    whole_record, welch = result.whole, result.welch
     parts: list[RenderableType] = []
-    if whole is not None:
-        parts.append(record_text(whole) if verbose else _main_results(whole))
+    if whole_record is not None:
+        parts.append(record_text(whole_record) if verbose else _main_results(whole_record))
     if welch is not None and verbose:
         parts.append(analysis_tables(result))
     elif welch is not None:
-        if whole is None:
+        if whole_record is None:
             parts.append(Text(result.validity.sentence))
             parts += spaced((fit_tables.welch_fits_table(welch),))
         parts += _warning_lines(result.warnings)
@@ -71,10 +71,10 @@ _RIG_PARAMETERS: Final = ("delay_s", "tool_inertia_kg_m2")
 """Parameters of the rig, which the verdict names if they differ from the file's values."""
 
 
-def _main_results(whole: WholeRecord) -> RenderableType:
+def _main_results(whole_record: WholeRecord) -> RenderableType:
     """Return the verdict, the modes and the parameters of damping and beam."""
-    parameters = tables.parameters_table(whole)
-    names = tables.parameter_names(whole.headline)
+    parameters = tables.parameters_table(whole_record)
+    names = tables.parameter_names(whole_record.headline)
     rows = [
         row for name, row in zip(names, parameters.rows, strict=True) if name not in _RIG_PARAMETERS
     ]
@@ -82,9 +82,9 @@ def _main_results(whole: WholeRecord) -> RenderableType:
     omitted_column = "meaning" if any(row["remark"] for row in rows) else "remark"
     columns = tuple(column for column in parameters.columns if column.key != omitted_column)
     short_table = replace(parameters, columns=columns, rows=tuple(rows))
-    modes = tables.modes_table(whole)
+    modes = tables.modes_table(whole_record)
     return Group(
-        *map(Text, whole.verdict.sentences),
+        *map(Text, whole_record.verdict.sentences),
         "",
         *spaced(
             (
@@ -138,29 +138,33 @@ def analysis_tables(result: RecordResult) -> RenderableType:
 
 def summary_table(results: Sequence[RecordResult]) -> RenderableType:
     """Return the mean and standard deviation of the Welch fits of several files as a table."""
-    analyses = [each.welch for each in results if each.welch is not None]
+    analyses = [result.welch for result in results if result.welch is not None]
     table = fit_tables.summary_table(analyses)
-    notes = [f"{each.name}: {each.validity.sentence}" for each in results if each.welch is not None]
+    notes = [
+        f"{result.name}: {result.validity.sentence}"
+        for result in results
+        if result.welch is not None
+    ]
     return terminal_table(replace(table, notes=(*table.notes, *notes)))
 
 
-def record_text(whole: WholeRecord) -> RenderableType:
+def record_text(whole_record: WholeRecord) -> RenderableType:
     """Return the verdict on one whole record, and its tables."""
-    verdict = whole.verdict
+    verdict = whole_record.verdict
     sentences = [
-        *(Text(sentence, style="bold") for sentence in damping_sentences(whole.headline)),
+        *(Text(sentence, style="bold") for sentence in damping_sentences(whole_record.headline)),
         *map(Text, verdict.sentences),
         *(Text(advice, style="dim") for advice in verdict.experiments),
     ]
     return Group(
-        Text(f"{whole.record.path.name}: verdict", style="italic"),
+        Text(f"{whole_record.record.path.name}: verdict", style="italic"),
         *(Padding(sentence, (0, 0, 0, 2)) for sentence in sentences),
         "",
-        record_tables(whole),
+        record_tables(whole_record),
     )
 
 
-def record_tables(whole: WholeRecord) -> RenderableType:
+def record_tables(whole_record: WholeRecord) -> RenderableType:
     """Return the tables of one whole record: modes, loss factors and parameters."""
     return Group(
         *spaced(
@@ -174,9 +178,9 @@ def record_tables(whole: WholeRecord) -> RenderableType:
                         tables.parameters_table,
                         tables.exact_geometry_table,
                     )
-                    if (table := make_table(whole)) is not None
+                    if (table := make_table(whole_record)) is not None
                 ),
-                *tables.amplitude_tables(whole),
+                *tables.amplitude_tables(whole_record),
             )
         )
     )
@@ -269,9 +273,9 @@ def _size_text(damping: ReportedLossFactor) -> str:
     return f"has a loss factor of {bounds} at {damping.omega_rad_s / (2 * math.pi):.3g} Hz"
 
 
-def _coefficient_is_flagged(headline: Headline, each: ReportedLossFactor) -> bool:
+def _coefficient_is_flagged(headline: Headline, damping: ReportedLossFactor) -> bool:
     """Return whether the coefficient of a damping carries a flag."""
-    return headline.parameters[_DAMPING_SYMBOLS[each.damping][2]].flag is not None
+    return headline.parameters[_DAMPING_SYMBOLS[damping.damping][2]].flag is not None
 
 
 def _order_text(headline: Headline, damping: ReportedLossFactor) -> str:

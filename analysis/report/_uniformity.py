@@ -82,10 +82,14 @@ def uniformity_figure(test: UniformBeamTest) -> Figure:
             std_axes.set_ylabel("Deviation (std)")
             percent_axes.set_ylabel("Deviation (%)")
     handles = [
-        each for axes in (std_axes, percent_axes) for each in axes.get_legend_handles_labels()[0]
+        handle_or_label
+        for axes in (std_axes, percent_axes)
+        for handle_or_label in axes.get_legend_handles_labels()[0]
     ]
     labels = [
-        each for axes in (std_axes, percent_axes) for each in axes.get_legend_handles_labels()[1]
+        handle_or_label
+        for axes in (std_axes, percent_axes)
+        for handle_or_label in axes.get_legend_handles_labels()[1]
     ]
     figure.align_ylabels()
     figure.legend(
@@ -144,7 +148,7 @@ def uniformity_table(test: UniformBeamTest) -> Table:
             Column("Mode", "mode"),
             Column("Constant", "constant", WORDS),
             Column("Measured", "measured"),
-            Column("std", "std", spread=True),
+            Column("std", "std", std_of_previous=True),
             Column("Uniform beam", "uniform_beam"),
             Column("Deviation (std)", "deviation_std"),
             Column("Deviation (%)", "deviation"),

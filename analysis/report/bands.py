@@ -35,7 +35,7 @@ _EXCITED_TO_NOISE_POWER: Final = 4.0
 By chance the ratio exceeds 2 in one of 10 000 blocks."""
 
 
-def supported_band_hz(whole: WholeRecord) -> Band | None:
+def supported_band_hz(whole_record: WholeRecord) -> Band | None:
     """Return the frequency band in which the data support the selected fit's loss factors.
 
     The modes determine the damping. A model whose orders the data support is also right between and
@@ -47,9 +47,9 @@ def supported_band_hz(whole: WholeRecord) -> Band | None:
     tuple of float or None
         First and last frequency in Hz; None if there is no such band.
     """
-    if not whole.withheld:
-        return excited_band_hz(whole.record, whole.analysis)
-    frequencies = [mode.frequency_hz.value for mode in whole.headline.modes if mode.shown]
+    if not whole_record.withheld:
+        return excited_band_hz(whole_record.record, whole_record.analysis)
+    frequencies = [mode.frequency_hz.value for mode in whole_record.headline.modes if mode.shown]
     if len(frequencies) < 2:
         return None
     return min(frequencies), max(frequencies)
@@ -149,15 +149,15 @@ class NearlyUniformBeam:
         )
 
 
-def loss_estimate(whole: WholeRecord) -> Estimate | None:
+def loss_estimate(whole_record: WholeRecord) -> Estimate | None:
     """Return the beam whose loss factors are drawn; None if no beam explains the losses."""
-    headline = whole.headline
+    headline = whole_record.headline
     if headline.tolerant is not None:
         return (
             None if headline.tolerant.basis == "none" else NearlyUniformBeam.of(headline.tolerant)
         )
     refused = headline.uniform_beam is not None and headline.uniform_beam.status == "refused"
-    return None if refused else whole.fit
+    return None if refused else whole_record.fit
 
 
 _GRID_POINTS: Final = 900

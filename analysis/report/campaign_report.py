@@ -55,7 +55,7 @@ def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
     """Return the verdict, or without one the statements on specimens and on the missing verdict."""
     if campaign.verdict is not None:
         return campaign.verdict.sentences
-    has_estimates = any(each.record_estimates for each in campaign.sessions)
+    has_estimates = any(session.record_estimates for session in campaign.sessions)
     return (
         *specimens(campaign.homogeneity),
         *([_NO_VERDICT_SENTENCE] if has_estimates else []),
@@ -139,7 +139,7 @@ def campaign_page(
     """
     from analysis.report._page import page, versions
 
-    paths = [each.path for each in campaign.sessions]
+    paths = [session.path for session in campaign.sessions]
     sentences = campaign_sentences(campaign)
     return page(
         "campaign.html",
@@ -149,9 +149,11 @@ def campaign_page(
         sentences=sentences[1:],
         experiments=campaign.verdict.experiments if campaign.verdict else (),
         warnings=_warning_texts(campaign),
-        pictures=[each for each in pictures if each.name in _WHOLE_RECORD_FIGURES],
+        pictures=[picture for picture in pictures if picture.name in _WHOLE_RECORD_FIGURES],
         tables=(*shown_tables(campaign), sessions_table(campaign)),
-        paper_pictures=[each for each in pictures if each.name not in _WHOLE_RECORD_FIGURES],
+        paper_pictures=[
+            picture for picture in pictures if picture.name not in _WHOLE_RECORD_FIGURES
+        ],
         paper_tables=paper_tables(campaign, with_paper=with_paper),
         how=[*_collect_facts(campaign), versions(made_at)],
     )
@@ -160,10 +162,10 @@ def campaign_page(
 def _warning_texts(campaign: CampaignResult) -> list[str]:
     """Return all warnings: files left out, lost trials, and the sessions' own warnings."""
     return [
-        *(f"Left out: {each.message}" for each in campaign.failures),
+        *(f"Left out: {failure.message}" for failure in campaign.failures),
         *(
-            f"Not predicted from the others: {each.path}: {each.reason}"
-            for each in campaign.lost_trials
+            f"Not predicted from the others: {trial.path}: {trial.reason}"
+            for trial in campaign.lost_trials
         ),
         *(
             f"{session.name}: {warning}"

@@ -63,35 +63,35 @@ def record_page(
     """
     from analysis.report._page import page, versions
 
-    whole = result.whole
-    assert whole is not None
-    figures = [each for each in pictures if each.name != UNIFORMITY]
-    test = whole.headline.uniform_beam
+    whole_record = result.whole
+    assert whole_record is not None
+    figures = [picture for picture in pictures if picture.name != UNIFORMITY]
+    test = whole_record.headline.uniform_beam
     return page(
         "record.html",
         title=result.name,
         session=_session_lines(result.record),
         note=result.record.metadata.get("note"),
-        first=damping_sentences(whole.headline),
-        sentences=whole.verdict.sentences,
-        experiments=whole.verdict.experiments,
+        first=damping_sentences(whole_record.headline),
+        sentences=whole_record.verdict.sentences,
+        experiments=whole_record.verdict.experiments,
         warnings=result.warnings,
         pictures=figures,
         uniformity=None
         if test is None
         else {
             "sentence": test.summary.sentence,
-            "pictures": [each for each in pictures if each.name == UNIFORMITY],
-            "tables": uniformity_tables(whole),
+            "pictures": [picture for picture in pictures if picture.name == UNIFORMITY],
+            "tables": uniformity_tables(whole_record),
         },
-        equations=[mathml(each) for each in equations(whole)],
-        definitions=definitions(whole),
-        types=types_table(whole),
+        equations=[mathml(picture_or_formula) for picture_or_formula in equations(whole_record)],
+        definitions=definitions(whole_record),
+        types=types_table(whole_record),
         modes=modes,
         tables=of_record,
         paper_pictures=paper_pictures,
         paper_tables=paper_tables,
-        how=[*_collect_facts(result, whole), versions(made_at)],
+        how=[*_collect_facts(result, whole_record), versions(made_at)],
     )
 
 
@@ -121,7 +121,7 @@ _METADATA_SHOWN_ELSEWHERE = frozenset(
 """Keys of metadata that the page shows in another section."""
 
 
-def _collect_facts(result: RecordResult, whole: WholeRecord) -> list[Facts]:
+def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[Facts]:
     """Return the facts on file, record, session and settings."""
     record, welch = result.record, result.welch
     return [
@@ -135,7 +135,7 @@ def _collect_facts(result: RecordResult, whole: WholeRecord) -> list[Facts]:
                 if key not in _METADATA_SHOWN_ELSEWHERE
             ],
         ),
-        ("Whole-record fits", _record_fit_facts(whole)),
+        ("Whole-record fits", _record_fit_facts(whole_record)),
         *([] if welch is None else [("Welch method (as in the paper)", _welch_facts(welch))]),
     ]
 
@@ -182,12 +182,12 @@ def _record_facts(record: Record) -> list[tuple[str, str]]:
     ]
 
 
-def _record_fit_facts(whole: WholeRecord) -> list[tuple[str, str]]:
+def _record_fit_facts(whole_record: WholeRecord) -> list[tuple[str, str]]:
     """Return estimator, band, types and fixed parameters of the whole-record fits, as facts."""
-    first_hz, last_hz = whole.band_hz
+    first_hz, last_hz = whole_record.band_hz
     lines = [
         f"{line.frequency_hz:.5g} Hz, {1e3 * line.amplitude_nm:.3g} mN·m"
-        for line in whole.analysis.lines
+        for line in whole_record.analysis.lines
     ]
     return [
         (
@@ -196,9 +196,9 @@ def _record_fit_facts(whole: WholeRecord) -> list[tuple[str, str]]:
             "for the measured angle minus the measured torque, whitened by the noise model; "
             "maximum likelihood for noise in the torque",
         ),
-        ("band", f"{first_hz:g} to {last_hz:g} Hz, {whole.analysis.frequency_hz.size} bins"),
-        ("types", ", ".join(whole.fits)),
-        ("fixed at the file's values", ", ".join(whole.fixed) or "none"),
+        ("band", f"{first_hz:g} to {last_hz:g} Hz, {whole_record.analysis.frequency_hz.size} bins"),
+        ("types", ", ".join(whole_record.fits)),
+        ("fixed at the file's values", ", ".join(whole_record.fixed) or "none"),
         ("narrow-band disturbances removed", "; ".join(lines) or "none found"),
         (
             "intervals and bands",
@@ -245,7 +245,7 @@ _LATEX_TABLES: Final = ("modes", "parameters")
 
 def _write_page(
     result: RecordResult,
-    whole: WholeRecord,
+    whole_record: WholeRecord,
     folder: Path,
     on_step: Callable[[str], None],
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
@@ -257,19 +257,19 @@ def _write_page(
 
     pictures = []
     with style.styled():
-        for illustration in illustrations(whole):
+        for illustration in illustrations(whole_record):
             stem = folder / "figures" / illustration.name
             pictures.append(
                 style.save_picture(illustration.figure, stem, illustration.description, formats)
             )
             on_step(f"figure {illustration.name}")
     modes, record_tables, paper_tables = report_tables(result)
-    for report_table in (modes, *uniformity_tables(whole), *record_tables, *paper_tables):
+    for report_table in (modes, *uniformity_tables(whole_record), *record_tables, *paper_tables):
         table = with_validity(report_table, result.validity)
         write_new(folder / "tables" / f"{table.name}.csv", csv_text(table))
         if table.name in _LATEX_TABLES:
             write_new(folder / "tables" / f"{table.name}.tex", latex_table(table))
-    write_new(folder / "tables" / "model.tex", latex(equations(whole)))
+    write_new(folder / "tables" / "model.tex", latex(equations(whole_record)))
     made_at = datetime.now().astimezone()
     text = record_page(
         result, pictures, modes, record_tables, made_at, paper_pictures, paper_tables
@@ -277,34 +277,37 @@ def _write_page(
     write_new(folder / "report.html", text)
 
 
-def uniformity_tables(whole: WholeRecord) -> tuple[Table, ...]:
+def uniformity_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
     """Return the tables of the test of the beam's uniformity; nothing without the test."""
-    test = whole.headline.uniform_beam
+    test = whole_record.headline.uniform_beam
     if test is None or test.p_value is None:
         return ()
-    modes = tables.exact_modes_table(whole)
+    modes = tables.exact_modes_table(whole_record)
     return (uniformity_table(test), *(() if modes is None else (modes,)))
 
 
 def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
     """Return the table of modes, those of whole-record fits, and those of the Welch method."""
-    whole, welch = result.whole, result.welch
-    assert whole is not None
-    conditions = tables.exact_geometry_table(whole), tables.condition_table(whole)
+    whole_record, welch = result.whole, result.welch
+    assert whole_record is not None
+    conditions = tables.exact_geometry_table(whole_record), tables.condition_table(whole_record)
     record_tables = (
-        tables.sizes_table(whole),
-        tables.parameters_table(whole),
-        *(each for each in conditions if each is not None),
-        tables.correlations_table(whole),
-        *tables.amplitude_tables(whole),
-        fit_tables.structures_table(whole),
+        tables.sizes_table(whole_record),
+        tables.parameters_table(whole_record),
+        *(table for table in conditions if table is not None),
+        tables.correlations_table(whole_record),
+        *tables.amplitude_tables(whole_record),
+        fit_tables.structures_table(whole_record),
     )
     paper_tables = (
         ()
         if welch is None
-        else (fit_tables.welch_fits_table(welch, whole.unsupported), fit_tables.peaks_table(welch))
+        else (
+            fit_tables.welch_fits_table(welch, whole_record.unsupported),
+            fit_tables.peaks_table(welch),
+        )
     )
-    return tables.modes_table(whole), record_tables, paper_tables
+    return tables.modes_table(whole_record), record_tables, paper_tables
 
 
 _WELCH_FIGURES: Final = ("welch_signals", "welch_frf", "welch_torque")
@@ -342,14 +345,14 @@ def write_report(
     OutputExistsError, OutputError
         If a file exists or cannot be written.
     """
-    whole = result.whole
+    whole_record = result.whole
     pictures: list[Picture] = []
     if result.welch is not None:
-        names = figures_of_paper(paper=True, whole_record=whole is not None)
+        names = figures_of_paper(paper=True, whole_record=whole_record is not None)
         pictures = _write_welch_figures(result.welch, names, folder / "figures", on_step, formats)
     write_new(folder / "tables.txt", tables_text(result))
-    if whole is not None:
-        _write_page(result, whole, folder, on_step, formats, pictures)
+    if whole_record is not None:
+        _write_page(result, whole_record, folder, on_step, formats, pictures)
     write_new(folder / "analysis.json", document_text(document([result])))
 
 

@@ -77,25 +77,25 @@ class Column:
         Heading for people. A column with an empty heading is written to files only.
     key : str
         Name for programs, with the SI unit: header in CSV, key in JSON.
-    form : str
+    number_format : str
         Format of the column's numbers; `WORDS` if the column contains words.
     factor : float
         Factor from SI units to the displayed unit.
-    spread : bool
+    std_of_previous : bool
         Whether the column contains the standard deviations of the column before it. The terminal,
         which is narrow, shows them after a ± in the same column.
     """
 
     heading: str
     key: str
-    form: str = ".4g"
+    number_format: str = ".4g"
     factor: float = 1.0
-    spread: bool = False
+    std_of_previous: bool = False
 
     @property
     def numeric(self) -> bool:
         """Whether the column contains numbers."""
-        return self.form != WORDS
+        return self.number_format != WORDS
 
     def shown(self, entry: Entry) -> Cell:
         """Return the cell that people see for an entry of this column."""
@@ -108,7 +108,7 @@ class Column:
         return (
             count_cell(entry)
             if isinstance(entry, int)
-            else number_cell(entry, self.form, self.factor)
+            else number_cell(entry, self.number_format, self.factor)
         )
 
 
@@ -253,28 +253,32 @@ def terminal_table(table: Table) -> rich.table.Table:
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    shown = RichTable(
+    rich_table = RichTable(
         title=Text(table.caption, style="bold"), title_justify="left",
         caption=Text("\n".join(table.notes)) if table.notes else None, caption_justify="left",
         min_width=len(table.caption),
         box=box.SIMPLE_HEAD, padding=(0, 1), header_style="bold", show_edge=False, pad_edge=False,
     )  # fmt: skip
-    spreads = [column.spread for column in table.shown_columns]
+    std_columns = [column.std_of_previous for column in table.shown_columns]
     for column in table.shown_columns:
-        if not column.spread:
-            shown.add_column(Text(column.heading), justify="right" if column.numeric else "left")
+        if not column.std_of_previous:
+            rich_table.add_column(
+                Text(column.heading), justify="right" if column.numeric else "left"
+            )
     rows = table.shown_rows
     for index, row in enumerate(rows):
         cells: list[Text] = []
-        for cell, spread in zip(row, spreads, strict=True):
-            if not spread:
+        for cell, is_std in zip(row, std_columns, strict=True):
+            if not is_std:
                 cells.append(Text(cell.text, style="dim italic" if cell.doubtful else ""))
             elif cell.value:
                 # No space follows the ±, so that a narrow terminal breaks the line before it.
                 cells[-1].append(f" ±{cell.text}")
-        ends = table.grouped and row[0].text != rows[min(index + 1, len(rows) - 1)][0].text
-        shown.add_row(*cells, end_section=ends, style="bold" if index == table.selected else "")
-    return shown
+        ends_group = table.grouped and row[0].text != rows[min(index + 1, len(rows) - 1)][0].text
+        rich_table.add_row(
+            *cells, end_section=ends_group, style="bold" if index == table.selected else ""
+        )
+    return rich_table
 
 
 _LATEX_SYMBOLS: Final = {
@@ -310,29 +314,30 @@ def latex_text(text: str) -> str:
     >>> print(latex_text("1e-5 s^α"), latex_text("ρ/EI"), latex_text("−7.2 %"))
     $10^{-5}$ s$^{\alpha}$ $\rho$/$EI$ $-$7.2 \%
     """
-    found = "".join(map(_latex_token, _LATEX_TOKENS.finditer(text)))
-    return found.replace("$$", "")
+    latex = "".join(map(_latex_token, _LATEX_TOKENS.finditer(text)))
+    return latex.replace("$$", "")
 
 
 def _latex_token(token: re.Match[str]) -> str:
     """Return the LaTeX of one match of `_LATEX_TOKENS`."""
-    part = token.groupdict()
-    if part["power"]:
-        digits = "" if part["digits"] == "1" else rf"{part['digits']} \cdot "
-        return f"${digits}10^{{{int(part['power'])}}}$"
-    if part["up"]:
-        up = "".join(
-            f"\\{_LATEX_SYMBOLS[each]} " if each in _LATEX_SYMBOLS else each for each in part["up"]
+    groups = token.groupdict()
+    if groups["power"]:
+        digits = "" if groups["digits"] == "1" else rf"{groups['digits']} \cdot "
+        return f"${digits}10^{{{int(groups['power'])}}}$"
+    if groups["up"]:
+        exponent = "".join(
+            f"\\{_LATEX_SYMBOLS[character]} " if character in _LATEX_SYMBOLS else character
+            for character in groups["up"]
         )
-        return f"$^{{{up.rstrip()}}}$"
-    if part["raised"]:
-        return f"$^{{{part['raised'].translate(_SUPERSCRIPT_DIGITS)}}}$"
-    if part["letter"]:
-        index = f"_{{{part['index']}}}" if part["index"] else ""
-        return rf"$\{_LATEX_SYMBOLS[part['letter']]}{index}$"
-    if part["minus"] or part["stiffness"]:
-        return "$-$" if part["minus"] else "$EI$"
-    return _LATEX_ESCAPES.get(part["other"], part["other"])
+        return f"$^{{{exponent.rstrip()}}}$"
+    if groups["raised"]:
+        return f"$^{{{groups['raised'].translate(_SUPERSCRIPT_DIGITS)}}}$"
+    if groups["letter"]:
+        index = f"_{{{groups['index']}}}" if groups["index"] else ""
+        return rf"$\{_LATEX_SYMBOLS[groups['letter']]}{index}$"
+    if groups["minus"] or groups["stiffness"]:
+        return "$-$" if groups["minus"] else "$EI$"
+    return _LATEX_ESCAPES.get(groups["other"], groups["other"])
 
 
 def latex_table(table: Table) -> str:
@@ -363,21 +368,21 @@ def latex_table(table: Table) -> str:
     return "\n".join(lines) + "\n"
 
 
-def number_cell(value: float | None, form: str = ".4g", factor: float = 1.0) -> Cell:
+def number_cell(value: float | None, number_format: str = ".4g", factor: float = 1.0) -> Cell:
     """Return a cell that shows a number; a dash if the number is unknown or not finite.
 
     Parameters
     ----------
     value : float or None
         The number, in SI units.
-    form : str
+    number_format : str
         Format of the number, as for the function `format`.
     factor : float
         Factor from SI units to the displayed unit.
     """
     if value is None or not math.isfinite(value):
         return Cell(None, ABSENT)
-    return Cell(float(value), f"{factor * value:{form}}".replace("-", "−"))
+    return Cell(float(value), f"{factor * value:{number_format}}".replace("-", "−"))
 
 
 def count_cell(value: int) -> Cell:
@@ -414,14 +419,16 @@ _SYMBOLS: Final = {"alpha": "α", "lambda": "λ"}
 """Symbols of the fractional orders by parameter name."""
 
 
-def unreported_parameters(structure: Structure, withheld: Collection[str]) -> frozenset[str]:
+def unreported_parameters(
+    structure: Structure, unsupported_orders: Collection[str]
+) -> frozenset[str]:
     """Return the names of a fit's parameters that are not properties of the antenna.
 
     Parameters
     ----------
     structure : Structure
         Structure of the fit.
-    withheld : collection of str
+    unsupported_orders : collection of str
         Fractional orders that the data do not support: "alpha" or "lambda".
 
     Returns
@@ -431,7 +438,10 @@ def unreported_parameters(structure: Structure, withheld: Collection[str]) -> fr
         coefficient is valid for one order only, as its unit shows.
     """
     return frozenset(
-        name for order in withheld for name in (order, COEFFICIENT_OF[order]) if structure.has(name)
+        name
+        for order in unsupported_orders
+        for name in (order, COEFFICIENT_OF[order])
+        if structure.has(name)
     )
 
 
@@ -445,11 +455,11 @@ def grey_cell(cell: Cell) -> Cell:
     return replace(cell, doubtful=cell.value is not None)
 
 
-def footnotes(withheld: Collection[str]) -> tuple[str, ...]:
+def footnotes(unsupported_orders: Collection[str]) -> tuple[str, ...]:
     """Return the note that explains the mark, if an order is not reported; else nothing."""
-    if not withheld:
+    if not unsupported_orders:
         return ()
-    orders = " or ".join(_SYMBOLS[order] for order in sorted(withheld))
+    orders = " or ".join(_SYMBOLS[order] for order in sorted(unsupported_orders))
     return (
         f"{MARK} not reported: the data support no order {orders}. The number belongs to its "
         "curve, not to the antenna.",

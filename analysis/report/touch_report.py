@@ -209,7 +209,11 @@ def write_touch_report(
         sentences=[line for session in sessions for line in session_lines(session)[:1]],
         experiments=(),
         warnings=[
-            *(f"{each.path.name}: {sentence}" for each in sessions for sentence in each.warnings),
+            *(
+                f"{session.path.name}: {sentence}"
+                for session in sessions
+                for sentence in session.warnings
+            ),
             *(f"Left out: {message}" for message in errors.values()),
         ],
         pictures=pictures,
@@ -228,14 +232,14 @@ def _collect_facts(sessions: Sequence[TouchedSession]) -> list[Facts]:
             "Sessions",
             [
                 (
-                    str(each.path),
-                    f"{each.rate_hz:g} Hz, "
-                    + ("torque and base shear" if each.has_shear else "torque alone"),
+                    str(session.path),
+                    f"{session.rate_hz:g} Hz, "
+                    + ("torque and base shear" if session.has_shear else "torque alone"),
                 )
-                for each in sessions
+                for session in sessions
             ],
         ),
-        ("Model", sorted({(model_words(each), _beam_text(each)) for each in sessions})),
+        ("Model", sorted({(model_words(session), _beam_text(session)) for session in sessions})),
         (
             "Estimate",
             [

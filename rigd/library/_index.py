@@ -114,7 +114,7 @@ class Index:
         ----------
         rows
             New and changed rows by file name.
-        gone
+        missing_files
             Names of files that no longer exist.
         """
         if self._path.exists() and not self._is_own_index():
@@ -199,7 +199,7 @@ class Index:
 
 def _column_values(row: SessionRow) -> list[object]:
     """Return a row's values in the order of the index's columns."""
-    values: dict[str, object] = {each.name: getattr(row, each.name) for each in fields(row)}
+    values: dict[str, object] = {field.name: getattr(row, field.name) for field in fields(row)}
     values["start_utc"] = None if row.start_utc_ns is None else _iso_time(row.start_utc_ns)
     values["modes"] = json.dumps(row.modes)
     values["validity"] = json.dumps(row.validity)

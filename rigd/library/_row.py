@@ -99,7 +99,7 @@ class SessionRow:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as a dictionary for JSON."""
-        document = {each.name: getattr(self, each.name) for each in fields(self)}
+        document = {field.name: getattr(self, field.name) for field in fields(self)}
         report = None if self.report is None else str(self.report)
         return document | {"path": str(self.path), "report": report, "modes": list(self.modes)}
 

@@ -100,11 +100,13 @@ def change_between(before: Quantity, after: Quantity) -> ModeChange:
     True
     """
     difference = after["value"] - before["value"]
-    if any(each.get("interval_95") is None or each.get("flag") for each in (before, after)):
+    if any(
+        quantity.get("interval_95") is None or quantity.get("flag") for quantity in (before, after)
+    ):
         return ModeChange(difference, None)
-    low, high = (before, after) if difference >= 0 else (after, before)
+    lower, higher = (before, after) if difference >= 0 else (after, before)
     half_width_95 = hypot(
-        low["interval_95"][1] - low["value"], high["value"] - high["interval_95"][0]
+        lower["interval_95"][1] - lower["value"], higher["value"] - higher["interval_95"][0]
     )
     return ModeChange(difference, abs(difference) > _SIGNIFICANCE_HALF_WIDTHS * half_width_95 > 0.0)
 

@@ -159,7 +159,9 @@ def chirp_signals(
     >>> len(signals.torque_nm), signals.segments["sweep"]
     (13000, (1000, 11000))
     """
-    rest, sweep, ring_down = (round(each * rate_hz) for each in (rest_s, sweep_s, ring_down_s))
+    rest, sweep, ring_down = (
+        round(duration_s * rate_hz) for duration_s in (rest_s, sweep_s, ring_down_s)
+    )
     t = np.arange(sweep) / rate_hz
     phase = 2 * np.pi * (start_hz * t + (stop_hz - start_hz) * t**2 / (2 * sweep_s))
     reference = np.zeros(rest + sweep + ring_down)

@@ -51,7 +51,7 @@ class MissingColumnError(TableError):
     """
 
     def __init__(self, name: str, titles: Sequence[str], line: int) -> None:
-        listed = ", ".join(repr(printable(each, 60)) for each in titles[:_MOST_TITLES_SHOWN])
+        listed = ", ".join(repr(printable(title, 60)) for title in titles[:_MOST_TITLES_SHOWN])
         more = (
             f" and {len(titles) - _MOST_TITLES_SHOWN} more"
             if len(titles) > _MOST_TITLES_SHOWN

@@ -86,7 +86,7 @@ def head_of(lines: Sequence[str]) -> LabviewHead | None:
         raise TableError(
             f"is a LabVIEW file whose head has no line {_LAST_LINE_TEXT}; export it again."
         )
-    separator = next((each for each in ("\t", ",", ";") if each in first), "\t")
+    separator = next((character for character in ("\t", ",", ";") if character in first), "\t")
     channels: dict[str, tuple[str, ...]] = {}
     for line in lines[: end_lines[-1] - 1]:
         key, *cells = (cell.strip().strip('"') for cell in line.rstrip("\r\n").split(separator))

@@ -418,7 +418,7 @@ def comma_in_single_message(line: int) -> str:
 
 def _next_row(rows: Sequence[TextRow], row: TextRow) -> TextRow | None:
     """Return the row after a given one; None if it is the last."""
-    return next((each for each in rows if each.index > row.index), None)
+    return next((other for other in rows if other.index > row.index), None)
 
 
 def _is_data(cells: Sequence[str], columns: Sequence[int], next_row: TextRow | None) -> bool:
@@ -491,7 +491,7 @@ def _layout_from_numbers(
     """
     row, rows_above = (
         rows[index],
-        list(takewhile(lambda each: each.index < rows[index].index, rows)),
+        list(takewhile(lambda other_row: other_row.index < rows[index].index, rows)),
     )
     columns = [number - 1 for number in numbers]
     if is_comment(row.cells):
@@ -515,7 +515,9 @@ def _layout_from_numbers(
             )
         return None
     units: Sequence[str] = ()
-    last_rows_above = [without_trailing_empty_cells(each.cells, 0) for each in rows_above[-2:]]
+    last_rows_above = [
+        without_trailing_empty_cells(other_row.cells, 0) for other_row in rows_above[-2:]
+    ]
     if (
         len(last_rows_above) == 2
         and len(last_rows_above[0]) == len(last_rows_above[1])

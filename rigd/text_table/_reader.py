@@ -341,9 +341,9 @@ class _NumberRows:
                 sign = "commas" if self.decimal_sign == COMMA else "points"
                 raise TableError(
                     f"line {thousands_check.grouped_line}: the {sign} in '{self.title(column)}' "
-                    "may be decimal signs or separators between thousands, as each has three digits "
-                    "behind it; save the file with decimal points and without separators between "
-                    "thousands."
+                    "may be decimal signs or separators between thousands, as each has three "
+                    "digits behind it; save the file with decimal points and without separators "
+                    "between thousands."
                 )
 
 

@@ -86,8 +86,8 @@ def _plot(quantity: _Quantity, mode: int, *, with_targets: bool) -> Plot:
     field, unit = quantity.field(mode), quantity.unit
 
     def values(records: npt.NDArray[Any], column: int) -> Values:
-        found: Values = records[field][:, column]
-        return found
+        column_values: Values = records[field][:, column]
+        return column_values
 
     # Curves with the same name have one entry in the legend.
     target, interval = f"asked for, 95 % ({unit})", f"95 % interval ({unit})"

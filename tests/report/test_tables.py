@@ -35,7 +35,7 @@ from rigd.beam import modes
     ],
 )
 def test_a_value_shows_the_digits_its_spread_leaves(value, std, text, as_text):
-    columns = (Column("value", "value"), Column("std", "std", spread=True))
+    columns = (Column("value", "value"), Column("std", "std", std_of_previous=True))
     table = Table.of("name", "", columns, [estimate_cells((value, std), std)])
     assert as_text(terminal_table(table)).split("\n")[2].strip() == text
 
@@ -149,7 +149,7 @@ def test_one_table_is_shown_in_its_units_and_written_in_full(as_text):
     """A file's name may look like markup, a value may be missing, unknown or for programs only."""
     columns = (
         Column("file", "file", WORDS), Column("ζ (1e-5)", "zeta", ".2f", 1e5),
-        Column("std", "zeta_std", ".2f", 1e5, spread=True), Column("used", "used", WORDS),
+        Column("std", "zeta_std", ".2f", 1e5, std_of_previous=True), Column("used", "used", WORDS),
     )  # fmt: skip
     rows = (
         {"file": Cell("/a/[b]x[/b]", "[b]x[/b]"), "zeta": 1.23456789e-5, "zeta_std": 1e-7,
