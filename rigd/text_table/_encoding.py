@@ -16,7 +16,11 @@ _MOST_MARK_BYTES: Final = 4
 
 
 def encodings(head: bytes) -> tuple[str, ...]:
-    """Return the possible encodings of a file from its first bytes, the most probable first."""
+    """Return the possible encodings of a file from its first bytes, the most probable first.
+
+    Most programs without UTF-8 write Windows-1252. Numbers have the same bytes in both encodings;
+    only titles and units can differ.
+    """
     marked = _encoding_of_mark(head)
     if marked is not None:
         return (marked,)

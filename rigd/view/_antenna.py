@@ -1,11 +1,12 @@
-"""The antenna in 3D: its motor, and the beam as it turns and bends, seen from behind the motor.
+"""The antenna in 3D: its motor and the turning and bending beam, seen from behind the motor.
 
-The bend is computed from the measured angle and the exact model; no sensor measures it.
+The deflection is computed from the measured angle and the exact model, because no sensor measures
+it.
 
-Lengths are drawn in beam lengths, so that every antenna fills the same picture. The beam points
-along x, and the motor turns it about z. Angle and bend are exaggerated by the same factor: nodes
-are drawn at their true positions, and a tip at rest is drawn at rest. In moves and searches, with
-their large angles, everything is drawn to scale.
+Lengths are drawn in beam lengths, so that every antenna fills the same space. The beam points along
+x, and the motor turns it about z. Motor angle and deflection are enlarged by the same factor, so
+that vibration nodes are drawn at their true positions and a tip at rest is drawn at rest. In moves
+and touch searches, whose angles are large, everything is drawn to scale.
 """
 
 import collections
@@ -29,16 +30,22 @@ if TYPE_CHECKING:
     from rigd.view._session_info import Subject
 
 Records = npt.NDArray[Any]
+"""Structured array of samples, shape (n,)."""
 Real = npt.NDArray[np.float64]
+"""Array of real numbers."""
 _TimedLines = tuple[int, npt.NDArray[np.float32]]
 """Time since the start of the session in ns, and the drawn lines at that time, (n, points, 3)."""
 
 ANTENNA: Final = "/antenna"
-"""Entity path in Rerun of the 3D drawing of the antenna; the following four are its parts."""
+"""Entity path in Rerun of the 3D drawing of the antenna."""
 BEAM: Final = f"{ANTENNA}/beam"
+"""Entity path in Rerun of the beam's lines."""
 TRAIL: Final = f"{ANTENNA}/trail"
+"""Entity path in Rerun of the trail of past beam lines."""
 LABEL: Final = f"{ANTENNA}/label"
+"""Entity path in Rerun of the label with the tip's deflection."""
 TOUCH: Final = f"{ANTENNA}/touch"
+"""Entity path in Rerun of the drawings of touches."""
 
 ENLARGEMENT: Final = 2.0
 """Factor by which the motor angle and the beam's deflection are enlarged in the drawing.
@@ -49,6 +56,7 @@ stays inside the drawing."""
 _UNSCALED_EXCITATIONS: Final = ("move", "touch")
 """Kinds of excitation (moves and touch searches) that are drawn without enlargement."""
 TITLE: Final = "Antenna"
+"""Title of the 3D view in Rerun's window."""
 
 DRAWN_HZ: Final = 20.0
 """Rate at which the beam is drawn, in hertz."""
@@ -58,7 +66,8 @@ TRAIL_S: Final = 0.5
 _SHAPE_HZ: Final = 100.0
 """Rate at which the beam's deflection is computed, to find the largest deflection of the tip."""
 _LABEL_HZ: Final = 4.0
-"""Rate at which the label with the tip's deflection and the trail of past lines are sent."""
+"""Rate at which two drawings are sent: the label with the tip's deflection, and the trail of past
+lines."""
 _MOST_INTERPOLATED_GAP_S: Final = 10.0
 """Longest gap between samples over which the motor angle is interpolated."""
 _ASSUMED_DAMPING_RATIO: Final = 2e-3
@@ -125,25 +134,27 @@ class Antenna:
         samples = np.concatenate([self._waiting, self._interpolate_to_ticks(samples)])
         count = len(samples) // self._shape_ticks
         self._waiting = samples[count * self._shape_ticks :]
-        moments: list[_TimedLines] = []
+        timed_lines: list[_TimedLines] = []
         labels: list[Drawing] = []
-        for step in samples[: count * self._shape_ticks].reshape(count, self._shape_ticks, 2):
-            deflection_m = self._filter.feed(step[:, 1])
+        for shape_samples in samples[: count * self._shape_ticks].reshape(
+            count, self._shape_ticks, 2
+        ):
+            deflection_m = self._filter.feed(shape_samples[:, 1])
             self._tips_m.append(abs(float(deflection_m[-1])))
             self._shape_count += 1
-            t_ns, angle_rad = int(step[-1, 0]), float(step[-1, 1])
+            t_ns, angle_rad = int(shape_samples[-1, 0]), float(shape_samples[-1, 1])
             if self._shape_count % self._shapes_per_drawing == 0:
                 deflection = deflection_m / self._length_m
-                drawn = (to_scale if self._to_scale else lines)(angle_rad, deflection)
-                moments.append((t_ns, drawn))
+                lines_to_draw = (to_scale if self._to_scale else lines)(angle_rad, deflection)
+                timed_lines.append((t_ns, lines_to_draw))
             if self._shape_count % self._shapes_per_label == 0:
                 text = label(max(self._tips_m), to_scale=self._to_scale)
                 labels.append(partial(_draw_label, t_ns=t_ns, text=text))
-        self._trail += [(t_ns, beam_and_line[1:]) for t_ns, beam_and_line in moments]
-        self._shapes += moments
+        self._trail += [(t_ns, both_lines[1:]) for t_ns, both_lines in timed_lines]
+        self._shapes += timed_lines
         drawings: list[Drawing] = []
-        if moments:
-            drawings.append(partial(_draw_lines, entity=BEAM, moments=moments))
+        if timed_lines:
+            drawings.append(partial(_draw_lines, entity=BEAM, moments=timed_lines))
         if labels and self._trail:
             drawings.append(partial(_draw_lines, entity=TRAIL, moments=self._trail))
             self._trail = []
@@ -166,12 +177,15 @@ class Antenna:
         later_index = next(
             (i for i in range(1, len(shapes)) if shapes[i][0] >= t_ns), len(shapes) - 1
         )
-        (earlier_ns, earlier), (later_ns, later) = shapes[later_index - 1], shapes[later_index]
+        (earlier_ns, earlier_lines), (later_ns, later_lines) = (
+            shapes[later_index - 1],
+            shapes[later_index],
+        )
         if t_ns < earlier_ns:
             return []  # the shape of that time is no longer stored
         fraction = min((t_ns - earlier_ns) / (later_ns - earlier_ns), 1.0)
-        beam_line = (1 - fraction) * earlier[1] + fraction * later[1]
-        displacement = later[1] - earlier[1]
+        beam_line = (1 - fraction) * earlier_lines[1] + fraction * later_lines[1]
+        displacement = later_lines[1] - earlier_lines[1]
         beam_positions = np.linspace(0.0, 1.0, len(beam_line))
         x = np.array([point["value"], *point["interval_95"]]) / self._length_m
         points, displacements = (
@@ -264,11 +278,11 @@ def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
         Coordinates x, y, z of the line and of the beam, shape (2, points, 3).
     """
     x = np.linspace(0.0, 1.0, deflection.size)
-    drawn = np.zeros((2, x.size, 3), dtype=np.float32)
-    drawn[:, :, 0] = x
-    drawn[0, :, 1] = ENLARGEMENT * angle_rad * x
-    drawn[1, :, 1] = ENLARGEMENT * (angle_rad * x + deflection)
-    return drawn
+    coordinates = np.zeros((2, x.size, 3), dtype=np.float32)
+    coordinates[:, :, 0] = x
+    coordinates[0, :, 1] = ENLARGEMENT * angle_rad * x
+    coordinates[1, :, 1] = ENLARGEMENT * (angle_rad * x + deflection)
+    return coordinates
 
 
 def to_scale(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
@@ -279,14 +293,14 @@ def to_scale(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
     angle_rad, deflection
         As for `lines`.
     """
-    along = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
-    across = np.array([-along[1], along[0], 0.0])
-    line = np.linspace(0.0, 1.0, deflection.size)[:, None] * along
-    return np.stack([line, line + deflection[:, None] * across]).astype(np.float32)
+    along_beam = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
+    across_beam = np.array([-along_beam[1], along_beam[0], 0.0])
+    line = np.linspace(0.0, 1.0, deflection.size)[:, None] * along_beam
+    return np.stack([line, line + deflection[:, None] * across_beam]).astype(np.float32)
 
 
 def label(tip_m: float, *, to_scale: bool = False) -> str:
-    """Return the label with the tip's deflection in mm, rounded to two digits or to 0.1 mm."""
+    """Return the text with the tip's deflection in mm, rounded to two digits or to 0.1 mm."""
     tip_mm = 1e3 * tip_m
     text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
     return f"tip deflection ± {text} mm, drawn {'to scale' if to_scale else f'× {ENLARGEMENT:g}'}"
@@ -387,13 +401,13 @@ def _draw_styles(stream: "RecordingStream") -> None:
     )
 
 
-def _draw_lines(stream: "RecordingStream", entity: str, moments: Sequence[_TimedLines]) -> None:
+def _draw_lines(stream: "RecordingStream", entity: str, timed_lines: Sequence[_TimedLines]) -> None:
     """Send lines to a Rerun entity, each group of lines at its time."""
     import rerun as rr
 
-    t_ns = np.array([t_ns for t_ns, _ in moments])
-    strips = np.concatenate([strips for _, strips in moments])
-    count = len(strips) // len(moments)
+    t_ns = np.array([t_ns for t_ns, _ in timed_lines])
+    strips = np.concatenate([strips for _, strips in timed_lines])
+    count = len(strips) // len(timed_lines)
     # Built here, because Rerun's own function for columns takes three times as long.
     column = rr.ComponentColumn(
         rr.LineStrips3D.descriptor_strips(),

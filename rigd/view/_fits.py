@@ -1,7 +1,7 @@
 """Fits of the record: modes over time with their shrinking intervals, and a table of the last fit.
 
-During a session a fit comes every second, or with every segment of a search for a precision. A
-recorded file has only the last fit, which is shown as a table.
+During a session a new fit arrives every second, or with every segment of a search for a target
+precision. A recorded file contains only the last fit, which is shown as a table.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 Fit = Mapping[str, Any]
-"""Fit as in JSON documents (docs/online_fit.md)."""
+"""Fit of a session's record as in JSON documents (docs/online_fit.md)."""
 
 TABLE: Final = "/fit_table"
 """Entity path in Rerun of the table with the last fit."""
@@ -169,7 +169,7 @@ def fit_table(fit: Fit | None) -> str:
         paragraphs.append(f"**{plain(search['reason'])}**")
     targets = _targets(fit)
     if targets:
-        rows = [_target_row(entry) for entry in targets]
+        rows = [_target_row(parameter_item) for parameter_item in targets]
         paragraphs.append(_markdown_table("asked for", "value", "std", "asked std", rows=rows))
     if not search.get("reason") and search.get("left_s") is not None:
         paragraphs.append(f"About **{search['left_s']:.0f} s** more.")
@@ -194,16 +194,16 @@ def fit_table(fit: Fit | None) -> str:
         paragraphs.append(validity.sentence)
         if validity.uniform_beam is not None:
             paragraphs.append(validity.uniform_beam.sentence)
-    rows = [_parameter_row(*entry) for entry in fit.get("parameters", {}).items()]
+    rows = [_parameter_row(*parameter_item) for parameter_item in fit.get("parameters", {}).items()]
     if rows:
         paragraphs.append(_markdown_table("parameter", "value", rows=[row for row in rows if row]))
     paragraphs += [plain(sentence) for sentence in fit.get("findings", ())[:_MOST_FINDINGS]]
     return "\n\n".join(paragraphs)
 
 
-def _markdown_table(*heads: str, rows: list[tuple[str, ...]]) -> str:
+def _markdown_table(*headings: str, rows: list[tuple[str, ...]]) -> str:
     """Return a Markdown table with the given column heads and rows."""
-    lines = (heads, ("---",) * len(heads), *rows)
+    lines = (headings, ("---",) * len(headings), *rows)
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 

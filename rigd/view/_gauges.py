@@ -11,6 +11,7 @@ import numpy.typing as npt
 from rigd.session.layout import WRENCH_FIELDS, Status
 
 Records = npt.NDArray[Any]
+"""Structured array of samples, shape (n,)."""
 
 WARNING_FRACTION: Final = 0.8
 """Fraction of a limit above which a gauge turns orange, as for the interlocks' warnings."""
@@ -84,14 +85,14 @@ class Gauges:
             Samples (n,) of ``SAMPLE_DTYPE``, in order. There may be gaps.
         """
         torque_nm = samples["torque_command_nm"]
-        peaks = {
+        largest_magnitudes = {
             "angle": _peak(samples["angle_rad"]),
             "velocity": _peak(self._speeds_from_fresh_angles(samples)),
             "tracking_error": _peak(samples["angle_reference_rad"] - samples["angle_rad"]),
             "torque_command": _peak(torque_nm),
             "i2t": self._update_rms_torque(torque_nm),
         } | {field.partition("_")[0]: _peak(samples[field]) for field in WRENCH_FIELDS}
-        return self.with_limits(peaks)
+        return self.with_limits(largest_magnitudes)
 
     def with_limits(self, values: Mapping[str, float | None]) -> dict[str, Gauge]:
         """Return gauges with the given magnitudes and this session's limits, by signal name.
@@ -126,8 +127,8 @@ class Gauges:
 
         A repeated (stale) reading is omitted, because the speed after it would be doubled.
         """
-        fresh = samples[(samples["status"] & Status.ANGLE_STALE) == 0]
-        ticks, angles_rad = fresh["tick"].astype(np.int64), fresh["angle_rad"]
+        fresh_samples = samples[(samples["status"] & Status.ANGLE_STALE) == 0]
+        ticks, angles_rad = fresh_samples["tick"].astype(np.int64), fresh_samples["angle_rad"]
         if self._last is not None:
             ticks = np.append(self._last[0], ticks)
             angles_rad = np.append(self._last[1], angles_rad)
@@ -147,5 +148,5 @@ class Gauges:
 
 def _peak(values: npt.NDArray[np.float64]) -> float | None:
     """Return the largest magnitude of the finite values; None if there are none."""
-    known = values[np.isfinite(values)]
-    return float(np.abs(known).max()) if known.size else None
+    finite_values = values[np.isfinite(values)]
+    return float(np.abs(finite_values).max()) if finite_values.size else None

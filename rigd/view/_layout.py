@@ -43,16 +43,20 @@ if TYPE_CHECKING:
 
 
 WINDOW_S = 10.0
-"""Time shown before the cursor. The viewer's load grows with this time, not with the session."""
+"""Time range before the cursor that most plots show, in seconds.
+
+The viewer's load grows with this range, not with the length of the session."""
 
 CLOSE_UP_S = 2.0
-"""Time shown in the tab Signals, short enough to resolve the oscillations."""
+"""Time range that the plots of the tab Signals show: short enough to resolve the oscillations."""
 
 HISTORY_S = 60.0
-"""Time shown before the cursor of values that arrive only a few times per second."""
+"""Time range before the cursor that plots of slow values show: a few values arrive per second."""
 
 WHOLE_S = 86_400.0
-"""Time shown of values that arrive at most once per second: longer than any session."""
+"""Time range of plots that show the whole session: longer than any session.
+
+Their values arrive at most once per second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +66,9 @@ class TimeView:
     Attributes
     ----------
     source, plot
-        Source and plot to show.
+        Source of the plotted values, and the plot to show.
     window_s
-        Time shown before the cursor.
+        Time range before the cursor that the plot shows.
     height
         Height inside the axes, in points, in a window of 1280 × 800.
     """
@@ -81,10 +85,11 @@ class TimeView:
 
 
 _OVERVIEW_PLOT_HEIGHT: Final = 228.0
-"""Heights in points of each plot in a tab: overview, tabs with three rows, tabs with four rows."""
+"""Height of each plot in the tab Overview, in points."""
 _THREE_ROW_PLOT_HEIGHT: Final = 189.0
+"""Height of each plot in a tab with three rows of plots, in points."""
 _FOUR_ROW_PLOT_HEIGHT: Final = 131.0
-"""Heights of the plots of a tab."""
+"""Height of each plot in a tab with four rows of plots, in points."""
 
 OVERVIEW: Final = tuple(
     TimeView(plots.SIGNALS, plot, WINDOW_S, _OVERVIEW_PLOT_HEIGHT)
@@ -186,9 +191,9 @@ def _overview() -> "rrb.Container":
     """Return the contents of the tab Overview: state, gauges, antenna, plots and response."""
     import rerun.blueprint as rrb
 
-    state, values = banner.views()
+    state_view, gauges_view = banner.views()
     return rrb.Vertical(
-        rrb.Horizontal(state, values, column_shares=[6, 7]),
+        rrb.Horizontal(state_view, gauges_view, column_shares=[6, 7]),
         rrb.Horizontal(
             rrb.Vertical(*map(_plot, OVERVIEW)),
             rrb.Vertical(
@@ -235,10 +240,11 @@ def _health(absent: Collection[str]) -> "rrb.Container":
     """Return the contents of the tab Health: plots of loop, bus and recorder, and a summary."""
     import rerun.blueprint as rrb
 
-    shown = [view for view in HEALTH if view.plot.component not in absent]
+    shown_views = [view for view in HEALTH if view.plot.component not in absent]
     return rrb.Horizontal(
         rrb.Grid(
-            *map(_plot, shown), grid_columns=1 if len(shown) < _LEAST_PLOTS_FOR_TWO_COLUMNS else 2
+            *map(_plot, shown_views),
+            grid_columns=1 if len(shown_views) < _LEAST_PLOTS_FOR_TWO_COLUMNS else 2,
         ),
         _summary(),
         column_shares=[7, 2],
@@ -405,8 +411,10 @@ _EXTREMES_INTERVAL_NS: Final = 100_000_000
 _MOST_VALUE_TO_AXIS_RATIO: Final = 1e9
 """Ratio of the largest value to the least axis length above which Rerun alone chooses the axis."""
 _LEAST_LABEL_SPACING, _MOST_LABEL_SPACING = 1e-300, 1e300
-"""Bounds of the label spacing, in the unit of the values, outside which Rerun alone chooses the
-axis."""
+"""Smallest and largest distance between axis labels, in the unit of the values, for which points
+are added.
+
+Outside these bounds Rerun alone chooses the axis."""
 _CurvePoint = tuple[int, float]
 """Point of a curve: time since the start of the session in ns, and value."""
 
@@ -432,9 +440,9 @@ class Scale:
 
     def frame(self) -> list["Drawing"]:
         """Return functions that send an empty first point, without which Rerun reports an error."""
-        nothing = {axis.view.ticks: np.array([[np.nan]]) for axis in self._axes}
+        empty_values = {axis.view.ticks: np.array([[np.nan]]) for axis in self._axes}
         start_ns = np.array([0])
-        return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=nothing)]
+        return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=empty_values)]
 
     def draw(self, t_ns: npt.NDArray[np.int64], columns: Mapping[str, Values]) -> list["Drawing"]:
         """Return functions that send the invisible points that the axes need for their labels.
@@ -492,15 +500,17 @@ class _AxisExtremes:
             return []
         high_ns, high = self._greatest.take(t_ns, high)
         low_ns, minus_low = self._least.take(t_ns, -low)
-        below, above = missing_ticks(-minus_low, high, self.view.height, self.view.plot.least_span)
+        value_below, value_above = missing_ticks(
+            -minus_low, high, self.view.height, self.view.plot.least_span
+        )
         # When either extreme leaves the window, the missing points are computed again.
         first_extreme_ns = min(low_ns, high_ns)
         new_points = []
-        if above is not None and self._must_send(self._above, above, t_ns):
-            self._above = first_extreme_ns, above
+        if value_above is not None and self._must_send(self._above, value_above, t_ns):
+            self._above = first_extreme_ns, value_above
             new_points.append(self._above)
-        if below is not None and self._must_send(self._below, below, t_ns):
-            self._below = first_extreme_ns, below
+        if value_below is not None and self._must_send(self._below, value_below, t_ns):
+            self._below = first_extreme_ns, value_below
             new_points.append(self._below)
         return new_points
 
@@ -547,39 +557,46 @@ def missing_ticks(
 
     Returns
     -------
-    below, above
+    value_below, value_above
         Values to add below and above the plotted values; None if none is needed on that side.
     """
     if 0.0 <= high - low < least_span and max(-low, high) < _MOST_VALUE_TO_AXIS_RATIO * least_span:
         # In steps, so that noise does not move the axis.
         step = least_span / 2
-        first, last = math.floor(low / step), math.ceil(high / step)
-        if last - first < 2:
-            first, last = (
-                (first - 1, last + 1)
-                if first == last
+        first_multiple, last_multiple = math.floor(low / step), math.ceil(high / step)
+        if last_multiple - first_multiple < 2:
+            first_multiple, last_multiple = (
+                (first_multiple - 1, last_multiple + 1)
+                if first_multiple == last_multiple
                 else (
-                    (first - 1, last)
-                    if low - first * step < last * step - high
-                    else (first, last + 1)
+                    (first_multiple - 1, last_multiple)
+                    if low - first_multiple * step < last_multiple * step - high
+                    else (first_multiple, last_multiple + 1)
                 )
             )
-        ends = first * step, last * step
+        ends = first_multiple * step, last_multiple * step
         ticks = missing_ticks(*ends, height)
-        below, above = (
+        value_below, value_above = (
             end if tick is None else tick for end, tick in zip(ends, ticks, strict=True)
         )
-        return below if below < low else None, above if above > high else None
+        return (
+            value_below if value_below < low else None,
+            value_above if value_above > high else None,
+        )
     spacing = AXIS_TO_RANGE_RATIO * (high - low) / height * LEAST_LABEL_SPACING_PT
     # Rerun shows a single value with one unit on either side.
     if not _LEAST_LABEL_SPACING < spacing < _MOST_LABEL_SPACING:
         return None, None
     step = 10.0 ** math.ceil(math.log10(spacing))
-    first, last = math.ceil(low / step), math.floor(high / step)
-    if last > first:
+    first_multiple, last_multiple = math.ceil(low / step), math.floor(high / step)
+    if last_multiple > first_multiple:
         return None, None
-    below, above = (first - 1) * step, (last + 1) * step
-    if last < first:
-        return below, above
+    value_below, value_above = (first_multiple - 1) * step, (last_multiple + 1) * step
+    if last_multiple < first_multiple:
+        return value_below, value_above
     # Prefer above: the point stays there while a signal oscillates, and makes room for the legend.
-    return (None, above) if above - high <= 2.0 * (low - below) else (below, None)
+    return (
+        (None, value_above)
+        if value_above - high <= 2.0 * (low - value_below)
+        else (value_below, None)
+    )

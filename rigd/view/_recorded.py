@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 
 Records = npt.NDArray[Any]
+"""Structured array of samples or timings, shape (n,)."""
 
 _BLOCK_S: Final = 1.0
 """Duration of the blocks of samples that are drawn together: the period of the charts."""
@@ -68,29 +69,29 @@ def subject_of_session(
     ticks = session.samples["tick"]
     if len(ticks) == 0:
         raise SessionError(f"{session.path}: no samples were recorded, so there is nothing to see.")
-    first, end = int(ticks[0]), int(ticks[-1]) + 1
+    first_tick, end = int(ticks[0]), int(ticks[-1]) + 1
     if session.start_utc_ns > _LAST_UTC_NS:
         raise SessionError(
             f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, "
             "which Rerun cannot show. The writing program must correct it."
         )
-    if end - first > _MOST_TICKS_PER_SAMPLE * len(ticks):
+    if end - first_tick > _MOST_TICKS_PER_SAMPLE * len(ticks):
         raise SessionError(
-            f"{session.path}: only {len(ticks)} of the {end - first} ticks from {first} to "
+            f"{session.path}: only {len(ticks)} of the {end - first_tick} ticks from {first_tick} to "
             f"{end - 1} have a sample, too few to be shown as a session."
         )
-    attached = [session.attachments.get(name, b"") for name in _ATTACHMENTS_WITH_DAMPING]
+    attachments = [session.attachments.get(name, b"") for name in _ATTACHMENTS_WITH_DAMPING]
     return Subject(
         name=session.metadata.get("id") or session.path.stem,
         rate_hz=_number_in_range(session, "rate_hz", 1.0, 1e5),
-        ticks=max(end, *(planned for _, planned in session.segments.values()), 0),
-        sweep=sweep_of({"sweep": (first, end), **session.segments}),
+        ticks=max(end, *(segment_end for _, segment_end in session.segments.values()), 0),
+        sweep=sweep_of({"sweep": (first_tick, end), **session.segments}),
         beam=Beam(
             _number_in_range(session, "beam_length_m", 1e-3, 1e3),
             _number_in_range(session, "beam_density_kg_per_m", 1e-6, 1e3),
             _number_in_range(session, "beam_bending_stiffness_n_m2", 1e-9, 1e9),
         ),
-        damping=next(filter(None, map(nominal_damping, attached)), None),
+        damping=next(filter(None, map(nominal_damping, attachments)), None),
         tool_inertia_kg_m2=session.number("tool_inertia_kg_m2", 0.0),
         angle_delay_s=session.number("angle_delay_s", 0.0),
         torque_delay_s=session.number("torque_delay_s", 0.0),
@@ -98,7 +99,7 @@ def subject_of_session(
         sweep_hz=band_of(session.metadata.get("excitation", ""), session.metadata),
         back=session.segments.get("back"),
         specimen=session.metadata.get("specimen", ""),
-        limits=_stated_limits(attached[-1]),
+        limits=_stated_limits(attachments[-1]),
         absent=_components_without_values(session, timings),
         recorded=True,
         # The file has only the last fit.
@@ -133,12 +134,12 @@ def _stated_limits(profile: bytes) -> dict[str, float]:
 
 def _components_without_values(session: Session, timings: Records | None) -> frozenset[str]:
     """Return the component names of plots for which a recorded session has no values."""
-    absent = {plot.component for plot in HEALTH.plots if plot is not FAULTY_TICKS}
+    components = {plot.component for plot in HEALTH.plots if plot is not FAULTY_TICKS}
     if timings is None or len(timings) == 0:
-        absent.add(AGES.component)
+        components.add(AGES.component)
     if not (session.samples["lateness_ns"].any() or session.samples["work_ns"].any()):
-        absent |= OF_REAL_TIME
-    return frozenset(absent)
+        components |= OF_REAL_TIME
+    return frozenset(components)
 
 
 def nominal_damping(profile: bytes) -> Damping | None:
@@ -207,14 +208,14 @@ def draw_session(
     counts = np.zeros(3, np.int64)
     drawn_samples, last_tick = 0, -1
     block_ticks = max(1, round(_BLOCK_S * subject.rate_hz))
-    for block, ages in _blocks(samples, timings, block_ticks):
+    for block, block_timings in _blocks(samples, timings, block_ticks):
         drawn_samples += len(block)
         counts += _count_faulty_ticks(block, last_tick)
         last_tick, t_ns = int(block["tick"][-1]), int(block["t_ns"][-1])
-        missed, late, lost = counts.tolist()
-        health = Health(missed_ticks=missed, late_ticks=late, lost_ticks=lost)
+        missed_ticks, late_ticks, lost_ticks = counts.tolist()
+        health = Health(missed_ticks=missed_ticks, late_ticks=late_ticks, lost_ticks=lost_ticks)
         for send_drawing in (
-            *scene.timings(ages),
+            *scene.timings(block_timings),
             *scene.samples(block),
             *scene.health(t_ns, health),
         ):
@@ -254,12 +255,12 @@ def recorded_blueprint(
     """
     import rerun.blueprint as rrb
 
-    live = blueprint(absent=absent, fit_modes=fit_modes)
+    live_layout = blueprint(absent=absent, fit_modes=fit_modes)
     return rrb.Blueprint(
-        rrb.Tabs(*front, *live.root_container.contents),
+        rrb.Tabs(*front, *live_layout.root_container.contents),
         rrb.TimePanel(timeline=TIMELINE, play_state="playing", state="collapsed"),
-        live.blueprint_panel,
-        live.selection_panel,
+        live_layout.blueprint_panel,
+        live_layout.selection_panel,
     )
 
 
@@ -289,18 +290,22 @@ def _notes(session: Session, touches: Sequence[Mapping[str, Any]]) -> Iterator[N
 def _touches(session: Session) -> list[dict[str, Any]]:
     """Return the session's touches with an estimated time within the record, in order of time."""
     last_s = 1e-9 * int(session.samples["t_ns"][-1])
-    timed = [touch for touch in touches_of(session.outcome) if touch["time_s"] is not None]
-    in_record = [touch for touch in timed if 0.0 <= touch["time_s"]["value"] <= last_s]
-    return sorted(in_record, key=lambda touch: touch["time_s"]["value"])
+    touches_with_time = [
+        touch for touch in touches_of(session.outcome) if touch["time_s"] is not None
+    ]
+    touches_in_record = [
+        touch for touch in touches_with_time if 0.0 <= touch["time_s"]["value"] <= last_s
+    ]
+    return sorted(touches_in_record, key=lambda touch: touch["time_s"]["value"])
 
 
 def _count_faulty_ticks(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:
     """Return the number of missed, late and lost ticks since the tick `last_tick`, shape (3,)."""
     gaps = np.diff(samples["tick"].astype(np.int64), prepend=last_tick) - 1
     status = samples["status"]
-    lost = np.where(status & Status.AFTER_LOST, gaps, 0)
-    late = (status & Status.LATE) != 0
-    return np.array([(gaps - lost).sum(), late.sum(), lost.sum()], np.int64)
+    lost_ticks = np.where(status & Status.AFTER_LOST, gaps, 0)
+    is_late = (status & Status.LATE) != 0
+    return np.array([(gaps - lost_ticks).sum(), is_late.sum(), lost_ticks.sum()], np.int64)
 
 
 def _blocks(

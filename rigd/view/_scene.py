@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from rigd.view._session_info import Health, Note, Subject
 
 Records = npt.NDArray[Any]
+"""Structured array of samples, timings or other records of a session, shape (n,)."""
 
 Drawing = Callable[["RecordingStream"], None]
 """Function that sends one item to a Rerun recording."""
@@ -58,6 +59,8 @@ _MOST_STORED_NOTES: Final = 200
 
 class Scene:
     """Scene of one session: computes its displays and returns the functions that draw them.
+
+    The scene itself sends nothing, so that a stalled viewer cannot disturb its computations.
 
     Parameters
     ----------
@@ -215,8 +218,8 @@ class Scene:
         if self._subject.fit_modes is None:
             return []
         source = self._fit_source
-        plotted = [] if source is None else self._plot(source, records)
-        return [*plotted, partial(send_table, fit=self._fit)]
+        plot_drawings = [] if source is None else self._plot(source, records)
+        return [*plot_drawings, partial(send_table, fit=self._fit)]
 
     def _draw_samples(self, samples: Records | None) -> list[Drawing]:
         """Return functions that draw a block of samples; none without a block."""
@@ -244,7 +247,7 @@ class Scene:
     def _draw_banner(self) -> list[Drawing]:
         """Return functions that draw the session's state and its gauges."""
         subject, t_ns, health = self._subject, self._health_ns, self._health
-        missed = banner.missed_gauge(subject, t_ns, health)
+        gauge_of_missed_ticks = banner.missed_gauge(subject, t_ns, health)
         return [
             partial(
                 banner.send_banner, subject=subject, state=self._state, t_ns=t_ns, health=health
@@ -253,7 +256,7 @@ class Scene:
                 banner.send_values,
                 state=self._state,
                 t_ns=t_ns,
-                gauges={**self._peaks, "missed": missed},
+                gauges={**self._peaks, "missed": gauge_of_missed_ticks},
             ),
         ]
 

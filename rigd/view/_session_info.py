@@ -61,8 +61,8 @@ class Subject:
         Frequencies at the start and end of a linear sweep; None if the excitation has no linear
         sweep.
     back
-        First tick and end (exclusive) of a second sweep, from the last frequency back to the first;
-        None if there is no second sweep.
+        First tick and end (exclusive) of a second sweep, which returns from the last frequency to
+        the first; None if there is no second sweep.
     specimen
         Name of the specimen as the operator gave it.
     limits
@@ -127,7 +127,7 @@ def sweep_of(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
 
 
 def band_of(kind: str, parameters: Mapping[str, float | int | str]) -> tuple[float, float] | None:
-    """Return the start and end frequency of a linear sweep; None for other excitations.
+    """Return the frequencies at the start and end of a linear sweep; None for other excitations.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ _LEVEL_OF_OUTCOME = {"complete": "info", "fault": "error"}
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """State of loop, recorder, disk and bus at one time; an unknown value is None.
+    """Condition of loop, recorder, disk and bus at one time; an unknown value is None.
 
     Attributes
     ----------
@@ -248,8 +248,8 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
     stream.set_time(TIMELINE, duration=1e-3 * round(1e-6 * note.t_ns))
     text = "\n".join(
         line
-        for part in note.message.splitlines()
-        for line in wrap(part, _LOG_WIDTH_CHARACTERS) or [""]
+        for paragraph in note.message.splitlines()
+        for line in wrap(paragraph, _LOG_WIDTH_CHARACTERS) or [""]
     )
     stream.log(EVENTS, rr.TextLog(text, level=_RERUN_LEVELS.get(note.level, "INFO")))
 

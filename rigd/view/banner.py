@@ -217,9 +217,9 @@ def missed_gauge(subject: "Subject", t_ns: int, health: "Health") -> Gauge:
     health
         Health reading at that time.
     """
-    scheduled = max(1e-9 * t_ns, 10.0) * subject.rate_hz
-    missed = health.missed_ticks
-    percentage = None if missed is None else 100.0 * missed / scheduled
+    scheduled_ticks = max(1e-9 * t_ns, 10.0) * subject.rate_hz
+    missed_ticks = health.missed_ticks
+    percentage = None if missed_ticks is None else 100.0 * missed_ticks / scheduled_ticks
     return Gauge(percentage, subject.limits.get("missed"), "%")
 
 
@@ -276,7 +276,7 @@ def send_values(
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     width, _ = SIZE
-    strips, colors, radii = [[[0.0, 8.0], [width, 8.0]]], [state.color], [_BAND_HEIGHT_PT / 2]
+    lines, colors, radii = [[[0.0, 8.0], [width, 8.0]]], [state.color], [_BAND_HEIGHT_PT / 2]
     label_positions, labels, label_colors = [], [], []
     for index, (name, label) in enumerate(_GAUGE_LABELS.items()):
         gauge = gauges.get(name)
@@ -292,7 +292,7 @@ def send_values(
         bar_left = x + _GAUGE_TEXT_WIDTH_PT
         if gauge.fraction is not None:
             bar_end = bar_left + _BAR_WIDTH_PT * min(gauge.fraction, 1.0)
-            strips += [
+            lines += [
                 [[bar_left, y], [bar_left + _BAR_WIDTH_PT, y]],
                 [[bar_left, y], [bar_end, y]],
             ]
@@ -300,7 +300,7 @@ def send_values(
             radii += [_BAR_HEIGHT_PT / 2] * 2
     stream.log(
         f"{VALUES}/bars",
-        rr.LineStrips2D(strips, colors=colors, radii=rr.Radius.ui_points(radii)),
+        rr.LineStrips2D(lines, colors=colors, radii=rr.Radius.ui_points(radii)),
     )
     stream.log(
         f"{VALUES}/texts",

@@ -28,8 +28,8 @@ _LEFT_MARGIN, _TOP_MARGIN, _BOTTOM_MARGIN = 62.0, 44.0, 54.0
 """Margins for tick labels and titles left of, above and below the frame, in points."""
 _RIGHT_MARGIN = 24.0
 """Margin on the right of the frame, in points."""
-_TITLE_RISE = 27.0
-"""Height of the middle of titles and legend above the frame, in points."""
+_TITLE_DISTANCE = 27.0
+"""Distance of the middle of titles and legend above the frame, in points."""
 
 LABEL_DROP = 12.0
 """Distance by which Rerun draws the middle of a label below its position, in points."""
@@ -52,7 +52,7 @@ class Axis:
     title
         Title with its unit.
     first, last
-        Values at the left or lower end and at the other end.
+        Values at the lower (or left) end and at the upper (or right) end.
     ticks
         Values with a tick label and a grid line.
     lines
@@ -206,7 +206,7 @@ class Chart:
 
         canvas_strips = [self.to_canvas(strip[:, 0], strip[:, 1]) for strip in strips]
         draw_order = (20.0 if static else 30.0) + order
-        shape = (
+        drawn_curve = (
             rr.Points2D(
                 np.concatenate(canvas_strips or [np.zeros((0, 2))]),
                 colors=[key.color],
@@ -221,7 +221,7 @@ class Chart:
                 draw_order=draw_order,
             )
         )
-        stream.log(f"{self.entity}/{name}", shape, static=static)
+        stream.log(f"{self.entity}/{name}", drawn_curve, static=static)
 
     def draw_note(self, stream: "RecordingStream", text: str, color: Color) -> None:
         """Write a text into the middle of the frame; an empty text removes the previous text.
@@ -304,7 +304,7 @@ class Chart:
         middle = (left + right) / 2
         labels = [
             *self.tick_labels(),
-            (self.y.title, left - 44.0 + _label_width(self.y.title) / 2, top - _TITLE_RISE),
+            (self.y.title, left - 44.0 + _label_width(self.y.title) / 2, top - _TITLE_DISTANCE),
         ]
         if self.x.title:
             labels.append((self.x.title, middle, bottom + 40.0))
@@ -332,13 +332,15 @@ class Chart:
         left, top, right, bottom = self.frame
         verticals = self.to_canvas([*self.x.ticks, *self.x.lines], self.y.first)[:, 0]
         horizontals = self.to_canvas(self.x.first, [*self.y.ticks, *self.y.lines])[:, 1]
-        dots = [
+        dot_positions = [
             *([x, y] for x in verticals for y in np.arange(bottom, top, -_DOT_SPACING)),
             *([x, y] for y in horizontals for x in np.arange(left, right, _DOT_SPACING)),
         ]
         stream.log(
             f"{self.entity}/grid",
-            rr.Points2D(dots, colors=[GREY], radii=rr.Radius.ui_points(0.5), draw_order=0.5),
+            rr.Points2D(
+                dot_positions, colors=[GREY], radii=rr.Radius.ui_points(0.5), draw_order=0.5
+            ),
             static=True,
         )
 
@@ -392,7 +394,7 @@ class Chart:
         x = right
         for key in reversed(self.legend):
             x -= _label_width(key.label)
-            entries.append((key, x, top - _TITLE_RISE))
+            entries.append((key, x, top - _TITLE_DISTANCE))
             x -= 46.0
         return entries[::-1]
 
@@ -449,8 +451,12 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
     (10.0, 20.0, 30.0, 40.0)
     """
     least_step = (last - first) / most
-    scale = 10.0 ** np.floor(np.log10(least_step))
-    step = next(digit * scale for digit in (1.0, 2.0, 5.0, 10.0) if digit * scale >= least_step)
+    power_of_ten = 10.0 ** np.floor(np.log10(least_step))
+    step = next(
+        digit * power_of_ten
+        for digit in (1.0, 2.0, 5.0, 10.0)
+        if digit * power_of_ten >= least_step
+    )
     first_index, last_index = np.ceil(first / step - 1e-9), np.floor(last / step + 1e-9)
     values = step * np.arange(first_index, last_index + 1) + 0.0  # adding turns −0 into 0
     return tuple(float(f"{value:.9g}") for value in values)
@@ -536,17 +542,17 @@ class Thinning:
         """
         group_indices, _ = self._extremes(values)
         before_gaps = np.flatnonzero(np.diff(group_indices) > 1)
-        first = self.groups[group_indices[before_gaps] + 1, 0]
-        last = self.groups[group_indices[before_gaps + 1] - 1].max(axis=1)
-        return np.unique(np.concatenate([first, last]))
+        first_indices = self.groups[group_indices[before_gaps] + 1, 0]
+        last_indices = self.groups[group_indices[before_gaps + 1] - 1].max(axis=1)
+        return np.unique(np.concatenate([first_indices, last_indices]))
 
     def _extremes(self, values: Real) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
         """Return the indices of groups with known values, and of both extremes of each group."""
-        grouped = values[self.groups]
-        unknown = np.isnan(grouped)
-        group_indices = np.flatnonzero(~unknown.all(axis=1))
-        grouped, unknown = grouped[group_indices], unknown[group_indices]
-        least = np.where(unknown, np.inf, grouped).argmin(axis=1)
-        greatest = np.where(unknown, -np.inf, grouped).argmax(axis=1)
-        columns = np.stack([least, greatest], axis=1)
+        grouped_values = values[self.groups]
+        is_unknown = np.isnan(grouped_values)
+        group_indices = np.flatnonzero(~is_unknown.all(axis=1))
+        grouped_values, is_unknown = grouped_values[group_indices], is_unknown[group_indices]
+        least_columns = np.where(is_unknown, np.inf, grouped_values).argmin(axis=1)
+        greatest_columns = np.where(is_unknown, -np.inf, grouped_values).argmax(axis=1)
+        columns = np.stack([least_columns, greatest_columns], axis=1)
         return group_indices, np.take_along_axis(self.groups[group_indices], columns, axis=1)

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 
 Real = npt.NDArray[np.float64]
+"""Array of real numbers."""
 Complex = npt.NDArray[np.complex128]
+"""Array of complex numbers."""
 
 
 # Estimate
@@ -96,10 +98,13 @@ LAST_HZ: Final = 60.0
 """Highest frequency shown: above the third mode and the band of the reference paper's chirp."""
 
 OVERVIEW_MAGNITUDE: Final = "/overview/magnitude"
-"""Entity paths in Rerun of the four charts of the frequency response."""
+"""Entity path in Rerun of the magnitude's chart in the tab Overview."""
 MAGNITUDE: Final = "/frequency_response/magnitude"
+"""Entity path in Rerun of the magnitude's chart."""
 PHASE: Final = "/frequency_response/phase"
+"""Entity path in Rerun of the phase's chart."""
 COHERENCE: Final = "/frequency_response/coherence"
+"""Entity path in Rerun of the coherence's chart."""
 SIZES: Final = {
     OVERVIEW_MAGNITUDE: (690.0, 285.0),
     MAGNITUDE: (1280.0, 374.0),
@@ -131,8 +136,8 @@ NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
 NO_COHERENCE: Final = "Of a single segment there is no coherence"
 """Text in the coherence chart of a finished response from a single segment."""
 
-_LEAST_WIDTH_FOR_FIVE_ENTRIES: Final = 700.0
-"""Width of a chart in points up to which its legend has no room for a fifth entry."""
+_MOST_WIDTH_FOR_FOUR_ENTRIES: Final = 700.0
+"""Width in points above which a chart's legend has room for a fifth entry."""
 _SHADE_NAMES: Final = ("not_estimated_below", "not_estimated_above")
 """Names of the shaded areas over the bands that are not estimated."""
 _FREQUENCY_GROUPS: Final = 200
@@ -217,7 +222,7 @@ class ResponseCharts:
         keys = (MEASURED_KEY, UNCERTAIN_KEY, *extra_keys)
         # The title of the view names the quantity.
         axis_with_short_title = replace(magnitude, title="dB re 1 N·m/rad")
-        self._graphs = (
+        self._response_curves = (
             *(
                 _ResponseCurve(
                     _chart(entity, axis, *keys), MEASURED_KEY, _magnitude_db, magnitude_db
@@ -247,7 +252,9 @@ class ResponseCharts:
             if damping_is_known
             else {}
         )
-        self._last_curves = {} if last is None else _last_response_curves(last, self._graphs)
+        self._last_curves = (
+            {} if last is None else _last_response_curves(last, self._response_curves)
+        )
         self._thinning: Thinning | None = None
         self._t_ns = 0
         self._last_update: tuple[Real, Complex] | None = None
@@ -258,23 +265,31 @@ class ResponseCharts:
 
     def chart(self, entity: str) -> Chart:
         """Return the chart with a given entity path."""
-        return next(graph.chart for graph in self._graphs if graph.chart.entity == entity)
+        return next(
+            response_curve.chart
+            for response_curve in self._response_curves
+            if response_curve.chart.entity == entity
+        )
 
     def draw_frames(self, stream: "RecordingStream") -> None:
         """Draw the parts that do not change: frames, nominal model and last session's response."""
-        for graph in self._graphs:
-            graph.chart.draw_frame(stream)
+        for response_curve in self._response_curves:
+            response_curve.chart.draw_frame(stream)
             for name in _SHADE_NAMES:
-                graph.chart.draw_shade(stream, name)
-            if graph.chart.entity in self._models:
-                graph.chart.draw_curve(
-                    stream, "model", self._models[graph.chart.entity], MODEL_KEY, static=True
+                response_curve.chart.draw_shade(stream, name)
+            if response_curve.chart.entity in self._models:
+                response_curve.chart.draw_curve(
+                    stream,
+                    "model",
+                    self._models[response_curve.chart.entity],
+                    MODEL_KEY,
+                    static=True,
                 )
-            if graph.chart.entity in self._last_curves:
-                graph.chart.draw_curve(
+            if response_curve.chart.entity in self._last_curves:
+                response_curve.chart.draw_curve(
                     stream,
                     "last",
-                    self._last_curves[graph.chart.entity],
+                    self._last_curves[response_curve.chart.entity],
                     LAST_KEY,
                     static=True,
                     order=1,
@@ -291,25 +306,27 @@ class ResponseCharts:
             Response estimated so far.
         """
         response = estimate.response.without_delays(**self._delays_s)
-        grid = response.frequency_hz
-        if self._thinning is None or self._thinning.grid.size != grid.size:
-            self._thinning = response_thinning(grid)
-        excited = estimate.excited
+        frequency_hz = response.frequency_hz
+        if self._thinning is None or self._thinning.grid.size != frequency_hz.size:
+            self._thinning = response_thinning(frequency_hz)
+        is_excited = estimate.excited
         self._t_ns = t_ns
-        self._last_update = grid, np.where(excited, response.response, np.nan)
-        is_coherent = excited
+        self._last_update = frequency_hz, np.where(is_excited, response.response, np.nan)
+        is_coherent = is_excited
         if response.coherence is not None:
-            is_coherent = excited & (response.coherence >= LOW_COHERENCE)
+            is_coherent = is_excited & (response.coherence >= LOW_COHERENCE)
         strips = self._thinning.strips
         self._curves, self._uncertain = {}, {}
-        for graph in self._graphs:
-            values, entity = graph.values(response), graph.chart.entity
+        for response_curve in self._response_curves:
+            values, entity = response_curve.values(response), response_curve.chart.entity
             # The coherence itself is always reliable.
-            is_reliable = is_coherent if graph.from_complex else excited
+            is_reliable = is_coherent if response_curve.from_complex else is_excited
             self._curves[entity] = strips(np.where(is_reliable, values, np.nan))
-            if graph.from_complex:
-                self._uncertain[entity] = strips(np.where(excited, values, np.nan))
-        excited_ends_hz = grid[excited][[0, -1]] if excited.any() else (LAST_HZ, LAST_HZ)
+            if response_curve.from_complex:
+                self._uncertain[entity] = strips(np.where(is_excited, values, np.nan))
+        excited_ends_hz = (
+            frequency_hz[is_excited][[0, -1]] if is_excited.any() else (LAST_HZ, LAST_HZ)
+        )
         self._excited_hz = float(excited_ends_hz[0]), float(excited_ends_hz[1])
         missing_text = NO_COHERENCE if estimate.final else NO_COHERENCE_YET
         self._note = missing_text if response.coherence is None else ""
@@ -317,14 +334,14 @@ class ResponseCharts:
     def draw(self, stream: "RecordingStream") -> None:
         """Draw the curves of the last update, at the session time of that update."""
         stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
-        for graph in self._graphs:
-            chart = graph.chart
-            if graph.from_complex:
+        for response_curve in self._response_curves:
+            chart = response_curve.chart
+            if response_curve.from_complex:
                 # The whole curve lies beneath, so that there is no gap at a change of colour.
                 uncertain_curve = self._uncertain.get(chart.entity, ())
                 chart.draw_curve(stream, "uncertain", uncertain_curve, UNCERTAIN_KEY)
-            curve = self._curves.get(chart.entity, ())
-            chart.draw_curve(stream, "measured", curve, graph.key, order=1)
+            measured_curve = self._curves.get(chart.entity, ())
+            chart.draw_curve(stream, "measured", measured_curve, response_curve.key, order=1)
             ends_hz = (FIRST_HZ, *self._excited_hz, LAST_HZ)
             for name, first_hz, last_hz in zip(
                 _SHADE_NAMES, ends_hz[::2], ends_hz[1::2], strict=True
@@ -346,14 +363,14 @@ class ResponseCharts:
 
 
 def _last_response_curves(
-    last: LastResponse, graphs: "Sequence[_ResponseCurve]"
+    last: LastResponse, response_curves: "Sequence[_ResponseCurve]"
 ) -> dict[str, Sequence[Real]]:
     """Return the curves of an earlier session's response, by the entity path of their chart."""
     thinning = response_thinning(last.frequency_hz)
     return {
-        graph.chart.entity: thinning.strips(graph.from_complex(last.response))
-        for graph in graphs
-        if graph.from_complex
+        response_curve.chart.entity: thinning.strips(response_curve.from_complex(last.response))
+        for response_curve in response_curves
+        if response_curve.from_complex
     }
 
 
@@ -474,7 +491,7 @@ def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
     """Return a chart of the frequency response, with a legend entry for bands without estimate."""
     size = SIZES[entity]
     if (
-        LAST_KEY not in keys or size[0] > _LEAST_WIDTH_FOR_FIVE_ENTRIES
+        LAST_KEY not in keys or size[0] > _MOST_WIDTH_FOR_FOUR_ENTRIES
     ):  # there is room for another entry
         keys = (*keys, NOT_ESTIMATED_KEY)
     return response_chart(entity, size, (FIRST_HZ, LAST_HZ), y, *keys)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 # Colours
 
 Color = tuple[int, int, int]
+"""Colour as red, green and blue from 0 to 255."""
 
 ORANGE: Color = (230, 159, 0)
 SKY_BLUE: Color = (86, 180, 233)
@@ -154,12 +155,12 @@ def _column(component: str, values: Values) -> "ComponentColumn":
     """Return values (n, k) as a column of Rerun's, with k scalars in each row."""
     import rerun as rr
 
-    rows, width = values.shape
-    batch = rr.components.ScalarBatch(values.ravel())
+    row_count, values_per_row = values.shape
+    scalar_batch = rr.components.ScalarBatch(values.ravel())
     return rr.ComponentColumn(
-        rr.ComponentDescriptor(component, component_type=batch.component_type()),
-        batch,
-        offsets=np.arange(0, rows * width + 1, width, dtype=np.int32),
+        rr.ComponentDescriptor(component, component_type=scalar_batch.component_type()),
+        scalar_batch,
+        offsets=np.arange(0, row_count * values_per_row + 1, values_per_row, dtype=np.int32),
     )
 
 
