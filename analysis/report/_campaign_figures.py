@@ -13,7 +13,7 @@ from analysis.report import _style as style
 from analysis.report._frf_figure import line_styles
 from analysis.report._paper_tables import welch_text
 from analysis.report._pooled_tables import exact_condition_text, session_count_text
-from analysis.report.table import MARK, unreported_parameters
+from analysis.report.table import NOT_REPORTED_MARK, unreported_parameters
 from rigd.view.frequency_charts import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
@@ -118,7 +118,9 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
     assert estimate is not None
     unsupported_orders = campaign.verdict.withheld if campaign.verdict else ()
     not_reported = unreported_parameters(STRUCTURES[estimate.structure], unsupported_orders)
-    note = f"  ·  {MARK} not reported: not supported by the data" if not_reported else ""
+    note = (
+        f"  ·  {NOT_REPORTED_MARK} not reported: not supported by the data" if not_reported else ""
+    )
     if any(campaign.homogeneity.is_mixed(parameter.name) for parameter in estimate.parameters):
         note += f"  ·  {MIXTURE_MARK} mean of a mixture"
     rows = -(-len(estimate.parameters) // _PANELS_PER_ROW)
@@ -150,7 +152,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
                label="session, ± 1.96 of its standard deviation"),
         Line2D([], [], color=style.BLUE, label="pooled"),
         Patch(facecolor=INTERVAL_COLOR, label="its 95 % interval"),
-        Patch(facecolor=style.SHADE, label="95 % prediction interval"),
+        Patch(facecolor=style.SHADE_COLOR, label="95 % prediction interval"),
     ]  # fmt: skip
     style.legend(figure, legend_entries, columns=4)
     return figure
@@ -169,7 +171,9 @@ def _draw_parameter_panel(
                 positions.append(number)
                 values.append(factor * estimate.parameters[parameter.name])
                 half_widths.append(1.96 * factor * std)
-    axes.axhspan(*(factor * end for end in parameter.next_interval), color=style.SHADE, zorder=0.5)
+    axes.axhspan(
+        *(factor * end for end in parameter.next_interval), color=style.SHADE_COLOR, zorder=0.5
+    )
     axes.axhspan(
         *(factor * end for end in parameter.interval),
         color=INTERVAL_COLOR if reported else style.FAINT,
@@ -186,7 +190,7 @@ def _draw_parameter_panel(
         color=session_color,
         linewidth=0.8,
     )
-    marks = "" if reported else MARK
+    marks = "" if reported else NOT_REPORTED_MARK
     marks += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
     p_value_text = f"p = {probability(parameter.chance)}".replace("= <", "<")
     axes.set_title(f"{symbol}{marks}   {p_value_text}")

@@ -20,7 +20,7 @@ from analysis.report._pooled_tables import (
     tolerant_table,
     uniform_beam_table,
 )
-from analysis.report.table import ABSENT, WORDS, Cell, Column, Entry, Row, Table
+from analysis.report.table import ABSENT_TEXT, TEXT_FORMAT, Cell, Column, Entry, Row, Table
 from rigd.session.user_metadata import META_PREFIX
 from rigd.units import suffix_of, unit_of
 
@@ -52,7 +52,7 @@ def main_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 
 def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
-    """Return the tables of modes, of parameters with a tolerance, and of the pooled fit."""
+    """Return the main tables: pooled modes, parameters with a tolerance, and the pooled fit."""
     candidates = (
         modes_table(campaign),
         tolerant_table(campaign),
@@ -62,7 +62,7 @@ def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 
 def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Table]:
-    """Return the tables that are written to files, by name, without empty ones."""
+    """Return the tables that are written to files, by name, except empty ones."""
     candidates = (
         *paper_tables(campaign, with_paper=with_paper),
         session_list_table(campaign),
@@ -84,7 +84,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
     """Return the table of all files with the metadata that they state, excluded files last."""
 
     def text_cell(text: str) -> Cell:
-        return Cell(text, text or ABSENT)
+        return Cell(text, text or ABSENT_TEXT)
 
     headings = ("file", "recorded (UTC)", "specimen", "operator", "note")
     keys = ("file", "start_utc", "specimen", "operator", "note")
@@ -92,16 +92,19 @@ def session_list_table(campaign: CampaignResult) -> Table:
         *(session.experiment for session in campaign.sessions),
         *(session.experiment for session in campaign.failures),
     )
-    added_names = dict.fromkeys(
+    metadata_names = dict.fromkeys(
         name for experiment in experiments if experiment for name in experiment.added
     )
     return Table.of(
         "session_list",
         "Sessions, as their files state them",
         (
-            *(Column(heading, key, WORDS) for heading, key in zip(headings, keys, strict=True)),
-            *map(_added_column, added_names),
-            Column("used", "used", WORDS),
+            *(
+                Column(heading, key, TEXT_FORMAT)
+                for heading, key in zip(headings, keys, strict=True)
+            ),
+            *map(_added_column, metadata_names),
+            Column("used", "used", TEXT_FORMAT),
         ),
         (
             (
@@ -112,11 +115,11 @@ def session_list_table(campaign: CampaignResult) -> Table:
                 text_cell(experiment.note if experiment else ""),
                 *(
                     _added_cell(experiment.added.get(name) if experiment else None)
-                    for name in added_names
+                    for name in metadata_names
                 ),
-                used,
+                is_used,
             )
-            for used, group in ((True, campaign.sessions), (False, campaign.failures))
+            for is_used, group in ((True, campaign.sessions), (False, campaign.failures))
             for session in group
             for experiment in (session.experiment,)
         ),
@@ -127,18 +130,18 @@ def _added_column(name: str) -> Column:
     """Return the column of metadata that users added, with the unit from its name."""
     unit = unit_of(name)
     heading = name.removesuffix(suffix_of(name)).replace("_", " ")
-    return Column(f"{heading} ({unit})" if unit else heading, f"{META_PREFIX}{name}", WORDS)
+    return Column(f"{heading} ({unit})" if unit else heading, f"{META_PREFIX}{name}", TEXT_FORMAT)
 
 
 def _added_cell(value: float | str | None) -> Cell:
     """Return the cell of a metadata value that users added; a dash if there is none."""
     if value is None:
-        return Cell(None, ABSENT)
+        return Cell(None, ABSENT_TEXT)
     return Cell(value, value if isinstance(value, str) else f"{value:g}")
 
 
 def sessions_welch_table(campaign: CampaignResult) -> Table:
-    """Return every session's Welch fits, and its distance from the nominal models."""
+    """Return the table of every session's Welch fits, with the distance from the nominal models."""
     rows = [
         {
             "file": str(session.path),
@@ -156,7 +159,7 @@ def sessions_welch_table(campaign: CampaignResult) -> Table:
 
 
 def sessions_record_table(campaign: CampaignResult) -> Table:
-    """Return every session's whole-record fits."""
+    """Return the table of every session's whole-record fits."""
     rows = [
         {
             "file": str(session.path),
@@ -189,7 +192,10 @@ def _file_only_table(name: str, rows: list[dict[str, Any]]) -> Table:
 
 
 def validation_table(campaign: CampaignResult) -> Table:
-    """Return each session's prediction errors from the other sessions, and the lost trials."""
+    """Return the table of errors when each session is predicted from the others.
+
+    The trials that failed follow.
+    """
     rows: list[dict[str, Any]] = [
         {
             "file": str(prediction.path),
@@ -210,7 +216,7 @@ def validation_table(campaign: CampaignResult) -> Table:
 
 
 def validation_summary(campaign: CampaignResult) -> Table:
-    """Return the fit and the leave-one-out error of each model, the best model first."""
+    """Return the table of each model's fit and leave-one-out error, the best model first."""
     rows: list[Row] = []
     for method, name, weighting, errors in by_model(campaign.validation):
         values = [session_error.error for session_error in errors]
@@ -235,7 +241,8 @@ def validation_summary(campaign: CampaignResult) -> Table:
         "validation",
         "Leave-one-out validation: rms error of the torque, mean over the sessions",
         (
-            Column("method", "method", WORDS), *FIT_NAME_COLUMNS, Column("sessions", "sessions"),
+            Column("method", "method", TEXT_FORMAT), *FIT_NAME_COLUMNS,
+            Column("sessions", "sessions"),
             Column("fit (NRMSE, %)", "nrmse_percent", ".2f"),
             Column("in-sample error (%)", "own_error", ".2f", 100.0),
             Column("leave-one-out error (%)", "error", ".2f", 100.0),
@@ -251,10 +258,10 @@ def validation_summary(campaign: CampaignResult) -> Table:
 
 
 def sessions_table(campaign: CampaignResult) -> Table:
-    """Return the verdict on each session by itself, then the files that were left out."""
+    """Return the table of verdicts on single sessions, then the files that were left out."""
     leading = campaign.homogeneity.leading
     groups = leading.groups if leading else ()
-    group_of = {name: f"{index}" for index, names in enumerate(groups, 1) for name in names}
+    group_by_file = {name: f"{index}" for index, names in enumerate(groups, 1) for name in names}
     name = campaign.headline.name if campaign.headline else None
     trials_by_path = {
         prediction.path: prediction
@@ -268,31 +275,31 @@ def sessions_table(campaign: CampaignResult) -> Table:
         finding_kinds = [finding.kind for finding in verdict.findings] if verdict else []
         return (
             session.name,
-            f"type {session.selected}" if session.selected else ABSENT,
+            f"type {session.selected}" if session.selected else ABSENT_TEXT,
             None if own_error is None else 100 * (1 - own_error),
             trial.error if trial else None,
-            ABSENT if verdict is None else "noise" if verdict.adequate else "more than noise",
-            ", ".join(dict.fromkeys(finding_kinds)) or ABSENT,
+            ABSENT_TEXT if verdict is None else "noise" if verdict.adequate else "more than noise",
+            ", ".join(dict.fromkeys(finding_kinds)) or ABSENT_TEXT,
         )
 
     left_out: list[tuple[Entry, ...]] = [
-        (failure.name, "left out", None, None, ABSENT, failure.message)
+        (failure.name, "left out", None, None, ABSENT_TEXT, failure.message)
         for failure in campaign.failures
     ]
     return Table.of(
         "sessions",
         "Sessions, each by itself",
         (
-            Column("file", "file", WORDS), Column("selects", "selected", WORDS),
+            Column("file", "file", TEXT_FORMAT), Column("selects", "selected", TEXT_FORMAT),
             Column("fit (NRMSE, %)" if trials_by_path else "", "nrmse_percent", ".2f"),
             Column("leave-one-out error (%)" if trials_by_path else "", "error", ".2f", 100.0),
-            Column("residual", "left", WORDS),
-            Column("other effects", "findings", WORDS),
-            Column("group" if groups else "", "group", WORDS),
+            Column("residual", "left", TEXT_FORMAT),
+            Column("other effects", "findings", TEXT_FORMAT),
+            Column("group" if groups else "", "group", TEXT_FORMAT),
         ),
         (
-            (*cells, group_of.get(str(cells[0]), ABSENT))
-            for cells in (*map(row, campaign.sessions), *left_out)
+            (*row_cells, group_by_file.get(str(row_cells[0]), ABSENT_TEXT))
+            for row_cells in (*map(row, campaign.sessions), *left_out)
         ),
         (
             *((f"Fit and error: of type {name}.",) if trials_by_path else ()),

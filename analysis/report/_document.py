@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from rigd.spectral import FrequencyResponse
 
     IndexValues = dict[str, float | None]
+    """Values of the paper's indices by name: mse, wmse, md."""
 
 NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
 """Indices of a fit for which there is no measured response to compare with."""
@@ -62,24 +63,24 @@ def indices_of_record_fit(fit: RecordFit, welch: WelchAnalysis) -> tuple[IndexVa
     """
     record = welch.record
     # The delay stated in the file has been removed from the responses.
-    stated_s = record.torque_delay_s - record.angle_delay_s
-    plant = replace(fit.plant, delay_s=fit.plant.delay_s - stated_s)
+    stated_delay_s = record.torque_delay_s - record.angle_delay_s
+    plant = replace(fit.plant, delay_s=fit.plant.delay_s - stated_delay_s)
 
-    def against(measured: FrequencyResponse) -> IndexValues:
+    def indices_against(measured: FrequencyResponse) -> IndexValues:
         (model,) = ResponseGrid(2j * np.pi * measured.frequency_hz).evaluate(plant, ())
-        return _indices(measured, model)
+        return _fit_indices(measured, model)
 
-    return against(welch.response), against(welch.whole_record)
+    return indices_against(welch.response), indices_against(welch.whole_record)
 
 
 def whole_record_indices(welch: WelchAnalysis) -> list[IndexValues]:
     """Return the indices of each Welch fit against the ratio of the whole record's transforms."""
     measured, record = welch.whole_record, welch.record
     grid = FrequencyResponseModel(measured.frequency_hz, record.beam, record.tool_inertia_kg_m2)
-    return [_indices(measured, grid.evaluate(model.fit.damping)) for model in welch.models]
+    return [_fit_indices(measured, grid.evaluate(model.fit.damping)) for model in welch.models]
 
 
-def _indices(measured: FrequencyResponse, model: NDArray[np.complex128]) -> IndexValues:
+def _fit_indices(measured: FrequencyResponse, model: NDArray[np.complex128]) -> IndexValues:
     """Return the paper's indices MSE, WMSE and MD of a model, against a measured response."""
     is_finite = np.isfinite(measured.response)
     if not is_finite.any():
@@ -151,7 +152,8 @@ def record_entries(whole_record: WholeRecord, welch: WelchAnalysis | None) -> di
                 "withheld": sorted(unreported_parameters(fit.structure, whole_record.unsupported)),
                 "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
                 "interval_95": {
-                    key: None if ends is None else list(ends) for key, ends in fit.interval.items()
+                    key: None if interval is None else list(interval)
+                    for key, interval in fit.interval.items()
                 },
                 "cost": fit.cost,
                 "degrees_of_freedom": fit.degrees_of_freedom,
@@ -162,10 +164,10 @@ def record_entries(whole_record: WholeRecord, welch: WelchAnalysis | None) -> di
                 "internal_size": _damping_size_json(fit.internal),
                 "external_size": _damping_size_json(fit.external),
                 "ringing": {**asdict(fit.ringing), "significant": fit.ringing.significant},
-                "indices": of_welch,
-                "indices_whole_record": of_record,
+                "indices": welch_indices,
+                "indices_whole_record": record_indices,
             }
-            for (name, fit), (of_welch, of_record) in zip(names, indices, strict=True)
+            for (name, fit), (welch_indices, record_indices) in zip(names, indices, strict=True)
         ],
         "modes": [
             {

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from analysis.identify import BACKGROUND
 from analysis.models import STRUCTURES
-from analysis.report.table import ABSENT, WORDS, Column, Table
+from analysis.report.table import ABSENT_TEXT, TEXT_FORMAT, Column, Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -266,7 +266,7 @@ def types_table(whole_record: WholeRecord) -> Table:
                 terms.append(
                     f"{coefficient} s{'' if is_first_order else '^' + symbol}"
                     if is_present
-                    else ABSENT
+                    else ABSENT_TEXT
                 )
                 if is_present:
                     descriptions.append(f"{damping_name} of {order_words[is_first_order]} order")
@@ -276,10 +276,10 @@ def types_table(whole_record: WholeRecord) -> Table:
         "types",
         "Types of damping",
         (
-            Column("Type", "type", WORDS),
-            Column("Internal", "internal", WORDS),
-            Column("External", "external", WORDS),
-            Column("Damping", "damping", WORDS),
+            Column("Type", "type", TEXT_FORMAT),
+            Column("Internal", "internal", TEXT_FORMAT),
+            Column("External", "external", TEXT_FORMAT),
+            Column("Damping", "damping", TEXT_FORMAT),
         ),
         rows(),
         (

@@ -12,8 +12,8 @@ from analysis.models import QUANTITIES
 from analysis.paper import LARGEST_SHIFT
 from analysis.report._document import response_fit_percent
 from analysis.report.table import (
-    ABSENT,
-    WORDS,
+    ABSENT_TEXT,
+    TEXT_FORMAT,
     Cell,
     Column,
     Entry,
@@ -40,7 +40,7 @@ _AT_LIMIT_NOTE: Final = "* at the limit of the search range: not determined by t
 
 
 def structures_table(whole_record: WholeRecord) -> Table:
-    """Return the comparison of all whole-record fits; orders without support are marked."""
+    """Return the table of all whole-record fits; orders without support are marked."""
     lowest_cost = min(fit.cost for fit in whole_record.fits.values())
     unsupported_orders = whole_record.unsupported
     delta_bic = whole_record.delta_bic
@@ -74,8 +74,8 @@ def structures_table(whole_record: WholeRecord) -> Table:
         "structures",
         "All structures on the whole record",
         (
-            Column("Type", "type", WORDS),
-            Column("", "status", WORDS),
+            Column("Type", "type", TEXT_FORMAT),
+            Column("", "status", TEXT_FORMAT),
             *_damping_columns(),
             *([Column("ΔBIC", "delta_bic")] if delta_bic else []),
             Column("Fit (%)", "nrmse_percent", ".2f"),
@@ -84,7 +84,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
             Column("", "cost"),
             Column("", "cost_above_lowest"),
             Column("", "degrees_of_freedom"),
-            Column("", "not_reported", WORDS),
+            Column("", "not_reported", TEXT_FORMAT),
         ),
         rows,
         (
@@ -111,7 +111,7 @@ def _marked_row(whole_record: WholeRecord) -> str:
 
 def _hidden_cell(cell: Cell) -> Cell:
     """Return a cell that shows a dash to people but contains its number for programs."""
-    return cell if cell.value is None else replace(cell, text=ABSENT, doubtful=True)
+    return cell if cell.value is None else replace(cell, text=ABSENT_TEXT, doubtful=True)
 
 
 def _damping_columns() -> list[Column]:
@@ -165,7 +165,10 @@ def _parameter_heading(name: str) -> str:
     return symbol if factor == 1.0 else f"{symbol} ({unit.split()[0]})"
 
 
-_NAME_COLUMNS: Final = (Column("Type", "type", WORDS), Column("Weights", "weighting", WORDS))
+_NAME_COLUMNS: Final = (
+    Column("Type", "type", TEXT_FORMAT),
+    Column("Weights", "weighting", TEXT_FORMAT),
+)
 """Columns that identify a Welch fit: type and weighting."""
 _INDEX_NAMES: Final = ("mse", "wmse", "md")
 """Names of the paper's indices."""
@@ -174,7 +177,7 @@ _INDEX_UNITS: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
 
 
 def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str] = ()) -> Table:
-    """Return the parameters and indices of every Welch fit of a record.
+    """Return the table of every Welch fit's parameters and indices.
 
     Parameters
     ----------
@@ -217,7 +220,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
 
 
 def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
-    """Return mean and standard deviation over several files of each Welch fit's results."""
+    """Return the table of each Welch fit's mean and standard deviation over several files."""
     rows: list[tuple[Entry, ...]] = []
     for models in zip(*(analysis.models for analysis in analyses), strict=True):
         fits = [model.fit for model in models]
@@ -276,7 +279,7 @@ def _type_and_weighting(model: FittedModel) -> tuple[str, str]:
 
 
 def peaks_table(analysis: WelchAnalysis) -> Table:
-    """Return the measured resonance peaks, and each model's deviations from them."""
+    """Return the table of measured resonance peaks and each model's deviations from them."""
     modes = range(1, len(analysis.peaks) + 1)
     measured = (
         *(2 * math.pi * p.frequency_hz if p else None for p in analysis.peaks),
@@ -312,7 +315,7 @@ _FAR_MODE_MARK: Final = "‡"
 
 
 def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
-    """Return the modes from each Welch fit's poles; None if no fit has modes.
+    """Return the table of modes from each Welch fit's poles; None if no fit has modes.
 
     Modes that are not the antenna's are marked or omitted.
     """
@@ -343,7 +346,7 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
             "fit does not follow this resonance. The number only describes the fitted curve."
         )
     if not all(is_underdamped) or not all(model.modes for model in models):
-        notes.append(f"{ABSENT} overdamped in this fit.")
+        notes.append(f"{ABSENT_TEXT} overdamped in this fit.")
     return Table.of(
         "welch_modes",
         "Modes of the fits to Welch's estimate",

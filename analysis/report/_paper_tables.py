@@ -17,8 +17,8 @@ from analysis.campaigns import best_models
 from analysis.campaigns.sentences import title
 from analysis.models import STRUCTURES, estimate_text
 from analysis.report.table import (
-    MARK,
-    WORDS,
+    NOT_REPORTED_MARK,
+    TEXT_FORMAT,
     Cell,
     Column,
     Entry,
@@ -36,7 +36,10 @@ if TYPE_CHECKING:
 
     from analysis.campaigns import CampaignResult
 
-FIT_NAME_COLUMNS: Final = (Column("type", "type", WORDS), Column("weights", "weighting", WORDS))
+FIT_NAME_COLUMNS: Final = (
+    Column("type", "type", TEXT_FORMAT),
+    Column("weights", "weighting", TEXT_FORMAT),
+)
 """Columns that identify a Welch fit: type and weighting."""
 
 
@@ -76,7 +79,7 @@ _PARENTHESES_NOTE: Final = "In parentheses: the paper's."
 
 
 def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
-    """Return the statistics of each parameter over the sessions (Table 3)."""
+    """Return the table of each parameter's statistics over the sessions (Table 3)."""
     rows: list[Row] = []
     for statistics in campaign.statistics:
         symbol, factor = _TABLE_3_HEADINGS[statistics.parameter]
@@ -110,7 +113,7 @@ def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
         ),
         (
             *FIT_NAME_COLUMNS,
-            Column("parameter", "parameter", WORDS),
+            Column("parameter", "parameter", TEXT_FORMAT),
             *(Column(name, name) for name in _STATISTICS),
         ),
         tuple(rows),
@@ -133,7 +136,7 @@ _PEAK_HEADINGS: Final = {"frequency_rad_s": "ω{} (rad/s)", "magnitude_db": "M{}
 
 
 def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
-    """Return the mean deviation of the models' resonance peaks from the measured ones (Table 4)."""
+    """Return the table of the resonance peaks' mean deviations (Table 4)."""
     types = list(dict.fromkeys(model.structure for model in campaign.nominal))
     weightings = list(dict.fromkeys(model.weighting for model in campaign.nominal))
     deviations = {
@@ -153,8 +156,8 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
             if (*row_key, type_name) in deviations
         }
         paper_values = {
-            item: papers_table4().get((item, weighting, quantity, mode))
-            for item in cells
+            each_type: papers_table4().get((each_type, weighting, quantity, mode))
+            for each_type in cells
             if with_paper
         }
         rows.append(
@@ -174,8 +177,8 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
             campaign.homogeneity,
         ),
         (
-            Column("peak", "quantity", WORDS),
-            Column("weights", "weighting", WORDS),
+            Column("peak", "quantity", TEXT_FORMAT),
+            Column("weights", "weighting", TEXT_FORMAT),
             *(Column(f"type {type_name}", type_name) for type_name in types),
         ),
         tuple(rows),
@@ -192,7 +195,7 @@ _TABLE_5_FACTORS: Final = {"alpha": 1.0, "zeta": 1e5, "lambda": 1.0, "gamma": 1e
 
 
 def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
-    """Return the parameters and the WMSE of the two best nominal models (Table 5)."""
+    """Return the table of the two best nominal models' parameters and WMSE (Table 5)."""
     rows: list[Row] = []
     std = {
         (statistics.structure, statistics.weighting, statistics.parameter): statistics.std
@@ -251,7 +254,7 @@ _INDEX_HEADINGS: Final = {
 
 
 def indices_table(campaign: CampaignResult) -> Table:
-    """Return the distance of each nominal model from the sessions' responses, as in Figure 7."""
+    """Return the table of the nominal models' distances from the sessions, as in Figure 7."""
     rows: list[Row] = []
     for model in campaign.nominal:
         row: dict[str, Entry] = {"type": model.structure, "weighting": model.weighting}
@@ -283,7 +286,7 @@ def indices_table(campaign: CampaignResult) -> Table:
 
 
 def bias_table(campaign: CampaignResult) -> Table:
-    """Return the bias of the Welch fits relative to the pooled whole-record estimates."""
+    """Return the table of the Welch fits' bias relative to pooled whole-record estimates."""
     unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
     rows: list[Row] = []
     for fit_bias in campaign.welch_biases:
@@ -304,7 +307,8 @@ def bias_table(campaign: CampaignResult) -> Table:
                     "type": fit_bias.structure,
                     "weighting": fit_bias.weighting,
                     "parameter": Cell(
-                        parameter.parameter, symbol + MARK * (parameter.parameter in not_reported)
+                        parameter.parameter,
+                        symbol + NOT_REPORTED_MARK * (parameter.parameter in not_reported),
                     ),
                     **cells,
                     "bias": estimate_cells((parameter.bias,), parameter.bias_std, factor)[0],
@@ -320,10 +324,10 @@ def bias_table(campaign: CampaignResult) -> Table:
         "welch_bias",
         title("Bias of the Welch fits against the whole records", campaign.homogeneity),
         (
-            *FIT_NAME_COLUMNS, Column("parameter", "parameter", WORDS),
+            *FIT_NAME_COLUMNS, Column("parameter", "parameter", TEXT_FORMAT),
             Column("Welch, mean", "welch"), Column("std", "welch_std", std_of_previous=True),
             Column("whole records", "record"), Column("std", "record_std", std_of_previous=True),
-            Column("difference", "bias"), Column("significant", "significant", WORDS),
+            Column("difference", "bias"), Column("significant", "significant", TEXT_FORMAT),
         ),
         tuple(rows),
         (

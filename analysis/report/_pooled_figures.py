@@ -165,7 +165,9 @@ def _session_estimates_of_mode(
     if mode.source == "modal":
         modal_fits = (session.modal for session in campaign.sessions)
         return [
-            each.mode(mode.number) for each in modal_fits if each and mode.number in each.visible
+            modal_fit.mode(mode.number)
+            for modal_fit in modal_fits
+            if modal_fit and mode.number in modal_fit.visible
         ]
     return [
         mode_estimate
@@ -244,7 +246,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
     pooled = campaign.headline
     assert pooled is not None
     peaks_hz = [mode.frequency_hz for mode in campaign.modes]
-    first_hz, last_hz = _band_hz(campaign, peaks_hz)
+    first_hz, last_hz = _response_band_hz(campaign, peaks_hz)
     band = response_band(_PooledFit.of(pooled), dense_grid(first_hz, last_hz, peaks_hz))
     is_measured = bool(campaign.sessions[0].frequency_hz.size)
     width_in, height_in = 11.0, 6.6
@@ -294,7 +296,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
     return figure
 
 
-def _band_hz(campaign: CampaignResult, peaks_hz: Sequence[float]) -> tuple[float, float]:
+def _response_band_hz(campaign: CampaignResult, peaks_hz: Sequence[float]) -> tuple[float, float]:
     """Return the band of the fits, but not below a quarter of the first mode's frequency."""
     first_hz, last_hz = campaign.record_band_hz
     lowest_hz = min([last_hz / 4, *(peak / 4 for peak in peaks_hz)])

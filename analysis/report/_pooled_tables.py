@@ -18,8 +18,8 @@ from analysis.campaigns.sentences import (
 from analysis.identify.headline import EXACT_CONDITION
 from analysis.models import STRUCTURES
 from analysis.report.table import (
-    MARK,
-    WORDS,
+    NOT_REPORTED_MARK,
+    TEXT_FORMAT,
     Cell,
     Column,
     Entry,
@@ -46,16 +46,16 @@ _INERTIA_COLUMNS: Final = (
     Column("std", "participation_std_kg_m2", std_of_previous=True),
 )
 """Columns of a mode's effective inertia and its standard deviation."""
-NOT_POOLED: Final = (
+NOT_POOLED_NOTE: Final = (
     "In grey: not pooled, as fewer than two sessions determine its damping or not all were fitted."
 )
-"""Note on the structures that are not pooled."""
+"""Note on the structures that are not pooled, for the table of structures."""
 
 
 def structures_table(campaign: CampaignResult) -> Table:
-    """Return all structures' joint fits to all sessions.
+    """Return the table of all structures' joint fits to all sessions.
 
-    Pooled structures come first, each group by increasing BIC.
+    Pooled structures come first. The lowest BIC is first in either group.
     """
 
     def row(ranked: RankedStructure) -> Row:
@@ -74,7 +74,7 @@ def structures_table(campaign: CampaignResult) -> Table:
         "structures",
         title("Structures, whole records of all sessions together", campaign.homogeneity),
         (
-            Column("type", "type", WORDS),
+            Column("type", "type", TEXT_FORMAT),
             Column("sessions fitted", "fitted"),
             Column("damping determined in", "sessions"),
             Column("selected in", "selected_alone"),
@@ -85,14 +85,14 @@ def structures_table(campaign: CampaignResult) -> Table:
         (
             "Damping and stiffness corrections have one value for all sessions, with a "
             "between-session variance where they differ; settings of the rig have one per session.",
-            *(() if all(ranked.pooled for ranked in campaign.structures) else (NOT_POOLED,)),
+            *(() if all(ranked.pooled for ranked in campaign.structures) else (NOT_POOLED_NOTE,)),
         ),
         selected=0 if campaign.pooled else None,
     )
 
 
 def likely_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
-    """Return the headline's estimate and the estimate with the lowest BIC, if it differs."""
+    """Return the reported pooled estimate, and the one with the lowest BIC if it differs."""
     estimates_by_name = {
         estimate.name: estimate
         for estimate in (campaign.headline, *campaign.pooled[:1])
@@ -108,12 +108,12 @@ def session_count_text(estimate: PooledEstimate, campaign: CampaignResult) -> st
 
 
 def exact_condition_text(campaign: CampaignResult) -> str:
-    """Return the condition under which pooled estimates hold; empty for the headline."""
+    """Return the condition under which a pooled estimate holds; empty without a condition."""
     return f", {EXACT_CONDITION}" if campaign.modal and campaign.modal.leads else ""
 
 
 def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -> Table:
-    """Return the pooled whole-record estimates: the headline's first, then by increasing BIC.
+    """Return the table of pooled estimates: the reported one first, then by increasing BIC.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
     unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
     homogeneity, headline = campaign.homogeneity, campaign.headline
     columns = (
-        Column("parameter", "parameter", WORDS),
+        Column("parameter", "parameter", TEXT_FORMAT),
         Column("pooled", "value"), Column("std", "std", std_of_previous=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
         Column("one session's std", "within_std"), Column("between sessions", "between_std"),
@@ -230,14 +230,15 @@ def _pooled_row(
 
 
 def tolerant_table(campaign: CampaignResult) -> Table:
-    """Return the parameters with a tolerance of the geometry, next to those of an exact beam.
+    """Return the table of parameters with a tolerance of the geometry.
 
-    The table has no rows if no tolerance is stated.
+    It also contains the parameters of an exactly uniform beam. It has no rows if no tolerance is
+    stated.
     """
     modal, numbers = campaign.modal, campaign_numbers(campaign)
     tolerant = modal.tolerant if modal else None
     columns = (
-        Column("parameter", "parameter", WORDS), Column("value", "value"),
+        Column("parameter", "parameter", TEXT_FORMAT), Column("value", "value"),
         Column("std", "std", std_of_previous=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
         Column(EXACT_CONDITION, "exact"), Column("std", "exact_std", std_of_previous=True),
@@ -288,13 +289,13 @@ def tolerant_table(campaign: CampaignResult) -> Table:
         (
             "The tolerance of the geometry is common to all sessions: more of them do not reduce "
             "it.",
-            *(f"{MARK} {flag}." for flag in flags),
+            *(f"{NOT_REPORTED_MARK} {flag}." for flag in flags),
         ),
     )
 
 
 def uniform_beam_table(campaign: CampaignResult) -> Table:
-    """Return the pooled modal constants next to those of the uniform beam that fits best."""
+    """Return the table of pooled modal constants and those of the best uniform beam."""
     modal, homogeneity = campaign.modal, campaign.homogeneity
     test = modal.uniform_beam if modal else None
     rows: list[Row] = []
@@ -315,7 +316,7 @@ def uniform_beam_table(campaign: CampaignResult) -> Table:
         "uniform_beam",
         title("Modal constants, and those of the uniform beam that fits best", homogeneity),
         (
-            Column("mode", "mode"), Column("constant", "constant", WORDS),
+            Column("mode", "mode"), Column("constant", "constant", TEXT_FORMAT),
             Column("measured", "measured"), Column("std", "std", std_of_previous=True),
             Column("uniform beam", "predicted"), Column("difference (std)", "deviation", ".1f"),
         ),
@@ -324,7 +325,7 @@ def uniform_beam_table(campaign: CampaignResult) -> Table:
 
 
 def modes_table(campaign: CampaignResult) -> Table:
-    """Return the pooled modes: frequency, damping ratio, and deviation between sessions."""
+    """Return the table of pooled modes: means and standard deviations between sessions."""
     homogeneity = campaign.homogeneity
     rows: list[Row] = []
     for mode in campaign.modes:
@@ -374,16 +375,16 @@ def modes_table(campaign: CampaignResult) -> Table:
 
 
 def specimens_table(campaign: CampaignResult) -> Table:
-    """Return the specimens as the files state them, the campaign's specimen first."""
+    """Return the table of specimens as the files state them, the campaign's first."""
     specimens = campaign.homogeneity.specimens
     return Table(
         "specimens",
         "Specimens, as the files state them",
         (
-            Column("this report's", "here", WORDS),
-            *(Column(key, key, WORDS) for key in in_dispute(specimens)),
+            Column("this report's", "here", TEXT_FORMAT),
+            *(Column(key, key, TEXT_FORMAT) for key in in_dispute(specimens)),
             Column("files", "files"),
-            Column("their names", "names", WORDS),
+            Column("their names", "names", TEXT_FORMAT),
         ),
         tuple(
             {
@@ -401,7 +402,7 @@ def specimens_table(campaign: CampaignResult) -> Table:
 
 
 def homogeneity_table(campaign: CampaignResult) -> Table:
-    """Return the scatter of each mode and parameter between the sessions."""
+    """Return the table of each mode's and parameter's scatter between the sessions."""
     homogeneity = campaign.homogeneity
 
     def row(scatter: Heterogeneity) -> Row:
@@ -426,7 +427,7 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
         "Homogeneity of the sessions"
         f"{f', by type {homogeneity.structure}' if homogeneity.structure else ''}",
         (
-            Column("quantity", "quantity", WORDS), Column("sessions", "sessions"),
+            Column("quantity", "quantity", TEXT_FORMAT), Column("sessions", "sessions"),
             Column("mean", "mean"), Column("between sessions", "between_std"),
             Column("τ/s", "between_in_own_std", ".3g"),
             Column("Cochran's Q", "cochran_q", ".3g"),

@@ -74,16 +74,16 @@ _MEASURED_COLOR: Final = "#BDBDBD"
 _RESPONSE_POINTS: Final = 900
 """Number of columns or points of the measured response in the panel of the whole band."""
 _DETAIL_POINTS: Final = 161
-"""Number of points of the model's response in the detail of a mode."""
+"""Number of points of the model's response in the enlarged panel of a mode."""
 _DETAIL_TO_HALF_WIDTH: Final = 6.0
-"""Range of a mode's detail to either side of the mode, relative to the resonance's half-width."""
+"""Frequency range of a mode's enlarged panel to either side, in half-widths of the resonance."""
 
 _LEAST_RELATIVE_DETAIL: Final = 0.006
-"""Least range of a mode's detail to either side of the mode, relative to the mode's frequency."""
+"""Least frequency range of a mode's enlarged panel to either side, relative to the frequency."""
 
 
 def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
-    """Draw magnitude, phase and relative width of the 95 % band, and a detail of every mode.
+    """Draw magnitude, phase and width of the 95 % band, and an enlarged panel of every mode.
 
     Parameters
     ----------
@@ -104,8 +104,8 @@ def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
         2, count, left=0.085, right=0.985, top=0.95, bottom=0.075, hspace=0.27, wspace=0.22,
         height_ratios=(3.4, 1.0),
     )  # fmt: skip
-    whole = grid[0, :].subgridspec(3, 1, height_ratios=(2.4, 1.0, 0.8), hspace=0.1)
-    magnitude, phase, width = (figure.add_subplot(whole[row]) for row in range(3))
+    upper_grid = grid[0, :].subgridspec(3, 1, height_ratios=(2.4, 1.0, 0.8), hspace=0.1)
+    magnitude, phase, width = (figure.add_subplot(upper_grid[row]) for row in range(3))
     _draw_magnitude(magnitude, measured.frequency_hz, measured_without_delay, band, _MEASURED_COLOR)
     modelled_db = magnitude_db(band.response)
     lowest_db = min(
@@ -131,28 +131,28 @@ def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
     for axes in (magnitude, phase, width):
         style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width)
     for column, mode in enumerate(visible_modes):
-        detail = figure.add_subplot(grid[1, column])
+        detail_axes = figure.add_subplot(grid[1, column])
         limits = _detail_range_hz(mode, measured.frequency_hz)
         in_detail = (measured.frequency_hz >= limits[0]) & (measured.frequency_hz <= limits[1])
         detail_band = model.band(np.linspace(*limits, _DETAIL_POINTS))
         _draw_magnitude(
-            detail,
+            detail_axes,
             measured.frequency_hz[in_detail],
             measured_without_delay[in_detail],
             detail_band,
             style.GREY,
         )
-        detail.set_xlim(limits)
-        detail.set_ylim(
+        detail_axes.set_xlim(limits)
+        detail_axes.set_ylim(
             style.limits(
                 magnitude_db(measured_without_delay[in_detail]), magnitude_db(detail_band.response)
             )
         )
-        detail.set_title(f"Mode {mode.number}", fontweight="normal", fontsize=8.5)
-        detail.set_facecolor("#FCFAF4")
-        detail.set_xlabel("Frequency (Hz)", labelpad=1)
+        detail_axes.set_title(f"Mode {mode.number}", fontweight="normal", fontsize=8.5)
+        detail_axes.set_facecolor("#FCFAF4")
+        detail_axes.set_xlabel("Frequency (Hz)", labelpad=1)
         if column == 0:
-            detail.set_ylabel("Magnitude (dB)")
+            detail_axes.set_ylabel("Magnitude (dB)")
     figure.legend(
         *magnitude.get_legend_handles_labels(), loc="upper right", bbox_to_anchor=(0.985, 0.995),
         ncols=3, borderaxespad=0.0,
@@ -184,7 +184,7 @@ def _draw_magnitude(
 
 
 def _detail_range_hz(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the frequency range of a mode's detail, which includes at least one bin."""
+    """Return the frequency range of a mode's enlarged panel, with at least one bin."""
     spacing_hz = float(np.diff(frequency_hz).max())
     relative_width = max(_DETAIL_TO_HALF_WIDTH * mode.damping_ratio, _LEAST_RELATIVE_DETAIL)
     half_hz = max(relative_width * mode.frequency_hz, spacing_hz)
@@ -213,7 +213,7 @@ def loss_figure(
     supported_hz: tuple[float, float] | None,
     *,
     unsupported_orders: Collection[str] = (),
-    doubtful: Collection[int] = (),
+    flagged_modes: Collection[int] = (),
 ) -> Figure:
     """Draw internal, external and total loss factor, and twice the damping ratio of each mode.
 
@@ -230,33 +230,36 @@ def loss_figure(
         data nowhere support the curves.
     unsupported_orders : collection of str
         Orders that the data do not support. If there is one, the total is not split into its parts.
-    doubtful : collection of int
+    flagged_modes : collection of int
         Numbers of the modes whose damping ratio is flagged. Their points are hollow.
     """
     figure = style.new_figure(9.0, 3.6)
     axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))
     drawn_values = _draw_loss_factors(axes, beam, axis_hz, supported_hz, unsupported_orders)
-    for label, filled in (("modes", True), ("modes, doubtful", False)):
-        drawn_modes = [mode for mode in modes if (mode.number not in doubtful) is filled]
+    for label, is_filled in (("modes", True), ("modes, doubtful", False)):
+        drawn_modes = [mode for mode in modes if (mode.number not in flagged_modes) is is_filled]
         if drawn_modes:
             axes.errorbar(
                 [mode.frequency_hz for mode in drawn_modes],
                 [2 * mode.damping_ratio for mode in drawn_modes],
                 [2 * NORMAL_95 * mode.damping_ratio_std for mode in drawn_modes],
                 fmt="o", color=style.INK, markersize=4.0, capsize=3.0, elinewidth=1.0,
-                markerfacecolor=style.INK if filled else "white", label=label, zorder=5,
+                markerfacecolor=style.INK if is_filled else "white", label=label, zorder=5,
             )  # fmt: skip
     modes_hz = [mode.frequency_hz for mode in modes]
     grey_bands_hz = [] if beam is None else _unsupported_ranges_hz(axis_hz, supported_hz, modes_hz)
     for edge_hz, end_hz in grey_bands_hz:
         axes.axvspan(edge_hz, end_hz, color="#F4F4F4", linewidth=0, zorder=0)
     style.frequency_axis(axes, axis_hz)
-    points = [2 * mode.damping_ratio for mode in modes]
+    mode_loss_factors = [2 * mode.damping_ratio for mode in modes]
     # Of curves what they mostly are: a total may rise without bound towards an end.
     top = max(
-        [*points, *(float(np.nanquantile(value, 0.98)) for value in drawn_values)], default=1.0
+        [*mode_loss_factors, *(float(np.nanquantile(value, 0.98)) for value in drawn_values)],
+        default=1.0,
     )
-    low = min([*points, *(float(np.nanmin(value)) for value in drawn_values)], default=top)
+    low = min(
+        [*mode_loss_factors, *(float(np.nanmin(value)) for value in drawn_values)], default=top
+    )
     plain_logarithmic(axes, max(low / 2, 3 * top / _MOST_LOSS_AXIS_RATIO), 3 * top)
     axes.set_ylabel("Loss factor (1)")
     axes.set_xlabel("Frequency (Hz)", labelpad=1)
@@ -282,9 +285,17 @@ def _draw_loss_factors(
     first_hz, last_hz = max(axis_hz[0], supported_hz[0]), min(axis_hz[1], supported_hz[1])
     if first_hz >= last_hz:
         return []
-    factors = loss_factors(beam, np.geomspace(first_hz, last_hz, _LOSS_POINTS))
+    loss_factors_over_frequency = loss_factors(beam, np.geomspace(first_hz, last_hz, _LOSS_POINTS))
     curves = dict(
-        zip(_CURVE_STYLES, (factors.internal, factors.external, factors.total), strict=True)
+        zip(
+            _CURVE_STYLES,
+            (
+                loss_factors_over_frequency.internal,
+                loss_factors_over_frequency.external,
+                loss_factors_over_frequency.total,
+            ),
+            strict=True,
+        )
     )
     has_both_parts = None not in curves.values()
     drawn_values = []
@@ -294,9 +305,19 @@ def _draw_loss_factors(
             continue
         color, dash = _CURVE_STYLES[label]
         axes.fill_between(
-            factors.frequency_hz, *factor.limits(), color=color, alpha=0.2, linewidth=0
+            loss_factors_over_frequency.frequency_hz,
+            *factor.limits(),
+            color=color,
+            alpha=0.2,
+            linewidth=0,
         )
-        axes.plot(factors.frequency_hz, factor.value, color=color, linestyle=dash, label=label)
+        axes.plot(
+            loss_factors_over_frequency.frequency_hz,
+            factor.value,
+            color=color,
+            linestyle=dash,
+            label=label,
+        )
         drawn_values.append(factor.value)
     return drawn_values
 
@@ -390,7 +411,7 @@ def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: Record
     axes.axhspan(
         -half_range_percent,
         half_range_percent,
-        color=style.SHADE,
+        color=style.SHADE_COLOR,
         linewidth=0,
         zorder=0,
         label="95 % of white noise",
@@ -414,7 +435,7 @@ def _draw_power_over_time(axes: Axes, model: ShownModel, analysis: RecordAnalysi
     times_s, power = residual_power(analysis, model.residual)
     half_range = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
     axes.axhspan(
-        max(1 - half_range, 0.0), 1 + half_range, color=style.SHADE, linewidth=0, zorder=0,
+        max(1 - half_range, 0.0), 1 + half_range, color=style.SHADE_COLOR, linewidth=0, zorder=0,
         label="95 % of white noise",
     )  # fmt: skip
     axes.plot(times_s, power, ".-", color=style.VERMILION, linewidth=0.7, markersize=3.0)
@@ -475,7 +496,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     model = ShownModel.of(headline, whole_record.record)
     analysis = model.compared(whole_record.analysis)
     modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
-    frf, _, loss, residual, signals = FIGURES
+    frf, _, loss_name, residual_name, signals_name = FIGURES
     measured = measured_response(whole_record)
     delay = "delay" if model.modal is None else "the delay that the file states"
     yield Illustration(
@@ -490,22 +511,22 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     if test is not None and test.p_value is not None:
         yield Illustration(UNIFORMITY, uniformity_figure(test), uniformity_description(test))
     beam = loss_estimate(whole_record)
-    doubtful = [mode.number for mode in headline.modes if mode.damping_ratio.flag is not None]
+    flagged_modes = [mode.number for mode in headline.modes if mode.damping_ratio.flag is not None]
     yield Illustration(
-        loss,
+        loss_name,
         loss_figure(
             model.modes,
             beam,
             (float(measured.frequency_hz[0]), highest_hz),
             supported_band_hz(whole_record),
             unsupported_orders=whole_record.withheld,
-            doubtful=doubtful,
+            flagged_modes=flagged_modes,
         ),
-        _loss_description(whole_record, drawn=beam is not None),
+        _loss_description(whole_record, has_curves=beam is not None),
     )
     power = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
     yield Illustration(
-        residual,
+        residual_name,
         residual_figure(model, analysis),
         f"Residual of the torque, measured minus that of {model.name}: its spectrum beside the "
         "noise model; its cumulative periodogram, which stays in the shaded range in 95 of 100 "
@@ -514,7 +535,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
         "noise.",
     )
     yield Illustration(
-        signals,
+        signals_name,
         signals_figure(whole_record.record, model, highest_hz),
         f"Motor angle; coupling torque from 0 to {highest_hz:g} Hz, measured and as {model.name} "
         "predicts it from the measured angle "
@@ -523,11 +544,11 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     )
 
 
-def _loss_description(whole_record: WholeRecord, *, drawn: bool) -> str:
-    """Return the description of the loss factor's figure."""
+def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
+    """Return the caption of the loss factor's figure."""
     points = "twice the damping ratio of each mode with its 95 % interval"
     reasons = _reasons_of_hollow_points(whole_record.headline)
-    if not drawn:
+    if not has_curves:
         return (
             f"Loss factor over frequency: {points}. There is no curve, because no beam with one "
             f"internal and one external order explains the losses.{reasons}"
@@ -550,7 +571,7 @@ def _loss_description(whole_record: WholeRecord, *, drawn: bool) -> str:
 
 
 def _describe_curve_model(whole_record: WholeRecord) -> str:
-    """Return which beam the loss factors' curves belong to, for the figure's description."""
+    """Return to which beam the curves of the loss factors belong, for the figure's caption."""
     tolerant = whole_record.headline.tolerant
     if tolerant is None:
         return f"type {whole_record.headline.name}"
@@ -561,7 +582,7 @@ def _describe_curve_model(whole_record: WholeRecord) -> str:
 
 
 def _reasons_of_hollow_points(headline: Headline) -> str:
-    """Return why points are hollow, for the figure's description; empty if none are."""
+    """Return why points are hollow, for the figure's caption; empty if none are."""
     reasons = dict.fromkeys(
         mode.damping_ratio.flag for mode in headline.modes if mode.shown and mode.damping_ratio.flag
     )

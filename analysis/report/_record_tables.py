@@ -10,8 +10,8 @@ from analysis.models import QUANTITIES
 from analysis.report._scales import scale_notes
 from analysis.report._shown_model import ShownModel
 from analysis.report.table import (
-    MARK,
-    WORDS,
+    NOT_REPORTED_MARK,
+    TEXT_FORMAT,
     Cell,
     Column,
     Entry,
@@ -38,16 +38,16 @@ if TYPE_CHECKING:
     from analysis.results import WholeRecord
 
 _STRONG_CORRELATION: Final = 0.9
-"""Correlation of two parameters from which on it is shown in bold."""
+"""Least magnitude of a correlation of two parameters that is shown in bold."""
 _MARK_NOTE: Final = (
-    f"{MARK} not a property of the antenna, for the reason in the remark: do not interpret. The "
-    "number only describes the fitted curve."
+    f"{NOT_REPORTED_MARK} not a property of the antenna, for the reason in the remark: do not "
+    "interpret. The number only describes the fitted curve."
 )
 """Note that explains the mark of flagged parameters."""
 
 
 def modes_table(whole_record: WholeRecord) -> Table:
-    """Return the modes' frequencies, damping ratios and effective inertias.
+    """Return the table of modes: frequencies, damping ratios and effective inertias.
 
     Modes with a doubtful damping ratio are marked.
     """
@@ -67,7 +67,7 @@ def modes_table(whole_record: WholeRecord) -> Table:
             *_MODE_COLUMNS,
             Column("Inertia (kg·mm²)" if has_inertias else "", "participation_kg_m2"),
             Column("std" if has_inertias else "", "participation_std_kg_m2"),
-            Column("Source" if has_inertias else "", "source", WORDS),
+            Column("Source" if has_inertias else "", "source", TEXT_FORMAT),
         ),
         rows,
         (
@@ -80,7 +80,7 @@ def modes_table(whole_record: WholeRecord) -> Table:
 
 
 def exact_modes_table(whole_record: WholeRecord) -> Table | None:
-    """Return the modes of the uniform beam that explains the modal constants; None if none does."""
+    """Return the table of a uniform beam's modes; None if no such beam explains the record."""
     headline = whole_record.headline
     test, exact = headline.uniform_beam, headline.exact
     if test is None or exact is None or test.status != "passed":
@@ -119,7 +119,7 @@ _SQUARE_MM_PER_SQUARE_M: Final = 1e6
 
 
 def _modes_source(headline: Headline) -> str:
-    """Return the name of the model to which a headline's modes belong."""
+    """Return the name of the model to which the reported modes belong."""
     return (
         "modal model"
         if any(m.source == "modal" for m in headline.modes)
@@ -161,10 +161,10 @@ def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
 
 
 def parameters_table(whole_record: WholeRecord) -> Table:
-    """Return all parameters with their uncertainties; flagged ones are marked, with the reason.
+    """Return the table of all parameters with uncertainties; flagged ones are marked.
 
     If the file states the uncertainties of the scales, the table also contains intervals that
-    include them.
+    include them. The last column states the reason for a mark.
     """
     headline = whole_record.headline
     values_with_scales = whole_record.combined
@@ -198,16 +198,16 @@ def parameters_table(whole_record: WholeRecord) -> Table:
 
 
 _PARAMETER_COLUMNS: Final = (
-    Column("Parameter", "parameter", WORDS),
-    Column("Meaning", "meaning", WORDS),
-    Column("Unit", "unit", WORDS),
+    Column("Parameter", "parameter", TEXT_FORMAT),
+    Column("Meaning", "meaning", TEXT_FORMAT),
+    Column("Unit", "unit", TEXT_FORMAT),
     Column("Value", "value"),
     Column("std", "std"),
     Column("95 % from", "low_95"),
     Column("to", "high_95"),
 )
 """Columns of a parameter: symbol, meaning, unit, value and uncertainty."""
-_REMARK_COLUMN: Final = Column("Remark", "remark", WORDS)
+_REMARK_COLUMN: Final = Column("Remark", "remark", TEXT_FORMAT)
 """Column with the reason for a parameter's mark."""
 _UNCERTAINTY_NOTE: Final = (
     "std is one standard deviation; intervals of ρ/EI and EI, and on an exactly uniform beam those "
@@ -217,7 +217,7 @@ _UNCERTAINTY_NOTE: Final = (
 
 
 def parameter_names(headline: Headline) -> tuple[str, ...]:
-    """Return the names of a headline's parameters in the order damping, beam, rig."""
+    """Return the names of the reported parameters in the order damping, beam, rig."""
     exact_parameters = () if headline.exact is None else headline.exact.parameters
     return tuple(dict.fromkeys((*(name for name in exact_parameters if name in headline.parameters),
                                 *headline.parameters)))  # fmt: skip
@@ -238,7 +238,10 @@ def _condition_text(headline: Headline) -> str:
 
 
 def exact_geometry_table(whole_record: WholeRecord) -> Table | None:
-    """Return the parameters of an exactly uniform beam; None if the main table shows them."""
+    """Return the table of an exactly uniform beam's parameters.
+
+    It is None if the main table shows these parameters.
+    """
     exact = whole_record.headline.exact
     if exact is None:
         return None
@@ -269,7 +272,7 @@ def _is_fixed(headline: Headline, name: str, *, exact: bool = False) -> bool:
 
 
 def sizes_table(whole_record: WholeRecord) -> Table:
-    """Return the loss factors of internal and external damping at their pivot frequencies.
+    """Return the table of internal and external loss factors at their pivot frequencies.
 
     There, the loss factor is not correlated with the order of the damping.
     """
@@ -278,8 +281,8 @@ def sizes_table(whole_record: WholeRecord) -> Table:
         "damping_sizes",
         "Loss factor of either damping at its pivot frequency",
         (
-            Column("Damping", "damping", WORDS),
-            Column("Quantity", "quantity", WORDS),
+            Column("Damping", "damping", TEXT_FORMAT),
+            Column("Quantity", "quantity", TEXT_FORMAT),
             Column("at ω (rad/s)", "omega_rad_s"),
             Column("Value", "value"),
             Column("std", "std"),
@@ -297,7 +300,10 @@ def sizes_table(whole_record: WholeRecord) -> Table:
 
 
 def condition_table(whole_record: WholeRecord) -> Table | None:
-    """Return the reported values next to those of a simpler structure; None if none suffices."""
+    """Return the table that compares reported values with a simpler structure's.
+
+    It is None if no simpler structure is sufficient.
+    """
     headline: Estimates = whole_record.headline.exact or whole_record.headline
     simpler = headline.simpler
     if simpler is None:
@@ -327,8 +333,8 @@ def condition_table(whole_record: WholeRecord) -> Table | None:
         "on_condition",
         f"If {assumption or 'the rest'} is assumed: type {simpler.name} (sufficient)",
         (
-            Column("Parameter", "parameter", WORDS),
-            Column("Unit", "unit", WORDS),
+            Column("Parameter", "parameter", TEXT_FORMAT),
+            Column("Unit", "unit", TEXT_FORMAT),
             Column("Assumed", "value"),
             Column("95 % from", "low_95"),
             Column("to", "high_95"),
@@ -345,7 +351,7 @@ def condition_table(whole_record: WholeRecord) -> Table | None:
 
 
 def correlations_table(whole_record: WholeRecord) -> Table:
-    """Return the correlations between the determined parameters of the selected fit."""
+    """Return the table of correlations between the determined parameters of the selected fit."""
     fit = whole_record.fit
     symbols = [_parameter_symbol(name) for name in fit.determined]
     return Table.of(
@@ -353,7 +359,7 @@ def correlations_table(whole_record: WholeRecord) -> Table:
         "Correlations of the parameters on an exactly uniform beam, "
         f"type {whole_record.headline.name}",
         (
-            Column("Parameter", "parameter", WORDS),
+            Column("Parameter", "parameter", TEXT_FORMAT),
             *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
         ),
         (
@@ -437,7 +443,7 @@ def _interval_ends(quantity: ReportedValue) -> tuple[float | None, float | None]
 def _reason_notes(quantities: Iterable[ReportedValue]) -> tuple[str, ...]:
     """Return a note for each reason for which quantities are marked."""
     reasons = dict.fromkeys(quantity.flag for quantity in quantities if quantity.flag is not None)
-    return tuple(f"{MARK} {reason}." for reason in reasons)
+    return tuple(f"{NOT_REPORTED_MARK} {reason}." for reason in reasons)
 
 
 def _parameter_description(name: str) -> tuple[str, str, str, float]:

@@ -51,37 +51,37 @@ if TYPE_CHECKING:
     from rigd.view.chart import Axis
 
     Real = NDArray[np.float64]
+    """Array of real numbers."""
     Complex = NDArray[np.complex128]
+    """Array of complex numbers."""
 
-RECORD: Final = "/whole_record"
+RECORD_ENTITY: Final = "/whole_record"
 """Entity path in Rerun of the whole record's results."""
 RECORD_TITLE: Final = "Whole record"
 """Title of the tab with the whole record's results."""
-VERDICT: Final = f"{RECORD}/verdict"
+VERDICT_ENTITY: Final = f"{RECORD_ENTITY}/verdict"
 """Entity path in Rerun of the verdict."""
-VERDICT_PAGE: Final = "Verdict"
+VERDICT_TITLE: Final = "Verdict"
 """Title of the tab with the verdict."""
-TORQUE_PAGE: Final = "Torque"
+TORQUE_TITLE: Final = "Torque"
 """Title of the tab with the torque over time."""
-FITS: Final = "/fits"
+FITS_ENTITY: Final = "/fits"
 """Entity path in Rerun of the Welch fits."""
-TITLE: Final = "Fits"
+FITS_TITLE: Final = "Fits"
 """Title of the tab with the Welch fits."""
-TABLES: Final = f"{FITS}/tables"
+TABLES_ENTITY: Final = f"{FITS_ENTITY}/tables"
 """Entity path in Rerun of the tables of the Welch fits."""
-MEASURED_PAGE: Final = "Measured"
+MEASURED_TITLE: Final = "Measured"
 """Title of the tab with the measured response."""
-TABLES_PAGE: Final = "Tables"
+TABLES_TITLE: Final = "Tables"
 """Title of the tab with the tables of the Welch fits."""
 
 _MEASURED_MAGNITUDE_KEY: Final = Key("|measured|", GREY)
 """Legend entry of the measured magnitude, with which residuals are compared."""
 _WIDE_CHART_SIZE: Final = (1280.0, 350.0)
-"""Width and height of the wide canvas and of the narrow ones, in points.
-
-They fit a window of 1280 × 800."""
+"""Width and height of a page's wide chart, in points, for a window of 1280 × 800."""
 _NARROW_CHART_SIZE: Final = (640.0, 262.0)
-"""Width and height of the canvases, in points, as they fit a window of 1280 × 800."""
+"""Width and height of a page's narrow charts, in points, for a window of 1280 × 800."""
 
 _LINES_BY_WEIGHTING: Final[dict[str, tuple[Color, float]]] = {
     "const": (ORANGE, 3.0),
@@ -159,7 +159,7 @@ class ChartPage:
 # Welch fits
 
 
-def pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
+def welch_pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
     """Return the pages of the Welch fits: the measured response, then one for each model type."""
     magnitude = _magnitude_axis(analysis)
     keys_by_weighting = line_keys(analysis.settings.weightings)
@@ -182,7 +182,7 @@ def line_keys(weightings: tuple[str, ...]) -> dict[str, Key]:
     }
 
 
-def draw(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
+def draw_welch_fits(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
     """Draw all pages of the Welch fits, which are the same at any time of the session.
 
     Parameters
@@ -194,17 +194,17 @@ def draw(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
     stream
         Recording to draw into.
     """
-    for page in pages(analysis):
+    for page in welch_pages(analysis):
         _draw_page(page, stream)
-    _draw_text(TABLES, f"```\n{tables}\n```", stream)
+    _draw_text(TABLES_ENTITY, f"```\n{tables}\n```", stream)
 
 
-def tab(analysis: WelchAnalysis) -> rrb.Container:
+def welch_fits_tab(analysis: WelchAnalysis) -> rrb.Container:
     """Return the tab of the Welch fits, which contains tabs for each page and for the tables."""
     import rerun.blueprint as rrb
 
-    tables = rrb.TextDocumentView(name=TABLES_PAGE, origin=TABLES)
-    return rrb.Tabs(*map(_page_view, pages(analysis)), tables, name=TITLE)
+    tables = rrb.TextDocumentView(name=TABLES_TITLE, origin=TABLES_ENTITY)
+    return rrb.Tabs(*map(_page_view, welch_pages(analysis)), tables, name=FITS_TITLE)
 
 
 def _draw_page(page: ChartPage, stream: RecordingStream) -> None:
@@ -243,9 +243,9 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
     coherence = response.coherence
     if coherence is None:
         coherence = np.full(response.frequency_hz.shape, np.nan)
-    entity = f"{FITS}/measured"
+    entity = f"{FITS_ENTITY}/measured"
     return ChartPage(
-        MEASURED_PAGE,
+        MEASURED_TITLE,
         (
             Graph(
                 "Magnitude of torque over angle, as estimated for the fits",
@@ -291,7 +291,7 @@ def _type_page(
         for key, model in zip(keys, models, strict=True)
     ]
     measured, band_hz = analysis.response.response, analysis.settings.band_hz
-    entity = f"{FITS}/type_{name}"
+    entity = f"{FITS_ENTITY}/type_{name}"
 
     def model_curves(values: Callable[[FittedModel], Real]) -> list[ChartCurve]:
         return [
@@ -410,7 +410,7 @@ class Lines:
 
 _PLOTS_OVER_TIME: Final = (
     Lines(
-        f"{RECORD}/torque",
+        f"{RECORD_ENTITY}/torque",
         "Coupling torque in the band of the fit (N·m)",
         ("measured (N·m)", "model (N·m)"),
         (SKY_BLUE, ORANGE),
@@ -418,7 +418,7 @@ _PLOTS_OVER_TIME: Final = (
         lambda torque: np.column_stack((torque.measured, torque.modelled)),
     ),
     Lines(
-        f"{RECORD}/residual",
+        f"{RECORD_ENTITY}/residual",
         "Residual, measured − model (mN·m)",
         ("residual (mN·m)",),
         (VERMILION,),
@@ -450,7 +450,7 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
     magnitude = _axis_of_responses(measured, [model])
     key, name = Key(shown_model.name.removeprefix("the "), ORANGE, 2.0), "model"
     short_key = replace(key, label="model")
-    entity = f"{RECORD}/response"
+    entity = f"{RECORD_ENTITY}/response"
     return ChartPage(
         "Response",
         (
@@ -522,7 +522,7 @@ def draw_record(
         *whole_record.verdict.sentences,
         *(f"* {advice}" for advice in whole_record.verdict.experiments),
     ]
-    _draw_text(VERDICT, "\n\n".join((*sentences, f"```\n{tables}\n```")), stream)
+    _draw_text(VERDICT_ENTITY, "\n\n".join((*sentences, f"```\n{tables}\n```")), stream)
     _draw_page(record_page(whole_record), stream)
     t_ns = np.round(1e9 * whole_record.record.time_s).astype(np.int64)
     for lines in _PLOTS_OVER_TIME:
@@ -535,14 +535,14 @@ def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container
 
     end_s = float(whole_record.record.time_s[-1])
     return rrb.Tabs(
-        rrb.TextDocumentView(name=VERDICT_PAGE, origin=VERDICT),
+        rrb.TextDocumentView(name=VERDICT_TITLE, origin=VERDICT_ENTITY),
         _page_view(record_page(whole_record)),
         rrb.Vertical(
             *(
                 _lines_view(lines, end_s, float(np.abs(lines.values(torque)).max()))
                 for lines in _PLOTS_OVER_TIME
             ),
-            name=TORQUE_PAGE,
+            name=TORQUE_TITLE,
         ),
         name=RECORD_TITLE,
     )
@@ -623,7 +623,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
         )
         tabs.append(record_tab(whole_record, torque))
     if welch is not None:
-        tabs.append(tab(welch))
+        tabs.append(welch_fits_tab(welch))
     session = read_session(result.record.path)
     timings = read_timings(result.record.path)
     try:
@@ -632,6 +632,6 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
             if whole_record is not None:
                 draw_record(whole_record, torque, as_text(record_tables(whole_record)), stream)
             if welch is not None:
-                draw(welch, as_text(analysis_tables(result)), stream)
+                draw_welch_fits(welch, as_text(analysis_tables(result)), stream)
     except RrdFileError as error:
         raise OutputError(str(error)) from None

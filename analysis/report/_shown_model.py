@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from analysis.report.bands import ResponseBand
 
     Real = NDArray[np.float64]
+    """Array of real numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,7 @@ class ShownModel:
 
     @classmethod
     def of(cls, headline: Headline, record: Record) -> ShownModel:
-        """Return the model that the report of a record shows.
+        """Return the model that a record's report shows, from the reported results (headline).
 
         Parameters
         ----------
@@ -117,7 +118,7 @@ class ShownModel:
 
 
 def shown_modes(headline: Headline) -> tuple[ModeEstimate, ...]:
-    """Return the modes that are visible in the record, with their standard deviations."""
+    """Return the reported modes that are visible in the record, with standard deviations."""
     return tuple(
         ModeEstimate(
             number=mode.number,

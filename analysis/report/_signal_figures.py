@@ -27,19 +27,21 @@ if TYPE_CHECKING:
     from analysis.report._shown_model import ShownModel
 
     LineStyle = dict[str, Any]
-    NoiseLine = tuple[NDArray[np.float64], LineStyle]
+    """Matplotlib's properties of a line."""
+    StyledSignal = tuple[NDArray[np.float64], LineStyle]
+    """Values of a signal with the style of its line."""
 
 _PERIODS_SHOWN: Final = 12
-"""Number of a mode's periods that its detail shows."""
+"""Number of a mode's periods that its enlarged panel shows."""
 _LEAST_DETAIL_S: Final = 0.3
-"""Least duration of a detail."""
+"""Least duration that an enlarged panel shows, in seconds."""
 _MOST_DETAIL_FRACTION: Final = 1 / 8
-"""Largest duration of a detail, as a fraction of the record."""
+"""Largest duration that an enlarged panel shows, as a fraction of the record."""
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
-    """Interval of a record that a detail of a figure shows.
+class RecordInterval:
+    """Time interval of a record that an enlarged panel of a figure shows.
 
     Attributes
     ----------
@@ -57,10 +59,10 @@ class Moment:
     last_s: float
 
 
-def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
+def resonance_intervals(record: Record, count: int) -> tuple[RecordInterval, ...]:
     """Return the interval in which each mode below the Nyquist frequency vibrates most."""
     duration_s = len(record.time_s) / record.rate_hz
-    moments = []
+    intervals = []
     modes_hz = undamped_frequencies_rad_s(record.beam, count) / (2 * math.pi)
     for number, frequency_hz in enumerate(modes_hz.tolist(), start=1):
         if frequency_hz >= record.rate_hz / 2:
@@ -69,36 +71,38 @@ def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
         length_s = min(_PERIODS_SHOWN / frequency_hz, _MOST_DETAIL_FRACTION * duration_s)
         length_s = max(length_s, _LEAST_DETAIL_S)
         samples = min(round(length_s * record.rate_hz), len(record.time_s))
-        first = round((centre_s - length_s / 2) * record.rate_hz)
-        first = min(max(first, 0), len(record.time_s) - samples)
-        block = slice(first, first + samples)
-        times_s = record.time_s[block]
-        moments.append(
-            Moment(
+        first_sample = round((centre_s - length_s / 2) * record.rate_hz)
+        first_sample = min(max(first_sample, 0), len(record.time_s) - samples)
+        sample_range = slice(first_sample, first_sample + samples)
+        times_s = record.time_s[sample_range]
+        intervals.append(
+            RecordInterval(
                 name=f"Mode {number}, {frequency_hz:.3g} Hz",
-                samples=block,
+                samples=sample_range,
                 first_s=float(times_s[0]),
                 last_s=float(times_s[-1]),
             )
         )
-    return tuple(moments)
+    return tuple(intervals)
 
 
-def mark(axes: Axes, moments: tuple[Moment, ...]) -> None:
-    """Shade intervals in the panel of the whole record and number them from 1."""
-    for number, moment in enumerate(moments, start=1):
-        axes.axvspan(moment.first_s, moment.last_s, color=style.SHADE, linewidth=0, zorder=0)
+def shade_intervals(axes: Axes, intervals: tuple[RecordInterval, ...]) -> None:
+    """Shade time intervals in the panel of the whole record and number them from 1."""
+    for number, interval in enumerate(intervals, start=1):
+        axes.axvspan(
+            interval.first_s, interval.last_s, color=style.SHADE_COLOR, linewidth=0, zorder=0
+        )
         axes.text(
-            (moment.first_s + moment.last_s) / 2, 1.01, str(number),
+            (interval.first_s + interval.last_s) / 2, 1.01, str(number),
             transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=7.5,
             color="#8A7A4A",
         )  # fmt: skip
 
 
-def enlarge(axes: Axes, number: int, moment: Moment) -> None:
-    """Turn a panel into the detail of one interval, with the number of its mark."""
-    axes.set_title(f"{number}  {moment.name}", fontsize=8.5, fontweight="normal")
-    axes.set_xlim(moment.first_s, moment.last_s)
+def set_up_detail(axes: Axes, number: int, interval: RecordInterval) -> None:
+    """Set title and time axis of an enlarged panel, with the number of its interval."""
+    axes.set_title(f"{number}  {interval.name}", fontsize=8.5, fontweight="normal")
+    axes.set_xlim(interval.first_s, interval.last_s)
     axes.set_facecolor("#FCFAF4")
 
 
@@ -135,29 +139,29 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
 
 
 def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figure:
-    """Draw angle, measured and modelled torque, and residual, with a detail of every mode.
+    """Draw angle, torque and residual, measured and modelled, and an enlarged panel of each mode.
 
     Parameters
     ----------
     record : Record
     model : ShownModel
-        Model of the torque, with the modes whose details are drawn.
+        Model of the torque, with the modes that get an enlarged panel.
     highest_hz : float
         Highest frequency of the fit's band.
     """
     torque = torque_in_band(record, model.transfer, highest_hz)
     record_of_fitted_beam = replace(record, beam=model.beam.plant.beam)
     modes = {mode.number: mode for mode in model.modes}
-    moments = tuple(
-        replace(moment, name=f"Mode {number}, {modes[number].frequency_hz:.4g} Hz")
-        for number, moment in enumerate(
-            resonance_moments(record_of_fitted_beam, max(modes, default=0)), start=1
+    intervals = tuple(
+        replace(interval, name=f"Mode {number}, {modes[number].frequency_hz:.4g} Hz")
+        for number, interval in enumerate(
+            resonance_intervals(record_of_fitted_beam, max(modes, default=0)), start=1
         )
         if number in modes
     )
     figure = style.new_figure(9.0, 6.8)
     grid = figure.add_gridspec(
-        2, len(moments) or 1, left=0.095, right=0.985, top=0.91, bottom=0.07, hspace=0.3,
+        2, len(intervals) or 1, left=0.095, right=0.985, top=0.91, bottom=0.07, hspace=0.3,
         wspace=0.25, height_ratios=(4.0, 1.2),
     )  # fmt: skip
     upper_grid = grid[0, :].subgridspec(3, 1, hspace=0.4, height_ratios=(1.1, 1.3, 0.8))
@@ -178,9 +182,9 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
     residual.set_xlabel("Time (s)", labelpad=1)
     for axes in (angle, torque_axes, residual):
         axes.tick_params(labelbottom=axes is residual)
-    mark(angle, moments)
+    shade_intervals(angle, intervals)
     detail_signals = (torque.measured, torque.modelled, torque.residual)
-    for column, moment in enumerate(moments):
+    for column, interval in enumerate(intervals):
         axes = figure.add_subplot(grid[1, column])
         axes.xaxis.set_major_locator(MaxNLocator(4))
         _draw_detail(
@@ -188,7 +192,7 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
             record,
             zip(detail_signals, _DETAIL_LINES, strict=True),
             column,
-            moment,
+            interval,
             _TORQUE_LABEL,
         )
         axes.set_xlabel("Time (s)", labelpad=1)
@@ -219,42 +223,47 @@ _DETAIL_LINES: Final[tuple[LineStyle, ...]] = (
     {"color": style.BLUE, "linewidth": 1.0},
     {"color": style.VERMILION, "linewidth": 0.8},
 )
-"""Styles of measured torque, modelled torque and residual in a detail."""
+"""Styles of measured torque, modelled torque and residual in an enlarged panel."""
 
 
 def _draw_whole_record(
     axes: Axes,
     record: Record,
-    lines: Iterable[NoiseLine],
+    lines: Iterable[StyledSignal],
     title: str,
     label: str,
     pad: float | None = None,
 ) -> None:
     """Draw signals over the whole record."""
-    drawn = tuple(lines)
-    for values, line_style in drawn:
+    decimated = tuple(lines)
+    for values, line_style in decimated:
         axes.plot(*style.envelope(record.time_s, values), **line_style)
     axes.set_title(title, pad=pad)
     axes.set_ylabel(label)
-    axes.set_ylim(style.limits(*(values for values, _ in drawn)))
+    axes.set_ylim(style.limits(*(values for values, _ in decimated)))
     axes.set_xlim(record.time_s[0], record.time_s[-1])
 
 
 def _draw_detail(
-    axes: Axes, record: Record, lines: Iterable[NoiseLine], column: int, moment: Moment, label: str
+    axes: Axes,
+    record: Record,
+    lines: Iterable[StyledSignal],
+    column: int,
+    interval: RecordInterval,
+    label: str,
 ) -> None:
-    """Draw one interval of signals. The first panel of a row has the legend."""
+    """Draw signals in the enlarged panel of one interval. The first panel of a row has a legend."""
     for values, line_style in lines:
-        axes.plot(record.time_s[moment.samples], values[moment.samples], **line_style)
-    enlarge(axes, column + 1, moment)
+        axes.plot(record.time_s[interval.samples], values[interval.samples], **line_style)
+    set_up_detail(axes, column + 1, interval)
     if column == 0:
         axes.set_ylabel(label)
 
 
 def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
-    """Draw angles (a) and torque (b) over the whole record, with a detail of each mode."""
+    """Draw angles (a) and torque (b) over the whole record and enlarged at each mode."""
     record = analysis.record
-    moments = resonance_moments(record, len(analysis.peaks))
+    intervals = resonance_intervals(record, len(analysis.peaks))
     sweep_s = record.sweep_samples / record.rate_hz
     parts = [
         record.metadata.get("excitation", "record"),
@@ -265,7 +274,7 @@ def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
     if record.gaps.missing_ticks:
         parts.append(f"{record.gaps.missing_ticks} missing ticks interpolated")
     figure = style.new_figure(13.0, 8.0, "Signals", "  ·  ".join(parts))
-    columns = max(len(moments), 1)
+    columns = max(len(intervals), 1)
     grid = figure.add_gridspec(
         4, columns, left=0.06, right=0.985, top=0.88, bottom=0.065, hspace=0.58, wspace=0.17,
         height_ratios=(1.25, 1.0, 1.25, 1.0),
@@ -283,18 +292,23 @@ def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
     _draw_whole_record(torque, record, torque_lines, "(b) Coupling torque", _TORQUE_LABEL, pad=14)
     for axes in (angle, torque):
         axes.set_xlabel("Time (s)", labelpad=1)
-        mark(axes, moments)
+        shade_intervals(axes, intervals)
     detail_angle_lines = (
         (reference_mrad, {"color": style.ORANGE}),
         (angle_mrad, {"color": style.BLUE}),
     )
-    for column, moment in enumerate(moments):
+    for column, interval in enumerate(intervals):
         angle_detail = figure.add_subplot(grid[1, column])
-        _draw_detail(angle_detail, record, detail_angle_lines, column, moment, _ANGLE_LABEL)
+        _draw_detail(angle_detail, record, detail_angle_lines, column, interval, _ANGLE_LABEL)
         torque_detail = figure.add_subplot(grid[3, column])
         line_style = green_line | {"linewidth": 0.9}
         _draw_detail(
-            torque_detail, record, ((record.torque_nm, line_style),), column, moment, _TORQUE_LABEL
+            torque_detail,
+            record,
+            ((record.torque_nm, line_style),),
+            column,
+            interval,
+            _TORQUE_LABEL,
         )
         torque_detail.set_xlabel("Time (s)", labelpad=1)
     return figure
@@ -306,7 +320,7 @@ def best_model(analysis: WelchAnalysis) -> FittedModel:
 
 
 def torque_figure(analysis: WelchAnalysis) -> Figure:
-    """Draw measured and modelled torque and their difference, with a detail of each mode.
+    """Draw measured and modelled torque and their difference, also enlarged at each mode.
 
     All three are limited to frequencies up to the band's end. Above it the measured torque is
     noise, and the modelled torque is the encoder's quantisation.
@@ -325,13 +339,13 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
         f"{1e3 * _rms(residual):.3g} mN·m rms, {100 * residual_fraction:.3g} % of the torque, the "
         "bias of Welch's estimate included",
     )  # fmt: skip
-    moments = resonance_moments(record, len(analysis.peaks))
+    intervals = resonance_intervals(record, len(analysis.peaks))
     grid = figure.add_gridspec(
-        2, max(len(moments), 1), left=0.06, right=0.985, top=0.87, bottom=0.065, hspace=0.28,
+        2, max(len(intervals), 1), left=0.06, right=0.985, top=0.87, bottom=0.065, hspace=0.28,
         wspace=0.17, height_ratios=(1.7, 1.0),
     )  # fmt: skip
-    whole = grid[0, :].subgridspec(2, 1, hspace=0.2, height_ratios=(1.7, 1.0))
-    top, residual_axes = figure.add_subplot(whole[0]), figure.add_subplot(whole[1])
+    upper_grid = grid[0, :].subgridspec(2, 1, hspace=0.2, height_ratios=(1.7, 1.0))
+    top, residual_axes = figure.add_subplot(upper_grid[0]), figure.add_subplot(upper_grid[1])
     torque_lines = ((measured, _MEASURED_LINE), (modelled, _MODELLED_LINE))
     _draw_whole_record(top, record, torque_lines, "Whole record", _TORQUE_LABEL, pad=14)
     top.tick_params(labelbottom=False)
@@ -339,12 +353,12 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
         residual_axes, record, ((residual, _RESIDUAL_LINE),), _RESIDUAL_TITLE, _TORQUE_LABEL
     )
     residual_axes.set_xlabel("Time (s)", labelpad=1)
-    mark(top, moments)
+    shade_intervals(top, intervals)
     styles = (_DETAIL_LINES[0], _DETAIL_LINES[1] | {"linewidth": 1.1}, _DETAIL_LINES[2])
     detail_lines = tuple(zip((measured, modelled, residual), styles, strict=True))
-    for column, moment in enumerate(moments):
+    for column, interval in enumerate(intervals):
         axes = figure.add_subplot(grid[1, column])
-        _draw_detail(axes, record, detail_lines, column, moment, _TORQUE_LABEL)
+        _draw_detail(axes, record, detail_lines, column, interval, _TORQUE_LABEL)
         axes.set_xlabel("Time (s)", labelpad=1)
     handles = [*top.get_lines()[:2], residual_axes.get_lines()[0]]
     figure.legend(

@@ -52,26 +52,27 @@ ORANGE: Final = "#E69F00"
 INK: Final = "#222222"
 """Colour of titles, labels and points."""
 GREY: Final = "#808080"
+"""Colour of measured curves."""
 FAINT: Final = "#D2D2D2"
-"""Colour of secondary lines."""
-SHADE: Final = "#F0E9D8"
+"""Colour of secondary lines, such as the ratio of transforms behind Welch's estimate."""
+SHADE_COLOR: Final = "#F0E9D8"
 """Colour of shaded areas, such as the range of white noise."""
 
 DPI: Final = 150
 """Resolution of PNG figures, in dots per inch."""
-_COMPRESSION: Final = 1
+_PNG_COMPRESSION_LEVEL: Final = 1
 """Compression level of PNG figures: fast, with a tenth more bytes for a quarter of the time."""
-_VECTOR: Final[dict[Any, Any]] = {
+_VECTOR_FORMAT_SETTINGS: Final[dict[Any, Any]] = {
     "svg.fonttype": "none", "svg.hashsalt": "rigd", "pdf.fonttype": 42,
 }  # fmt: skip
 """Matplotlib's settings for SVG and PDF: text stays text, and identifiers are the same each time.
 """
-_NO_METADATA: Final = {
+_OMITTED_METADATA: Final = {
     "svg": dict.fromkeys(("Creator", "Date", "Format", "Type")),
     "pdf": dict.fromkeys(("Creator", "CreationDate", "Producer")),
 }
 """Metadata that is omitted from SVG and PDF, so that the same figure gives the same file."""
-COLUMNS: Final = 1000
+SCREEN_COLUMNS: Final = 1000
 """Number of columns into which a line is decimated: the pixels of a full-width panel on a screen.
 """
 
@@ -79,7 +80,7 @@ _FREQUENCY_TICKS_HZ: Final = tuple(
     digit * 10.0**decade for decade in range(-4, 5) for digit in (1, 2, 5)
 )
 """Frequencies with a tick label on a logarithmic axis, in hertz."""
-_RC: Final[dict[Any, Any]] = {
+_MATPLOTLIB_SETTINGS: Final[dict[Any, Any]] = {
     "font.size": 8.5,
     "axes.titlesize": 9.5,
     "axes.titleweight": "bold",
@@ -113,7 +114,7 @@ _RC: Final[dict[Any, Any]] = {
 @contextmanager
 def styled() -> Iterator[None]:
     """Provide a context in which figures are made and saved in the style of this module."""
-    with rc_context(_RC), warnings.catch_warnings():
+    with rc_context(_MATPLOTLIB_SETTINGS), warnings.catch_warnings():
         # A file name may hold characters that the font lacks; a box in a title does no harm.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         yield
@@ -197,10 +198,12 @@ def render_figure(figure: Figure, kind: FigureFormat) -> bytes:
     buffer = io.BytesIO()
     if kind == "png":
         # Fast compression: a tenth more bytes for a quarter of the time.
-        figure.savefig(buffer, format=kind, dpi=DPI, pil_kwargs={"compress_level": _COMPRESSION})
+        figure.savefig(
+            buffer, format=kind, dpi=DPI, pil_kwargs={"compress_level": _PNG_COMPRESSION_LEVEL}
+        )
     else:
-        with rc_context(_VECTOR):
-            figure.savefig(buffer, format=kind, metadata=_NO_METADATA[kind])
+        with rc_context(_VECTOR_FORMAT_SETTINGS):
+            figure.savefig(buffer, format=kind, metadata=_OMITTED_METADATA[kind])
     return buffer.getvalue()
 
 
@@ -259,7 +262,7 @@ def save_picture(
 def envelope(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
-    columns: int = COLUMNS,
+    columns: int = SCREEN_COLUMNS,
     *,
     logarithmic: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

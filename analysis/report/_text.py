@@ -13,7 +13,7 @@ from rich.text import Text
 from analysis.identify.headline import EXACT_CONDITION, MISREAD
 from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
-from analysis.report.table import MARK, estimate_cells, terminal_table
+from analysis.report.table import NOT_REPORTED_MARK, estimate_cells, terminal_table
 from analysis.suited import LEFT_OUT
 from rigd.printable import listed
 
@@ -97,7 +97,7 @@ def _main_results(whole_record: WholeRecord) -> RenderableType:
 
 def _with_mark_notes_only(table: Table, caption: str = "") -> Table:
     """Return a table without notes, except those that explain marked numbers."""
-    notes = tuple(note for note in table.notes if note.startswith(MARK))
+    notes = tuple(note for note in table.notes if note.startswith(NOT_REPORTED_MARK))
     return replace(table, caption=caption, notes=notes)
 
 

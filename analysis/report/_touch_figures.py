@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from rigd.touch import TouchEstimate
 
 _SHOWN_BEFORE_MS: Final = 25.0
-"""Time that is shown before and after a touch, in milliseconds."""
+"""Time that is shown before a touch, in milliseconds."""
 _SHOWN_AFTER_MS: Final = 100.0
-"""Time that is shown around a touch."""
+"""Time that is shown after a touch, in milliseconds."""
 _LEAST_LOG_LIKELIHOOD_RANGE: Final = 40.0
 """Least range of the log-likelihood's axis."""
 _LINEAR_RANGE_STD: Final = 5.0
 """Number of standard deviations up to which the axis of innovations is linear."""
 _MOST_DETAIL_FRACTION: Final = 0.25
-"""Fraction of the antenna's length within which all contact points get an additional detail."""
+"""Largest extent of the contact points, relative to the antenna, for an enlarged map of them."""
 _SESSION_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE)
 """Colours of the sessions in the map."""
 
@@ -90,7 +90,7 @@ def _draw_likelihood(axes: Axes, estimate: TouchEstimate) -> None:
     axes.plot(estimate.positions_m, relative, color=style.BLUE)
     if estimate.x_m is not None:
         low, high = estimate.x_m.interval_95
-        axes.axvspan(low, high, color=style.SHADE, linewidth=0, zorder=0)
+        axes.axvspan(low, high, color=style.SHADE_COLOR, linewidth=0, zorder=0)
         axes.axvline(estimate.x_m.value, color=style.VERMILION, linewidth=0.9)
     axes.set_xlim(0.0, float(estimate.positions_m[-1]))
     axes.set_ylim(-max(_LEAST_LOG_LIKELIHOOD_RANGE, float(np.quantile(-relative, 0.75))), 2.0)
@@ -117,7 +117,7 @@ def _draw_innovations(
 ) -> None:
     """Draw the innovations of one channel over time, in standard deviations."""
     times_ms = 1e3 * (estimate.innovation_times_s - touch_time_s)
-    axes.axhspan(-NORMAL_95, NORMAL_95, color=style.SHADE, linewidth=0, zorder=0)
+    axes.axhspan(-NORMAL_95, NORMAL_95, color=style.SHADE_COLOR, linewidth=0, zorder=0)
     axes.axvline(0.0, color=style.GREY, linewidth=0.8)
     axes.plot(
         times_ms, estimate.innovations[row], ".-", color=style.BLUE, linewidth=0.7, markersize=2.5

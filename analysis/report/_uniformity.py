@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.identify import CONSTANTS
 from analysis.report import _style as style
-from analysis.report.table import WORDS, Cell, Column, Table, estimate_cells, number_cell
+from analysis.report.table import TEXT_FORMAT, Cell, Column, Table, estimate_cells, number_cell
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def uniformity_figure(test: UniformBeamTest) -> Figure:
         std_axes, percent_axes = (figure.add_subplot(grid[row, column]) for row in range(2))
         std_axes.set_title(_CONSTANT_TITLES[name], fontsize=8.5)
         std_axes.axhspan(
-            -NORMAL_95, NORMAL_95, color=style.SHADE, linewidth=0, zorder=0,
+            -NORMAL_95, NORMAL_95, color=style.SHADE_COLOR, linewidth=0, zorder=0,
             label="95 % of uniform beams",
         )  # fmt: skip
         values = deviations[:, column] / std[:, column]
@@ -123,7 +123,7 @@ def uniformity_description(test: UniformBeamTest) -> str:
 
 
 def uniformity_table(test: UniformBeamTest) -> Table:
-    """Return measured and predicted modal constants with their deviations."""
+    """Return the table of measured and predicted modal constants with their deviations."""
     rows: list[tuple[Entry, ...]] = []
     deviations = _deviations(test).ravel()
     for index, (measured, std, predicted, deviation) in enumerate(
@@ -146,7 +146,7 @@ def uniformity_table(test: UniformBeamTest) -> Table:
         "Modal constants measured and of a uniform beam",
         (
             Column("Mode", "mode"),
-            Column("Constant", "constant", WORDS),
+            Column("Constant", "constant", TEXT_FORMAT),
             Column("Measured", "measured"),
             Column("std", "std", std_of_previous=True),
             Column("Uniform beam", "uniform_beam"),

@@ -24,13 +24,15 @@ if TYPE_CHECKING:
     from analysis.results import WholeRecord
 
     Band = tuple[float, float]
+    """Lowest and highest frequency of a band, in hertz."""
 
     Real = NDArray[np.float64]
+    """Array of real numbers."""
 
 _BLOCK_BINS: Final = 24
 """Number of frequency bins over which the power is averaged to find the excited band."""
 _EXCITED_TO_NOISE_POWER: Final = 4.0
-"""Ratio of a block's mean power to the noise's above which the block counts as excited.
+"""Ratio of a block's mean power to the noise's power, above which the block counts as excited.
 
 By chance the ratio exceeds 2 in one of 10 000 blocks."""
 
@@ -56,7 +58,7 @@ def supported_band_hz(whole_record: WholeRecord) -> Band | None:
 
 
 def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
-    """Return the lowest and highest frequency at which the measured torque exceeds the noise.
+    """Return the lowest and highest frequency at which the torque's power exceeds the noise's.
 
     Parameters
     ----------
@@ -191,8 +193,8 @@ _GRADIENT_NAMES: Final = {
     "density_over_stiffness": "ln_density_over_stiffness",
     "bending_stiffness_n_m2": "ln_stiffness",
 }
-"""Parameters for which the response's derivatives by the logarithm are available, with their names.
-"""
+"""Names under which the response's derivatives by a parameter's logarithm are computed, by
+parameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +218,7 @@ class ResponseBand:
 
     def magnitude_limits(self) -> tuple[Real, Real]:
         """Return the lower and upper limit of the magnitude's 95 % band, in N·m/rad, (n,) each."""
-        return _limits(np.abs(self.response), self.log_magnitude_std)
+        return _logarithmic_limits(np.abs(self.response), self.log_magnitude_std)
 
 
 def response_band(fit: Estimate, frequency_hz: Real) -> ResponseBand:
@@ -310,7 +312,7 @@ class LossFactor:
 
     def limits(self) -> tuple[Real, Real]:
         """Return the lower and upper limit of the loss factor's 95 % band, shape (n,) each."""
-        return _limits(self.value, self.log_std)
+        return _logarithmic_limits(self.value, self.log_std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -355,20 +357,20 @@ def loss_factors(fit: Estimate, frequency_hz: Real) -> LossFactors:
     """
     omega = 2 * np.pi * frequency_hz
     values = fit.parameters
-    total = np.zeros(omega.size)
+    total_value = np.zeros(omega.size)
     total_slopes = np.zeros((len(fit.determined), omega.size))
     internal = external = None
     if fit.structure.internal:
-        value, slope_pair = _loss_with_slopes(omega, values["zeta"], values["alpha"], 1.0)
+        loss_value, slope_pair = _loss_with_slopes(omega, values["zeta"], values["alpha"], 1.0)
         gradient = _rows_by_parameter(
             fit, {"zeta": slope_pair[0], "alpha": slope_pair[1]}, omega.size
         )
-        internal = LossFactor(value, _standard_deviations(gradient, fit.covariance))
-        total, total_slopes = total + value, total_slopes + value * gradient
+        internal = LossFactor(loss_value, _standard_deviations(gradient, fit.covariance))
+        total_value, total_slopes = total_value + loss_value, total_slopes + loss_value * gradient
     if fit.structure.external:
-        inertia = values["density_over_stiffness"] * omega**2
-        value, slope_pair = _loss_with_slopes(
-            omega, values["gamma"] / inertia, values["lambda"], -1.0
+        inertia_term = values["density_over_stiffness"] * omega**2
+        loss_value, slope_pair = _loss_with_slopes(
+            omega, values["gamma"] / inertia_term, values["lambda"], -1.0
         )
         gradient = _rows_by_parameter(
             fit,
@@ -379,10 +381,12 @@ def loss_factors(fit: Estimate, frequency_hz: Real) -> LossFactors:
             },
             omega.size,
         )
-        external = LossFactor(value, _standard_deviations(gradient, fit.covariance))
-        total, total_slopes = total + value, total_slopes + value * gradient
+        external = LossFactor(loss_value, _standard_deviations(gradient, fit.covariance))
+        total_value, total_slopes = total_value + loss_value, total_slopes + loss_value * gradient
     with np.errstate(invalid="ignore", divide="ignore"):
-        total_loss = LossFactor(total, _standard_deviations(total_slopes / total, fit.covariance))
+        total_loss = LossFactor(
+            total_value, _standard_deviations(total_slopes / total_value, fit.covariance)
+        )
     return LossFactors(frequency_hz, internal, external, total_loss)
 
 
@@ -419,8 +423,8 @@ def _standard_deviations(gradient: Real, covariance: Real) -> Real:
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _limits(value: Real, log_std: Real) -> tuple[Real, Real]:
-    """Return the lower and upper limit of a 95 % interval that is symmetric in the logarithm."""
+def _logarithmic_limits(value: Real, log_std: Real) -> tuple[Real, Real]:
+    """Return the limits of a value's 95 % interval, which is symmetric in the logarithm."""
     # An undetermined one may overflow: its band is then everything.
     factor = np.exp(np.minimum(NORMAL_95 * log_std, 300.0))
     return value / factor, value * factor

@@ -80,8 +80,8 @@ def campaign_tables(
     parts: list[RenderableType] = []
     sentences = campaign_sentences(campaign)
     if sentences:
-        first, *others = sentences
-        parts += [Text(first, style="bold"), *map(Text, others)]
+        first_sentence, *further_sentences = sentences
+        parts += [Text(first_sentence, style="bold"), *map(Text, further_sentences)]
         if campaign.verdict is not None and campaign.verdict.experiments:
             parts.append(Text("Further experiments:"))
             parts += [Text(f"  {advice}") for advice in campaign.verdict.experiments]

@@ -118,13 +118,13 @@ def _is_free(folder: Path) -> bool:
     return not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir()))
 
 
-def _unused_folder(folder: Path, taken: set[Path], *, overwrite: bool = False) -> Path:
+def _unused_folder(folder: Path, reserved_folders: set[Path], *, overwrite: bool = False) -> Path:
     """Return the folder, or the first numbered folder name like it that is not in use."""
     number, candidate = 1, folder
-    while candidate in taken or (os.path.lexists(candidate) and not overwrite):
+    while candidate in reserved_folders or (os.path.lexists(candidate) and not overwrite):
         number += 1
         candidate = folder.with_name(f"{folder.name}-{number}")
-    taken.add(candidate)
+    reserved_folders.add(candidate)
     return candidate
 
 

@@ -34,7 +34,7 @@ def record_page(
     result: RecordResult,
     pictures: Sequence[Picture],
     modes: Table,
-    of_record: Sequence[Table],
+    record_tables: Sequence[Table],
     made_at: datetime,
     paper_pictures: Sequence[Picture] = (),
     paper_tables: Sequence[Table] = (),
@@ -48,7 +48,7 @@ def record_page(
     pictures : sequence of Picture
         Figures of the whole-record fits. The table of modes follows the first figure.
     modes : Table
-    of_record : sequence of Table
+    record_tables : sequence of Table
         Tables of the whole-record fits.
     made_at : datetime
         Date and time of the report, with a time zone.
@@ -88,7 +88,7 @@ def record_page(
         definitions=definitions(whole_record),
         types=types_table(whole_record),
         modes=modes,
-        tables=of_record,
+        tables=record_tables,
         paper_pictures=paper_pictures,
         paper_tables=paper_tables,
         how=[*_collect_facts(result, whole_record), versions(made_at)],

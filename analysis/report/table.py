@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from analysis.models import Structure
     from rigd.session import Validity
 
-ABSENT: Final = "–"
-"""Text of a cell without a value."""
-WORDS: Final = ""
-"""Format of a column that contains no numbers."""
+ABSENT_TEXT: Final = "–"
+"""Text that a cell without a value shows."""
+TEXT_FORMAT: Final = ""
+"""Number format of a column that contains texts instead of numbers."""
 
 Value = str | float | bool | None
-"""Value of a cell for programs."""
+"""Value of a cell as programs read it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class Column:
     key : str
         Name for programs, with the SI unit: header in CSV, key in JSON.
     number_format : str
-        Format of the column's numbers; `WORDS` if the column contains words.
+        Format of the column's numbers; `TEXT_FORMAT` if the column contains texts.
     factor : float
         Factor from SI units to the displayed unit.
     std_of_previous : bool
@@ -95,7 +95,7 @@ class Column:
     @property
     def numeric(self) -> bool:
         """Whether the column contains numbers."""
-        return self.number_format != WORDS
+        return self.number_format != TEXT_FORMAT
 
     def shown(self, entry: Entry) -> Cell:
         """Return the cell that people see for an entry of this column."""
@@ -238,11 +238,11 @@ def csv_text(table: Table) -> str:
 
 def json_rows(table: Table) -> list[dict[str, Value]]:
     """Return a table's rows as plain values by their keys; None if unknown or not finite."""
-    return [{key: _plain(entry) for key, entry in row.items()} for row in table.rows]
+    return [{key: _program_value(entry) for key, entry in row.items()} for row in table.rows]
 
 
-def _plain(entry: Entry) -> Value:
-    """Return an entry's value for programs; None if it is not finite."""
+def _program_value(entry: Entry) -> Value:
+    """Return an entry's value as programs read it; None if it is not finite."""
     value = entry.value if isinstance(entry, Cell) else entry
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
@@ -381,7 +381,7 @@ def number_cell(value: float | None, number_format: str = ".4g", factor: float =
         Factor from SI units to the displayed unit.
     """
     if value is None or not math.isfinite(value):
-        return Cell(None, ABSENT)
+        return Cell(None, ABSENT_TEXT)
     return Cell(float(value), f"{factor * value:{number_format}}".replace("-", "−"))
 
 
@@ -412,10 +412,10 @@ def estimate_cells(
     )
 
 
-MARK: Final = "†"
-"""Mark of numbers that are not reported results."""
+NOT_REPORTED_MARK: Final = "†"
+"""Mark after a number that is not a reported result."""
 
-_SYMBOLS: Final = {"alpha": "α", "lambda": "λ"}
+_ORDER_SYMBOLS: Final = {"alpha": "α", "lambda": "λ"}
 """Symbols of the fractional orders by parameter name."""
 
 
@@ -447,7 +447,9 @@ def unreported_parameters(
 
 def mark_cell(cell: Cell) -> Cell:
     """Return a cell in grey with the mark of numbers that are not reported; dashes get no mark."""
-    return grey_cell(cell if cell.value is None else replace(cell, text=cell.text + MARK))
+    return grey_cell(
+        cell if cell.value is None else replace(cell, text=cell.text + NOT_REPORTED_MARK)
+    )
 
 
 def grey_cell(cell: Cell) -> Cell:
@@ -459,8 +461,8 @@ def footnotes(unsupported_orders: Collection[str]) -> tuple[str, ...]:
     """Return the note that explains the mark, if an order is not reported; else nothing."""
     if not unsupported_orders:
         return ()
-    orders = " or ".join(_SYMBOLS[order] for order in sorted(unsupported_orders))
+    orders = " or ".join(_ORDER_SYMBOLS[order] for order in sorted(unsupported_orders))
     return (
-        f"{MARK} not reported: the data support no order {orders}. The number belongs to its "
-        "curve, not to the antenna.",
+        f"{NOT_REPORTED_MARK} not reported: the data support no order {orders}. The number belongs "
+        "to its curve, not to the antenna.",
     )

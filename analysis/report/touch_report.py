@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.report._document import document_text, versions
 from analysis.report.folder import write_new
-from analysis.report.table import WORDS, Cell, Column, Entry, Table, csv_text, number_cell
+from analysis.report.table import TEXT_FORMAT, Cell, Column, Entry, Table, csv_text, number_cell
 from analysis.results import DEFAULT_FORMATS, finite
 from rigd.units import decimals, with_half_width
 
@@ -42,14 +42,14 @@ def touches_table(sessions: Sequence[TouchedSession]) -> Table:
     """
     several = len(sessions) > 1
     columns = (
-        Column("Session" if several else "", "session", WORDS),
+        Column("Session" if several else "", "session", TEXT_FORMAT),
         Column("Touch", "number"),
         Column("Time (s)", "time_s"),
         Column("From the axis (m)", "x_m"),
         Column("Angle (rad)", "angle_rad", ".4f"),
         Column("Peak force (N)", "force_n"),
         Column("Stiffness (N/m)", "stiffness_n_per_m"),
-        Column("Kind", "kind", WORDS),
+        Column("Kind", "kind", TEXT_FORMAT),
     )
     rows = [_touch_row(session, touch) for session in sessions for touch in session.touches]
     return Table(

@@ -77,8 +77,8 @@ def subject_of_session(
         )
     if end - first_tick > _MOST_TICKS_PER_SAMPLE * len(ticks):
         raise SessionError(
-            f"{session.path}: only {len(ticks)} of the {end - first_tick} ticks from {first_tick} to "
-            f"{end - 1} have a sample, too few to be shown as a session."
+            f"{session.path}: only {len(ticks)} of the {end - first_tick} ticks from "
+            f"{first_tick} to {end - 1} have a sample, too few to be shown as a session."
         )
     attachments = [session.attachments.get(name, b"") for name in _ATTACHMENTS_WITH_DAMPING]
     return Subject(
