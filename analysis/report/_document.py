@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from analysis.results import RecordResult, WholeRecord
     from rigd.spectral import FrequencyResponse
 
+    # Values of the paper's indices by name: mse, wmse, md.
     IndexValues = dict[str, float | None]
-    """Values of the paper's indices by name: mse, wmse, md."""
 
 NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
 """Indices of a fit for which there is no measured response to compare with."""

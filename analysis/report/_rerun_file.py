@@ -50,10 +50,10 @@ if TYPE_CHECKING:
     from analysis.results import RecordResult, WholeRecord
     from rigd.view.chart import Axis
 
+    # Array of real numbers.
     Real = NDArray[np.float64]
-    """Array of real numbers."""
+    # Array of complex numbers.
     Complex = NDArray[np.complex128]
-    """Array of complex numbers."""
 
 RECORD_ENTITY: Final = "/whole_record"
 """Entity path in Rerun of the whole record's results."""

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from analysis.record import Record
     from analysis.report.bands import ResponseBand
 
+    # Array of real numbers.
     Real = NDArray[np.float64]
-    """Array of real numbers."""
 
 
 @dataclass(frozen=True, slots=True)

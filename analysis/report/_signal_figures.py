@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from analysis.record import Record
     from analysis.report._shown_model import ShownModel
 
+    # Matplotlib's properties of a line.
     LineStyle = dict[str, Any]
-    """Matplotlib's properties of a line."""
+    # Values of a signal with the style of its line.
     StyledSignal = tuple[NDArray[np.float64], LineStyle]
-    """Values of a signal with the style of its line."""
 
 _PERIODS_SHOWN: Final = 12
 """Number of a mode's periods that its enlarged panel shows."""

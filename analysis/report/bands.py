@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from analysis.record import Record
     from analysis.results import WholeRecord
 
+    # Lowest and highest frequency of a band, in hertz.
     Band = tuple[float, float]
-    """Lowest and highest frequency of a band, in hertz."""
 
+    # Array of real numbers.
     Real = NDArray[np.float64]
-    """Array of real numbers."""
 
 _BLOCK_BINS: Final = 24
 """Number of frequency bins over which the power is averaged to find the excited band."""
