@@ -70,8 +70,8 @@ _COLUMNS_TO_READ: Final = tuple(name for name in _SQL_TYPES if name != "start_ut
 """Columns that are read from the index: all but the start time as text, which is for other
 programs."""
 
-Stamped = tuple[str, SessionRow]
-"""Stamp of a row's source files, and the row."""
+StampedRow = tuple[str, SessionRow]
+"""Size and time of a row's source files as a stamp, and the row."""
 
 
 class Index:
@@ -87,11 +87,11 @@ class Index:
         self._folder = folder
         self._path = folder / INDEX_NAME
 
-    def read(self) -> dict[str, Stamped]:
-        """Return the stamped rows of the index by file name; empty without a valid index."""
+    def read(self) -> dict[str, StampedRow]:
+        """Return the index's rows with their stamps, by file name; empty without a valid index."""
         if not self._is_own_index():
             return {}
-        rows: dict[str, Stamped] = {}
+        rows: dict[str, StampedRow] = {}
         try:
             with self._connection("ro") as database:
                 if database.execute("PRAGMA user_version").fetchone() != (_INDEX_VERSION,):
@@ -101,13 +101,15 @@ class Index:
                     with contextlib.suppress(ValueError, TypeError):  # the row is rebuilt
                         rows[file] = (
                             stamp,
-                            self._row(file, dict(zip(_COLUMNS_TO_READ, values, strict=True))),
+                            self._row_from_values(
+                                file, dict(zip(_COLUMNS_TO_READ, values, strict=True))
+                            ),
                         )
         except sqlite3.Error:  # locked for long, or damaged
             return {}
         return rows
 
-    def write(self, rows: Mapping[str, Stamped], missing_files: Collection[str]) -> None:
+    def write(self, rows: Mapping[str, StampedRow], missing_files: Collection[str]) -> None:
         """Store new rows in the index and remove rows of missing files, if the index is writable.
 
         Parameters
@@ -128,7 +130,7 @@ class Index:
                 self._path.unlink()
                 self._store(rows, missing_files)
 
-    def _store(self, rows: Mapping[str, Stamped], missing_files: Collection[str]) -> None:
+    def _store(self, rows: Mapping[str, StampedRow], missing_files: Collection[str]) -> None:
         """Store and remove rows in one transaction, and create the table if necessary."""
         with self._connection("rwc") as database:
             database.execute("BEGIN IMMEDIATE")
@@ -175,16 +177,20 @@ class Index:
         """Return whether the file is an index of this program, or empty."""
         try:
             with self._path.open("rb") as file:
-                head = file.read(_APPLICATION_ID_POSITION.stop)
+                first_bytes = file.read(_APPLICATION_ID_POSITION.stop)
         except OSError:
             return False
-        mark = _APPLICATION_ID.to_bytes(4, "big")
-        return not head or (
-            head.startswith(_SQLITE_FIRST_BYTES) and head[_APPLICATION_ID_POSITION] == mark
+        application_id = _APPLICATION_ID.to_bytes(4, "big")
+        return not first_bytes or (
+            first_bytes.startswith(_SQLITE_FIRST_BYTES)
+            and first_bytes[_APPLICATION_ID_POSITION] == application_id
         )
 
-    def _row(self, file: str, values: dict[str, object]) -> SessionRow:
-        """Return the row with the given column values; raise ValueError or TypeError if invalid."""
+    def _row_from_values(self, file: str, values: dict[str, object]) -> SessionRow:
+        """Return the session row with the given column values.
+
+        It raises ValueError or TypeError if a value is invalid.
+        """
         report = values["report"]
         for name, value in values.items():
             if name != "report" and not isinstance(value, _PYTHON_TYPES[_SQL_TYPES[name]]):
@@ -211,10 +217,10 @@ def _column_values(row: SessionRow) -> list[object]:
 def _iso_time(utc_ns: int) -> str | None:
     """Return a time in ns since 1970 as UTC in ISO 8601; None if it is beyond the calendar."""
     try:
-        moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
+        time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
     except OverflowError:
         return None
-    return moment.isoformat(timespec="milliseconds")
+    return time.isoformat(timespec="milliseconds")
 
 
 def _is_storable_name(file: str) -> bool:

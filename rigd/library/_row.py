@@ -13,7 +13,7 @@ from rigd.runtime import read_plain_file
 from rigd.session import Validity
 from rigd.session.quick_look import modes_of, read_quick_look
 
-SUFFIX: Final = ".mcap"
+SESSION_SUFFIX: Final = ".mcap"
 """File name suffix of a session file."""
 INCOMPLETE_SUFFIX: Final = ".mcap.part"
 """File name suffix of a session file that is being recorded or is incomplete."""
@@ -132,16 +132,21 @@ def read_row(path: Path, quick_look: Path | None, report: Path | None) -> tuple[
     from rigd.session.user_metadata import added_metadata
 
     size = path.stat().st_size
-    name = path.name.removesuffix(INCOMPLETE_SUFFIX).removesuffix(SUFFIX)
-    results: dict[str, Any] = _modes_of_results(quick_look, report)
+    name = path.name.removesuffix(INCOMPLETE_SUFFIX).removesuffix(SESSION_SUFFIX)
+    results_of_analysis: dict[str, Any] = _modes_of_results(quick_look, report)
     if report is not None and (report / REPORT_PAGE).is_file():
-        results["report"] = report / REPORT_PAGE
+        results_of_analysis["report"] = report / REPORT_PAGE
     try:
         summary = read_summary(path)
     except SessionError as error:
         path.stat()  # raises if the file no longer exists
         row = SessionRow(
-            name, path, size, outcome="unreadable", problem=printable(str(error)), **results
+            name,
+            path,
+            size,
+            outcome="unreadable",
+            problem=printable(str(error)),
+            **results_of_analysis,
         )
         return row, not isinstance(error, SessionAccessError)
     metadata, outcome = summary.metadata, summary.outcome or {}
@@ -177,7 +182,7 @@ def read_row(path: Path, quick_look: Path | None, report: Path | None) -> tuple[
             for name, value in user_metadata
         },
         problem=summary.problem,
-        **results,
+        **results_of_analysis,
     )
     return row, True
 
@@ -196,8 +201,8 @@ def _count_of_key(values: Mapping[str, str], key: str) -> int | None:
     """Return the count that a key states; None if it is not a count of up to 63 bits."""
     text = values.get(key, "")
     # More digits are not a count and exceed 64 bits.
-    countable = text.isascii() and text.isdigit() and len(text) <= _MOST_COUNT_DIGITS + 1
-    return int(text) if countable and int(text) < 2**63 else None
+    is_count = text.isascii() and text.isdigit() and len(text) <= _MOST_COUNT_DIGITS + 1
+    return int(text) if is_count and int(text) < 2**63 else None
 
 
 def _number_of_key(values: Mapping[str, str], key: str) -> float | None:
@@ -230,8 +235,8 @@ def _with_validity(modes: tuple[Mode, ...], document: object) -> Document:
     """Return modes with the validity that a document states; empty without modes."""
     if not modes:
         return {}
-    stated = document.get("validity") if isinstance(document, dict) else None
-    return {"modes": modes, "validity": Validity.of_document(stated).as_json()}
+    validity_document = document.get("validity") if isinstance(document, dict) else None
+    return {"modes": modes, "validity": Validity.of_document(validity_document).as_json()}
 
 
 def _read_json(path: Path) -> object:

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Final
 
 from rigd.errors import UserError
-from rigd.library._index import Index, Stamped
+from rigd.library._index import Index, StampedRow
 from rigd.library._row import (
     INCOMPLETE_SUFFIX,
     REPORT_FOLDER,
     REPORT_PAGE,
     RESULTS_FILE,
-    SUFFIX,
+    SESSION_SUFFIX,
     SessionRow,
     read_row,
 )
@@ -80,7 +80,7 @@ def list_sessions(
     >>> row.id, row.outcome, row.duration_s
     ('session', 'complete', 21.5)
     """
-    first_ns, last_ns = _moment_ns(since, "since"), _moment_ns(until, "until")
+    first_ns, last_ns = _time_ns(since, "since"), _time_ns(until, "until")
     requested = {
         "specimen": specimen,
         "operator": operator,
@@ -109,25 +109,30 @@ def _searchable_text(row: SessionRow) -> str:
     return "\n".join((*texts, *user_metadata)).casefold()
 
 
-def _moment_ns(given: str | datetime | None, name: str) -> int | None:
+def _time_ns(given_time: str | datetime | None, name: str) -> int | None:
     """Return a time in ns since 1970; for a date without time, the start or end of its day."""
-    if given is None or given == "":
+    if given_time is None or given_time == "":
         return None
     try:
-        moment = given if isinstance(given, datetime) else datetime.fromisoformat(given.strip())
-        if name == "until" and not isinstance(given, datetime) and _is_date_only(given):
+        moment = (
+            given_time
+            if isinstance(given_time, datetime)
+            else datetime.fromisoformat(given_time.strip())
+        )
+        if name == "until" and not isinstance(given_time, datetime) and _is_date_only(given_time):
             moment = datetime.combine(moment, time()) + timedelta(days=1, microseconds=-1)
         # Without an offset it is local time.
         return int(moment.timestamp()) * _NS_PER_S + moment.microsecond * 1000
     except (ValueError, OverflowError, OSError):
         raise LibraryError(
-            f"{name} = {str(given)[:40]!r} is not a date; write 2026-11-20 or 2026-11-20T14:30."
+            f"{name} = {str(given_time)[:40]!r} is not a date; write 2026-11-20 or "
+            "2026-11-20T14:30."
         ) from None
 
 
-def _is_date_only(given: str) -> bool:
-    """Return whether a text is too short for a date with a time of day."""
-    return len(given.strip()) <= _DATE_CHARACTERS
+def _is_date_only(text: str) -> bool:
+    """Return whether a text is a date without a time of day, by its length."""
+    return len(text.strip()) <= _DATE_CHARACTERS
 
 
 # Files
@@ -160,7 +165,7 @@ def _read_rows(folder: Path, on_progress: Callable[[float], None] | None) -> lis
     index = Index(folder)
     indexed_rows = index.read()
     rows: list[SessionRow] = []
-    new_rows: dict[str, Stamped] = {}
+    new_rows: dict[str, StampedRow] = {}
     files_to_read = []
     for name, file in session_files.items():
         stamp, row = indexed_rows.get(name, ("", None))
@@ -201,7 +206,7 @@ def _find_session_files(folder: Path) -> dict[str, _SessionFiles]:
         with os.scandir(folder) as entries:
             for entry in entries:
                 name = entry.name
-                if name.endswith((SUFFIX, INCOMPLETE_SUFFIX)):
+                if name.endswith((SESSION_SUFFIX, INCOMPLETE_SUFFIX)):
                     session_files[name] = _SessionFiles(entry)
                 elif name.endswith(QUICK_LOOK_SUFFIX):
                     quick_looks[name.removesuffix(QUICK_LOOK_SUFFIX)] = Path(entry.path)
@@ -215,9 +220,9 @@ def _find_session_files(folder: Path) -> dict[str, _SessionFiles]:
             "files."
         ) from None
     for name, file in session_files.items():
-        if name.endswith(SUFFIX):
-            stem = name.removesuffix(SUFFIX)
-            file.add_results(quick_looks.get(stem), reports.get(stem, (0, None))[1])
+        if name.endswith(SESSION_SUFFIX):
+            session_name = name.removesuffix(SESSION_SUFFIX)
+            file.add_results(quick_looks.get(session_name), reports.get(session_name, (0, None))[1])
     return session_files
 
 

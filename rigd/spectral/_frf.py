@@ -78,9 +78,9 @@ class FrequencyResponse:
         """
         # Rounding errors of the caller must not lose the bin at either end.
         tolerance_hz = 1e-9 * max(abs(first_hz), abs(last_hz))
-        first = int(np.searchsorted(self.frequency_hz, first_hz - tolerance_hz, side="left"))
-        end = int(np.searchsorted(self.frequency_hz, last_hz + tolerance_hz, side="right"))
-        if first >= end:
+        first_bin = int(np.searchsorted(self.frequency_hz, first_hz - tolerance_hz, side="left"))
+        end_bin = int(np.searchsorted(self.frequency_hz, last_hz + tolerance_hz, side="right"))
+        if first_bin >= end_bin:
             raise SpectralError(
                 f"The band {first_hz:g} to {last_hz:g} Hz holds no bin of a frequency response "
                 f"that runs from {self.frequency_hz[0]:g} to {self.frequency_hz[-1]:g} Hz; "
@@ -88,9 +88,9 @@ class FrequencyResponse:
             )
         return replace(
             self,
-            frequency_hz=self.frequency_hz[first:end],
-            response=self.response[first:end],
-            coherence=None if self.coherence is None else self.coherence[first:end],
+            frequency_hz=self.frequency_hz[first_bin:end_bin],
+            response=self.response[first_bin:end_bin],
+            coherence=None if self.coherence is None else self.coherence[first_bin:end_bin],
         )
 
     def without_delays(self, *, input_delay_s: float, output_delay_s: float) -> "FrequencyResponse":
@@ -114,7 +114,7 @@ class FrequencyResponse:
 def checked_records(
     input_: ArrayLike, output: ArrayLike, rate_hz: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return input and output as float arrays, and raise if they are not valid.
+    """Return input and output as float arrays after a check; raise if they are not valid.
 
     They must have one dimension, equal length and finite values, and the input must not be zero.
 
@@ -150,12 +150,17 @@ def checked_records(
 # Segments of a record
 
 PAPER_RATE_HZ: Final = 1000.0
-"""Settings of the reference paper's Welch estimate; lengths are in samples."""
+"""Sampling rate of the reference paper's records, in hertz."""
 PAPER_SEGMENT_LENGTH: Final = 17266
+"""Number of samples in a segment of the reference paper's Welch estimate."""
 PAPER_OVERLAP: Final = 2590
+"""Number of samples in the overlap of the reference paper's segments."""
 PAPER_NFFT: Final = 160_000
+"""Number of samples of the reference paper's zero-padded transforms."""
 PAPER_SEGMENTS: Final = 8
+"""Number of segments in the reference paper's records."""
 PAPER_OVERLAP_FRACTION: Final = 0.15
+"""Overlap of the reference paper's segments, as a fraction of a segment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +219,7 @@ def segment_count(samples: int, segment_length: int, overlap: int) -> int:
 
 
 def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tuple[int, int]:
-    """Return the longest segments of which a record contains `segments`, and their overlap.
+    """Return the largest segment length and overlap for a given number of segments.
 
     The overlap is rounded to the nearest sample. If it is rounded down, as is usual, eight segments
     with 15 % overlap exceed a record of 120 000 samples by five samples. Seven segments are then
@@ -253,15 +258,15 @@ def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tup
             f"segment), not {segments} segments with an overlap of {overlap_fraction:g}."
         )
 
-    def end_of_last(length: int) -> int:
+    def end_of_last_segment(length: int) -> int:
         return length + (segments - 1) * (length - round(overlap_fraction * length))
 
     # The end grows with the length except for rounding, so start above and decrease.
     length = int(samples / (1 + (segments - 1) * (1 - overlap_fraction))) + segments + 1
-    while length > 1 and end_of_last(length) > samples:
+    while length > 1 and end_of_last_segment(length) > samples:
         length -= 1
     overlap = round(overlap_fraction * length)
-    if length < 2 or overlap >= length or end_of_last(length) > samples:
+    if length < 2 or overlap >= length or end_of_last_segment(length) > samples:
         raise SpectralError(
             f"A record of {samples} samples is too short for {segments} segments "
             f"with an overlap of {overlap_fraction:.0%}; ask for fewer segments."
@@ -294,7 +299,7 @@ def check_segmentation(segment_length: int, overlap: int, nfft: int) -> None:
 
 @dataclass(slots=True)
 class CrossSpectra:
-    """Auto- and cross-spectra of input and output, summed over segments, in each bin.
+    """Auto- and cross-spectra of input and output in each bin, summed over segments.
 
     Common factors of the spectral densities (rate, power of the window, number of segments) cancel
     in every ratio and are omitted.

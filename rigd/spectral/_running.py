@@ -29,8 +29,9 @@ from rigd.spectral._frf import (
 )
 
 Real = NDArray[np.float64]
+"""Array of real numbers."""
 
-LEAST_FRACTION: Final = 0.25
+LEAST_SEGMENT_FRACTION: Final = 0.25
 """Least fraction of a segment from which a response is estimated.
 
 Shorter segments have too little resolution."""
@@ -130,14 +131,14 @@ class RunningResponse:
 
     def estimate(self) -> RunningEstimate | None:
         """Return the response estimated so far; None while there are too few samples."""
-        final = self._segments.over
+        is_final = self._segments.over
         sums, reference_power = self._sums, self._reference_power
-        newest = self._segments.newest(self._length)
+        newest_samples = self._segments.newest(self._length)
         shortest_segment = self._length
-        if self._newest_count_as_segment(newest.shape[1], final):
+        if self._newest_count_as_segment(newest_samples.shape[1], is_final):
             sums, reference_power = sums.copy(), reference_power.copy()
-            self._add(newest, sums, reference_power)
-            shortest_segment = newest.shape[1]
+            self._add(newest_samples, sums, reference_power)
+            shortest_segment = newest_samples.shape[1]
         if sums.segments == 0:
             return None
         response = sums.response(self._frequency_hz, "h1")
@@ -147,14 +148,14 @@ class RunningResponse:
         return RunningEstimate(
             response=response,
             excited=excited_bins(reference_power, -(-self._nfft // shortest_segment)),
-            final=final,
+            final=is_final,
         )
 
     def _newest_count_as_segment(self, newest_count: int, is_final: bool) -> bool:
         """Return whether the newest samples count as a segment in addition to the whole ones."""
         if self._segments.end == self._summed_up_to or (is_final and self._sums.segments):
             return False
-        return newest_count >= LEAST_FRACTION * self._length
+        return newest_count >= LEAST_SEGMENT_FRACTION * self._length
 
     def _add(
         self,
@@ -237,13 +238,15 @@ class Segments:
         segment : ndarray of float, shape (channels, length)
             Values of the segment, as a view of the internal array.
         """
-        for first, block in self._gaps.fill(ticks, values):
-            start, stop = max(first, 0), first + block.shape[1]
+        for first_tick, block in self._gaps.fill(ticks, values):
+            start, end_tick = max(first_tick, 0), first_tick + block.shape[1]
             if self._limit is not None:
-                self.over = stop >= self._limit
-                stop = min(stop, self._limit)
-            if start < stop:
-                yield from self._add_block(start, block[:, start - first : stop - first])
+                self.over = end_tick >= self._limit
+                end_tick = min(end_tick, self._limit)
+            if start < end_tick:
+                yield from self._add_block(
+                    start, block[:, start - first_tick : end_tick - first_tick]
+                )
 
     def newest(self, most: int) -> Real:
         """Return at most `most` of the newest samples without a gap, (channels, n), as a view."""
@@ -258,21 +261,21 @@ class Segments:
         added = 0
         while added < block.shape[1]:
             segment_end = self._next + self._length
-            part = block[:, added : added + min(segment_end - self.end, self._length)]
-            added += part.shape[1]
-            self._append(part)
+            samples = block[:, added : added + min(segment_end - self.end, self._length)]
+            added += samples.shape[1]
+            self._append(samples)
             if self.end == segment_end:
                 yield self._next, self.newest(self._length)
                 self._next += self._hop
 
-    def _append(self, part: Real) -> None:
+    def _append(self, samples: Real) -> None:
         """Append samples to the internal array, which stores at least the newest segment."""
-        count = part.shape[1]
+        count = samples.shape[1]
         if self._used + count > self._buffer.shape[1]:
-            newest = self.newest(self._length)
-            self._buffer[:, : newest.shape[1]] = newest
-            self._used = newest.shape[1]
-        self._buffer[:, self._used : self._used + count] = part
+            newest_samples = self.newest(self._length)
+            self._buffer[:, : newest_samples.shape[1]] = newest_samples
+            self._used = newest_samples.shape[1]
+        self._buffer[:, self._used : self._used + count] = samples
         self._used += count
         self._available = min(self._available + count, self._length)
         self.end += count
@@ -325,7 +328,7 @@ def _interpolate_to_ticks(ticks: NDArray[np.int64], values: Real) -> tuple[int, 
 
 # Excited bins
 
-LEAST_POWER: Final = 2e-3
+LEAST_RELATIVE_POWER: Final = 2e-3
 """Least power of the reference in an excited bin, relative to the largest power.
 
 It is above the leakage of a Hamming window (−43 dB in its side lobes, and its pedestal of 0.08
@@ -352,7 +355,7 @@ def excited_bins(power: NDArray[np.float64], resolution_bins: int) -> NDArray[np
     largest = power.max(initial=0.0)
     if not largest > 0.0:
         return np.zeros(power.shape, dtype=np.bool_)
-    without_dips = _is_near_marked(power > LEAST_POWER * largest, resolution_bins)
+    without_dips = _is_near_marked(power > LEAST_RELATIVE_POWER * largest, resolution_bins)
     return ~_is_near_marked(~without_dips, 2 * resolution_bins)
 
 
@@ -362,8 +365,8 @@ def _is_near_marked(is_marked: NDArray[np.bool_], distance: int) -> NDArray[np.b
     Beyond the ends, the marks of the end bins continue.
     """
     counts = np.cumsum(np.pad(is_marked, (distance + 1, distance), mode="edge"))
-    near: NDArray[np.bool_] = counts[2 * distance + 1 :] > counts[: -2 * distance - 1]
-    return near
+    is_near: NDArray[np.bool_] = counts[2 * distance + 1 :] > counts[: -2 * distance - 1]
+    return is_near
 
 
 # Lowest bins of a transform
@@ -425,13 +428,13 @@ class LowBins:
 
 
 def _fast_length(least: int) -> int:
-    """Return the smallest transform length ≥ `least` that has no prime factor above 5."""
-    best = 1 << (least - 1).bit_length()
-    fives = 1
-    while fives < best:
-        odd = fives
-        while odd < best:
-            best = min(best, odd << (-(-least // odd) - 1).bit_length())
-            odd *= 3
-        fives *= 5
-    return best
+    """Return the smallest transform length of at least `least` without a prime factor above 5."""
+    best_length = 1 << (least - 1).bit_length()
+    power_of_five = 1
+    while power_of_five < best_length:
+        odd_factor = power_of_five
+        while odd_factor < best_length:
+            best_length = min(best_length, odd_factor << (-(-least // odd_factor) - 1).bit_length())
+            odd_factor *= 3
+        power_of_five *= 5
+    return best_length

@@ -68,11 +68,11 @@ def _check_torque_only_while_enabled(devices: Devices) -> None:
     devices.drive.disable()
     devices.drive.disable()
     speeds = []
-    last = _run_ticks(devices, 360, 1, torque_nm=_TORQUE_NM)[0][0]
+    last_angle = _run_ticks(devices, 360, 1, torque_nm=_TORQUE_NM)[0][0]
     for block in range(20):
         angles, _ = _run_ticks(devices, 361 + 100 * block, 100, torque_nm=_TORQUE_NM)
-        speeds.append(abs(angles[-1] - last))
-        last = angles[-1]
+        speeds.append(abs(angles[-1] - last_angle))
+        last_angle = angles[-1]
     _require(speeds[-1] < 0.2 * max(speeds), "it does not coast to a stop once it is disabled")
 
 
@@ -111,17 +111,19 @@ def _check_line_health(devices: Devices) -> None:
     """Check that the devices report bits, bit rate and errors of their lines."""
     _require(devices.drive.health().bits in (None, 0), "there were bits on the line before")
     _connect(devices)
-    before = devices.drive.health(), devices.sensor.health()
+    all_before = devices.drive.health(), devices.sensor.health()
     _run_ticks(devices, 0, 100)
-    after = devices.drive.health(), devices.sensor.health()
-    for then, now in zip(before, after, strict=True):
-        if then.bits is None or now.bits is None:
-            _require(then.bits is now.bits, "a line's bits are counted now and then")
+    all_after = devices.drive.health(), devices.sensor.health()
+    for health_before, health_after in zip(all_before, all_after, strict=True):
+        if health_before.bits is None or health_after.bits is None:
+            _require(
+                health_before.bits is health_after.bits, "a line's bits are counted now and then"
+            )
         else:
-            _require(now.bits > then.bits, "a line carries nothing")
-            _require((now.bit_rate_bit_s or 0.0) > 0.0, "a line has no bit rate")
-        _require(not now.errors, "a line has errors")
-    _require(after[1].status == 0, "the sensor's status is not 0")
+            _require(health_after.bits > health_before.bits, "a line carries nothing")
+            _require((health_after.bit_rate_bit_s or 0.0) > 0.0, "a line has no bit rate")
+        _require(not health_after.errors, "a line has errors")
+    _require(all_after[1].status == 0, "the sensor's status is not 0")
 
 
 DEVICE_CHECKS: tuple[Callable[[Devices], None], ...] = (

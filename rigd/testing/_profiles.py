@@ -75,14 +75,14 @@ def write_profile(
 
 def _added_lines(section: str, remaining: dict[str, Value]) -> list[str]:
     """Return lines for a section's keys that the base lacks; remove them from `remaining`."""
-    new = [key for key in remaining if section and key.rpartition(".")[0] + "." == section]
-    return [f"{key.removeprefix(section)} = {_value_text(remaining.pop(key))}" for key in new]
+    new_keys = [key for key in remaining if section and key.rpartition(".")[0] + "." == section]
+    return [f"{key.removeprefix(section)} = {_value_text(remaining.pop(key))}" for key in new_keys]
 
 
 def _value_text(value: Value) -> str:
     """Return a value as it is written in a profile."""
     text = json.dumps(value, ensure_ascii=False)
-    parts = value if isinstance(value, Sequence) else (value,)
-    if any(isinstance(part, bool | str) for part in parts):
+    items = value if isinstance(value, Sequence) else (value,)
+    if any(isinstance(item, bool | str) for item in items):
         return text
     return f'{{ value = {text}, source = "assumed" }}'

@@ -11,22 +11,22 @@ POINT: Final = "."
 COMMA: Final = ","
 """Decimal comma."""
 
-_UNSIGNED: Final = r"(?:\d+{mark}?\d*|{mark}\d+)(?:[eE][-+]?\d+)?"
+_UNSIGNED_PATTERN: Final = r"(?:\d+{mark}?\d*|{mark}\d+)(?:[eE][-+]?\d+)?"
 """Pattern of a finite number without sign, in which {mark} is replaced by the decimal sign."""
 _NOT_FINITE_PATTERN: Final = r"nan|inf|infinity"
 """Pattern of NaN and infinity."""
 _NUMBER_PATTERNS: Final = {
     mark: re.compile(
-        rf"[-+]?(?:{_UNSIGNED.replace('{mark}', re.escape(mark))}|{_NOT_FINITE_PATTERN})",
+        rf"[-+]?(?:{_UNSIGNED_PATTERN.replace('{mark}', re.escape(mark))}|{_NOT_FINITE_PATTERN})",
         re.ASCII | re.IGNORECASE,
     )
     for mark in (POINT, COMMA)
 }
-"""Pattern of a number by decimal sign."""
+"""Patterns of numbers, by decimal sign."""
 _GROUPED_PATTERNS: Final = {
     mark: re.compile(rf"[-+]?[1-9]\d{{0,2}}{re.escape(mark)}\d{{3}}") for mark in (POINT, COMMA)
 }
-"""Pattern of a number with exactly three digits after the sign, such as 1.234, by sign."""
+"""Patterns of numbers with exactly three digits after the decimal sign, by decimal sign."""
 _SHORT_INTEGER_PATTERN: Final = re.compile(r"[-+]?\d{1,3}")
 """Pattern of an integer of at most three digits."""
 _DATE_PATTERN: Final = re.compile(
@@ -70,7 +70,7 @@ def number_of(cell: str, decimal_sign: str) -> float:
 
 
 def fast_number_converter(decimal_sign: str) -> Callable[[str], float]:
-    """Return a fast conversion of cells to numbers, which raises ValueError if in doubt."""
+    """Return a fast function from a cell to its number; it raises ValueError if in doubt."""
     return float if decimal_sign == POINT else _number_with_comma
 
 
@@ -93,25 +93,25 @@ class ThousandsCheck:
     and other cells contain numbers below 1000 without the sign.
     """
 
-    def __init__(self, mark: str) -> None:
-        self._mark = mark
+    def __init__(self, decimal_sign: str) -> None:
+        self._decimal_sign = decimal_sign
         self.grouped_line = 0
         self.plain = False
 
     def proves_decimal_sign(self, cell: str, line: int) -> bool:
         """Add a cell and return whether it proves that the sign is a decimal sign."""
         text = cell.strip()
-        if self._mark not in text:
+        if self._decimal_sign not in text:
             self.plain = self.plain or _SHORT_INTEGER_PATTERN.fullmatch(text) is not None
             return False
-        if not _GROUPED_PATTERNS[self._mark].fullmatch(text):
+        if not _GROUPED_PATTERNS[self._decimal_sign].fullmatch(text):
             return True
         self.grouped_line = self.grouped_line or line
         return False
 
 
 def are_split_decimals(rows: Sequence[Sequence[str]]) -> bool:
-    """Return whether cells between commas are parts of numbers with decimal commas (0,025).
+    """Return whether commas in decimal numbers (0,025) were taken as separators of cells.
 
     Every line then has an even number of cells without a decimal sign. The second cell of each pair
     is an unsigned integer. At least one of these has a leading zero, which no integer has.
@@ -144,7 +144,10 @@ def is_comment(row: Sequence[str]) -> bool:
 
 
 def is_row_of_units(row: Sequence[str], columns: Sequence[int]) -> bool:
-    """Return whether a line contains no number and a known unit in one of the columns."""
+    """Return whether a line below the titles is a row of units.
+
+    It is if it contains no number, and a known unit in at least one of the columns.
+    """
     cells = [cell.strip() for cell in row]
     if any(is_any_number(cell) for cell in cells if cell and cell != "1"):
         return False

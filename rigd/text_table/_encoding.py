@@ -15,18 +15,18 @@ _MOST_MARK_BYTES: Final = 4
 """Number of bytes in the longest byte order mark."""
 
 
-def encodings(head: bytes) -> tuple[str, ...]:
+def encodings(first_bytes: bytes) -> tuple[str, ...]:
     """Return the possible encodings of a file from its first bytes, the most probable first.
 
     Most programs without UTF-8 write Windows-1252. Numbers have the same bytes in both encodings;
     only titles and units can differ.
     """
-    marked = _encoding_of_mark(head)
-    if marked is not None:
-        return (marked,)
-    if len(head) > 1 and not head[1] and head[0]:
+    encoding = _encoding_of_mark(first_bytes)
+    if encoding is not None:
+        return (encoding,)
+    if len(first_bytes) > 1 and not first_bytes[1] and first_bytes[0]:
         return ("utf-16-le",)
-    if len(head) > 1 and not head[0] and head[1]:
+    if len(first_bytes) > 1 and not first_bytes[0] and first_bytes[1]:
         return ("utf-16-be",)
     return ("utf-8", "cp1252")
 
@@ -55,6 +55,6 @@ def decode_text(data: bytes) -> str:
     return data.decode(_encoding_of_mark(data[:_MOST_MARK_BYTES]) or "utf-8")
 
 
-def _encoding_of_mark(head: bytes) -> str | None:
+def _encoding_of_mark(first_bytes: bytes) -> str | None:
     """Return the encoding that a byte order mark states; None without a mark."""
-    return next((name for mark, name in _BYTE_ORDER_MARKS if head.startswith(mark)), None)
+    return next((name for mark, name in _BYTE_ORDER_MARKS if first_bytes.startswith(mark)), None)

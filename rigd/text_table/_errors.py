@@ -29,8 +29,8 @@ class TableError(Exception):
 
     def __str__(self) -> str:
         """Return the message with the invalid text from the file."""
-        shown = f" ('{printable(self.cell, _MOST_CELL_CHARACTERS_SHOWN)}')" if self.cell else ""
-        return self.message.replace("{cell}", shown)
+        cell_text = f" ('{printable(self.cell, _MOST_CELL_CHARACTERS_SHOWN)}')" if self.cell else ""
+        return self.message.replace("{cell}", cell_text)
 
     def unquoted(self) -> str:
         """Return the message without any text from the file."""
@@ -51,15 +51,17 @@ class MissingColumnError(TableError):
     """
 
     def __init__(self, name: str, titles: Sequence[str], line: int) -> None:
-        listed = ", ".join(repr(printable(title, 60)) for title in titles[:_MOST_TITLES_SHOWN])
-        more = (
+        listed_titles = ", ".join(
+            repr(printable(title, 60)) for title in titles[:_MOST_TITLES_SHOWN]
+        )
+        more_titles = (
             f" and {len(titles) - _MOST_TITLES_SHOWN} more"
             if len(titles) > _MOST_TITLES_SHOWN
             else ""
         )
-        where = f" (line {line})" if line else ""
+        line_text = f" (line {line})" if line else ""
         super().__init__(
-            f"has no channel '{name}'; it has {listed}{more}{where}."
+            f"has no channel '{name}'; it has {listed_titles}{more_titles}{line_text}."
             if titles
             else f"has no channel '{name}', and no other either."
         )

@@ -8,7 +8,7 @@ from typing import Final
 
 from rigd.text_table._errors import TableError
 
-COMMENT: Final = "Comment"
+COMMENT_TITLE: Final = "Comment"
 """Title of the last column, with comments."""
 _FIRST_LINE_TEXT: Final = "LabVIEW Measurement"
 """Text at the beginning of a LabVIEW measurement file."""
@@ -51,8 +51,8 @@ class LabviewHead:
 
     def start_ns(self, column: int) -> int | None:
         """Return the time of a column's first sample in ns since 1970; None if it is not stated."""
-        first_s = self.number("X0", column)
-        if first_s is None or not isfinite(first_s):
+        offset_s = self.number("X0", column)
+        if offset_s is None or not isfinite(offset_s):
             return None
         day, time = self.text("Date", column), self.text("Time", column).replace(",", ".")
         seconds, _, fraction = time.partition(".")
@@ -63,7 +63,7 @@ class LabviewHead:
             if day or time:
                 return None
             head_ns = 0
-        return head_ns + round(first_s * 1e9)
+        return head_ns + round(offset_s * 1e9)
 
 
 def head_of(lines: Sequence[str]) -> LabviewHead | None:
@@ -74,8 +74,8 @@ def head_of(lines: Sequence[str]) -> LabviewHead | None:
     TableError
         If the last line of the head is missing.
     """
-    first = next((line for line in lines if line.strip()), "")
-    if not first.lstrip('"').startswith(_FIRST_LINE_TEXT):
+    first_line = next((line for line in lines if line.strip()), "")
+    if not first_line.lstrip('"').startswith(_FIRST_LINE_TEXT):
         return None
     end_lines = [
         number
@@ -86,7 +86,7 @@ def head_of(lines: Sequence[str]) -> LabviewHead | None:
         raise TableError(
             f"is a LabVIEW file whose head has no line {_LAST_LINE_TEXT}; export it again."
         )
-    separator = next((character for character in ("\t", ",", ";") if character in first), "\t")
+    separator = next((character for character in ("\t", ",", ";") if character in first_line), "\t")
     channels: dict[str, tuple[str, ...]] = {}
     for line in lines[: end_lines[-1] - 1]:
         key, *cells = (cell.strip().strip('"') for cell in line.rstrip("\r\n").split(separator))

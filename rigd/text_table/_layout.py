@@ -20,10 +20,10 @@ from rigd.text_table._head_rates import stated_rate_hz
 from rigd.text_table._stamps import is_stamp
 from rigd.text_table.titles import bare_unit, is_unit
 
-HEAD_LINES: Final = 500
+MOST_HEAD_LINES: Final = 500
 """Number of lines at the beginning of a file in which the first line of numbers must be."""
 
-BLANKS: Final = " "
+BLANK_SEPARATOR: Final = " "
 """Separator that means any number of blanks."""
 _SEPARATORS: Final = ("\t", ";", ",", "|")
 """Characters that may separate cells, without blanks."""
@@ -32,7 +32,7 @@ _SEPARATOR_NAMES: Final = {
     ";": "semicolons",
     ",": "commas",
     "|": "bars",
-    BLANKS: "blanks",
+    BLANK_SEPARATOR: "blanks",
 }
 """Names of the separators in messages."""
 _EXCEL_SEPARATOR_LINE: Final = "sep="
@@ -78,13 +78,13 @@ class TableLayout:
         Units in the row below the titles; "" for an empty cell. Empty if there is no such row.
     width : int
         Number of cells in each row.
-    optional : int
+    optional_columns : int
         Number of columns at the end that a row may lack, such as the comment in LabVIEW's files.
-    skip : int
+    rows_before_numbers : int
         Number of rows before the first row of numbers.
     columns : tuple of int
         Indices of the requested columns, in the order of the request.
-    first : tuple of str
+    first_cells : tuple of str
         Cells of the first row of numbers.
     labview : LabviewHead or None
         Head of the file if it is a LabVIEW measurement file.
@@ -97,10 +97,10 @@ class TableLayout:
     titles_line: int
     units: tuple[str, ...]
     width: int
-    optional: int
-    skip: int
+    optional_columns: int
+    rows_before_numbers: int
     columns: tuple[int, ...]
-    first: tuple[str, ...]
+    first_cells: tuple[str, ...]
     labview: "_labview.LabviewHead | None" = None
     rate_hz: float | None = None
 
@@ -117,21 +117,21 @@ def stated_separator(first_line: str) -> str | None:
 
 def rows_of_cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of a text: number of the row's first line, and its cells."""
-    if separator == BLANKS:
+    if separator == BLANK_SEPARATOR:
         for number, line in enumerate(lines, 1):
             yield number, line.split()
         return
-    reader = csv.reader(lines, delimiter=separator)
+    csv_reader = csv.reader(lines, delimiter=separator)
     lines_before = 0
-    for row in reader:
+    for row in csv_reader:
         yield lines_before + 1, row
-        lines_before = reader.line_num
+        lines_before = csv_reader.line_num
 
 
-def without_trailing_empty_cells(row: Sequence[str], width: int) -> list[str]:
+def without_trailing_empty_cells(row: Sequence[str], column_count: int) -> list[str]:
     """Return a row without the empty cells that follow the last column."""
     cells = list(row)
-    while len(cells) > width and not cells[-1].strip():
+    while len(cells) > column_count and not cells[-1].strip():
         cells.pop()
     return cells
 
@@ -174,7 +174,7 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
     Parameters
     ----------
     lines : sequence of str
-        First lines with their line ends, at most `HEAD_LINES`.
+        First lines with their line ends, at most `MOST_HEAD_LINES`.
     names : sequence of str
         Titles of the requested columns, or numbers such as ``#3`` for the third column.
 
@@ -191,8 +191,12 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
     labview = _labview.head_of(lines)
     if labview is not None:
         separator_in_file = labview.separator
-    present_separators = [mark for mark in _SEPARATORS if any(mark in line for line in lines)]
-    candidates = [separator_in_file] if separator_in_file else [*present_separators, BLANKS]
+    present_separators = [
+        character for character in _SEPARATORS if any(character in line for line in lines)
+    ]
+    candidates = (
+        [separator_in_file] if separator_in_file else [*present_separators, BLANK_SEPARATOR]
+    )
     failures: list[_NotThisTableError] = []
     best_layout: TableLayout | None = None
     for separator in candidates:
@@ -216,23 +220,25 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
             failures.append(unlikely)
             continue
         if separator == ",":
-            _check_split_decimals(rows[layout.skip :], layout)
-        if best_layout is None or layout.skip < best_layout.skip:
+            _check_split_decimals(rows[layout.rows_before_numbers :], layout)
+        if best_layout is None or layout.rows_before_numbers < best_layout.rows_before_numbers:
             best_layout = layout
     nearest_failure = max(failures, key=lambda failure: failure.rank, default=None)
     # A table that starts late does not count if earlier lines nearly form a table.
     has_earlier_titles = any(
         failed.rank == _RANK_ALL_TITLES
         and best_layout
-        and failed.index < best_layout.skip
-        and failed.separator != BLANKS
+        and failed.index < best_layout.rows_before_numbers
+        and failed.separator != BLANK_SEPARATOR
         for failed in failures
     )
     if best_layout is None or has_earlier_titles:
         assert nearest_failure is not None
         raise nearest_failure.error
     if labview is None:
-        return replace(best_layout, rate_hz=stated_rate_hz(lines[: best_layout.skip]))
+        return replace(
+            best_layout, rate_hz=stated_rate_hz(lines[: best_layout.rows_before_numbers])
+        )
     return best_layout
 
 
@@ -242,11 +248,11 @@ class _NotThisTableError(Exception):
     `rank` states how much of the table was found, and `error` is the error for the user.
     """
 
-    def __init__(self, rank: int, error: TableError, index: int = HEAD_LINES) -> None:
+    def __init__(self, rank: int, error: TableError, row_index: int = MOST_HEAD_LINES) -> None:
         super().__init__()
         self.rank = rank
         self.error = error
-        self.index = index
+        self.index = row_index
         self.separator = ""
 
 
@@ -280,7 +286,7 @@ def _layout_with_separator(
             if layout is not None:
                 return layout
         except _NotThisTableError as unlikely:
-            if unlikely.index == HEAD_LINES:
+            if unlikely.index == MOST_HEAD_LINES:
                 unlikely.index = row.index
             if not requested_titles:
                 raise
@@ -363,17 +369,17 @@ def _layout_below_titles(
             raise _NotThisTableError(
                 _RANK_ALL_TITLES, MissingColumnError(name, titles, titles_row.line)
             )
-    optional = int(labview is not None and titles[-1] == _labview.COMMENT)
+    optional_columns = int(labview is not None and titles[-1] == _labview.COMMENT_TITLE)
     units: Sequence[str] = ()
-    above = rows[index - 1].cells if index else []
-    if len(without_trailing_empty_cells(above, width)) == width and all(
-        is_unit(cell) for cell in above if cell
+    cells_above = rows[index - 1].cells if index else []
+    if len(without_trailing_empty_cells(cells_above, width)) == width and all(
+        is_unit(cell) for cell in cells_above if cell
     ):
-        units = above
+        units = cells_above
     for row in rows[index + 1 : index + 2 + _MOST_LINES_BELOW_TITLES]:
         cells = without_trailing_empty_cells(row.cells, width)
-        fits = width - optional <= len(cells) <= width
-        if fits and _is_data(cells, columns, _next_row(rows, row)):
+        has_table_width = width - optional_columns <= len(cells) <= width
+        if has_table_width and _is_data(cells, columns, _next_row(rows, row)):
             _check_single_column(row.line, cells)
             return TableLayout(
                 separator=separator,
@@ -381,10 +387,10 @@ def _layout_below_titles(
                 titles_line=titles_row.line,
                 units=tuple(bare_unit(cell) for cell in units),
                 width=width,
-                optional=optional,
-                skip=row.index,
+                optional_columns=optional_columns,
+                rows_before_numbers=row.index,
                 columns=tuple(columns),
-                first=tuple(cells),
+                first_cells=tuple(cells),
                 labview=labview,
             )
         if len(cells) <= width and not units and is_row_of_units(cells, columns):
@@ -501,12 +507,12 @@ def _layout_from_numbers(
     ):
         filled_columns = [c for c in columns if c < len(row.cells) and row.cells[c]]
         number_columns = [c for c in filled_columns if is_any_number(row.cells[c])]
-        following = _next_row(rows, row)
+        row_below = _next_row(rows, row)
         if (
             number_columns
             and len(number_columns) < len(filled_columns)
-            and following is not None
-            and len(following.cells) == len(row.cells)
+            and row_below is not None
+            and len(row_below.cells) == len(row.cells)
             and not _is_row_of_column_numbers(rows, index)
         ):
             column = next(c for c in filled_columns if c not in number_columns)
@@ -526,15 +532,15 @@ def _layout_from_numbers(
         units = rows_above.pop().cells
     titles: Sequence[str] = ()
     titles_line = 0
-    optional = 0
+    optional_columns = 0
     if rows_above and (len(_plain_titles(rows_above[-1])) > 1 or len(row.cells) == 1):
         titles, titles_line = _plain_titles(rows_above[-1]), rows_above[-1].line
-        optional = int(labview is not None and titles[-1:] == [_labview.COMMENT])
+        optional_columns = int(labview is not None and titles[-1:] == [_labview.COMMENT_TITLE])
     if titles and not units and all(is_unit(title) for title in titles if title):
         units = titles
     cells = without_trailing_empty_cells(row.cells, len(titles)) if titles else row.cells
-    if titles and not len(titles) - optional <= len(cells) <= len(titles):
-        if separator != BLANKS or len(cells) > len(titles):
+    if titles and not len(titles) - optional_columns <= len(cells) <= len(titles):
+        if separator != BLANK_SEPARATOR or len(cells) > len(titles):
             raise _NotThisTableError(
                 _RANK_ALL_TITLES,
                 TableError(
@@ -552,10 +558,10 @@ def _layout_from_numbers(
         if units
         else (),
         width=width,
-        optional=optional,
-        skip=row.index,
+        optional_columns=optional_columns,
+        rows_before_numbers=row.index,
         columns=tuple(columns),
-        first=tuple(cells),
+        first_cells=tuple(cells),
         labview=labview,
     )
 
@@ -582,11 +588,11 @@ def _is_row_of_column_numbers(rows: Sequence[TextRow], index: int) -> bool:
 def _missing_title_error(rows: Sequence[TextRow], names: Sequence[str]) -> _NotThisTableError:
     """Return the error for a missing title, with the titles of the most probable row."""
 
-    def found(row: TextRow) -> int:
+    def count_found_names(row: TextRow) -> int:
         return sum(name in row.cells or name in _plain_titles(row) for name in names)
 
-    best_row = max(rows, key=found)
-    if found(best_row):
+    best_row = max(rows, key=count_found_names)
+    if count_found_names(best_row):
         titles = _plain_titles(best_row)
         name = next(title for title in names if title not in titles and title not in best_row.cells)
         return _NotThisTableError(

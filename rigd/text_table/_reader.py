@@ -25,7 +25,7 @@ from rigd.text_table._cells import (
 from rigd.text_table._encoding import encodings
 from rigd.text_table._errors import TableError
 from rigd.text_table._layout import (
-    HEAD_LINES,
+    MOST_HEAD_LINES,
     TableLayout,
     comma_in_single_message,
     find_layout,
@@ -38,9 +38,10 @@ from rigd.text_table._layout import (
 from rigd.text_table._stamps import StampReader, is_stamp
 from rigd.text_table.titles import is_title_of_times, stated_unit_of, time_unit_s
 
-MAX_LINE: Final = 65_536
-"""Largest number of characters in a line: enough for hundreds of columns. A longer line is an
-error."""
+MOST_LINE_CHARACTERS: Final = 65_536
+"""Largest number of characters in a line; a longer line is an error.
+
+It is enough for hundreds of columns."""
 
 _ENCODING_BYTES: Final = 4
 """Number of bytes from which the encoding is detected."""
@@ -77,7 +78,7 @@ class TableColumn:
 
 @dataclass(frozen=True, slots=True)
 class TableTimes:
-    """Column of times that was not requested.
+    """Column of times that was read in addition to the requested columns.
 
     Attributes
     ----------
@@ -170,7 +171,7 @@ def _read(stream: BinaryIO, encoding: str, names: Sequence[str], most_rows: int)
     """Read columns of a text with a given encoding."""
     with _open_lines(stream, encoding) as lines:
         layout = find_layout(_first_lines(lines), names)
-    first_cells = [layout.first[column] for column in layout.columns]
+    first_cells = [layout.first_cells[column] for column in layout.columns]
     decimal_sign = (
         COMMA if any(COMMA in cell and not is_stamp(cell) for cell in first_cells) else POINT
     )
@@ -183,14 +184,14 @@ def _read(stream: BinaryIO, encoding: str, names: Sequence[str], most_rows: int)
 
 def _first_lines(lines: Iterator[str]) -> list[str]:
     """Return the first lines of a file, from which the layout is detected."""
-    head: list[str] = []
+    first_lines: list[str] = []
     characters = 0
-    for line in islice(lines, HEAD_LINES):
-        head.append(line)
+    for line in islice(lines, MOST_HEAD_LINES):
+        first_lines.append(line)
         characters += len(line)
         if characters > _MOST_HEAD_CHARACTERS:
             break
-    return head
+    return first_lines
 
 
 class _DecimalCommaError(Exception):
@@ -211,12 +212,12 @@ def _open_lines(stream: BinaryIO, encoding: str) -> Iterator[Iterator[str]]:
 def _lines_of_bounded_length(text: TextIOWrapper) -> Iterator[str]:
     """Yield the lines of a text, and raise TableError for a line that is too long."""
     number = 0
-    while line := text.readline(MAX_LINE + 1):
+    while line := text.readline(MOST_LINE_CHARACTERS + 1):
         number += 1
-        if len(line) > MAX_LINE:
+        if len(line) > MOST_LINE_CHARACTERS:
             raise TableError(
-                f"line {number}: a line of more than {MAX_LINE} characters; a table has one line "
-                "per sample and few channels. Export the session's channels alone."
+                f"line {number}: a line of more than {MOST_LINE_CHARACTERS} characters; a table has "
+                "one line per sample and few channels. Export the session's channels alone."
             )
         yield line
 
@@ -245,10 +246,10 @@ class _NumberRows:
     """Number of interruptions of the numbers by empty lines."""
 
     def __post_init__(self) -> None:
-        first = self.layout.first
-        numeric = (c for c, cell in enumerate(first) if is_any_number(cell))
-        self.stamps = {c: StampReader() for c in self.columns_to_read if is_stamp(first[c])}
-        self.checked_columns = sorted({*self.columns_to_read, *numeric} - {*self.stamps})
+        first_cells = self.layout.first_cells
+        number_columns = (c for c, cell in enumerate(first_cells) if is_any_number(cell))
+        self.stamps = {c: StampReader() for c in self.columns_to_read if is_stamp(first_cells[c])}
+        self.checked_columns = sorted({*self.columns_to_read, *number_columns} - {*self.stamps})
         self.thousands_checks = {
             c: ThousandsCheck(self.decimal_sign)
             for c in self.checked_columns
@@ -265,7 +266,7 @@ class _NumberRows:
         """Return a row with the table's number of cells, or raise TableError."""
         width = self.layout.width
         cells = without_trailing_empty_cells(row, width)
-        if width - self.layout.optional <= len(cells) < width:
+        if width - self.layout.optional_columns <= len(cells) < width:
             cells += [""] * (width - len(cells))
         if len(cells) != width:
             raise TableError(
@@ -334,15 +335,15 @@ class _NumberRows:
     def check_thousands(self) -> None:
         """Raise TableError if a column's decimal signs may be thousands separators."""
         for column, thousands_check in self.thousands_checks.items():
-            doubtful = thousands_check.plain or (
+            is_ambiguous = thousands_check.plain or (
                 self.decimal_sign == COMMA and not self.sign_is_certain
             )
-            if thousands_check.grouped_line and doubtful:
-                sign = "commas" if self.decimal_sign == COMMA else "points"
+            if thousands_check.grouped_line and is_ambiguous:
+                sign_noun = "commas" if self.decimal_sign == COMMA else "points"
                 raise TableError(
-                    f"line {thousands_check.grouped_line}: the {sign} in '{self.title(column)}' "
-                    "may be decimal signs or separators between thousands, as each has three "
-                    "digits behind it; save the file with decimal points and without separators "
+                    f"line {thousands_check.grouped_line}: the {sign_noun} in "
+                    f"'{self.title(column)}' may be decimal signs or separators between thousands, as "
+                    "each has three digits behind it; save the file with decimal points and without separators "
                     "between thousands."
                 )
 
@@ -373,7 +374,9 @@ def _read_columns(
     blank_line = 0
     with _open_lines(stream, encoding) as lines:
         for line, row in islice(
-            rows_of_cells(_skip_excel_separator_line(lines), layout.separator), layout.skip, None
+            rows_of_cells(_skip_excel_separator_line(lines), layout.separator),
+            layout.rows_before_numbers,
+            None,
         ):
             if len(row) != layout.width:
                 if not any(cell.strip() for cell in row) and len(row) < 2:
@@ -427,8 +430,8 @@ def _skip_excel_separator_line(lines: Iterator[str]) -> Iterator[str]:
 
     The empty line preserves the numbers of the following lines.
     """
-    first = next(lines, "")
-    yield "\n" if stated_separator(first) else first
+    first_line = next(lines, "")
+    yield "\n" if stated_separator(first_line) else first_line
     yield from lines
 
 
@@ -444,7 +447,7 @@ def _blank_lines_remark(rows: _NumberRows) -> str:
 
 def _times_column(layout: TableLayout) -> int | None:
     """Return the index of a column of times that is not requested; None if there is none."""
-    for column, cell in enumerate(layout.first):
+    for column, cell in enumerate(layout.first_cells):
         if column in layout.columns or not (is_any_number(cell) or is_stamp(cell)):
             continue
         if is_stamp(cell):
@@ -467,7 +470,7 @@ def _time_unit_s(layout: TableLayout, column: int) -> float | None:
 
 def _unit_in_file(layout: TableLayout, column: int) -> str:
     """Return the unit of a column that the file states; "s" for times of day."""
-    if is_stamp(layout.first[column]):
+    if is_stamp(layout.first_cells[column]):
         return "s"
     in_row = layout.units[column] if layout.units else ""
     in_head = layout.labview.text("Y_Unit_Label", column) if layout.labview else ""

@@ -40,16 +40,16 @@ class StampReader:
         stamp = _STAMP_PATTERN.fullmatch(text)
         if stamp is None:
             raise ValueError(text)
-        first = self._first = self._first or stamp
+        first_stamp = self._first = self._first or stamp
         days = 0
-        if stamp["date"] != first["date"]:
-            days = _day_number(stamp["date"]) - _day_number(first["date"])
+        if stamp["date"] != first_stamp["date"]:
+            days = _day_number(stamp["date"]) - _day_number(first_stamp["date"])
         seconds = (
             days * _SECONDS_PER_DAY
             + _seconds_since_midnight(stamp)
-            - _seconds_since_midnight(first)
+            - _seconds_since_midnight(first_stamp)
         )
-        return (seconds * 10**9 + _nanoseconds(stamp) - _nanoseconds(first)) / 1e9
+        return (seconds * 10**9 + _nanoseconds(stamp) - _nanoseconds(first_stamp)) / 1e9
 
 
 def _seconds_since_midnight(stamp: re.Match[str]) -> int:
