@@ -216,8 +216,8 @@ def _lines_of_bounded_length(text: TextIOWrapper) -> Iterator[str]:
         number += 1
         if len(line) > MOST_LINE_CHARACTERS:
             raise TableError(
-                f"line {number}: a line of more than {MOST_LINE_CHARACTERS} characters; a table has "
-                "one line per sample and few channels. Export the session's channels alone."
+                f"line {number}: a line of more than {MOST_LINE_CHARACTERS} characters; a table "
+                "has one line per sample and few channels. Export the session's channels alone."
             )
         yield line
 
@@ -342,9 +342,9 @@ class _NumberRows:
                 sign_noun = "commas" if self.decimal_sign == COMMA else "points"
                 raise TableError(
                     f"line {thousands_check.grouped_line}: the {sign_noun} in "
-                    f"'{self.title(column)}' may be decimal signs or separators between thousands, as "
-                    "each has three digits behind it; save the file with decimal points and without separators "
-                    "between thousands."
+                    f"'{self.title(column)}' may be decimal signs or separators between thousands, "
+                    "as each has three digits behind it; save the file with decimal points and without "
+                    "separators between thousands."
                 )
 
 
