@@ -40,7 +40,7 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
         lost; ``fits`` and ``modes`` of single sessions; and the tables by the names of their CSV
         files. All numbers are finite.
     """
-    leading = campaign.homogeneity.leading
+    leading_quantity = campaign.homogeneity.leading
     content: dict[str, Any] = finite(
         {
             "versions": versions(),
@@ -59,7 +59,8 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
                 for session in campaign.sessions
             ],
             "one_specimen": campaign.homogeneity.one_specimen,
-            "groups": leading and {"quantity": leading.quantity, "files": leading.groups},
+            "groups": leading_quantity
+            and {"quantity": leading_quantity.quantity, "files": leading_quantity.groups},
             "trials": {
                 "asked": campaign.trials,
                 "done": campaign.trials - len(campaign.lost_trials),
@@ -130,10 +131,10 @@ def _record_fit_json(session: SessionAnalysis, fit: RecordEstimate) -> dict[str,
 
 
 def _std_of_free_parameters(
-    std: Mapping[str, float | None], free: Collection[str]
+    std: Mapping[str, float | None], free_parameters: Collection[str]
 ) -> dict[str, float | None]:
     """Return standard deviations with None for fixed parameters, which were not estimated."""
-    return {name: value if name in free else None for name, value in std.items()}
+    return {name: value if name in free_parameters else None for name, value in std.items()}
 
 
 def _mode_json(session: SessionAnalysis, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from analysis.campaigns.sentences import MIXTURE_MARK, label, probability, title
 from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._frf_figure import line_styles
-from analysis.report._paper_tables import welch_text
+from analysis.report._paper_tables import welch_method_text
 from analysis.report._pooled_tables import exact_condition_text, session_count_text
 from analysis.report.table import NOT_REPORTED_MARK, unreported_parameters
 from rigd.view.frequency_charts import magnitude_db, phase_deg
@@ -278,7 +278,7 @@ def _new_response_figure(
     )
     return style.new_figure(
         width_in, height_in, f"{count} sessions — {heading}",
-        f"coupling torque over motor angle, {welch_text(campaign)}{drawn_sessions_text}  ·  "
+        f"coupling torque over motor angle, {welch_method_text(campaign)}{drawn_sessions_text}  ·  "
         "a nominal model has the mean of the sessions' parameters",
     )  # fmt: skip
 
@@ -315,8 +315,8 @@ def _draw_responses(
 def shown_sessions(campaign: CampaignResult) -> list[SessionAnalysis]:
     """Return the sessions to draw together, evenly spread over the campaign."""
     last = len(campaign.sessions) - 1
-    chosen = np.unique(np.linspace(0, last, _MOST_DRAWN_SESSIONS).round().astype(int))
-    return [campaign.sessions[number] for number in chosen]
+    session_indices = np.unique(np.linspace(0, last, _MOST_DRAWN_SESSIONS).round().astype(int))
+    return [campaign.sessions[number] for number in session_indices]
 
 
 def draw_session(
@@ -325,7 +325,7 @@ def draw_session(
     frequency_hz: NDArray[np.float64],
     response: NDArray[np.complex128],
     columns: int,
-    dots: int,
+    most_dots: int,
     alpha: float = 1.0,
 ) -> Line2D:
     """Draw one session's response in the background and return the line of its magnitude."""
@@ -333,7 +333,7 @@ def draw_session(
         *_decimated_line(frequency_hz, magnitude_db(response), columns), color=SESSION_COLOR,
         linewidth=0.5, alpha=alpha, rasterized=True,
     )  # fmt: skip
-    point_indices = style.log_spaced_indices(frequency_hz, dots)
+    point_indices = style.log_spaced_indices(frequency_hz, most_dots)
     # Dots: a line would run up and down wherever noise wraps the phase.
     phase.plot(
         frequency_hz[point_indices], phase_deg(response[point_indices]), ".", markersize=0.8,
@@ -359,8 +359,8 @@ def _add_legend(figure: Figure, handles: dict[str, Line2D]) -> None:
 
 def _db_limits(campaign: CampaignResult, models: Sequence[NominalModel]) -> tuple[float, float]:
     """Return magnitude limits in dB that contain all sessions' responses and the models' peaks."""
-    measured = [session.response for session in campaign.sessions]
-    return style.db_limits(measured, [model.response for model in models], room_db=3.0)
+    measured_frf = [session.response for session in campaign.sessions]
+    return style.db_limits(measured_frf, [model.response for model in models], headroom_db=3.0)
 
 
 _ROW_HEIGHT_IN: Final = 0.27
@@ -428,8 +428,12 @@ def validation_figure(campaign: CampaignResult) -> Figure:
 
 def _predicted_sessions_text(campaign: CampaignResult) -> str:
     """Return how many of the sessions were predicted, as text."""
-    done = campaign.trials - len(campaign.lost_trials)
-    return f"{done} of {campaign.trials}" if campaign.lost_trials else str(done)
+    completed_trials = campaign.trials - len(campaign.lost_trials)
+    return (
+        f"{completed_trials} of {campaign.trials}"
+        if campaign.lost_trials
+        else str(completed_trials)
+    )
 
 
 def _model_label(_method: str, structure: str, weighting: str | None) -> str:

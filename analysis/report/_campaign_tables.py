@@ -17,7 +17,7 @@ from analysis.report._pooled_tables import (
     pooled_table,
     specimens_table,
     structures_table,
-    tolerant_table,
+    tolerance_table,
     uniform_beam_table,
 )
 from analysis.report.table import ABSENT_TEXT, TEXT_FORMAT, Cell, Column, Entry, Row, Table
@@ -55,7 +55,7 @@ def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     """Return the main tables: pooled modes, parameters with a tolerance, and the pooled fit."""
     candidates = (
         modes_table(campaign),
-        tolerant_table(campaign),
+        tolerance_table(campaign),
         *(pooled_table(campaign, estimate) for estimate in likely_estimates(campaign)[:1]),
     )
     return tuple(table for table in candidates if table.rows)
@@ -71,7 +71,7 @@ def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[st
         structures_table(campaign),
         *([specimens_table(campaign)] if len(campaign.homogeneity.specimens) > 1 else []),
         homogeneity_table(campaign),
-        tolerant_table(campaign),
+        tolerance_table(campaign),
         uniform_beam_table(campaign),
         pooled_table(campaign),
         modes_table(campaign),
@@ -259,8 +259,8 @@ def validation_summary(campaign: CampaignResult) -> Table:
 
 def sessions_table(campaign: CampaignResult) -> Table:
     """Return the table of verdicts on single sessions, then the files that were left out."""
-    leading = campaign.homogeneity.leading
-    groups = leading.groups if leading else ()
+    leading_quantity = campaign.homogeneity.leading
+    groups = leading_quantity.groups if leading_quantity else ()
     group_by_file = {name: f"{index}" for index, names in enumerate(groups, 1) for name in names}
     name = campaign.headline.name if campaign.headline else None
     trials_by_path = {
@@ -303,6 +303,10 @@ def sessions_table(campaign: CampaignResult) -> Table:
         ),
         (
             *((f"Fit and error: of type {name}.",) if trials_by_path else ()),
-            *((f"Group: by the {label(leading.quantity)[0]}.",) if leading and groups else ()),
+            *(
+                (f"Group: by the {label(leading_quantity.quantity)[0]}.",)
+                if leading_quantity and groups
+                else ()
+            ),
         ),
     )  # fmt: skip

@@ -45,13 +45,15 @@ NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
 """Indices of a fit for which there is no measured response to compare with."""
 
 
-def indices_of_record_fit(fit: RecordFit, welch: WelchAnalysis) -> tuple[IndexValues, IndexValues]:
+def indices_of_record_fit(
+    fit: RecordFit, welch_analysis: WelchAnalysis
+) -> tuple[IndexValues, IndexValues]:
     """Return the paper's indices of a whole-record fit, in the band of the Welch fits.
 
     Parameters
     ----------
     fit : RecordFit
-    welch : WelchAnalysis
+    welch_analysis : WelchAnalysis
         Welch fits of the same record.
 
     Returns
@@ -61,32 +63,35 @@ def indices_of_record_fit(fit: RecordFit, welch: WelchAnalysis) -> tuple[IndexVa
         estimate, on the bins of the paper's fits; the second are the distance to the empirical
         transfer function estimate.
     """
-    record = welch.record
+    record = welch_analysis.record
     # The delay stated in the file has been removed from the responses.
     stated_delay_s = record.torque_delay_s - record.angle_delay_s
     plant = replace(fit.plant, delay_s=fit.plant.delay_s - stated_delay_s)
 
-    def indices_against(measured: FrequencyResponse) -> IndexValues:
-        (model,) = ResponseGrid(2j * np.pi * measured.frequency_hz).evaluate(plant, ())
-        return _fit_indices(measured, model)
+    def indices_against(measured_frf: FrequencyResponse) -> IndexValues:
+        (model,) = ResponseGrid(2j * np.pi * measured_frf.frequency_hz).evaluate(plant, ())
+        return _fit_indices(measured_frf, model)
 
-    return indices_against(welch.response), indices_against(welch.whole_record)
+    return indices_against(welch_analysis.response), indices_against(welch_analysis.whole_record)
 
 
-def whole_record_indices(welch: WelchAnalysis) -> list[IndexValues]:
+def whole_record_indices(welch_analysis: WelchAnalysis) -> list[IndexValues]:
     """Return the indices of each Welch fit against the ratio of the whole record's transforms."""
-    measured, record = welch.whole_record, welch.record
-    grid = FrequencyResponseModel(measured.frequency_hz, record.beam, record.tool_inertia_kg_m2)
-    return [_fit_indices(measured, grid.evaluate(model.fit.damping)) for model in welch.models]
+    measured_frf, record = welch_analysis.whole_record, welch_analysis.record
+    grid = FrequencyResponseModel(measured_frf.frequency_hz, record.beam, record.tool_inertia_kg_m2)
+    return [
+        _fit_indices(measured_frf, grid.evaluate(model.fit.damping))
+        for model in welch_analysis.models
+    ]
 
 
-def _fit_indices(measured: FrequencyResponse, model: NDArray[np.complex128]) -> IndexValues:
+def _fit_indices(measured_frf: FrequencyResponse, model: NDArray[np.complex128]) -> IndexValues:
     """Return the paper's indices MSE, WMSE and MD of a model, against a measured response."""
-    is_finite = np.isfinite(measured.response)
+    is_finite = np.isfinite(measured_frf.response)
     if not is_finite.any():
         return NOT_COMPARED
-    omega = 2 * np.pi * measured.frequency_hz[is_finite]
-    return asdict(fit_indices(omega, measured.response[is_finite], model[is_finite]))
+    omega = 2 * np.pi * measured_frf.frequency_hz[is_finite]
+    return asdict(fit_indices(omega, measured_frf.response[is_finite], model[is_finite]))
 
 
 def response_fit_percent(analysis: WelchAnalysis, model: FittedModel) -> float:
@@ -98,17 +103,19 @@ def response_fit_percent(analysis: WelchAnalysis, model: FittedModel) -> float:
     model : FittedModel
         One of the analysis's fitted models.
     """
-    measured = analysis.response.response
-    is_finite = np.isfinite(measured)
-    measured, modelled = measured[is_finite], model.response[is_finite]
-    return nrmse_percent(measured - modelled, measured - measured.mean())
+    measured_frf = analysis.response.response
+    is_finite = np.isfinite(measured_frf)
+    measured_frf, modelled_frf = measured_frf[is_finite], model.response[is_finite]
+    return nrmse_percent(measured_frf - modelled_frf, measured_frf - measured_frf.mean())
 
 
 _CURVE_POINTS = 200
 """Number of frequencies at which the document states response and loss factors."""
 
 
-def record_entries(whole_record: WholeRecord, welch: WelchAnalysis | None) -> dict[str, Any]:
+def record_entries(
+    whole_record: WholeRecord, welch_analysis: WelchAnalysis | None
+) -> dict[str, Any]:
     """Return the entries of the JSON document for one whole record.
 
     Returns
@@ -139,7 +146,9 @@ def record_entries(whole_record: WholeRecord, welch: WelchAnalysis | None) -> di
         for name, fit in whole_record.fits.items()
     ]
     indices = [
-        (NOT_COMPARED, NOT_COMPARED) if welch is None else indices_of_record_fit(fit, welch)
+        (NOT_COMPARED, NOT_COMPARED)
+        if welch_analysis is None
+        else indices_of_record_fit(fit, welch_analysis)
         for _, fit in names
     ]
     return {

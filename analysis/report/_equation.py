@@ -79,7 +79,7 @@ def _function_of(function: str, argument: Formula) -> Formula:
 
 
 def _join(*parts: Formula) -> Formula:
-    """Return several formulas, one after the other."""
+    """Return a formula that consists of several formulas, one after the other."""
     return reduce(Formula.__add__, parts)
 
 
@@ -122,8 +122,8 @@ def _inertial_terms(structure: Structure) -> Formula:
     """Return ``rho/EI s^2 + gamma s^lambda`` with the terms of the structure."""
     ratio = _fraction(_variable("ρ", r"\rho"), _EI)
     # In display size although it is inside a fraction.
-    large = f'<mstyle displaystyle="true">{ratio.mathml}</mstyle>'
-    inertia = Formula(large, ratio.tex.replace("frac", "dfrac")) + _power(_S, _TWO)
+    displayed_ratio = f'<mstyle displaystyle="true">{ratio.mathml}</mstyle>'
+    inertia = Formula(displayed_ratio, ratio.tex.replace("frac", "dfrac")) + _power(_S, _TWO)
     if not structure.external:
         return inertia
     return _join(
@@ -247,7 +247,7 @@ def definitions(whole_record: WholeRecord) -> str:
             "of, below it the beam's, which the parameters are of",
         ]
     names = whole_record.headline.parameters
-    statements += [words for name, words in _EFFECT_DEFINITIONS.items() if name in names]
+    statements += [definition for name, definition in _EFFECT_DEFINITIONS.items() if name in names]
     return f"{'; '.join(statements)}. The numbers are in the table of the parameters."
 
 

@@ -281,7 +281,7 @@ def _type_and_weighting(model: FittedModel) -> tuple[str, str]:
 def peaks_table(analysis: WelchAnalysis) -> Table:
     """Return the table of measured resonance peaks and each model's deviations from them."""
     modes = range(1, len(analysis.peaks) + 1)
-    measured = (
+    measured_values = (
         *(2 * math.pi * p.frequency_hz if p else None for p in analysis.peaks),
         *(p.magnitude_db if p else None for p in analysis.peaks),
     )
@@ -294,7 +294,7 @@ def peaks_table(analysis: WelchAnalysis) -> Table:
             *(Column(f"M{n} (dB)", f"magnitude_{n}_db", ".3f") for n in modes),
         ),
         (
-            ("measured", "", *measured),
+            ("measured", "", *measured_values),
             *(
                 (
                     *_type_and_weighting(model),

@@ -42,9 +42,9 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
     types = settings.types
     columns = min(len(types), 4 if len(types) > 6 else 3)
     rows = -(-len(types) // columns)
-    legend_rows = -(-(len(settings.weightings) + 2) // _LEGEND_COLUMNS)
+    legend_row_count = -(-(len(settings.weightings) + 2) // _LEGEND_COLUMNS)
     width_in = max(3.2 * columns, 8.0)
-    header_height_in = 1.0 + 0.2 * legend_rows
+    header_height_in = 1.0 + 0.2 * legend_row_count
     height_in = 2.9 * rows + 1.0 + header_height_in
     figure = style.new_figure(
         width_in, height_in, "Frequency response by Welch's method",
@@ -60,7 +60,7 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
     # Room for the scores above the highest peak.
     limits_db = style.db_limits(
         [analysis.response.response], [model.response for model in analysis.models],
-        room_db=5.0 * len(settings.weightings),
+        headroom_db=5.0 * len(settings.weightings),
     )  # fmt: skip
     handles: dict[str, Line2D] = {}
     panels = style.type_panels(figure, grid, types, settings.band_hz, limits_db)
@@ -76,12 +76,12 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
 
 
 def line_styles(weightings: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Return the colour and dash of the models with each weighting.
+    """Return colour and dash of the fitted models' lines, by the weighting of the fit.
 
     The paper's two weightings have the styles of the paper.
     """
-    others = cycle(_FURTHER_LINES)
-    return {name: _LINES_BY_WEIGHTING.get(name) or next(others) for name in weightings}
+    further_lines = cycle(_FURTHER_LINES)
+    return {name: _LINES_BY_WEIGHTING.get(name) or next(further_lines) for name in weightings}
 
 
 def _estimate_text(analysis: WelchAnalysis) -> str:
@@ -110,16 +110,16 @@ def _draw_type_panel(
                 whole_record.response, {"color": style.FAINT, "linewidth": 0.6},
             )
         )  # fmt: skip
-    measured = analysis.response
+    measured_frf = analysis.response
     curves.append(
         (
-            f"measured, {ESTIMATOR_WORDS[analysis.settings.estimator]}", measured.frequency_hz,
-            measured.response, {"color": style.GREY, "linewidth": 1.3},
+            f"measured, {ESTIMATOR_WORDS[analysis.settings.estimator]}", measured_frf.frequency_hz,
+            measured_frf.response, {"color": style.GREY, "linewidth": 1.3},
         )
     )  # fmt: skip
     curves.extend(
         (
-            f"model, weights {model.fit.weighting}", measured.frequency_hz, model.response,
+            f"model, weights {model.fit.weighting}", measured_frf.frequency_hz, model.response,
             {**lines[model.fit.weighting], "linewidth": 1.2},
         )
         for model in models

@@ -51,13 +51,13 @@ def paper_tables(campaign: CampaignResult, *, with_paper: bool = False) -> tuple
     if not campaign.nominal:
         return ()
     return (
-        *(make(campaign, with_paper=with_paper) for make in (table3, table4, table5)),
+        *(make_table(campaign, with_paper=with_paper) for make_table in (table3, table4, table5)),
         indices_table(campaign),
         *([bias_table(campaign)] if campaign.welch_biases else []),
     )
 
 
-def welch_text(campaign: CampaignResult) -> str:
+def welch_method_text(campaign: CampaignResult) -> str:
     """Return how the sessions' frequency responses were estimated, as text."""
     settings = campaign.settings
     counts = [session.segments for session in campaign.sessions]
@@ -118,7 +118,7 @@ def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
         ),
         tuple(rows),
         (
-            f"{welch_text(campaign)}; {campaign.settings.band_hz[0]:g} to "
+            f"{welch_method_text(campaign)}; {campaign.settings.band_hz[0]:g} to "
             f"{campaign.settings.band_hz[1]:g} Hz.",
             *(
                 [_AT_LIMIT_NOTE]
@@ -358,7 +358,7 @@ def _cells_with_paper_values(
 
 
 def _paper_entries(paper_values: Mapping[str, float | None]) -> dict[str, Entry]:
-    """Return the paper's numbers as entries for programs."""
+    """Return the paper's numbers as table entries for files; their keys begin with ``paper_``."""
     return {f"paper_{name}": value for name, value in paper_values.items()}
 
 

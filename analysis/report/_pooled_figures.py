@@ -57,34 +57,34 @@ class _PooledFit:
     @classmethod
     def of_campaign(cls, campaign: CampaignResult) -> _PooledFit | None:
         """Return the estimate to which a campaign's parameters belong; None if there is none."""
-        modal, pooled = campaign.modal, campaign.headline
-        tolerant = modal.tolerant if modal else None
-        if tolerant is None:
+        modal_result, pooled = campaign.modal, campaign.headline
+        tolerant_estimate = modal_result.tolerant if modal_result else None
+        if tolerant_estimate is None:
             return None if pooled is None else cls.of(pooled)
-        if tolerant.basis == "none":
+        if tolerant_estimate.basis == "none":
             return None
         return cls(
             structure=STRUCTURES[_FREEST_TYPE],
-            plant=tolerant.plant,
-            parameters=tolerant.values,
-            determined=tuple(tolerant.std),
-            covariance=tolerant.covariance,
+            plant=tolerant_estimate.plant,
+            parameters=tolerant_estimate.values,
+            determined=tuple(tolerant_estimate.std),
+            covariance=tolerant_estimate.covariance,
         )
 
     @classmethod
-    def of(cls, pooled: PooledEstimate) -> _PooledFit:
+    def of(cls, pooled_estimate: PooledEstimate) -> _PooledFit:
         """Return a pooled estimate with its covariance enlarged for the number of sessions."""
         # Bands are 1.96 standard deviations wide, and Student's t of few sessions is more.
-        interval_ratio = student_t_quantile(0.95, pooled.sessions - 1) / NORMAL_95
+        interval_ratio = student_t_quantile(0.95, pooled_estimate.sessions - 1) / NORMAL_95
         return cls(
-            structure=STRUCTURES[pooled.structure],
-            plant=pooled.plant,
+            structure=STRUCTURES[pooled_estimate.structure],
+            plant=pooled_estimate.plant,
             parameters={
-                **pooled.plant.parameters,
-                **{parameter.name: parameter.value for parameter in pooled.parameters},
+                **pooled_estimate.plant.parameters,
+                **{parameter.name: parameter.value for parameter in pooled_estimate.parameters},
             },
-            determined=tuple(parameter.name for parameter in pooled.parameters),
-            covariance=interval_ratio**2 * pooled.covariance,
+            determined=tuple(parameter.name for parameter in pooled_estimate.parameters),
+            covariance=interval_ratio**2 * pooled_estimate.covariance,
         )  # fmt: skip
 
 
@@ -100,18 +100,18 @@ def damping_figure(campaign: CampaignResult) -> Figure:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    pooled = campaign.headline
-    assert pooled is not None
-    modes, sessions = campaign.modes, _session_count_of_modes(campaign, pooled)
+    pooled_estimate = campaign.headline
+    assert pooled_estimate is not None
+    modes, sessions = campaign.modes, _session_count_of_modes(campaign, pooled_estimate)
     width_in, height_in = 11.0, 6.6
     figure = style.new_figure(
         width_in, height_in,
         title(
-            f"Damping against frequency, {session_count_text(pooled, campaign)}",
+            f"Damping against frequency, {session_count_text(pooled_estimate, campaign)}",
             campaign.homogeneity,
         ),
-        f"{_source_of_modes(campaign, pooled)}  ·  curve: half the pooled loss factor between "
-        "the modes  ·  below: each mode, frequency from the pooled mean",
+        f"{_source_of_modes(campaign, pooled_estimate)}  ·  curve: half the pooled loss factor "
+        "between the modes  ·  below: each mode, frequency from the pooled mean",
     )  # fmt: skip
     grid = figure.add_gridspec(
         2, len(modes), left=0.075, right=0.985, top=1 - 0.95 / height_in, bottom=0.5 / height_in,
@@ -120,7 +120,7 @@ def damping_figure(campaign: CampaignResult) -> Figure:
     axes = figure.add_subplot(grid[0, :])
     _draw_loss_factor(axes, modes, _PooledFit.of_campaign(campaign))
     for column, mode in enumerate(modes):
-        session_modes = _session_estimates_of_mode(campaign, pooled, mode)
+        session_modes = _session_estimates_of_mode(campaign, pooled_estimate, mode)
         axes.plot(
             [session_mode.frequency_hz for session_mode in session_modes],
             [100 * session_mode.damping_ratio for session_mode in session_modes], "o",
@@ -146,20 +146,24 @@ def damping_figure(campaign: CampaignResult) -> Figure:
     return figure
 
 
-def _source_of_modes(campaign: CampaignResult, pooled: PooledEstimate) -> str:
+def _source_of_modes(campaign: CampaignResult, pooled_estimate: PooledEstimate) -> str:
     """Return the name of the model to which the modes belong."""
     is_modal = campaign.modal is not None and campaign.modal.leads
-    return "modal model" if is_modal else f"type {pooled.name}"
+    return "modal model" if is_modal else f"type {pooled_estimate.name}"
 
 
-def _session_count_of_modes(campaign: CampaignResult, pooled: PooledEstimate) -> int:
+def _session_count_of_modes(campaign: CampaignResult, pooled_estimate: PooledEstimate) -> int:
     """Return the number of sessions from which the modes are pooled."""
-    modal = campaign.modal
-    return modal.sessions if modal is not None and modal.leads else pooled.sessions
+    modal_result = campaign.modal
+    return (
+        modal_result.sessions
+        if modal_result is not None and modal_result.leads
+        else pooled_estimate.sessions
+    )
 
 
 def _session_estimates_of_mode(
-    campaign: CampaignResult, pooled: PooledEstimate, mode: PooledMode
+    campaign: CampaignResult, pooled_estimate: PooledEstimate, mode: PooledMode
 ) -> list[ModeEstimate]:
     """Return the estimates of one mode from every session, by the pooled mode's model."""
     if mode.source == "modal":
@@ -174,7 +178,7 @@ def _session_estimates_of_mode(
         for session in campaign.sessions
         for estimate in session.record_estimates
         for mode_estimate in estimate.modes
-        if estimate.name == pooled.name and mode_estimate.number == mode.number
+        if estimate.name == pooled_estimate.name and mode_estimate.number == mode.number
     ]
 
 
@@ -183,10 +187,10 @@ def _draw_loss_factor(axes: Axes, modes: Sequence[PooledMode], fit: _PooledFit |
     if len(modes) < 2 or fit is None:
         return
     frequency_hz = np.geomspace(modes[0].frequency_hz, modes[-1].frequency_hz, _LOSS_FACTOR_POINTS)
-    total = loss_factors(fit, frequency_hz).total
-    low, high = total.limits()
+    total_loss_factor = loss_factors(fit, frequency_hz).total
+    low, high = total_loss_factor.limits()
     axes.fill_between(frequency_hz, 50 * low, 50 * high, color=INTERVAL_COLOR, linewidth=0)
-    axes.plot(frequency_hz, 50 * total.value, color=style.BLUE)
+    axes.plot(frequency_hz, 50 * total_loss_factor.value, color=style.BLUE)
 
 
 def _draw_pooled_mode(axes: Axes, mode: PooledMode, sessions: int) -> None:
@@ -243,21 +247,21 @@ def response_figure(campaign: CampaignResult) -> Figure:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    pooled = campaign.headline
-    assert pooled is not None
+    pooled_estimate = campaign.headline
+    assert pooled_estimate is not None
     peaks_hz = [mode.frequency_hz for mode in campaign.modes]
     first_hz, last_hz = _response_band_hz(campaign, peaks_hz)
-    band = response_band(_PooledFit.of(pooled), dense_grid(first_hz, last_hz, peaks_hz))
+    band = response_band(_PooledFit.of(pooled_estimate), dense_grid(first_hz, last_hz, peaks_hz))
     is_measured = bool(campaign.sessions[0].frequency_hz.size)
     width_in, height_in = 11.0, 6.6
     figure = style.new_figure(
         width_in, height_in,
         title(
-            f"Pooled frequency response, {session_count_text(pooled, campaign)}",
+            f"Pooled frequency response, {session_count_text(pooled_estimate, campaign)}",
             campaign.homogeneity,
         ),
         "coupling torque over motor angle, without delays  ·  pooled: type "
-        f"{pooled.name}{exact_condition_text(campaign)}"
+        f"{pooled_estimate.name}{exact_condition_text(campaign)}"
         + (
             f"  ·  sessions: {ESTIMATOR_WORDS[campaign.settings.estimator]}, which a fast sweep "
             "biases at the resonances"
@@ -270,7 +274,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
         height_ratios=(2.4, 1.0, 0.8), hspace=0.1,
     )  # fmt: skip
     magnitude, phase, width = (figure.add_subplot(grid[row]) for row in range(3))
-    lowest_db = _draw_sessions(campaign, pooled, magnitude, phase, band.frequency_hz)
+    lowest_db = _draw_sessions(campaign, pooled_estimate, magnitude, phase, band.frequency_hz)
     low, high = (magnitude_db(limit.astype(complex)) for limit in band.magnitude_limits())
     modelled_db = magnitude_db(band.response)
     magnitude.fill_between(band.frequency_hz, low, high, color=INTERVAL_COLOR, linewidth=0)
@@ -305,7 +309,7 @@ def _response_band_hz(campaign: CampaignResult, peaks_hz: Sequence[float]) -> tu
 
 def _draw_sessions(
     campaign: CampaignResult,
-    pooled: PooledEstimate,
+    pooled_estimate: PooledEstimate,
     magnitude: Axes,
     phase: Axes,
     grid_hz: NDArray[np.float64],
@@ -313,17 +317,19 @@ def _draw_sessions(
     """Draw the response of each session; return the lowest magnitude worth showing, in dB."""
     from analysis.identify import ResponseGrid
 
-    lowest = np.inf
+    lowest_db = np.inf
     for session in shown_sessions(campaign):
         frequency_hz, response = session.frequency_hz, session.response
         if not frequency_hz.size:
             estimates = [
-                estimate for estimate in session.record_estimates if estimate.name == pooled.name
+                estimate
+                for estimate in session.record_estimates
+                if estimate.name == pooled_estimate.name
             ]
             if not estimates:
                 continue
             frequency_hz = grid_hz
             response = ResponseGrid(2j * np.pi * grid_hz).evaluate(estimates[0].plant, ())[0]
-        lowest = min(lowest, float(np.quantile(magnitude_db(response), 0.005)))
+        lowest_db = min(lowest_db, float(np.quantile(magnitude_db(response), 0.005)))
         draw_session(magnitude, phase, frequency_hz, response, _RESPONSE_COLUMNS, _RESPONSE_COLUMNS)
-    return lowest
+    return lowest_db

@@ -58,16 +58,18 @@ def structures_table(campaign: CampaignResult) -> Table:
     Pooled structures come first. The lowest BIC is first in either group.
     """
 
-    def row(ranked: RankedStructure) -> Row:
-        grey: Callable[[Cell], Cell] = (lambda cell: cell) if ranked.pooled else grey_cell
+    def row(ranked_structure: RankedStructure) -> Row:
+        as_grey: Callable[[Cell], Cell] = (
+            (lambda cell: cell) if ranked_structure.pooled else grey_cell
+        )
         return {
-            "type": Cell(ranked.structure, ranked.name),
-            "fitted": grey(count_cell(ranked.fitted)),
-            "sessions": grey(count_cell(ranked.determined)),
-            "bic_above_lowest": grey(number_cell(ranked.bic_above_lowest, ".1f")),
-            "misfit": grey(number_cell(ranked.misfit)),
-            "selected_alone": grey(count_cell(ranked.selected_alone)),
-            "pooled": ranked.pooled,
+            "type": Cell(ranked_structure.structure, ranked_structure.name),
+            "fitted": as_grey(count_cell(ranked_structure.fitted)),
+            "sessions": as_grey(count_cell(ranked_structure.determined)),
+            "bic_above_lowest": as_grey(number_cell(ranked_structure.bic_above_lowest, ".1f")),
+            "misfit": as_grey(number_cell(ranked_structure.misfit)),
+            "selected_alone": as_grey(count_cell(ranked_structure.selected_alone)),
+            "pooled": ranked_structure.pooled,
         }
 
     return Table(
@@ -85,7 +87,11 @@ def structures_table(campaign: CampaignResult) -> Table:
         (
             "Damping and stiffness corrections have one value for all sessions, with a "
             "between-session variance where they differ; settings of the rig have one per session.",
-            *(() if all(ranked.pooled for ranked in campaign.structures) else (NOT_POOLED_NOTE,)),
+            *(
+                ()
+                if all(ranked_structure.pooled for ranked_structure in campaign.structures)
+                else (NOT_POOLED_NOTE,)
+            ),
         ),
         selected=0 if campaign.pooled else None,
     )
@@ -103,8 +109,11 @@ def likely_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
 
 def session_count_text(estimate: PooledEstimate, campaign: CampaignResult) -> str:
     """Return the number of sessions in an estimate as text, such as "7 of 10 sessions"."""
-    every = len(campaign.sessions)
-    return f"{estimate.sessions}{f' of {every}' if estimate.sessions < every else ''} sessions"
+    session_total = len(campaign.sessions)
+    return (
+        f"{estimate.sessions}{f' of {session_total}' if estimate.sessions < session_total else ''}"
+        " sessions"
+    )
 
 
 def exact_condition_text(campaign: CampaignResult) -> str:
@@ -112,13 +121,13 @@ def exact_condition_text(campaign: CampaignResult) -> str:
     return f", {EXACT_CONDITION}" if campaign.modal and campaign.modal.leads else ""
 
 
-def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -> Table:
+def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None = None) -> Table:
     """Return the table of pooled estimates: the reported one first, then by increasing BIC.
 
     Parameters
     ----------
     campaign : CampaignResult
-    only : PooledEstimate, optional
+    only_estimate : PooledEstimate, optional
         Estimate to show. Without it, as in the files, all estimates are in the table, followed by
         the structures that are not pooled, without values.
     """
@@ -131,7 +140,7 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
         Column("one session's std", "within_std"), Column("between sessions", "between_std"),
         Column("p", "p_value"),
     )  # fmt: skip
-    if only is None:
+    if only_estimate is None:
         ordered_estimates = sorted(campaign.pooled, key=lambda item: item is not headline)
         rows = [
             _pooled_row(estimate, parameter, campaign, unsupported_orders)
@@ -154,35 +163,36 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
         ]
         return Table("pooled", "Pooled whole-record estimates", columns, tuple(rows))
     role = "freest structure"
-    if only is not headline:
+    if only_estimate is not headline:
         role = "lowest BIC; valid only if it is the true one"
     role += exact_condition_text(campaign)
     notes = [
         "One session's std: standard deviation that a typical session states. Between sessions: "
         "standard deviation between sessions beyond that (τ). p: p-value of Cochran's Q. "
-        f"Residual {only.misfit:.4g} times the noise."
+        f"Residual {only_estimate.misfit:.4g} times the noise."
     ]
-    if unreported_parameters(STRUCTURES[only.structure], unsupported_orders):
+    if unreported_parameters(STRUCTURES[only_estimate.structure], unsupported_orders):
         notes += footnotes(unsupported_orders)
-    if any(homogeneity.is_mixed(parameter.name) for parameter in only.parameters):
+    if any(homogeneity.is_mixed(parameter.name) for parameter in only_estimate.parameters):
         notes.append(MIXTURE_NOTE)
     return Table(
-        f"pooled_{only.name.replace(', ', '_').replace(' ', '_')}",
+        f"pooled_{only_estimate.name.replace(', ', '_').replace(' ', '_')}",
         title(
-            f"Pooled over {session_count_text(only, campaign)}: type {only.name} ({role})",
+            f"Pooled over {session_count_text(only_estimate, campaign)}: "
+            f"type {only_estimate.name} ({role})",
             homogeneity,
         ),
         columns,
         tuple(
-            _pooled_row(only, parameter, campaign, unsupported_orders)
-            for parameter in only.parameters
+            _pooled_row(only_estimate, parameter, campaign, unsupported_orders)
+            for parameter in only_estimate.parameters
         ),
         tuple(notes),
     )
 
 
 def _pooled_row(
-    pooled: PooledEstimate,
+    pooled_estimate: PooledEstimate,
     parameter: PooledParameter,
     campaign: CampaignResult,
     unsupported_orders: Collection[str],
@@ -194,7 +204,7 @@ def _pooled_row(
         (parameter.value, parameter.std, *parameter.interval), parameter.std, factor
     )
     is_reported = parameter.name not in unreported_parameters(
-        STRUCTURES[pooled.structure], unsupported_orders
+        STRUCTURES[pooled_estimate.structure], unsupported_orders
     )
     if not is_reported:
         value = mark_cell(value)
@@ -206,12 +216,12 @@ def _pooled_row(
             else replace(value, strong=True)
         )
     return {
-        "type": pooled.structure,
-        "name": pooled.name,
-        "headline": pooled is campaign.headline,
-        "sessions": pooled.sessions,
-        "bic": pooled.bic,
-        "misfit": pooled.misfit,
+        "type": pooled_estimate.structure,
+        "name": pooled_estimate.name,
+        "headline": pooled_estimate is campaign.headline,
+        "sessions": pooled_estimate.sessions,
+        "bic": pooled_estimate.bic,
+        "misfit": pooled_estimate.misfit,
         "parameter": Cell(
             parameter.name, with_mark(with_unit(parameter.name), parameter.name, homogeneity)
         ),
@@ -229,21 +239,21 @@ def _pooled_row(
     }
 
 
-def tolerant_table(campaign: CampaignResult) -> Table:
+def tolerance_table(campaign: CampaignResult) -> Table:
     """Return the table of parameters with a tolerance of the geometry.
 
     It also contains the parameters of an exactly uniform beam. It has no rows if no tolerance is
     stated.
     """
-    modal, numbers = campaign.modal, campaign_numbers(campaign)
-    tolerant = modal.tolerant if modal else None
+    modal_result, numbers = campaign.modal, campaign_numbers(campaign)
+    tolerant_estimate = modal_result.tolerant if modal_result else None
     columns = (
         Column("parameter", "parameter", TEXT_FORMAT), Column("value", "value"),
         Column("std", "std", std_of_previous=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
         Column(EXACT_CONDITION, "exact"), Column("std", "exact_std", std_of_previous=True),
     )  # fmt: skip
-    if modal is None or tolerant is None or numbers is None:
+    if modal_result is None or tolerant_estimate is None or numbers is None:
         return Table("parameters", "", columns, ())
     exact_parameters = numbers.exact.parameters if numbers.exact else {}
     rows: list[Row] = []
@@ -265,8 +275,8 @@ def tolerant_table(campaign: CampaignResult) -> Table:
                 "value": mark_cell(value) if quantity.flag else replace(value, strong=True),
                 **dict(zip(("std", "low_95", "high_95"), others, strict=True)),
                 **dict(zip(("exact", "exact_std"), exact_cells, strict=True)),
-                "uniformity_percent": 100 * tolerant.uniformity,
-                "basis": tolerant.basis,
+                "uniformity_percent": 100 * tolerant_estimate.uniformity,
+                "basis": tolerant_estimate.basis,
                 "flag": quantity.flag,
             }
         )
@@ -276,10 +286,10 @@ def tolerant_table(campaign: CampaignResult) -> Table:
     return Table(
         "parameters",
         title(
-            f"Parameters from the modal constants of {modal.sessions} sessions"
+            f"Parameters from the modal constants of {modal_result.sessions} sessions"
             + (
-                f", uniform to {100 * tolerant.uniformity:g} %"
-                if tolerant.basis == "geometry"
+                f", uniform to {100 * tolerant_estimate.uniformity:g} %"
+                if tolerant_estimate.basis == "geometry"
                 else ""
             ),
             campaign.homogeneity,
@@ -296,12 +306,16 @@ def tolerant_table(campaign: CampaignResult) -> Table:
 
 def uniform_beam_table(campaign: CampaignResult) -> Table:
     """Return the table of pooled modal constants and those of the best uniform beam."""
-    modal, homogeneity = campaign.modal, campaign.homogeneity
-    test = modal.uniform_beam if modal else None
+    modal_result, homogeneity = campaign.modal, campaign.homogeneity
+    test = modal_result.uniform_beam if modal_result else None
     rows: list[Row] = []
     for constant in test.as_json()["constants"] if test else ():
-        measured, std, predicted = (constant[key] for key in ("measured", "std", "predicted"))
-        measured_cell, std_cell, predicted_cell = estimate_cells((measured, std, predicted), std)
+        measured_value, std, predicted_value = (
+            constant[key] for key in ("measured", "std", "predicted")
+        )
+        measured_cell, std_cell, predicted_cell = estimate_cells(
+            (measured_value, std, predicted_value), std
+        )
         rows.append(
             {
                 "mode": constant["mode"],
@@ -309,7 +323,7 @@ def uniform_beam_table(campaign: CampaignResult) -> Table:
                 "measured": measured_cell,
                 "std": std_cell,
                 "predicted": predicted_cell,
-                "deviation": (measured - predicted) / std,
+                "deviation": (measured_value - predicted_value) / std,
             }
         )
     return Table(

@@ -82,41 +82,43 @@ _LEAST_RELATIVE_DETAIL: Final = 0.006
 """Least frequency range of a mode's enlarged panel to either side, relative to the frequency."""
 
 
-def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
+def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
     """Draw magnitude, phase and width of the 95 % band, and an enlarged panel of every mode.
 
     Parameters
     ----------
-    measured : FrequencyResponse
+    measured_frf : FrequencyResponse
         Empirical transfer function estimate, which includes the delay between the channels.
     model : ShownModel
     """
-    first_hz, last_hz = float(measured.frequency_hz[0]), float(measured.frequency_hz[-1])
+    first_hz, last_hz = float(measured_frf.frequency_hz[0]), float(measured_frf.frequency_hz[-1])
     visible_modes = [mode for mode in model.modes if first_hz < mode.frequency_hz < last_hz]
     grid_hz = dense_grid(first_hz, last_hz, [mode.frequency_hz for mode in visible_modes])
     band = model.band(grid_hz)
-    measured_without_delay = measured.response * np.exp(
-        2j * np.pi * model.delay_s * measured.frequency_hz
+    measured_without_delay = measured_frf.response * np.exp(
+        2j * np.pi * model.delay_s * measured_frf.frequency_hz
     )
     figure = style.new_figure(9.0, 6.4)
-    count = max(len(visible_modes), 1)
+    panel_count = max(len(visible_modes), 1)
     grid = figure.add_gridspec(
-        2, count, left=0.085, right=0.985, top=0.95, bottom=0.075, hspace=0.27, wspace=0.22,
+        2, panel_count, left=0.085, right=0.985, top=0.95, bottom=0.075, hspace=0.27, wspace=0.22,
         height_ratios=(3.4, 1.0),
     )  # fmt: skip
     upper_grid = grid[0, :].subgridspec(3, 1, height_ratios=(2.4, 1.0, 0.8), hspace=0.1)
-    magnitude, phase, width = (figure.add_subplot(upper_grid[row]) for row in range(3))
-    _draw_magnitude(magnitude, measured.frequency_hz, measured_without_delay, band, _MEASURED_COLOR)
+    magnitude, phase, width_axes = (figure.add_subplot(upper_grid[row]) for row in range(3))
+    _draw_magnitude(
+        magnitude, measured_frf.frequency_hz, measured_without_delay, band, _MEASURED_COLOR
+    )
     modelled_db = magnitude_db(band.response)
     lowest_db = min(
         float(np.quantile(magnitude_db(measured_without_delay), 0.005)),
         float(np.quantile(modelled_db, 0.05)),
     )
     magnitude.set_ylim(lowest_db - 5, float(modelled_db.max()) + 5)
-    point_indices = style.log_spaced_indices(measured.frequency_hz, _RESPONSE_POINTS)
+    point_indices = style.log_spaced_indices(measured_frf.frequency_hz, _RESPONSE_POINTS)
     style.dots(
         phase,
-        measured.frequency_hz[point_indices],
+        measured_frf.frequency_hz[point_indices],
         phase_deg(measured_without_delay[point_indices]),
         size_pt=2.0,
         color=style.GREY,
@@ -124,25 +126,27 @@ def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
     phase.plot(band.frequency_hz, phase_deg(band.response), color=style.BLUE)
     style.response_axes(magnitude, phase)
     half_percent = 100 * NORMAL_95 * band.log_magnitude_std
-    width.plot(band.frequency_hz, half_percent, color=style.BLUE, linewidth=1.0)
-    plain_logarithmic(width, 0.8 * half_percent.min(), 1.4 * half_percent.max())
-    width.set_ylabel("Band (± %)")
-    width.set_xlabel("Frequency (Hz)", labelpad=1)
-    for axes in (magnitude, phase, width):
-        style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width)
+    width_axes.plot(band.frequency_hz, half_percent, color=style.BLUE, linewidth=1.0)
+    plain_logarithmic(width_axes, 0.8 * half_percent.min(), 1.4 * half_percent.max())
+    width_axes.set_ylabel("Band (± %)")
+    width_axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    for axes in (magnitude, phase, width_axes):
+        style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width_axes)
     for column, mode in enumerate(visible_modes):
         detail_axes = figure.add_subplot(grid[1, column])
-        limits = _detail_range_hz(mode, measured.frequency_hz)
-        in_detail = (measured.frequency_hz >= limits[0]) & (measured.frequency_hz <= limits[1])
-        detail_band = model.band(np.linspace(*limits, _DETAIL_POINTS))
+        detail_limits_hz = _detail_range_hz(mode, measured_frf.frequency_hz)
+        in_detail = (measured_frf.frequency_hz >= detail_limits_hz[0]) & (
+            measured_frf.frequency_hz <= detail_limits_hz[1]
+        )
+        detail_band = model.band(np.linspace(*detail_limits_hz, _DETAIL_POINTS))
         _draw_magnitude(
             detail_axes,
-            measured.frequency_hz[in_detail],
+            measured_frf.frequency_hz[in_detail],
             measured_without_delay[in_detail],
             detail_band,
             style.GREY,
         )
-        detail_axes.set_xlim(limits)
+        detail_axes.set_xlim(detail_limits_hz)
         detail_axes.set_ylim(
             style.limits(
                 magnitude_db(measured_without_delay[in_detail]), magnitude_db(detail_band.response)
@@ -163,13 +167,15 @@ def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
 def _draw_magnitude(
     axes: Axes,
     frequency_hz: NDArray[np.float64],
-    measured: NDArray[np.complex128],
+    measured_frf: NDArray[np.complex128],
     band: ResponseBand,
     color: str,
 ) -> None:
     """Draw the measured magnitude, the model's magnitude over it, and the model's 95 % band."""
     axes.plot(
-        *style.envelope(frequency_hz, magnitude_db(measured), _RESPONSE_POINTS, logarithmic=True),
+        *style.envelope(
+            frequency_hz, magnitude_db(measured_frf), _RESPONSE_POINTS, logarithmic=True
+        ),
         color=color, linewidth=0.8, label="measured",
     )  # fmt: skip
     low, high = (magnitude_db(limit.astype(complex)) for limit in band.magnitude_limits())
@@ -327,7 +333,7 @@ def _unsupported_ranges_hz(
     supported_hz: tuple[float, float] | None,
     modes_hz: list[float],
 ) -> list[tuple[float, float]]:
-    """Return the ranges of the axis outside the modes or outside the supported band."""
+    """Return the frequency ranges to shade: outside the modes and outside the supported band."""
     if not modes_hz:
         return [axis_hz]
     first_hz, last_hz = modes_hz[0], modes_hz[-1]
@@ -370,12 +376,12 @@ def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> N
     frequency_hz = analysis.frequency_hz
     density = analysis.noise_nm2_per_hz * np.abs(model.residual) ** 2 / 2
     is_compared = analysis.compared
-    bins = np.flatnonzero(is_compared)
-    blocks = np.array_split(bins, max(bins.size // _BINS_PER_POINT, 1))
+    compared_bins = np.flatnonzero(is_compared)
+    blocks = np.array_split(compared_bins, max(compared_bins.size // _BINS_PER_POINT, 1))
     middle_hz = [float(frequency_hz[block].mean()) for block in blocks]
-    rms = [1e3 * float(np.sqrt(density[block].mean())) for block in blocks]
+    rms_values = [1e3 * float(np.sqrt(density[block].mean())) for block in blocks]
     axes.plot(
-        middle_hz, rms, ".", color=style.VERMILION, markersize=3.5,
+        middle_hz, rms_values, ".", color=style.VERMILION, markersize=3.5,
         label=f"residual, mean of {_BINS_PER_POINT} bins",
     )  # fmt: skip
     point_slice = slice(None, None, max(frequency_hz.size // _NOISE_MODEL_POINTS, 1))
@@ -392,7 +398,7 @@ def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> N
             ha="center", fontsize=7.5, color=style.PURPLE,
         )  # fmt: skip
         axes.axvline(line.frequency_hz, color=style.PURPLE, linewidth=1.0, linestyle=":")
-    plain_logarithmic(axes, min(rms) / 1.6, max(rms) * 1.6)
+    plain_logarithmic(axes, min(rms_values) / 1.6, max(rms_values) * 1.6)
     axes.set_xlim(0.0, frequency_hz[-1])
     axes.set_title("Spectrum (grey: modes)")
     axes.set_ylabel("Torque (mN·m/√Hz)")
@@ -405,7 +411,7 @@ def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: Record
     is_compared = analysis.compared
     power = np.abs(model.residual[is_compared]) ** 2
     cumulative = np.cumsum(power) / power.sum()
-    uniform = np.arange(1, power.size + 1) / power.size
+    uniform_distribution = np.arange(1, power.size + 1) / power.size
     frequency_hz = analysis.frequency_hz[is_compared]
     half_range_percent = 100 * KOLMOGOROV_95 / np.sqrt(power.size)
     axes.axhspan(
@@ -416,7 +422,7 @@ def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: Record
         zorder=0,
         label="95 % of white noise",
     )
-    difference = 100 * (cumulative - uniform)
+    difference = 100 * (cumulative - uniform_distribution)
     axes.plot(*style.envelope(frequency_hz, difference, 400), color=style.VERMILION)
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7)
     for mode in model.modes:
@@ -497,11 +503,11 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     analysis = model.compared(whole_record.analysis)
     modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
     frf, _, loss_name, residual_name, signals_name = FIGURES
-    measured = measured_response(whole_record)
+    measured_frf = measured_response(whole_record)
     delay = "delay" if model.modal is None else "the delay that the file states"
     yield Illustration(
         frf,
-        frf_figure(measured, model),
+        frf_figure(measured_frf, model),
         "Frequency response from motor angle to coupling torque: magnitude and phase, measured "
         f"(empirical transfer function estimate, {delay} removed) and of {model.name}; half-width "
         f"of the model's 95 % band; details of the modes ({modes} Hz). The band is narrower than "
@@ -517,7 +523,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
         loss_figure(
             model.modes,
             beam,
-            (float(measured.frequency_hz[0]), highest_hz),
+            (float(measured_frf.frequency_hz[0]), highest_hz),
             supported_band_hz(whole_record),
             unsupported_orders=whole_record.withheld,
             flagged_modes=flagged_modes,
@@ -572,12 +578,12 @@ def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
 
 def _describe_curve_model(whole_record: WholeRecord) -> str:
     """Return to which beam the curves of the loss factors belong, for the figure's caption."""
-    tolerant = whole_record.headline.tolerant
-    if tolerant is None:
+    tolerant_estimate = whole_record.headline.tolerant
+    if tolerant_estimate is None:
         return f"type {whole_record.headline.name}"
-    if tolerant.basis == "losses":
+    if tolerant_estimate.basis == "losses":
         return "of both dampings by damping ratios and residue phases alone"
-    percent = 100 * tolerant.uniformity
+    percent = 100 * tolerant_estimate.uniformity
     return f"of a beam whose modes lie where those of a uniform one do, to {percent:g} %"
 
 

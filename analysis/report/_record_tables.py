@@ -82,15 +82,17 @@ def modes_table(whole_record: WholeRecord) -> Table:
 def exact_modes_table(whole_record: WholeRecord) -> Table | None:
     """Return the table of a uniform beam's modes; None if no such beam explains the record."""
     headline = whole_record.headline
-    test, exact = headline.uniform_beam, headline.exact
-    if test is None or exact is None or test.status != "passed":
+    test, exact_estimates = headline.uniform_beam, headline.exact
+    if test is None or exact_estimates is None or test.status != "passed":
         return None
-    modes = [mode for mode in exact.modes if mode.shown and mode.damping_ratio.flag is None]
+    modes = [
+        mode for mode in exact_estimates.modes if mode.shown and mode.damping_ratio.flag is None
+    ]
     if not modes:
         return None
     return Table.of(
         "exact_geometry_modes",
-        f"Modes {EXACT_CONDITION}: type {exact.name}",
+        f"Modes {EXACT_CONDITION}: type {exact_estimates.name}",
         _MODE_COLUMNS,
         ((mode.number, *_mode_cells(mode)) for mode in modes),
         ("A condition: narrower than the modal model, and right only if the beam is uniform.",),
@@ -137,8 +139,8 @@ def _inertia_cells(participation: ReportedValue | None) -> tuple[Cell, Cell]:
 
 def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
     """Yield notes on the fit of the modal model and on its resonances that are not the beam's."""
-    modal = whole_record.headline.modal
-    if modal is None:
+    modal_fit = whole_record.headline.modal
+    if modal_fit is None:
         return
     yield (
         "Inertia: effective inertia about the motor axis that takes part in the mode; it is "
@@ -150,7 +152,9 @@ def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
     yield f"Fit of the modal model {percent:.2f} % (NRMSE)."
     further_hz = [
         f"{frequency_hz:.4g}"
-        for mode, frequency_hz in zip(modal.numbers, modal.model.frequencies_hz, strict=True)
+        for mode, frequency_hz in zip(
+            modal_fit.numbers, modal_fit.model.frequencies_hz, strict=True
+        )
         if mode == 0
     ]
     if further_hz:
@@ -225,14 +229,14 @@ def parameter_names(headline: Headline) -> tuple[str, ...]:
 
 def _condition_text(headline: Headline) -> str:
     """Return the condition under which a table's parameters hold, for the table's caption."""
-    tolerant = headline.tolerant
-    if tolerant is None:
+    tolerant_estimate = headline.tolerant
+    if tolerant_estimate is None:
         exact = "" if headline.modal is None else f", {EXACT_CONDITION}"
         return f", type {headline.name}{exact}"
-    if tolerant.basis == "geometry":
-        percent = 100 * tolerant.uniformity
+    if tolerant_estimate.basis == "geometry":
+        percent = 100 * tolerant_estimate.uniformity
         return f" if each mode lies where that of a uniform beam does, to {percent:g} %"
-    if tolerant.basis == "losses":
+    if tolerant_estimate.basis == "losses":
         return " by damping ratios and residue phases alone, whatever the positions of the modes"
     return " of the beam that fits the losses best: it does not explain them"
 
@@ -242,19 +246,19 @@ def exact_geometry_table(whole_record: WholeRecord) -> Table | None:
 
     It is None if the main table shows these parameters.
     """
-    exact = whole_record.headline.exact
-    if exact is None:
+    exact_estimates = whole_record.headline.exact
+    if exact_estimates is None:
         return None
-    flags = [parameter.flag for parameter in exact.parameters.values() if parameter.flag]
+    flags = [parameter.flag for parameter in exact_estimates.parameters.values() if parameter.flag]
     return Table.of(
         "exact_geometry",
-        f"Parameters {EXACT_CONDITION}: type {exact.name}",
+        f"Parameters {EXACT_CONDITION}: type {exact_estimates.name}",
         (*_PARAMETER_COLUMNS, _REMARK_COLUMN),
         (
             _parameter_row(
                 name, parameter, {}, is_fixed=_is_fixed(whole_record.headline, name, exact=True)
             )
-            for name, parameter in exact.parameters.items()
+            for name, parameter in exact_estimates.parameters.items()
         ),
         (
             "A condition, not a result: no antenna is known to be uniform to 1e-5. "
@@ -271,7 +275,7 @@ def _is_fixed(headline: Headline, name: str, *, exact: bool = False) -> bool:
     return name not in headline.fit.interval and name != "drag"
 
 
-def sizes_table(whole_record: WholeRecord) -> Table:
+def loss_factors_table(whole_record: WholeRecord) -> Table:
     """Return the table of internal and external loss factors at their pivot frequencies.
 
     There, the loss factor is not correlated with the order of the damping.
@@ -290,7 +294,7 @@ def sizes_table(whole_record: WholeRecord) -> Table:
             Column("95 % from", "low_95"),
             Column("to", "high_95"),
         ),
-        (_size_row(headline, loss_factor) for loss_factor in headline.sizes),
+        (_loss_factor_row(headline, loss_factor) for loss_factor in headline.sizes),
         (
             "Coefficient and order are strongly correlated; a loss factor is known far better than "
             "either.",
@@ -299,20 +303,20 @@ def sizes_table(whole_record: WholeRecord) -> Table:
     )
 
 
-def condition_table(whole_record: WholeRecord) -> Table | None:
+def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
     """Return the table that compares reported values with a simpler structure's.
 
     It is None if no simpler structure is sufficient.
     """
     headline: Estimates = whole_record.headline.exact or whole_record.headline
-    simpler = headline.simpler
-    if simpler is None:
+    simpler_estimates = headline.simpler
+    if simpler_estimates is None:
         return None
     assumption = " and ".join(
-        f"{QUANTITIES[name][0]} = {at:g}" for name, at in simpler.fixed.items()
+        f"{QUANTITIES[name][0]} = {at:g}" for name, at in simpler_estimates.fixed.items()
     )
     rows: list[tuple[Entry, ...]] = []
-    for name, value in simpler.parameters.items():
+    for name, value in simpler_estimates.parameters.items():
         symbol, _meaning, unit, factor = _parameter_description(name)
         free_value = headline.parameters.get(name)
         rows.append(
@@ -331,7 +335,7 @@ def condition_table(whole_record: WholeRecord) -> Table | None:
         )
     return Table.of(
         "on_condition",
-        f"If {assumption or 'the rest'} is assumed: type {simpler.name} (sufficient)",
+        f"If {assumption or 'the rest'} is assumed: type {simpler_estimates.name} (sufficient)",
         (
             Column("Parameter", "parameter", TEXT_FORMAT),
             Column("Unit", "unit", TEXT_FORMAT),
@@ -411,7 +415,7 @@ def _unit_cell(unit_text: str) -> Cell:
     return Cell(_SI_UNITS.get(unit_text, unit if power.startswith("1e") else unit_text), unit_text)
 
 
-def _size_row(headline: Headline, loss_factor: ReportedLossFactor) -> tuple[Entry, ...]:
+def _loss_factor_row(headline: Headline, loss_factor: ReportedLossFactor) -> tuple[Entry, ...]:
     """Return the table row of the loss factor of internal or external damping."""
     size, internal = loss_factor.size, loss_factor.damping == "internal"
     symbol = "ζ ω^α sin(απ/2)" if internal else "γ ω^λ sin(λπ/2) / (ρ/EI ω²)"
@@ -421,8 +425,8 @@ def _size_row(headline: Headline, loss_factor: ReportedLossFactor) -> tuple[Entr
         flag = flag or headline.parameters["zeta" if internal else "gamma"].flag
         symbol = symbol[0]
     value, std, low, high = _quantity_cells(size)
-    relative = number_cell(None if size.std is None else size.std / size.value, "#.2g", 100.0)
-    further_cells: tuple[Cell, ...] = (std, relative, low, high)
+    relative_std = number_cell(None if size.std is None else size.std / size.value, "#.2g", 100.0)
+    further_cells: tuple[Cell, ...] = (std, relative_std, low, high)
     if flag is not None:
         value, further_cells = mark_cell(value), tuple(map(grey_cell, further_cells))
     return (loss_factor.damping, symbol, loss_factor.omega_rad_s, value, *further_cells)

@@ -173,9 +173,11 @@ def welch_pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
 
 
 def line_keys(weightings: tuple[str, ...]) -> dict[str, Key]:
-    """Return the label and line style of the models with each weighting."""
-    others = cycle(_FURTHER_LINES)
-    keys_by_weighting = {name: _LINES_BY_WEIGHTING.get(name) or next(others) for name in weightings}
+    """Return label and line style of the fitted models, by the weighting of the fit."""
+    further_lines = cycle(_FURTHER_LINES)
+    keys_by_weighting = {
+        name: _LINES_BY_WEIGHTING.get(name) or next(further_lines) for name in weightings
+    }
     return {
         name: Key(f"model, weights {name}", color, width)
         for name, (color, width) in keys_by_weighting.items()
@@ -290,7 +292,7 @@ def _type_page(
         replace(key, label=label_format.format(model.fit.weighting))
         for key, model in zip(keys, models, strict=True)
     ]
-    measured, band_hz = analysis.response.response, analysis.settings.band_hz
+    measured_frf, band_hz = analysis.response.response, analysis.settings.band_hz
     entity = f"{FITS_ENTITY}/type_{name}"
 
     def model_curves(values: Callable[[FittedModel], Real]) -> list[ChartCurve]:
@@ -312,7 +314,7 @@ def _type_page(
                     f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_KEY, *keys
                 ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured)),
+                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured_frf)),
                     *model_curves(lambda model: magnitude_db(model.response)),
                 ),
             ),
@@ -327,7 +329,7 @@ def _type_page(
                     *short_keys,
                 ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
+                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured_frf), dotted=True),
                     *model_curves(lambda model: phase_deg(model.response)),
                 ),
             ),
@@ -342,8 +344,8 @@ def _type_page(
                     *short_keys,
                 ),
                 (
-                    ChartCurve("measured", _MEASURED_MAGNITUDE_KEY, magnitude_db(measured)),
-                    *model_curves(lambda model: magnitude_db(measured - model.response)),
+                    ChartCurve("measured", _MEASURED_MAGNITUDE_KEY, magnitude_db(measured_frf)),
+                    *model_curves(lambda model: magnitude_db(measured_frf - model.response)),
                 ),
             ),
         ),
@@ -363,10 +365,10 @@ def _magnitude_axis(analysis: WelchAnalysis) -> Axis:
     )
 
 
-def _axis_of_responses(measured: Complex, models: Sequence[Complex]) -> Axis:
+def _axis_of_responses(measured_frf: Complex, models: Sequence[Complex]) -> Axis:
     """Return a magnitude axis for measured and modelled responses, and for their residuals."""
-    responses = [measured, *models]
-    measured_and_residuals = [measured, *(measured - model for model in models)]
+    responses = [measured_frf, *models]
+    measured_and_residuals = [measured_frf, *(measured_frf - model for model in models)]
     return magnitude_axis(
         min(float(np.nanquantile(magnitude_db(values), 0.02)) for values in measured_and_residuals),
         max(float(np.nanmax(magnitude_db(values))) for values in responses) + 3.0,
@@ -442,12 +444,12 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
     )
     grid_hz = measured_with_delay.frequency_hz
     delay_phasor = np.exp(2j * np.pi * shown_model.delay_s * grid_hz)
-    measured, model = (
+    measured_frf, model = (
         measured_with_delay.response * delay_phasor,
         shown_model.band(grid_hz).response,
     )
     band_hz = float(grid_hz[0]), float(grid_hz[-1])
-    magnitude = _axis_of_responses(measured, [model])
+    magnitude = _axis_of_responses(measured_frf, [model])
     key, name = Key(shown_model.name.removeprefix("the "), ORANGE, 2.0), "model"
     short_key = replace(key, label="model")
     entity = f"{RECORD_ENTITY}/response"
@@ -461,7 +463,7 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
                     f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_KEY, key
                 ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured)),
+                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured_frf)),
                     ChartCurve(name, key, magnitude_db(model)),
                 ),
             ),
@@ -476,7 +478,7 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
                     short_key,
                 ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
+                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured_frf), dotted=True),
                     ChartCurve(name, key, phase_deg(model)),
                 ),
             ),
@@ -491,8 +493,8 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
                     short_key,
                 ),
                 (
-                    ChartCurve("measured", _MEASURED_MAGNITUDE_KEY, magnitude_db(measured)),
-                    ChartCurve(name, key, magnitude_db(measured - model)),
+                    ChartCurve("measured", _MEASURED_MAGNITUDE_KEY, magnitude_db(measured_frf)),
+                    ChartCurve(name, key, magnitude_db(measured_frf - model)),
                 ),
             ),
         ),
@@ -548,7 +550,7 @@ def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container
     )
 
 
-def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesView:
+def _lines_view(lines: Lines, end_s: float, largest_value: float) -> rrb.TimeSeriesView:
     """Return a plot over the whole session, independent of the current time."""
     import rerun as rr
     import rerun.blueprint as rrb
@@ -568,7 +570,7 @@ def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesVie
         overrides={lines.entity: series_style},
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(lines.names) > 1),
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
-        axis_y=rrb.ScalarAxis(range=_labelled_axis_range(largest)),
+        axis_y=rrb.ScalarAxis(range=_labelled_axis_range(largest_value)),
         time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),
     )
 
@@ -612,7 +614,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     """
     from rigd.view import draw_session
 
-    whole_record, welch, tabs = result.whole, result.welch, []
+    whole_record, welch_analysis, tabs = result.whole, result.welch, []
     if whole_record is not None:
         from analysis.report._signal_figures import torque_in_band
 
@@ -622,8 +624,8 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
             whole_record.band_hz[1],
         )
         tabs.append(record_tab(whole_record, torque))
-    if welch is not None:
-        tabs.append(welch_fits_tab(welch))
+    if welch_analysis is not None:
+        tabs.append(welch_fits_tab(welch_analysis))
     session = read_session(result.record.path)
     timings = read_timings(result.record.path)
     try:
@@ -631,7 +633,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
             draw_session(stream, session, timings, front=tabs)
             if whole_record is not None:
                 draw_record(whole_record, torque, as_text(record_tables(whole_record)), stream)
-            if welch is not None:
-                draw_welch_fits(welch, as_text(analysis_tables(result)), stream)
+            if welch_analysis is not None:
+                draw_welch_fits(welch_analysis, as_text(analysis_tables(result)), stream)
     except RrdFileError as error:
         raise OutputError(str(error)) from None

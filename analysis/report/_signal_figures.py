@@ -128,13 +128,13 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
     angle = Measurement.of_record(record).angle_from_rest(highest_hz)
     all_samples = slice(0, angle.size)
     band_hz = (0.0, highest_hz)
-    modelled, _ = TorquePredictor(
+    modelled_nm, _ = TorquePredictor(
         band_limited(angle, record.rate_hz, band_hz), record.rate_hz, all_samples
     ).torque(plant)
-    offset = float(np.mean(record.torque_nm - modelled))
+    offset = float(np.mean(record.torque_nm - modelled_nm))
     return TorqueInBand(
         measured=band_limited(record.torque_nm - offset, record.rate_hz, band_hz),
-        modelled=modelled,
+        modelled=modelled_nm,
     )
 
 
@@ -235,12 +235,12 @@ def _draw_whole_record(
     pad: float | None = None,
 ) -> None:
     """Draw signals over the whole record."""
-    decimated = tuple(lines)
-    for values, line_style in decimated:
+    decimated_line = tuple(lines)
+    for values, line_style in decimated_line:
         axes.plot(*style.envelope(record.time_s, values), **line_style)
     axes.set_title(title, pad=pad)
     axes.set_ylabel(label)
-    axes.set_ylim(style.limits(*(values for values, _ in decimated)))
+    axes.set_ylim(style.limits(*(values for values, _ in decimated_line)))
     axes.set_xlim(record.time_s[0], record.time_s[-1])
 
 
@@ -328,16 +328,16 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
     record = analysis.record
     model = best_model(analysis)
     band_hz = (0.0, analysis.settings.band_hz[1])
-    modelled = band_limited(modelled_torque(record, model.fit.damping), record.rate_hz, band_hz)
-    measured = band_limited(record.torque_nm, record.rate_hz, band_hz)
-    residual = measured - modelled
-    residual_fraction = _rms(residual) / _rms(measured) if measured.any() else np.nan
+    modelled_nm = band_limited(modelled_torque(record, model.fit.damping), record.rate_hz, band_hz)
+    measured_nm = band_limited(record.torque_nm, record.rate_hz, band_hz)
+    residual_nm = measured_nm - modelled_nm
+    residual_fraction = _rms(residual_nm) / _rms(measured_nm) if measured_nm.any() else np.nan
     figure = style.new_figure(
         13.0, 8.0, "Torque, measured and modelled",
         f"type {model.fit.structure.name}, weights {model.fit.weighting} (lowest WMSE)  ·  exact "
         f"model's response to the measured angle  ·  0 to {band_hz[1]:g} Hz  ·  residual "
-        f"{1e3 * _rms(residual):.3g} mN·m rms, {100 * residual_fraction:.3g} % of the torque, the "
-        "bias of Welch's estimate included",
+        f"{1e3 * _rms(residual_nm):.3g} mN·m rms, {100 * residual_fraction:.3g} % of the torque, "
+        "the bias of Welch's estimate included",
     )  # fmt: skip
     intervals = resonance_intervals(record, len(analysis.peaks))
     grid = figure.add_gridspec(
@@ -346,16 +346,16 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
     )  # fmt: skip
     upper_grid = grid[0, :].subgridspec(2, 1, hspace=0.2, height_ratios=(1.7, 1.0))
     top, residual_axes = figure.add_subplot(upper_grid[0]), figure.add_subplot(upper_grid[1])
-    torque_lines = ((measured, _MEASURED_LINE), (modelled, _MODELLED_LINE))
+    torque_lines = ((measured_nm, _MEASURED_LINE), (modelled_nm, _MODELLED_LINE))
     _draw_whole_record(top, record, torque_lines, "Whole record", _TORQUE_LABEL, pad=14)
     top.tick_params(labelbottom=False)
     _draw_whole_record(
-        residual_axes, record, ((residual, _RESIDUAL_LINE),), _RESIDUAL_TITLE, _TORQUE_LABEL
+        residual_axes, record, ((residual_nm, _RESIDUAL_LINE),), _RESIDUAL_TITLE, _TORQUE_LABEL
     )
     residual_axes.set_xlabel("Time (s)", labelpad=1)
     shade_intervals(top, intervals)
     styles = (_DETAIL_LINES[0], _DETAIL_LINES[1] | {"linewidth": 1.1}, _DETAIL_LINES[2])
-    detail_lines = tuple(zip((measured, modelled, residual), styles, strict=True))
+    detail_lines = tuple(zip((measured_nm, modelled_nm, residual_nm), styles, strict=True))
     for column, interval in enumerate(intervals):
         axes = figure.add_subplot(grid[1, column])
         _draw_detail(axes, record, detail_lines, column, interval, _TORQUE_LABEL)

@@ -373,7 +373,7 @@ def type_panels(
 def db_limits(
     measured: Sequence[NDArray[np.complex128]],
     models: Sequence[NDArray[np.complex128]],
-    room_db: float,
+    headroom_db: float,
 ) -> tuple[float, float]:
     """Return magnitude limits in dB that contain the measured responses and the models' peaks.
 
@@ -383,7 +383,7 @@ def db_limits(
     top_db = float(measured_db.max())
     peaks_db = max(float(magnitude_db(model).max()) for model in models)
     low_db = float(np.quantile(measured_db, 0.002)) - 4.0
-    return low_db, min(max(top_db, peaks_db), top_db + 15.0) + room_db
+    return low_db, min(max(top_db, peaks_db), top_db + 15.0) + headroom_db
 
 
 def legend(

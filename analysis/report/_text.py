@@ -48,16 +48,16 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
         Whether all tables are included. Otherwise the text contains the verdict, the modes and the
         parameters of damping and beam, or without a whole-record fit the Welch fits.
     """
-    whole_record, welch = result.whole, result.welch
+    whole_record, welch_analysis = result.whole, result.welch
     parts: list[RenderableType] = []
     if whole_record is not None:
         parts.append(record_text(whole_record) if verbose else _main_results(whole_record))
-    if welch is not None and verbose:
+    if welch_analysis is not None and verbose:
         parts.append(analysis_tables(result))
-    elif welch is not None:
+    elif welch_analysis is not None:
         if whole_record is None:
             parts.append(Text(result.validity.sentence))
-            parts += spaced((fit_tables.welch_fits_table(welch),))
+            parts += spaced((fit_tables.welch_fits_table(welch_analysis),))
         parts += _warning_lines(result.warnings)
     else:
         # The reason for missing Welch fits was reported before.
@@ -118,17 +118,17 @@ def analysis_tables(result: RecordResult) -> RenderableType:
 
     Orders that the whole record does not support are marked.
     """
-    welch = result.welch
-    assert welch is not None
-    modes = fit_tables.welch_modes_table(welch)
+    welch_analysis = result.welch
+    assert welch_analysis is not None
+    modes = fit_tables.welch_modes_table(welch_analysis)
     return Group(
         Text(f"{result.name}: Welch method (as in the paper)", style="italic"),
         Text(result.validity.sentence),
         "",
         *spaced(
             (
-                fit_tables.welch_fits_table(welch, result.unsupported),
-                fit_tables.peaks_table(welch),
+                fit_tables.welch_fits_table(welch_analysis, result.unsupported),
+                fit_tables.peaks_table(welch_analysis),
                 *(() if modes is None else (modes,)),
             )
         ),
@@ -174,7 +174,7 @@ def record_tables(whole_record: WholeRecord) -> RenderableType:
                     for make_table in (
                         tables.modes_table,
                         tables.exact_modes_table,
-                        tables.sizes_table,
+                        tables.loss_factors_table,
                         tables.parameters_table,
                         tables.exact_geometry_table,
                     )

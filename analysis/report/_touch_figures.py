@@ -86,14 +86,16 @@ def touch_figure(touch: Touch, estimate: TouchEstimate) -> Figure:
 
 def _draw_likelihood(axes: Axes, estimate: TouchEstimate) -> None:
     """Draw the relative log-likelihood of the contact point along the beam."""
-    relative = estimate.log_likelihood - estimate.log_likelihood.max()
-    axes.plot(estimate.positions_m, relative, color=style.BLUE)
+    relative_log_likelihood = estimate.log_likelihood - estimate.log_likelihood.max()
+    axes.plot(estimate.positions_m, relative_log_likelihood, color=style.BLUE)
     if estimate.x_m is not None:
         low, high = estimate.x_m.interval_95
         axes.axvspan(low, high, color=style.SHADE_COLOR, linewidth=0, zorder=0)
         axes.axvline(estimate.x_m.value, color=style.VERMILION, linewidth=0.9)
     axes.set_xlim(0.0, float(estimate.positions_m[-1]))
-    axes.set_ylim(-max(_LEAST_LOG_LIKELIHOOD_RANGE, float(np.quantile(-relative, 0.75))), 2.0)
+    axes.set_ylim(
+        -max(_LEAST_LOG_LIKELIHOOD_RANGE, float(np.quantile(-relative_log_likelihood, 0.75))), 2.0
+    )
     axes.set_title("Point of contact")
     axes.set_ylabel("Relative log-likelihood")
     axes.set_xlabel("Distance from the axis (m)", labelpad=1)
@@ -153,13 +155,13 @@ def map_figure(sessions: Sequence[TouchedSession]) -> Figure:
         1, 1 + has_detail, left=0.075, right=0.97, top=0.93, bottom=0.1, wspace=0.22
     )
     overview = figure.add_subplot(grid[0])
-    _draw_map(overview, sessions, numbered=not has_detail)
+    _draw_map(overview, sessions, with_numbers=not has_detail)
     overview.plot(0.0, 0.0, "o", color=style.INK, markersize=7)
     overview.set_aspect("equal", adjustable="datalim")
     overview.set_title("Seen from above")
     if has_detail:
         detail_axes = figure.add_subplot(grid[1])
-        _draw_map(detail_axes, sessions, numbered=True)
+        _draw_map(detail_axes, sessions, with_numbers=True)
         ends = np.concatenate(
             [t.ends_m for session in sessions for t in session.touches if t.ends_m is not None]
         )
@@ -178,7 +180,7 @@ def map_figure(sessions: Sequence[TouchedSession]) -> Figure:
     return figure
 
 
-def _draw_map(axes: Axes, sessions: Sequence[TouchedSession], *, numbered: bool) -> None:
+def _draw_map(axes: Axes, sessions: Sequence[TouchedSession], *, with_numbers: bool) -> None:
     """Draw the contact points of sessions with their intervals, and the bent antenna."""
     for number, session in enumerate(sessions):
         color = _SESSION_COLORS[number % len(_SESSION_COLORS)]
@@ -195,7 +197,7 @@ def _draw_map(axes: Axes, sessions: Sequence[TouchedSession], *, numbered: bool)
                 markerfacecolor=color if kind_is_known else "white",
             )  # fmt: skip
             name = None
-            if numbered:
+            if with_numbers:
                 axes.annotate(
                     str(touch.number), tuple(touch.point_m), xytext=(5, 4),
                     textcoords="offset points", fontsize=7.5, color=color, clip_on=True,

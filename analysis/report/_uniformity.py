@@ -126,7 +126,7 @@ def uniformity_table(test: UniformBeamTest) -> Table:
     """Return the table of measured and predicted modal constants with their deviations."""
     rows: list[tuple[Entry, ...]] = []
     deviations = _deviations(test).ravel()
-    for index, (measured, std, predicted, deviation) in enumerate(
+    for index, (measured_value, std, predicted_value, deviation) in enumerate(
         zip(
             test.measured.tolist(), test.std.tolist(), test.predicted.tolist(), deviations.tolist(),
             strict=True,
@@ -134,7 +134,7 @@ def uniformity_table(test: UniformBeamTest) -> Table:
     ):  # fmt: skip
         name = CONSTANTS[index % len(CONSTANTS)]
         name_cell = Cell(name, name.removesuffix("_rad").replace("_", " "))
-        cells = estimate_cells((measured, std, predicted), std)
+        cells = estimate_cells((measured_value, std, predicted_value), std)
         rows.append(
             (
                 test.modes[index // len(CONSTANTS)], name_cell, *cells,

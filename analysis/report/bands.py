@@ -158,8 +158,8 @@ def loss_estimate(whole_record: WholeRecord) -> Estimate | None:
         return (
             None if headline.tolerant.basis == "none" else NearlyUniformBeam.of(headline.tolerant)
         )
-    refused = headline.uniform_beam is not None and headline.uniform_beam.status == "refused"
-    return None if refused else whole_record.fit
+    is_refused = headline.uniform_beam is not None and headline.uniform_beam.status == "refused"
+    return None if is_refused else whole_record.fit
 
 
 _GRID_POINTS: Final = 900
@@ -399,15 +399,15 @@ def _loss_with_slopes(
     """
     log_omega, angle = np.log(omega), _QUARTER_TURN * order
     magnitude = coefficient * omega**order
-    in_phase, in_quadrature = magnitude * np.cos(angle), magnitude * np.sin(angle)
-    real_part = 1 + sign * in_phase
+    in_phase_part, quadrature_part = magnitude * np.cos(angle), magnitude * np.sin(angle)
+    real_part = 1 + sign * in_phase_part
     real_part = np.where(real_part > 0, real_part, np.nan)
     by_order = (
         log_omega
         + _QUARTER_TURN / np.tan(angle)
-        - sign * (in_phase * log_omega - _QUARTER_TURN * in_quadrature) / real_part
+        - sign * (in_phase_part * log_omega - _QUARTER_TURN * quadrature_part) / real_part
     )
-    return in_quadrature / real_part, (1 / real_part, by_order)
+    return quadrature_part / real_part, (1 / real_part, by_order)
 
 
 def _rows_by_parameter(fit: Estimate, slopes: dict[str, Real], points: int) -> Real:

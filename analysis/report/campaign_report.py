@@ -15,7 +15,7 @@ from analysis.identify.headline import EXACT_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
 from analysis.report._document import document_text
-from analysis.report._paper_tables import paper_tables, welch_text
+from analysis.report._paper_tables import paper_tables, welch_method_text
 from analysis.report._text import as_text, spaced
 from analysis.report.folder import write_new
 from analysis.report.table import csv_text
@@ -213,7 +213,7 @@ def _collect_facts(campaign: CampaignResult) -> list[Facts]:
         (
             "Welch method (as in the paper)",
             [
-                ("estimator", welch_text(campaign)),
+                ("estimator", welch_method_text(campaign)),
                 ("band", f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz"),
                 ("types", ", ".join(settings.types)),
                 ("weights", ", ".join(settings.weightings)),
@@ -277,9 +277,9 @@ def write_campaign(
     from analysis.report import _style as style
 
     pictures = []
-    for name, (draw, description) in _figures_with_data(campaign).items():
+    for name, (draw_figure, description) in _figures_with_data(campaign).items():
         with style.styled():
-            figure = draw()
+            figure = draw_figure()
             pictures.append(
                 style.save_picture(figure, folder / "figures" / name, description, formats)
             )

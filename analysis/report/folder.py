@@ -88,15 +88,15 @@ def report_folders(
     return folders
 
 
-def check_new_file(path: Path, what: str, *, overwrite: bool = False) -> None:
-    """Raise OutputExistsError if a path exists. The message names the option that requests it.
+def check_new_file(path: Path, message_subject: str, *, overwrite: bool = False) -> None:
+    """Raise OutputExistsError if a path exists and must not be replaced.
 
     Parameters
     ----------
     path : Path
         File to be written.
-    what : str
-        Option that requests the file.
+    message_subject : str
+        Beginning of the error message: the option that requests the file, or "The file".
     overwrite : bool
         Whether the file may exist if it contains results of an analysis in JSON.
     """
@@ -104,12 +104,13 @@ def check_new_file(path: Path, what: str, *, overwrite: bool = False) -> None:
         return
     if not overwrite:
         raise OutputExistsError(
-            f"{what} {path} exists; choose another name or move it away, nothing is overwritten."
+            f"{message_subject} {path} exists; choose another name or move it away, nothing is "
+            "overwritten."
         )
     if not _contains_results(path):
         raise OutputExistsError(
-            f"{what} {path} exists and does not hold results of an analysis, which is all that "
-            "--overwrite replaces; choose another name or move it away."
+            f"{message_subject} {path} exists and does not hold results of an analysis, which is all "
+            "that --overwrite replaces; choose another name or move it away."
         )
 
 

@@ -123,7 +123,7 @@ _METADATA_SHOWN_ELSEWHERE = frozenset(
 
 def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[Facts]:
     """Return the facts on file, record, session and settings."""
-    record, welch = result.record, result.welch
+    record, welch_analysis = result.record, result.welch
     return [
         ("File", _file_facts(record.path)),
         ("Record", _record_facts(record)),
@@ -136,7 +136,11 @@ def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[Fact
             ],
         ),
         ("Whole-record fits", _record_fit_facts(whole_record)),
-        *([] if welch is None else [("Welch method (as in the paper)", _welch_facts(welch))]),
+        *(
+            []
+            if welch_analysis is None
+            else [("Welch method (as in the paper)", _welch_facts(welch_analysis))]
+        ),
     ]
 
 
@@ -288,11 +292,14 @@ def uniformity_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
 
 def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
     """Return the table of modes, those of whole-record fits, and those of the Welch method."""
-    whole_record, welch = result.whole, result.welch
+    whole_record, welch_analysis = result.whole, result.welch
     assert whole_record is not None
-    conditions = tables.exact_geometry_table(whole_record), tables.condition_table(whole_record)
+    conditions = (
+        tables.exact_geometry_table(whole_record),
+        tables.simpler_structure_table(whole_record),
+    )
     record_tables = (
-        tables.sizes_table(whole_record),
+        tables.loss_factors_table(whole_record),
         tables.parameters_table(whole_record),
         *(table for table in conditions if table is not None),
         tables.correlations_table(whole_record),
@@ -301,10 +308,10 @@ def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple
     )
     paper_tables = (
         ()
-        if welch is None
+        if welch_analysis is None
         else (
-            fit_tables.welch_fits_table(welch, whole_record.unsupported),
-            fit_tables.peaks_table(welch),
+            fit_tables.welch_fits_table(welch_analysis, whole_record.unsupported),
+            fit_tables.peaks_table(welch_analysis),
         )
     )
     return tables.modes_table(whole_record), record_tables, paper_tables

@@ -40,9 +40,9 @@ def touches_table(sessions: Sequence[TouchedSession]) -> Table:
     ----------
     sessions : sequence of TouchedSession
     """
-    several = len(sessions) > 1
+    has_several_sessions = len(sessions) > 1
     columns = (
-        Column("Session" if several else "", "session", TEXT_FORMAT),
+        Column("Session" if has_several_sessions else "", "session", TEXT_FORMAT),
         Column("Touch", "number"),
         Column("Time (s)", "time_s"),
         Column("From the axis (m)", "x_m"),
@@ -58,7 +58,7 @@ def touches_table(sessions: Sequence[TouchedSession]) -> Table:
         columns,
         tuple(rows),
         ("± or to: 95 % interval; the angle is that of the motor at the touch.",) if rows else (),
-        grouped=several,
+        grouped=has_several_sessions,
     )
 
 
@@ -110,10 +110,10 @@ def session_lines(session: TouchedSession) -> list[str]:
     count = len(session.touches)
     touch_count_text = "no touch" if count == 0 else "1 touch" if count == 1 else f"{count} touches"
     by = "during the session" if session.found == "loop" else "in the record"
-    detected = f", detected {by}" if count else ""
+    detection_text = f", detected {by}" if count else ""
     validity = f" {session.validity.sentence}" if count else ""
     return [
-        f"{session.path.name}: {touch_count_text}{detected}. "
+        f"{session.path.name}: {touch_count_text}{detection_text}. "
         f"Model: {model_words(session)}.{validity}",
         *(f"Warning: {sentence}" for sentence in session.warnings),
     ]

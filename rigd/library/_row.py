@@ -155,8 +155,8 @@ def read_row(path: Path, quick_look: Path | None, report: Path | None) -> tuple[
         outcome_text = "recording"
     elif summary.problem:
         outcome_text = "incomplete"
-    scheduled = _count_of_key(outcome, "scheduled")
-    ticks = summary.samples if scheduled is None else scheduled
+    scheduled_ticks = _count_of_key(outcome, "scheduled")
+    tick_count = summary.samples if scheduled_ticks is None else scheduled_ticks
     rate_hz = _number_of_key(metadata, "rate_hz") or 0.0
     user_metadata = list(added_metadata(metadata).items())[:_MOST_META_ENTRIES]
     row = SessionRow(
@@ -171,8 +171,10 @@ def read_row(path: Path, quick_look: Path | None, report: Path | None) -> tuple[
         note=_text_of_key(metadata, "note"),
         outcome=outcome_text,
         reason=_text_of_key(outcome, "reason"),
-        duration_s=_finite_or_none(ticks / rate_hz) if ticks is not None and rate_hz > 0 else None,
-        scheduled=scheduled,
+        duration_s=_finite_or_none(tick_count / rate_hz)
+        if tick_count is not None and rate_hz > 0
+        else None,
+        scheduled=scheduled_ticks,
         recorded=summary.samples,
         missed=_count_of_key(outcome, "missed"),
         late=_count_of_key(outcome, "late"),
@@ -198,7 +200,7 @@ def _text_of_key(values: Mapping[str, str], key: str) -> str:
 
 
 def _count_of_key(values: Mapping[str, str], key: str) -> int | None:
-    """Return the count that a key states; None if it is not a count of up to 63 bits."""
+    """Return the non-negative integer that a key states; None if there is none below 2**63."""
     text = values.get(key, "")
     # More digits are not a count and exceed 64 bits.
     is_count = text.isascii() and text.isdigit() and len(text) <= _MOST_COUNT_DIGITS + 1

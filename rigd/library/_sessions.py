@@ -81,13 +81,15 @@ def list_sessions(
     ('session', 'complete', 21.5)
     """
     first_ns, last_ns = _time_ns(since, "since"), _time_ns(until, "until")
-    requested = {
+    requested_values = {
         "specimen": specimen,
         "operator": operator,
         "excitation": excitation,
         "outcome": outcome,
     }
-    required_values = {name: value.strip().casefold() for name, value in requested.items() if value}
+    required_values = {
+        name: value.strip().casefold() for name, value in requested_values.items() if value
+    }
 
     def fits(row: SessionRow) -> bool:
         if any(getattr(row, name).casefold() != value for name, value in required_values.items()):

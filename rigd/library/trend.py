@@ -136,12 +136,12 @@ def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
                 for number, points in enumerate(trends)
                 if number not in assigned
             }
-            nearest = min(distances, key=distances.__getitem__, default=None)
-            if nearest is None or distances[nearest] > _MOST_LOG_FREQUENCY_RATIO:
-                nearest = len(trends)
+            nearest_trend = min(distances, key=distances.__getitem__, default=None)
+            if nearest_trend is None or distances[nearest_trend] > _MOST_LOG_FREQUENCY_RATIO:
+                nearest_trend = len(trends)
                 trends.append([])
-            assigned.add(nearest)
-            points = trends[nearest]
+            assigned.add(nearest_trend)
+            points = trends[nearest_trend]
             changes: tuple[ModeChange | None, ModeChange | None] = (None, None)
             if points:
                 first = points[0]

@@ -134,9 +134,9 @@ def checked_records(
         )
     for name, record in (("input", x), ("output", y)):
         if not np.isfinite(record).all():
-            count = int(np.count_nonzero(~np.isfinite(record)))
+            invalid_count = int(np.count_nonzero(~np.isfinite(record)))
             raise SpectralError(
-                f"{count} of {record.size} samples of the {name} are NaN or infinite; "
+                f"{invalid_count} of {record.size} samples of the {name} are NaN or infinite; "
                 "fill or cut them before estimating a frequency response."
             )
     if not x.any():

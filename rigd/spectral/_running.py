@@ -258,11 +258,13 @@ class Segments:
             self.end = first
             self._available = 0
             self._next = -(-first // self._hop) * self._hop
-        added = 0
-        while added < block.shape[1]:
+        added_count = 0
+        while added_count < block.shape[1]:
             segment_end = self._next + self._length
-            samples = block[:, added : added + min(segment_end - self.end, self._length)]
-            added += samples.shape[1]
+            samples = block[
+                :, added_count : added_count + min(segment_end - self.end, self._length)
+            ]
+            added_count += samples.shape[1]
             self._append(samples)
             if self.end == segment_end:
                 yield self._next, self.newest(self._length)
@@ -352,10 +354,10 @@ def excited_bins(power: NDArray[np.float64], resolution_bins: int) -> NDArray[np
     -------
     ndarray of bool, shape (n,)
     """
-    largest = power.max(initial=0.0)
-    if not largest > 0.0:
+    largest_power = power.max(initial=0.0)
+    if not largest_power > 0.0:
         return np.zeros(power.shape, dtype=np.bool_)
-    without_dips = _is_near_marked(power > LEAST_RELATIVE_POWER * largest, resolution_bins)
+    without_dips = _is_near_marked(power > LEAST_RELATIVE_POWER * largest_power, resolution_bins)
     return ~_is_near_marked(~without_dips, 2 * resolution_bins)
 
 

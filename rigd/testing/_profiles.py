@@ -51,32 +51,40 @@ def write_profile(
     >>> profile.name, profile.control.pole_rad_s
     ('stiff', 60.0)
     """
-    remaining = dict(values or {})
-    name = str(remaining.get("name", load_profile(base).name))
+    remaining_values = dict(values or {})
+    name = str(remaining_values.get("name", load_profile(base).name))
     lines: list[str] = []
     section = ""
     for line in load_profile(base).text.splitlines():
         if line.startswith("["):
-            lines += _added_lines(section, remaining)
+            lines += _added_lines(section, remaining_values)
             section = line.strip("[] ") + "."
         match = _LINE_PATTERN.fullmatch(line)
-        if match and (key := section + match[1]) in remaining:
-            text = json.dumps(remaining.pop(key), ensure_ascii=False)
+        if match and (key := section + match[1]) in remaining_values:
+            text = json.dumps(remaining_values.pop(key), ensure_ascii=False)
             lines.append("".join((match[1], match[2], match[3] or "", text, match[5] or "")))
         else:
             lines.append(line)
-    lines += _added_lines(section, remaining)
-    if remaining:
-        raise ValueError(f"{base} has no section for {', '.join(remaining)}")
+    lines += _added_lines(section, remaining_values)
+    if remaining_values:
+        raise ValueError(f"{base} has no section for {', '.join(remaining_values)}")
     path = folder / f"{name}.toml"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 
-def _added_lines(section: str, remaining: dict[str, Value]) -> list[str]:
-    """Return lines for a section's keys that the base lacks; remove them from `remaining`."""
-    new_keys = [key for key in remaining if section and key.rpartition(".")[0] + "." == section]
-    return [f"{key.removeprefix(section)} = {_value_text(remaining.pop(key))}" for key in new_keys]
+def _added_lines(section: str, remaining_values: dict[str, Value]) -> list[str]:
+    """Return lines for a section's keys that the base lacks.
+
+    The keys are removed from `remaining_values`.
+    """
+    new_keys = [
+        key for key in remaining_values if section and key.rpartition(".")[0] + "." == section
+    ]
+    return [
+        f"{key.removeprefix(section)} = {_value_text(remaining_values.pop(key))}"
+        for key in new_keys
+    ]
 
 
 def _value_text(value: Value) -> str:

@@ -159,13 +159,13 @@ def chirp_signals(
     >>> len(signals.torque_nm), signals.segments["sweep"]
     (13000, (1000, 11000))
     """
-    rest, sweep, ring_down = (
+    rest_samples, sweep_samples, ring_down_samples = (
         round(duration_s * rate_hz) for duration_s in (rest_s, sweep_s, ring_down_s)
     )
-    t = np.arange(sweep) / rate_hz
+    t = np.arange(sweep_samples) / rate_hz
     phase = 2 * np.pi * (start_hz * t + (stop_hz - start_hz) * t**2 / (2 * sweep_s))
-    reference = np.zeros(rest + sweep + ring_down)
-    reference[rest : rest + sweep] = amplitude_rad * np.sin(phase)
+    reference = np.zeros(rest_samples + sweep_samples + ring_down_samples)
+    reference[rest_samples : rest_samples + sweep_samples] = amplitude_rad * np.sin(phase)
 
     def motor(s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         return 1 / (1 + s / _MOTOR_LOOP_POLE_RAD_S) ** 2
@@ -179,9 +179,9 @@ def chirp_signals(
         angle = quantum_rad * np.round(angle / quantum_rad)
     noise = noise_nm * np.random.default_rng(seed).standard_normal(reference.size)
     segments = {
-        "rest": (0, rest),
-        "sweep": (rest, rest + sweep),
-        "ring_down": (rest + sweep, reference.size),
+        "rest": (0, rest_samples),
+        "sweep": (rest_samples, rest_samples + sweep_samples),
+        "ring_down": (rest_samples + sweep_samples, reference.size),
     }
     torque = _causal_response(reference, rate_hz, torque_of) + noise
     metadata = {"excitation": "chirp", "start_hz": repr(start_hz), "stop_hz": repr(stop_hz)}
@@ -276,9 +276,9 @@ def _causal_response(
     The transform is evaluated on ``s = sigma + j omega``, for the values followed by zeros.
     """
     n = len(values)
-    padded = 1 << (4 * n).bit_length()
+    padded_length = 1 << (4 * n).bit_length()
     sigma = rate_hz / n
     decay = np.exp(-sigma * np.arange(n) / rate_hz)
-    s = np.asarray(sigma + 2j * np.pi * np.fft.rfftfreq(padded, 1 / rate_hz), np.complex128)
-    spectrum = np.multiply(np.fft.rfft(values * decay, padded), transfer_of_s(s))
-    return np.asarray(np.fft.irfft(spectrum, padded)[:n] / decay)
+    s = np.asarray(sigma + 2j * np.pi * np.fft.rfftfreq(padded_length, 1 / rate_hz), np.complex128)
+    spectrum = np.multiply(np.fft.rfft(values * decay, padded_length), transfer_of_s(s))
+    return np.asarray(np.fft.irfft(spectrum, padded_length)[:n] / decay)

@@ -188,9 +188,9 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
     separator_in_file = stated_separator(lines[0])
     if separator_in_file:
         lines = ["\n", *lines[1:]]
-    labview = _labview.head_of(lines)
-    if labview is not None:
-        separator_in_file = labview.separator
+    labview_head = _labview.head_of(lines)
+    if labview_head is not None:
+        separator_in_file = labview_head.separator
     present_separators = [
         character for character in _SEPARATORS if any(character in line for line in lines)
     ]
@@ -211,10 +211,10 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
             )
             continue
         nonempty_rows = [row for row in rows if any(row.cells)]
-        if labview is not None:
-            nonempty_rows = [row for row in nonempty_rows if row.line > labview.last_line]
+        if labview_head is not None:
+            nonempty_rows = [row for row in nonempty_rows if row.line > labview_head.last_line]
         try:
-            layout = _layout_with_separator(nonempty_rows, separator, names, labview)
+            layout = _layout_with_separator(nonempty_rows, separator, names, labview_head)
         except _NotThisTableError as unlikely:
             unlikely.separator = separator
             failures.append(unlikely)
@@ -226,16 +226,16 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
     nearest_failure = max(failures, key=lambda failure: failure.rank, default=None)
     # A table that starts late does not count if earlier lines nearly form a table.
     has_earlier_titles = any(
-        failed.rank == _RANK_ALL_TITLES
+        failed_layout.rank == _RANK_ALL_TITLES
         and best_layout
-        and failed.index < best_layout.rows_before_numbers
-        and failed.separator != BLANK_SEPARATOR
-        for failed in failures
+        and failed_layout.index < best_layout.rows_before_numbers
+        and failed_layout.separator != BLANK_SEPARATOR
+        for failed_layout in failures
     )
     if best_layout is None or has_earlier_titles:
         assert nearest_failure is not None
         raise nearest_failure.error
-    if labview is None:
+    if labview_head is None:
         return replace(
             best_layout, rate_hz=stated_rate_hz(lines[: best_layout.rows_before_numbers])
         )
@@ -264,7 +264,7 @@ def _layout_with_separator(
     rows: Sequence[TextRow],
     separator: str,
     names: Sequence[str],
-    labview: "_labview.LabviewHead | None",
+    labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout:
     """Return the layout of the table for a given separator, or raise the most specific error."""
     column_numbers = [_column_number(name) for name in names]
@@ -279,9 +279,9 @@ def _layout_with_separator(
             continue
         try:
             if requested_titles:
-                return _layout_below_titles(rows, index, separator, names, labview)
+                return _layout_below_titles(rows, index, separator, names, labview_head)
             layout = _layout_from_numbers(
-                rows, index, separator, [n or 0 for n in column_numbers], labview
+                rows, index, separator, [n or 0 for n in column_numbers], labview_head
             )
             if layout is not None:
                 return layout
@@ -327,7 +327,7 @@ def _layout_below_titles(
     index: int,
     separator: str,
     names: Sequence[str],
-    labview: "_labview.LabviewHead | None",
+    labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout:
     """Return the layout of the table below a row of titles."""
     titles_row = rows[index]
@@ -369,7 +369,7 @@ def _layout_below_titles(
             raise _NotThisTableError(
                 _RANK_ALL_TITLES, MissingColumnError(name, titles, titles_row.line)
             )
-    optional_columns = int(labview is not None and titles[-1] == _labview.COMMENT_TITLE)
+    optional_columns = int(labview_head is not None and titles[-1] == _labview.COMMENT_TITLE)
     units: Sequence[str] = ()
     cells_above = rows[index - 1].cells if index else []
     if len(without_trailing_empty_cells(cells_above, width)) == width and all(
@@ -391,7 +391,7 @@ def _layout_below_titles(
                 rows_before_numbers=row.index,
                 columns=tuple(columns),
                 first_cells=tuple(cells),
-                labview=labview,
+                labview=labview_head,
             )
         if len(cells) <= width and not units and is_row_of_units(cells, columns):
             units = cells + [""] * (width - len(cells))
@@ -489,7 +489,7 @@ def _layout_from_numbers(
     index: int,
     separator: str,
     numbers: Sequence[int],
-    labview: "_labview.LabviewHead | None",
+    labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout | None:
     """Return the layout if a row is the first one with numbers; None if it is not.
 
@@ -535,7 +535,7 @@ def _layout_from_numbers(
     optional_columns = 0
     if rows_above and (len(_plain_titles(rows_above[-1])) > 1 or len(row.cells) == 1):
         titles, titles_line = _plain_titles(rows_above[-1]), rows_above[-1].line
-        optional_columns = int(labview is not None and titles[-1:] == [_labview.COMMENT_TITLE])
+        optional_columns = int(labview_head is not None and titles[-1:] == [_labview.COMMENT_TITLE])
     if titles and not units and all(is_unit(title) for title in titles if title):
         units = titles
     cells = without_trailing_empty_cells(row.cells, len(titles)) if titles else row.cells
@@ -562,7 +562,7 @@ def _layout_from_numbers(
         rows_before_numbers=row.index,
         columns=tuple(columns),
         first_cells=tuple(cells),
-        labview=labview,
+        labview=labview_head,
     )
 
 

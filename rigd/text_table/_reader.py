@@ -343,8 +343,8 @@ class _NumberRows:
                 raise TableError(
                     f"line {thousands_check.grouped_line}: the {sign_noun} in "
                     f"'{self.title(column)}' may be decimal signs or separators between thousands, "
-                    "as each has three digits behind it; save the file with decimal points and without "
-                    "separators between thousands."
+                    "as each has three digits behind it; save the file with decimal points and "
+                    "without separators between thousands."
                 )
 
 
@@ -366,7 +366,7 @@ def _read_columns(
         for column in columns_to_read
         if column not in rows.stamps
     ]
-    stamps = [(values[column].append, column) for column in rows.stamps]
+    stamp_appends = [(values[column].append, column) for column in rows.stamps]
     pick_cells, convert = itemgetter(*rows.checked_columns), fast_number_converter(decimal_sign)
     has_single_column = len(rows.checked_columns) == 1
     line_numbers = array("I")
@@ -414,7 +414,7 @@ def _read_columns(
                 empty_lines = []
             for append, index in number_appends:
                 append(numbers[index])
-            for append, column in stamps:
+            for append, column in stamp_appends:
                 append(rows.stamp(row, column, line))
             line_numbers.append(line)
             if len(line_numbers) > most_rows:
@@ -510,8 +510,8 @@ def _text_table(
     table_times = None
     if (
         times_column is not None
-        and np.isfinite(stamps := np.frombuffer(values[times_column])).any()
+        and np.isfinite(time_values := np.frombuffer(values[times_column])).any()
     ):
         title = layout.titles[times_column] if layout.titles else f"#{times_column + 1}"
-        table_times = TableTimes(title, stamps, _time_unit_s(layout, times_column))
+        table_times = TableTimes(title, time_values, _time_unit_s(layout, times_column))
     return TextTable(columns, lines, layout.width, table_times, _blank_lines_remark(rows))

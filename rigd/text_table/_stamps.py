@@ -67,9 +67,9 @@ def _nanoseconds(stamp: re.Match[str]) -> int:
 
 def _day_number(day: str | None) -> int:
     """Return the day number of an unambiguous date: year first, or day first with points."""
-    parts = re.split(r"[-/.]", day or "")
-    if len(parts) == 3 and len(parts[0]) == 4:
-        return date(int(parts[0]), int(parts[1]), int(parts[2])).toordinal()
-    if len(parts) == 3 and len(parts[2]) == 4 and "." in (day or ""):
-        return date(int(parts[2]), int(parts[1]), int(parts[0])).toordinal()
+    date_parts = re.split(r"[-/.]", day or "")
+    if len(date_parts) == 3 and len(date_parts[0]) == 4:
+        return date(int(date_parts[0]), int(date_parts[1]), int(date_parts[2])).toordinal()
+    if len(date_parts) == 3 and len(date_parts[2]) == 4 and "." in (day or ""):
+        return date(int(date_parts[2]), int(date_parts[1]), int(date_parts[0])).toordinal()
     raise ValueError(day)

@@ -36,15 +36,15 @@ Real = npt.NDArray[np.float64]
 _TimedLines = tuple[int, npt.NDArray[np.float32]]
 """Time since the start of the session in ns, and the drawn lines at that time, (n, points, 3)."""
 
-ANTENNA: Final = "/antenna"
+ANTENNA_ENTITY: Final = "/antenna"
 """Entity path in Rerun of the 3D drawing of the antenna."""
-BEAM: Final = f"{ANTENNA}/beam"
+BEAM_ENTITY: Final = f"{ANTENNA_ENTITY}/beam"
 """Entity path in Rerun of the beam's lines."""
-TRAIL: Final = f"{ANTENNA}/trail"
+TRAIL_ENTITY: Final = f"{ANTENNA_ENTITY}/trail"
 """Entity path in Rerun of the trail of past beam lines."""
-LABEL: Final = f"{ANTENNA}/label"
+LABEL_ENTITY: Final = f"{ANTENNA_ENTITY}/label"
 """Entity path in Rerun of the label with the tip's deflection."""
-TOUCH: Final = f"{ANTENNA}/touch"
+TOUCH_ENTITY: Final = f"{ANTENNA_ENTITY}/touch"
 """Entity path in Rerun of the drawings of touches."""
 
 ENLARGEMENT: Final = 2.0
@@ -55,7 +55,7 @@ a third of the beam's length. With this factor the motor's motion is visible, an
 stays inside the drawing."""
 _UNSCALED_EXCITATIONS: Final = ("move", "touch")
 """Kinds of excitation (moves and touch searches) that are drawn without enlargement."""
-TITLE: Final = "Antenna"
+VIEW_TITLE: Final = "Antenna"
 """Title of the 3D view in Rerun's window."""
 
 DRAWN_HZ: Final = 20.0
@@ -154,9 +154,9 @@ class Antenna:
         self._shapes += timed_lines
         drawings: list[Drawing] = []
         if timed_lines:
-            drawings.append(partial(_draw_lines, entity=BEAM, moments=timed_lines))
+            drawings.append(partial(_draw_lines, entity=BEAM_ENTITY, moments=timed_lines))
         if labels and self._trail:
-            drawings.append(partial(_draw_lines, entity=TRAIL, moments=self._trail))
+            drawings.append(partial(_draw_lines, entity=TRAIL_ENTITY, moments=self._trail))
             self._trail = []
         return drawings + labels
 
@@ -170,16 +170,17 @@ class Antenna:
             beam line at that time is not stored.
         """
         point, time = touch.get("x_m"), touch.get("time_s")
-        shapes = list(self._shapes)
-        if point is None or time is None or len(shapes) < 2:
+        stored_lines = list(self._shapes)
+        if point is None or time is None or len(stored_lines) < 2:
             return []
         t_ns = round(1e9 * time["value"])
         later_index = next(
-            (i for i in range(1, len(shapes)) if shapes[i][0] >= t_ns), len(shapes) - 1
+            (i for i in range(1, len(stored_lines)) if stored_lines[i][0] >= t_ns),
+            len(stored_lines) - 1,
         )
         (earlier_ns, earlier_lines), (later_ns, later_lines) = (
-            shapes[later_index - 1],
-            shapes[later_index],
+            stored_lines[later_index - 1],
+            stored_lines[later_index],
         )
         if t_ns < earlier_ns:
             return []  # the shape of that time is no longer stored
@@ -239,15 +240,15 @@ def view() -> "rrb.Spatial3DView":
     import rerun.blueprint as rrb
 
     return rrb.Spatial3DView(
-        name=TITLE,
-        origin=ANTENNA,
+        name=VIEW_TITLE,
+        origin=ANTENNA_ENTITY,
         line_grid=rrb.LineGrid3D(spacing=0.1, color=(*GREY, 16)),
         # From above and behind the motor: positive angles turn to the left.
         eye_controls=rrb.EyeControls3D(
             position=(-0.30, 0.0, 1.05), look_target=(0.45, 0.0, -0.03), eye_up=(0.0, 0.0, 1.0)
         ),
         overrides={
-            TRAIL: rrb.VisibleTimeRanges(
+            TRAIL_ENTITY: rrb.VisibleTimeRanges(
                 timeline=TIMELINE,
                 start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S),
                 end=rrb.TimeRangeBoundary.cursor_relative(),
@@ -329,7 +330,7 @@ def _draw_motor(stream: "RecordingStream") -> None:
     import rerun as rr
 
     stream.log(
-        f"{ANTENNA}/mount",
+        f"{ANTENNA_ENTITY}/mount",
         rr.Boxes3D(
             centers=[(0, 0, -0.2)],
             half_sizes=[(0.1, 0.1, 0.01)],
@@ -339,7 +340,7 @@ def _draw_motor(stream: "RecordingStream") -> None:
         static=True,
     )
     stream.log(
-        f"{ANTENNA}/motor",
+        f"{ANTENNA_ENTITY}/motor",
         rr.Cylinders3D(
             centers=[(0, 0, -0.12), (0, 0, -0.035), (0, 0, 0)],
             lengths=[0.14, 0.05, 0.03],
@@ -351,7 +352,7 @@ def _draw_motor(stream: "RecordingStream") -> None:
     )
     axis = [(0, 0, -0.3), (0, 0, 0.2)]
     stream.log(
-        f"{ANTENNA}/axis",
+        f"{ANTENNA_ENTITY}/axis",
         rr.LineStrips3D([axis], colors=[GREY], radii=rr.Radius.ui_points(0.5)),
         static=True,
     )
@@ -366,7 +367,7 @@ def _draw_direction(stream: "RecordingStream") -> None:
     end = arc[-1]
     tangent, out = 0.15 * np.array([end[1], -end[0], 0.0]), 0.075 * end
     stream.log(
-        f"{ANTENNA}/positive",
+        f"{ANTENNA_ENTITY}/positive",
         rr.LineStrips3D(
             [arc, [end + tangent + out, end, end + tangent - out]],
             colors=[GREY],
@@ -375,7 +376,7 @@ def _draw_direction(stream: "RecordingStream") -> None:
         static=True,
     )
     stream.log(
-        f"{ANTENNA}/positive/sign",
+        f"{ANTENNA_ENTITY}/positive/sign",
         rr.Points3D([1.25 * end], radii=[0.0], colors=[GREY], labels=["+"], show_labels=True),
         static=True,
     )
@@ -386,14 +387,14 @@ def _draw_styles(stream: "RecordingStream") -> None:
     import rerun as rr
 
     for entity, colors, widths in (
-        (BEAM, [GREY, SKY_BLUE], [1.0, 2.5]),
-        (TRAIL, [_TRAIL_COLOR], [0.6]),
+        (BEAM_ENTITY, [GREY, SKY_BLUE], [1.0, 2.5]),
+        (TRAIL_ENTITY, [_TRAIL_COLOR], [0.6]),
     ):
         style = rr.LineStrips3D.from_fields(colors=colors, radii=rr.Radius.ui_points(widths))
         stream.log(entity, style, static=True)
     beyond_the_tip = [(1.25, 0.0, 0.0)]
     stream.log(
-        LABEL,
+        LABEL_ENTITY,
         rr.Points3D.from_fields(
             positions=beyond_the_tip, radii=[0.0], colors=[SKY_BLUE], show_labels=True
         ),
@@ -423,7 +424,7 @@ def _draw_label(stream: "RecordingStream", t_ns: int, text: str) -> None:
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    stream.log(LABEL, rr.Points3D.from_fields(labels=[text]))
+    stream.log(LABEL_ENTITY, rr.Points3D.from_fields(labels=[text]))
 
 
 def _draw_touch(
@@ -434,7 +435,7 @@ def _draw_touch(
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     point, ends = points[:1], points[1:]
-    entity = f"{TOUCH}/{number}"
+    entity = f"{TOUCH_ENTITY}/{number}"
     stream.log(
         f"{entity}/interval",
         rr.LineStrips3D([ends], colors=[VERMILION], radii=rr.Radius.ui_points(4.0)),
@@ -445,7 +446,7 @@ def _draw_touch(
     )
     # Only the label of the last touch: labels of several passes would overlap.
     stream.log(
-        f"{TOUCH}/label",
+        f"{TOUCH_ENTITY}/label",
         rr.Points3D(point, radii=[0.0], colors=[VERMILION], labels=[text], show_labels=True),
     )
     stream.log(

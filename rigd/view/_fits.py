@@ -126,7 +126,9 @@ def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
     if fit is None:
         return record
     record["t_ns"] = round(1e9 * fit["duration_s"])
-    stds = {(target["quantity"], target["mode"]): target["asked_std"] for target in _targets(fit)}
+    target_stds = {
+        (target["quantity"], target["mode"]): target["asked_std"] for target in _targets(fit)
+    }
     for mode in fit.get("modes", ()):
         for quantity in _QUANTITIES if mode["mode"] <= modes else ():
             estimate = mode[quantity.key]
@@ -134,7 +136,7 @@ def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
             if not mode.get("shown", True) or estimate["flag"] or interval is None:
                 continue
             value, (low, high) = estimate["value"], interval
-            target_std = stds.get((quantity.name, mode["mode"]))
+            target_std = target_stds.get((quantity.name, mode["mode"]))
             target_half_width = np.nan
             if target_std is not None and estimate["std"]:
                 target_half_width = target_std * (high - low) / (2.0 * estimate["std"])
@@ -186,9 +188,9 @@ def fit_table(fit: Fit | None) -> str:
         paragraphs.append(
             _markdown_table("mode", "frequency (Hz)", "damping ratio (%)", rows=modes)
         )
-    unseen = unseen_modes(fit.get("modes", ()))
-    if unseen:
-        paragraphs.append(f"Not visible so far: {unseen}.")
+    modes_not_visible = unseen_modes(fit.get("modes", ()))
+    if modes_not_visible:
+        paragraphs.append(f"Not visible so far: {modes_not_visible}.")
     if modes:
         validity = Validity.of_document(fit.get("validity"))
         paragraphs.append(validity.sentence)

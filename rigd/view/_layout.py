@@ -22,14 +22,14 @@ from rigd.view import _antenna as antenna
 from rigd.view import banner, plots
 from rigd.view._fits import TABLE as FIT_TABLE
 from rigd.view._fits import fit_source
-from rigd.view._session_info import EVENTS, RECENT_EVENTS, SUMMARY
+from rigd.view._session_info import EVENTS_ENTITY, RECENT_EVENTS_ENTITY, SUMMARY_ENTITY
 from rigd.view.frequency_charts import (
-    COHERENCE,
-    MAGNITUDE,
-    OVERVIEW_MAGNITUDE,
-    PHASE,
+    COHERENCE_ENTITY,
+    MAGNITUDE_ENTITY,
+    OVERVIEW_MAGNITUDE_ENTITY,
+    PHASE_ENTITY,
     SIZES,
-    SPECTROGRAM,
+    SPECTROGRAM_ENTITY,
 )
 from rigd.view.frequency_charts import SIZE as SPECTROGRAM_SIZE
 from rigd.view.plots import TIMELINE, Plot, Source, Values, send_columns
@@ -91,7 +91,7 @@ _THREE_ROW_PLOT_HEIGHT: Final = 189.0
 _FOUR_ROW_PLOT_HEIGHT: Final = 131.0
 """Height of each plot in a tab with four rows of plots, in points."""
 
-OVERVIEW: Final = tuple(
+OVERVIEW_PLOTS: Final = tuple(
     TimeView(plots.SIGNALS, plot, WINDOW_S, _OVERVIEW_PLOT_HEIGHT)
     for plot in (plots.ANGLE, plots.COUPLING_TORQUE)
 )
@@ -119,12 +119,12 @@ HEALTH: Final = (
 """Plots of the tab Health."""
 _LEAST_PLOTS_FOR_TWO_COLUMNS: Final = 4
 """Least number of plots in the tab Health for which they are arranged in two columns."""
-TIME_VIEWS: Final = (*OVERVIEW, *SIGNALS, *HEALTH)
+TIME_VIEWS: Final = (*OVERVIEW_PLOTS, *SIGNALS, *HEALTH)
 """All plots over time of the window, without those of the tab Fit."""
 
-TABS = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
+TAB_TITLES = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
 """Titles of the tabs that every session has, in the window's order."""
-FIT_TAB = "Fit"
+FIT_TAB_TITLE = "Fit"
 """Title of the tab that follows the first one if the session's record is fitted."""
 _FIT_TAB_HEIGHT_PT: Final = 640.0
 """Total height of the plots in the tab Fit, in points."""
@@ -173,10 +173,10 @@ def blueprint(
         _health(absent),
         _events(),
     ]
-    names = list(TABS)
+    names = list(TAB_TITLES)
     if fit_modes is not None:
         contents.insert(1, _fit(fit_modes, with_targets=fit_targets))
-        names.insert(1, FIT_TAB)
+        names.insert(1, FIT_TAB_TITLE)
     for tab, name in zip(contents, names, strict=True):
         tab.name = name
     return rrb.Blueprint(
@@ -195,12 +195,12 @@ def _overview() -> "rrb.Container":
     return rrb.Vertical(
         rrb.Horizontal(state_view, gauges_view, column_shares=[6, 7]),
         rrb.Horizontal(
-            rrb.Vertical(*map(_plot, OVERVIEW)),
+            rrb.Vertical(*map(_plot, OVERVIEW_PLOTS)),
             rrb.Vertical(
                 chart_view(
                     "Frequency response: magnitude of torque over angle",
-                    OVERVIEW_MAGNITUDE,
-                    SIZES[OVERVIEW_MAGNITUDE],
+                    OVERVIEW_MAGNITUDE_ENTITY,
+                    SIZES[OVERVIEW_MAGNITUDE_ENTITY],
                 ),
                 rrb.Horizontal(antenna.view(), _recent_events()),
                 row_shares=[6, 5],
@@ -221,9 +221,9 @@ def _signals() -> "rrb.Container":
 def _frequency_response() -> "rrb.Container":
     """Return the contents of the tab with magnitude, phase and coherence."""
     return chart_page(
-        chart_view("Magnitude of torque over angle", MAGNITUDE, SIZES[MAGNITUDE]),
-        chart_view("Phase of torque over angle", PHASE, SIZES[PHASE]),
-        chart_view("Coherence of angle and torque", COHERENCE, SIZES[COHERENCE]),
+        chart_view("Magnitude of torque over angle", MAGNITUDE_ENTITY, SIZES[MAGNITUDE_ENTITY]),
+        chart_view("Phase of torque over angle", PHASE_ENTITY, SIZES[PHASE_ENTITY]),
+        chart_view("Coherence of angle and torque", COHERENCE_ENTITY, SIZES[COHERENCE_ENTITY]),
     )
 
 
@@ -232,7 +232,7 @@ def _spectrogram() -> "rrb.Container":
     import rerun.blueprint as rrb
 
     return rrb.Vertical(
-        chart_view("Spectrogram of the coupling torque", SPECTROGRAM, SPECTROGRAM_SIZE)
+        chart_view("Spectrogram of the coupling torque", SPECTROGRAM_ENTITY, SPECTROGRAM_SIZE)
     )
 
 
@@ -373,14 +373,14 @@ def _summary() -> "rrb.TextDocumentView":
     """Return the view of the session's summary."""
     import rerun.blueprint as rrb
 
-    return rrb.TextDocumentView(name="Health", origin=SUMMARY)
+    return rrb.TextDocumentView(name="Health", origin=SUMMARY_ENTITY)
 
 
 def _recent_events() -> "rrb.TextDocumentView":
     """Return the view of the newest events: a document, because a log does not wrap its lines."""
     import rerun.blueprint as rrb
 
-    return rrb.TextDocumentView(name="Events, newest first", origin=RECENT_EVENTS)
+    return rrb.TextDocumentView(name="Events, newest first", origin=RECENT_EVENTS_ENTITY)
 
 
 def _log() -> "rrb.TextLogView":
@@ -389,7 +389,7 @@ def _log() -> "rrb.TextLogView":
 
     return rrb.TextLogView(
         name="Events",
-        origin=EVENTS,
+        origin=EVENTS_ENTITY,
         columns=rrb.TextLogColumns(
             timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]
         ),
@@ -495,7 +495,7 @@ class _AxisExtremes:
         self._above: _CurvePoint | None = None
 
     def take(self, t_ns: int, low: float, high: float) -> list[_CurvePoint]:
-        """Add the extremes of a time interval and return the invisible points to send."""
+        """Add the least and greatest value of an interval; return the invisible points to send."""
         if not (math.isfinite(low) and math.isfinite(high)):
             return []
         high_ns, high = self._greatest.take(t_ns, high)

@@ -155,8 +155,8 @@ def nominal_damping(profile: bytes) -> Damping | None:
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
     # Comparisons with NaN are false.
-    plausible = 0.0 <= zeta <= 1.0 and 0.0 <= alpha < 2.0 and 0.0 <= gamma < np.inf
-    return Damping(zeta, alpha, gamma, lambda_) if plausible and 0.0 <= lambda_ < 2.0 else None
+    is_plausible = 0.0 <= zeta <= 1.0 and 0.0 <= alpha < 2.0 and 0.0 <= gamma < np.inf
+    return Damping(zeta, alpha, gamma, lambda_) if is_plausible and 0.0 <= lambda_ < 2.0 else None
 
 
 def draw_session(

@@ -320,12 +320,12 @@ class _BlockBuffer:
         self._parts: list[Records] = []
 
     def add(self, records: Records) -> Records | None:
-        """Add records (n,) and return all that are stored; None until they span a block."""
+        """Add records (n,); return all buffered records once they span a block, else None."""
         if len(records) == 0:
             return None
         self._parts.append(records)
-        span = int(records["tick"][-1]) - int(self._parts[0]["tick"][0]) + 1
-        return self.take_remaining() if span >= self._ticks else None
+        span_ticks = int(records["tick"][-1]) - int(self._parts[0]["tick"][0]) + 1
+        return self.take_remaining() if span_ticks >= self._ticks else None
 
     def take_remaining(self) -> Records | None:
         """Return and remove the records that are still stored; None if there are none."""

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 
-EVENTS: Final = "/events"
+EVENTS_ENTITY: Final = "/events"
 """Entity path in Rerun of the log."""
-RECENT_EVENTS: Final = "/recent_events"
+RECENT_EVENTS_ENTITY: Final = "/recent_events"
 """Entity path in Rerun of the document with the newest events."""
-SUMMARY: Final = "/summary"
+SUMMARY_ENTITY: Final = "/summary"
 """Entity path in Rerun of the table with the session's health."""
 
 _LOG_WIDTH_CHARACTERS: Final = 150
@@ -251,7 +251,7 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
         for paragraph in note.message.splitlines()
         for line in wrap(paragraph, _LOG_WIDTH_CHARACTERS) or [""]
     )
-    stream.log(EVENTS, rr.TextLog(text, level=_RERUN_LEVELS.get(note.level, "INFO")))
+    stream.log(EVENTS_ENTITY, rr.TextLog(text, level=_RERUN_LEVELS.get(note.level, "INFO")))
 
 
 def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -> None:
@@ -264,7 +264,9 @@ def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -
         time_s = max(0.0, 1e-9 * note.t_ns)  # the first event may come a tick early
         symbol = _LEVEL_PREFIXES.get(note.level, "")
         lines.append(f"**{time_s:.1f} s** {symbol}{plain(note.message)}")
-    stream.log(RECENT_EVENTS, rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN))
+    stream.log(
+        RECENT_EVENTS_ENTITY, rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN)
+    )
 
 
 def plain(text: str) -> str:
@@ -312,7 +314,7 @@ def send_summary(
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     text = summary(subject, t_ns, health)
-    stream.log(SUMMARY, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    stream.log(SUMMARY_ENTITY, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
 def _number_text(value: float | None, number_format: str = "{:.0f}") -> str:

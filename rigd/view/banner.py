@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from rigd.view._session_info import Health, Subject
 
-STATE: Final = "/state"
+STATE_ENTITY: Final = "/state"
 """Entity path in Rerun of the text with the session's state."""
-VALUES: Final = "/values"
+GAUGES_ENTITY: Final = "/values"
 """Entity path in Rerun of the gauges."""
 
 
@@ -82,15 +82,15 @@ _COLOR_OF_OUTCOME: Final = {"complete": SKY_BLUE, "stopped": GREY, "fault": RED}
 """Colour of the band after a session, by its outcome."""
 
 
-def preparing(doing: str = "") -> BannerState:
+def preparing(activity: str = "") -> BannerState:
     """Return the banner's state for a session before its record.
 
     Parameters
     ----------
-    doing
+    activity
         Text that says what the session does at present.
     """
-    return BannerState("PREPARING", ORANGE, doing)
+    return BannerState("PREPARING", ORANGE, activity)
 
 
 def ended(outcome: str, reason: str) -> BannerState:
@@ -170,7 +170,7 @@ def send_banner(
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     text = banner(subject, state, t_ns, health)
-    stream.log(STATE, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    stream.log(STATE_ENTITY, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
 # Values with their limits
@@ -299,11 +299,11 @@ def send_values(
             colors += [_EMPTY_BAR_COLOR, color]
             radii += [_BAR_HEIGHT_PT / 2] * 2
     stream.log(
-        f"{VALUES}/bars",
+        f"{GAUGES_ENTITY}/bars",
         rr.LineStrips2D(lines, colors=colors, radii=rr.Radius.ui_points(radii)),
     )
     stream.log(
-        f"{VALUES}/texts",
+        f"{GAUGES_ENTITY}/texts",
         rr.Points2D(
             label_positions, labels=labels, colors=label_colors, radii=0.0, show_labels=True
         ),
@@ -316,10 +316,10 @@ def views() -> "tuple[rrb.View, rrb.View]":
 
     width, height = SIZE
     return (
-        rrb.TextDocumentView(name="State", origin=STATE),
+        rrb.TextDocumentView(name="State", origin=STATE_ENTITY),
         rrb.Spatial2DView(
             name="Values and limits",
-            origin=VALUES,
+            origin=GAUGES_ENTITY,
             visual_bounds=rrb.VisualBounds2D(x_range=[0.0, width], y_range=[0.0, height]),
         ),
     )

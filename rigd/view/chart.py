@@ -427,10 +427,10 @@ def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, 
     multiples = [
         (digit, float(f"{digit}e{exponent}")) for exponent in exponents for digit in range(1, 10)
     ]
-    in_range = [(digit, value) for digit, value in multiples if first <= value <= last]
+    multiples_in_range = [(digit, value) for digit, value in multiples if first <= value <= last]
     return (
-        tuple(value for digit, value in in_range if digit in (1, 2, 5)),
-        tuple(value for digit, value in in_range if digit not in (1, 2, 5)),
+        tuple(value for digit, value in multiples_in_range if digit in (1, 2, 5)),
+        tuple(value for digit, value in multiples_in_range if digit not in (1, 2, 5)),
     )
 
 

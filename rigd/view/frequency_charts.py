@@ -97,19 +97,19 @@ FIRST_HZ: Final = 0.5
 LAST_HZ: Final = 60.0
 """Highest frequency shown: above the third mode and the band of the reference paper's chirp."""
 
-OVERVIEW_MAGNITUDE: Final = "/overview/magnitude"
+OVERVIEW_MAGNITUDE_ENTITY: Final = "/overview/magnitude"
 """Entity path in Rerun of the magnitude's chart in the tab Overview."""
-MAGNITUDE: Final = "/frequency_response/magnitude"
+MAGNITUDE_ENTITY: Final = "/frequency_response/magnitude"
 """Entity path in Rerun of the magnitude's chart."""
-PHASE: Final = "/frequency_response/phase"
+PHASE_ENTITY: Final = "/frequency_response/phase"
 """Entity path in Rerun of the phase's chart."""
-COHERENCE: Final = "/frequency_response/coherence"
+COHERENCE_ENTITY: Final = "/frequency_response/coherence"
 """Entity path in Rerun of the coherence's chart."""
 SIZES: Final = {
-    OVERVIEW_MAGNITUDE: (690.0, 285.0),
-    MAGNITUDE: (1280.0, 374.0),
-    PHASE: (640.0, 274.0),
-    COHERENCE: (640.0, 274.0),
+    OVERVIEW_MAGNITUDE_ENTITY: (690.0, 285.0),
+    MAGNITUDE_ENTITY: (1280.0, 374.0),
+    PHASE_ENTITY: (640.0, 274.0),
+    COHERENCE_ENTITY: (640.0, 274.0),
 }
 """Width and height of each chart's canvas in points, by entity path."""
 
@@ -228,13 +228,15 @@ class ResponseCharts:
                     _chart(entity, axis, *keys), MEASURED_KEY, _magnitude_db, magnitude_db
                 )
                 for entity, axis in (
-                    (OVERVIEW_MAGNITUDE, axis_with_short_title),
-                    (MAGNITUDE, magnitude),
+                    (OVERVIEW_MAGNITUDE_ENTITY, axis_with_short_title),
+                    (MAGNITUDE_ENTITY, magnitude),
                 )
             ),
-            _ResponseCurve(_chart(PHASE, PHASE_AXIS, *keys), MEASURED_KEY, _phase_deg, phase_deg),
             _ResponseCurve(
-                _chart(COHERENCE, COHERENCE_AXIS, COHERENCE_KEY), COHERENCE_KEY, _coherence
+                _chart(PHASE_ENTITY, PHASE_AXIS, *keys), MEASURED_KEY, _phase_deg, phase_deg
+            ),
+            _ResponseCurve(
+                _chart(COHERENCE_ENTITY, COHERENCE_AXIS, COHERENCE_KEY), COHERENCE_KEY, _coherence
             ),
         )
         self._delays_s = {
@@ -245,9 +247,9 @@ class ResponseCharts:
         magnitude_strips = thinning.strips(model_db)
         self._models = (
             {
-                OVERVIEW_MAGNITUDE: magnitude_strips,
-                MAGNITUDE: magnitude_strips,
-                PHASE: thinning.strips(phase_deg(model)),
+                OVERVIEW_MAGNITUDE_ENTITY: magnitude_strips,
+                MAGNITUDE_ENTITY: magnitude_strips,
+                PHASE_ENTITY: thinning.strips(phase_deg(model)),
             }
             if damping_is_known
             else {}
@@ -347,7 +349,7 @@ class ResponseCharts:
                 _SHADE_NAMES, ends_hz[::2], ends_hz[1::2], strict=True
             ):
                 chart.move_shade(stream, name, first_hz, last_hz)
-        self.chart(COHERENCE).draw_note(stream, self._note, COHERENCE_KEY.color)
+        self.chart(COHERENCE_ENTITY).draw_note(stream, self._note, COHERENCE_KEY.color)
 
     def as_last(self, subject: "Subject") -> LastResponse | None:
         """Return the last update for comparison with a later session; None without an update.
@@ -499,7 +501,7 @@ def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
 
 # Spectrogram
 
-SPECTROGRAM: Final = "/spectrogram"
+SPECTROGRAM_ENTITY: Final = "/spectrogram"
 """Entity path of the spectrogram in Rerun."""
 SIZE: Final = (1280.0, 677.0)
 """Width and height of the spectrogram's canvas, in points."""
@@ -545,7 +547,7 @@ class SpectrogramChart:
         self._lowest_hz = float(frequency_hz[1]) - half_bin_hz
         width, height = SIZE
         self.chart = Chart(
-            SPECTROGRAM,
+            SPECTROGRAM_ENTITY,
             width,
             height,
             Axis("Time since the start of the session (s)", 0.0, end_s, steps(0.0, end_s, 15)),
@@ -553,7 +555,7 @@ class SpectrogramChart:
             right=_BAR_MARGIN,
         )
         self._bar = Chart(
-            f"{SPECTROGRAM}/bar",
+            f"{SPECTROGRAM_ENTITY}/bar",
             width,
             height,
             Axis("", 0.0, 1.0, ()),
@@ -575,11 +577,11 @@ class SpectrogramChart:
         corners = self.chart.to_canvas(
             [0.0, self.chart.x.last], [self._lowest_hz, self.chart.y.last]
         )
-        _position_image(stream, f"{SPECTROGRAM}/levels", corners, self._image.shape)
+        _position_image(stream, f"{SPECTROGRAM_ENTITY}/levels", corners, self._image.shape)
         corners = self._bar.to_canvas([0.0, 1.0], [LOWEST_DB, HIGHEST_DB])
         bar = np.arange(255, -1, -1, dtype=np.uint8)[:, None]
-        _position_image(stream, f"{SPECTROGRAM}/colors", corners, bar.shape)
-        _send_image(stream, f"{SPECTROGRAM}/colors", bar, static=True)
+        _position_image(stream, f"{SPECTROGRAM_ENTITY}/colors", corners, bar.shape)
+        _send_image(stream, f"{SPECTROGRAM_ENTITY}/colors", bar, static=True)
         self.chart.draw_frame(stream)
         self._bar.draw_frame(stream)
 
@@ -606,7 +608,7 @@ class SpectrogramChart:
         """Send the columns of the spectrogram so far to Rerun."""
         if self._filled:
             stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
-            _send_image(stream, f"{SPECTROGRAM}/levels", self.image)
+            _send_image(stream, f"{SPECTROGRAM_ENTITY}/levels", self.image)
 
 
 def _position_image(
