@@ -109,8 +109,8 @@ def check_new_file(path: Path, message_subject: str, *, overwrite: bool = False)
         )
     if not _contains_results(path):
         raise OutputExistsError(
-            f"{message_subject} {path} exists and does not hold results of an analysis, which is all "
-            "that --overwrite replaces; choose another name or move it away."
+            f"{message_subject} {path} exists and does not hold results of an analysis, which is "
+            "all that --overwrite replaces; choose another name or move it away."
         )
 
 

@@ -154,9 +154,9 @@ class Antenna:
         self._shapes += timed_lines
         drawings: list[Drawing] = []
         if timed_lines:
-            drawings.append(partial(_draw_lines, entity=BEAM_ENTITY, moments=timed_lines))
+            drawings.append(partial(_draw_lines, entity=BEAM_ENTITY, timed_lines=timed_lines))
         if labels and self._trail:
-            drawings.append(partial(_draw_lines, entity=TRAIL_ENTITY, moments=self._trail))
+            drawings.append(partial(_draw_lines, entity=TRAIL_ENTITY, timed_lines=self._trail))
             self._trail = []
         return drawings + labels
 
