@@ -73,7 +73,7 @@ class _PooledFit:
 
     @classmethod
     def of(cls, pooled_estimate: PooledEstimate) -> _PooledFit:
-        """Return a pooled estimate with its covariance enlarged for the number of sessions."""
+        """Return a pooled estimate with its covariance enlarged for a small number of sessions."""
         # Bands are 1.96 standard deviations wide, and Student's t of few sessions is more.
         interval_ratio = student_t_quantile(0.95, pooled_estimate.sessions - 1) / NORMAL_95
         return cls(
@@ -301,7 +301,10 @@ def response_figure(campaign: CampaignResult) -> Figure:
 
 
 def _response_band_hz(campaign: CampaignResult, peaks_hz: Sequence[float]) -> tuple[float, float]:
-    """Return the band of the fits, but not below a quarter of the first mode's frequency."""
+    """Return the lowest and highest frequency of the response figure.
+
+    It is the band of the fits, but not below a quarter of the first mode's frequency.
+    """
     first_hz, last_hz = campaign.record_band_hz
     lowest_hz = min([last_hz / 4, *(peak / 4 for peak in peaks_hz)])
     return max(first_hz, lowest_hz), last_hz

@@ -139,7 +139,9 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
 
 
 def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figure:
-    """Draw angle, torque and residual, measured and modelled, and an enlarged panel of each mode.
+    """Draw the angle, the measured and modelled torque and their difference.
+
+    Below, the torques and their difference are enlarged at each mode.
 
     Parameters
     ----------

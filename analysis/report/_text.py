@@ -57,7 +57,7 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
     elif welch_analysis is not None:
         if whole_record is None:
             parts.append(Text(result.validity.sentence))
-            parts += spaced((fit_tables.welch_fits_table(welch_analysis),))
+            parts += with_empty_lines((fit_tables.welch_fits_table(welch_analysis),))
         parts += _warning_lines(result.warnings)
     else:
         # The reason for missing Welch fits was reported before.
@@ -86,7 +86,7 @@ def _main_results(whole_record: WholeRecord) -> RenderableType:
     return Group(
         *map(Text, whole_record.verdict.sentences),
         "",
-        *spaced(
+        *with_empty_lines(
             (
                 _with_mark_notes_only(modes),
                 _with_mark_notes_only(short_table, caption=parameters.caption),
@@ -125,7 +125,7 @@ def analysis_tables(result: RecordResult) -> RenderableType:
         Text(f"{result.name}: Welch method (as in the paper)", style="italic"),
         Text(result.validity.sentence),
         "",
-        *spaced(
+        *with_empty_lines(
             (
                 fit_tables.welch_fits_table(welch_analysis, result.unsupported),
                 fit_tables.peaks_table(welch_analysis),
@@ -167,7 +167,7 @@ def record_text(whole_record: WholeRecord) -> RenderableType:
 def record_tables(whole_record: WholeRecord) -> RenderableType:
     """Return the tables of one whole record: modes, loss factors and parameters."""
     return Group(
-        *spaced(
+        *with_empty_lines(
             (
                 *(
                     table
@@ -186,7 +186,7 @@ def record_tables(whole_record: WholeRecord) -> RenderableType:
     )
 
 
-def spaced(tables_to_show: Iterable[Table]) -> Iterator[RenderableType]:
+def with_empty_lines(tables_to_show: Iterable[Table]) -> Iterator[RenderableType]:
     """Yield tables for the terminal, each followed by an empty line."""
     for table in tables_to_show:
         yield terminal_table(table)

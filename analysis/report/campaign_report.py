@@ -16,7 +16,7 @@ from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
 from analysis.report._document import document_text
 from analysis.report._paper_tables import paper_tables, welch_method_text
-from analysis.report._text import as_text, spaced
+from analysis.report._text import as_text, with_empty_lines
 from analysis.report.folder import write_new
 from analysis.report.table import csv_text
 from analysis.results import DEFAULT_FORMATS
@@ -86,9 +86,9 @@ def campaign_tables(
             parts.append(Text("Further experiments:"))
             parts += [Text(f"  {advice}") for advice in campaign.verdict.experiments]
         parts.append("")
-    parts += spaced(shown_tables(campaign) if verbose else main_tables(campaign))
+    parts += with_empty_lines(shown_tables(campaign) if verbose else main_tables(campaign))
     if verbose or with_paper or campaign.headline is None:
-        parts += spaced(paper_tables(campaign, with_paper=with_paper))
+        parts += with_empty_lines(paper_tables(campaign, with_paper=with_paper))
     parts += [
         Text(f"Warning: {session.name}: {warning}", style="yellow")
         for session in campaign.sessions

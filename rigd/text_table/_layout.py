@@ -639,7 +639,7 @@ def _no_numbers_error(rows: Sequence[TextRow], names: Sequence[str]) -> TableErr
 
 
 def _check_split_decimals(rows: Sequence[TextRow], layout: TableLayout) -> None:
-    """Raise TableError if decimal commas have split the numbers into two cells."""
+    """Raise TableError if commas in decimal numbers were taken as separators of cells."""
     nonempty_rows = [
         without_trailing_empty_cells(row.cells, layout.width) for row in rows if any(row.cells)
     ]

@@ -297,7 +297,7 @@ class _NumberRows:
         return values
 
     def stamp(self, row: Sequence[str], column: int, line: int) -> float:
-        """Return a time of day as the seconds since the column's first time."""
+        """Return the time stamp in a cell, in seconds since the column's first time stamp."""
         try:
             return self.stamps[column](row[column])
         except ValueError:
@@ -461,7 +461,7 @@ def _times_column(layout: TableLayout) -> int | None:
 
 
 def _time_unit_s(layout: TableLayout, column: int) -> float | None:
-    """Return the unit of a column of times, in seconds; None if the file does not state it."""
+    """Return the length of a time column's unit in seconds; None if the file states no unit."""
     unit = time_unit_s(_unit_in_file(layout, column))
     if unit is None and layout.titles and is_title_of_times(layout.titles[column]):
         unit = time_unit_s(layout.titles[column].rpartition("_")[2])

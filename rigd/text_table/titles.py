@@ -98,5 +98,5 @@ def is_title_of_times(title: str) -> bool:
 
 
 def time_unit_s(unit: str) -> float | None:
-    """Return a unit of time in seconds; None if the unit is unknown."""
+    """Return the length of a unit of time in seconds; None if the unit is unknown."""
     return TIME_UNITS_S.get(_plain_unit(unit))

@@ -145,10 +145,12 @@ class Antenna:
             t_ns, angle_rad = int(shape_samples[-1, 0]), float(shape_samples[-1, 1])
             if self._shape_count % self._shapes_per_drawing == 0:
                 deflection = deflection_m / self._length_m
-                lines_to_draw = (to_scale if self._to_scale else lines)(angle_rad, deflection)
-                timed_lines.append((t_ns, lines_to_draw))
+                scaled_lines = (unscaled_lines if self._to_scale else enlarged_lines)(
+                    angle_rad, deflection
+                )
+                timed_lines.append((t_ns, scaled_lines))
             if self._shape_count % self._shapes_per_label == 0:
-                text = label(max(self._tips_m), to_scale=self._to_scale)
+                text = tip_label(max(self._tips_m), to_scale=self._to_scale)
                 labels.append(partial(_draw_label, t_ns=t_ns, text=text))
         self._trail += [(t_ns, both_lines[1:]) for t_ns, both_lines in timed_lines]
         self._shapes += timed_lines
@@ -262,7 +264,7 @@ def static_drawings() -> list["Drawing"]:
     return [_draw_motor, _draw_direction, _draw_styles]
 
 
-def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
+def enlarged_lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
     """Return the straight line and the bent beam in beam lengths, with their motion enlarged.
 
     Parameters
@@ -286,13 +288,13 @@ def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
     return coordinates
 
 
-def to_scale(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
+def unscaled_lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
     """Return the straight line and the bent beam in beam lengths, true to scale.
 
     Parameters
     ----------
     angle_rad, deflection
-        As for `lines`.
+        As for `enlarged_lines`.
     """
     along_beam = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
     across_beam = np.array([-along_beam[1], along_beam[0], 0.0])
@@ -300,7 +302,7 @@ def to_scale(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
     return np.stack([line, line + deflection[:, None] * across_beam]).astype(np.float32)
 
 
-def label(tip_m: float, *, to_scale: bool = False) -> str:
+def tip_label(tip_m: float, *, to_scale: bool = False) -> str:
     """Return the text with the tip's deflection in mm, rounded to two digits or to 0.1 mm."""
     tip_mm = 1e3 * tip_m
     text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"

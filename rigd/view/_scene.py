@@ -222,7 +222,7 @@ class Scene:
         return [*plot_drawings, partial(send_table, fit=self._fit)]
 
     def _draw_samples(self, samples: Records | None) -> list[Drawing]:
-        """Return functions that draw a block of samples; none without a block."""
+        """Return functions that draw a block of samples; none if no block is complete."""
         if samples is None:
             return []
         self._t_ns = int(samples["t_ns"][-1])
@@ -265,7 +265,7 @@ class Scene:
         return partial(send_recent, t_ns=t_ns, notes=tuple(self._notes))
 
     def _draw_timings(self, timings: Records | None) -> list[Drawing]:
-        """Return functions that draw a block of the readings' ages; none without a block."""
+        """Return functions that plot the ages of readings; none if no block of them is complete."""
         return [] if timings is None else self._plot(READINGS, timings)
 
     def _plot(self, source: Source, records: Records) -> list[Drawing]:

@@ -150,7 +150,7 @@ class Chart:
         return np.stack([left + (right - left) * x_fraction, bottom - (bottom - top) * up], axis=-1)
 
     def draw_frame(self, stream: "RecordingStream") -> None:
-        """Draw the parts that do not change: frame, grid, tick labels, titles and legend."""
+        """Send the static parts of the chart: frame, grid, tick labels, titles and legend."""
         import rerun as rr
 
         left, top, right, bottom = self.frame
@@ -170,10 +170,10 @@ class Chart:
         """Return the text of each tick label and the canvas coordinates of its middle."""
         left, _, _, bottom = self.frame
         return [
-            (number(tick), float(self.to_canvas(tick, self.y.first)[0]), bottom + 14.0)
+            (tick_text(tick), float(self.to_canvas(tick, self.y.first)[0]), bottom + 14.0)
             for tick in self.x.ticks
         ] + [
-            (number(tick), left - 26.0, float(self.to_canvas(self.x.first, tick)[1]))
+            (tick_text(tick), left - 26.0, float(self.to_canvas(self.x.first, tick)[1]))
             for tick in self.y.ticks
         ]
 
@@ -399,7 +399,7 @@ class Chart:
         return entries[::-1]
 
 
-def number(value: float) -> str:
+def tick_text(value: float) -> str:
     """Return a number as the text of a tick label, with a true minus sign."""
     return f"{value + 0.0:.9g}".replace("-", "−")  # adding turns −0 into 0
 

@@ -274,7 +274,7 @@ class ResponseCharts:
         )
 
     def draw_frames(self, stream: "RecordingStream") -> None:
-        """Draw the parts that do not change: frames, nominal model and last session's response."""
+        """Send the static parts: frames, nominal model and the last session's response."""
         for response_curve in self._response_curves:
             response_curve.chart.draw_frame(stream)
             for name in _SHADE_NAMES:
@@ -334,7 +334,7 @@ class ResponseCharts:
         self._note = missing_text if response.coherence is None else ""
 
     def draw(self, stream: "RecordingStream") -> None:
-        """Draw the curves of the last update, at the session time of that update."""
+        """Send the curves that the last `update` computed to Rerun, at their session time."""
         stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
         for response_curve in self._response_curves:
             chart = response_curve.chart
@@ -573,7 +573,7 @@ class SpectrogramChart:
         return self._image[:, : self._filled]
 
     def draw_frame(self, stream: "RecordingStream") -> None:
-        """Draw the parts that do not change: the axes and the colour bar."""
+        """Send the static parts of the chart: the axes and the colour bar."""
         corners = self.chart.to_canvas(
             [0.0, self.chart.x.last], [self._lowest_hz, self.chart.y.last]
         )

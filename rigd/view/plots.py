@@ -152,7 +152,7 @@ def send_columns(
 
 
 def _column(component: str, values: Values) -> "ComponentColumn":
-    """Return values (n, k) as a column of Rerun's, with k scalars in each row."""
+    """Return values (n, k) in the form that Rerun stores, with k scalars in each row."""
     import rerun as rr
 
     row_count, values_per_row = values.shape
