@@ -118,11 +118,11 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
     assert estimate is not None
     unsupported_orders = campaign.verdict.withheld if campaign.verdict else ()
     not_reported = unreported_parameters(STRUCTURES[estimate.structure], unsupported_orders)
-    note = (
+    subtitle_note = (
         f"  ·  {NOT_REPORTED_MARK} not reported: not supported by the data" if not_reported else ""
     )
     if any(campaign.homogeneity.is_mixed(parameter.name) for parameter in estimate.parameters):
-        note += f"  ·  {MIXTURE_MARK} mean of a mixture"
+        subtitle_note += f"  ·  {MIXTURE_MARK} mean of a mixture"
     rows = -(-len(estimate.parameters) // _PANELS_PER_ROW)
     width_in, height_in = 13.0, 2.6 * rows + 1.35
     figure = style.new_figure(
@@ -134,7 +134,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
         ),
         f"freest type that the sessions support{exact_condition_text(campaign)}  ·  "
         f"residual {estimate.misfit:.3g} times the noise  ·  p: p-value of Cochran's Q"
-        f"{note}",
+        f"{subtitle_note}",
     )  # fmt: skip
     grid = figure.add_gridspec(
         rows, _PANELS_PER_ROW, left=0.06, right=0.99, top=1 - 1.2 / height_in,

@@ -135,17 +135,19 @@ def _inertial_terms(structure: Structure) -> Formula:
 
 def _beam_equations(structure: Structure) -> tuple[Formula, Formula]:
     """Return Eq. 25 of the reference paper, and the equation of its beta."""
-    elastic, z = _elastic_factor(structure), _BETA + _L
+    elastic_factor, z = _elastic_factor(structure), _BETA + _L
     sin, cos, sinh, cosh = (_function_of(name, z) for name in ("sin", "cos", "sinh", "cosh"))
-    stiffness = _EI if elastic is None else _join(_EI, _OPEN, elastic, _CLOSE)
+    stiffness = _EI if elastic_factor is None else _join(_EI, _OPEN, elastic_factor, _CLOSE)
     numerator = _join(sin, cosh, _MINUS, cos, sinh)
     denominator = _join(_ONE, _PLUS, cos, cosh)
     response = _join(
         _G, _OF_S, _EQUALS, _MINUS, stiffness, _BETA, _fraction(numerator, denominator)
     )
-    inertial = _inertial_terms(structure)
+    inertial_terms = _inertial_terms(structure)
     minus_beta_to_4 = (
-        (_OPEN + inertial + _CLOSE) if elastic is None else _fraction(inertial, elastic)
+        (_OPEN + inertial_terms + _CLOSE)
+        if elastic_factor is None
+        else _fraction(inertial_terms, elastic_factor)
     )
     return response, _join(_power(_BETA, _number_formula("4")), _EQUALS, _MINUS, minus_beta_to_4)
 

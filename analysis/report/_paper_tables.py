@@ -85,7 +85,7 @@ def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
         symbol, factor = _TABLE_3_HEADINGS[statistics.parameter]
         paper_values: dict[str, float | None] = {}
         if with_paper:
-            paper_row = papers_table3().get(
+            paper_row = published_table3().get(
                 (statistics.structure, statistics.weighting, statistics.parameter)
             )
             paper_values = {name: getattr(paper_row, name, None) for name in _STATISTICS}
@@ -156,7 +156,7 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
             if (*row_key, type_name) in deviations
         }
         paper_values = {
-            each_type: papers_table4().get((each_type, weighting, quantity, mode))
+            each_type: published_table4().get((each_type, weighting, quantity, mode))
             for each_type in cells
             if with_paper
         }
@@ -202,7 +202,7 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
         for statistics in campaign.statistics
     }
     for model in best_models(campaign.nominal):
-        paper_wmse = papers_wmse().get((model.structure, model.weighting))
+        paper_wmse = published_wmse().get((model.structure, model.weighting))
         paper_values = {"wmse": paper_wmse} if with_paper else {}
         rows.append(
             {
@@ -378,7 +378,7 @@ class PaperStatistics:
 
 
 @cache
-def papers_table3() -> Mapping[tuple[str, str, str], PaperStatistics]:
+def published_table3() -> Mapping[tuple[str, str, str], PaperStatistics]:
     """Return the paper's Table 3, by type, weighting and parameter."""
     return {
         (row["type"], row["weighting"], row["parameter"]): PaperStatistics(
@@ -389,7 +389,7 @@ def papers_table3() -> Mapping[tuple[str, str, str], PaperStatistics]:
 
 
 @cache
-def papers_table4() -> Mapping[tuple[str, str, str, int], float]:
+def published_table4() -> Mapping[tuple[str, str, str, int], float]:
     """Return the paper's Table 4, by type, weighting, quantity and mode.
 
     The names of the quantities are those of `MeanPeakDeviation`.
@@ -404,7 +404,7 @@ def papers_table4() -> Mapping[tuple[str, str, str, int], float]:
 
 
 @cache
-def papers_wmse() -> Mapping[tuple[str, str], float]:
+def published_wmse() -> Mapping[tuple[str, str], float]:
     """Return the paper's weighted mean square error of its two best models.
 
     The keys are type and weighting.

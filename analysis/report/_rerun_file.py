@@ -13,11 +13,11 @@ from analysis.report._text import analysis_tables, as_text, damping_sentences, r
 from analysis.report.folder import OutputError, OutputExistsError
 from rigd.session import read_session, read_timings
 from rigd.view import chart_page, chart_view
-from rigd.view.chart import Chart, Key, Thinning
+from rigd.view.chart import Chart, LegendEntry, Thinning
 from rigd.view.frequency_charts import (
     COHERENCE_AXIS,
-    COHERENCE_KEY,
-    MEASURED_KEY,
+    COHERENCE_ENTRY,
+    MEASURED_ENTRY,
     PHASE_AXIS,
     magnitude_axis,
     magnitude_db,
@@ -76,7 +76,7 @@ MEASURED_TITLE: Final = "Measured"
 TABLES_TITLE: Final = "Tables"
 """Title of the tab with the tables of the Welch fits."""
 
-_MEASURED_MAGNITUDE_KEY: Final = Key("|measured|", GREY)
+_MEASURED_MAGNITUDE_ENTRY: Final = LegendEntry("|measured|", GREY)
 """Legend entry of the measured magnitude, with which residuals are compared."""
 _WIDE_CHART_SIZE: Final = (1280.0, 350.0)
 """Width and height of a page's wide chart, in points, for a window of 1280 × 800."""
@@ -120,7 +120,7 @@ class ChartCurve:
     """
 
     name: str
-    key: Key
+    key: LegendEntry
     values: Real
     dotted: bool = False
 
@@ -172,14 +172,14 @@ def welch_pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
     )
 
 
-def line_keys(weightings: tuple[str, ...]) -> dict[str, Key]:
+def line_keys(weightings: tuple[str, ...]) -> dict[str, LegendEntry]:
     """Return label and line style of the fitted models, by the weighting of the fit."""
     further_lines = cycle(_FURTHER_LINES)
     keys_by_weighting = {
         name: _LINES_BY_WEIGHTING.get(name) or next(further_lines) for name in weightings
     }
     return {
-        name: Key(f"model, weights {name}", color, width)
+        name: LegendEntry(f"model, weights {name}", color, width)
         for name, (color, width) in keys_by_weighting.items()
     }
 
@@ -252,16 +252,20 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
             Graph(
                 "Magnitude of torque over angle, as estimated for the fits",
                 response_chart(
-                    f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_KEY
+                    f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_ENTRY
                 ),
-                (ChartCurve("measured", MEASURED_KEY, magnitude_db(response.response)),),
+                (ChartCurve("measured", MEASURED_ENTRY, magnitude_db(response.response)),),
             ),
             Graph(
                 "Phase of torque over angle",
                 response_chart(
-                    f"{entity}/phase", _NARROW_CHART_SIZE, band_hz, PHASE_AXIS, MEASURED_KEY
+                    f"{entity}/phase", _NARROW_CHART_SIZE, band_hz, PHASE_AXIS, MEASURED_ENTRY
                 ),
-                (ChartCurve("measured", MEASURED_KEY, phase_deg(response.response), dotted=True),),
+                (
+                    ChartCurve(
+                        "measured", MEASURED_ENTRY, phase_deg(response.response), dotted=True
+                    ),
+                ),
             ),
             Graph(
                 "Coherence of angle and torque",
@@ -270,9 +274,9 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
                     _NARROW_CHART_SIZE,
                     band_hz,
                     COHERENCE_AXIS,
-                    COHERENCE_KEY,
+                    COHERENCE_ENTRY,
                 ),
-                (ChartCurve("coherence", COHERENCE_KEY, coherence),),
+                (ChartCurve("coherence", COHERENCE_ENTRY, coherence),),
             ),
         ),
         response.frequency_hz,
@@ -281,7 +285,7 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
 
 
 def _type_page(
-    analysis: WelchAnalysis, name: str, magnitude: Axis, keys_by_weighting: dict[str, Key]
+    analysis: WelchAnalysis, name: str, magnitude: Axis, keys_by_weighting: dict[str, LegendEntry]
 ) -> ChartPage:
     """Return the page of a model type: magnitude, phase and residuals of its models."""
     models = [model for model in analysis.models if model.fit.structure.name == name]
@@ -311,10 +315,15 @@ def _type_page(
             Graph(
                 f"Magnitude, type {name} ({scores})",
                 response_chart(
-                    f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_KEY, *keys
+                    f"{entity}/magnitude",
+                    _WIDE_CHART_SIZE,
+                    band_hz,
+                    magnitude,
+                    MEASURED_ENTRY,
+                    *keys,
                 ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured_frf)),
+                    ChartCurve("measured", MEASURED_ENTRY, magnitude_db(measured_frf)),
                     *model_curves(lambda model: magnitude_db(model.response)),
                 ),
             ),
@@ -325,11 +334,11 @@ def _type_page(
                     _NARROW_CHART_SIZE,
                     band_hz,
                     PHASE_AXIS,
-                    MEASURED_KEY,
+                    MEASURED_ENTRY,
                     *short_keys,
                 ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured_frf), dotted=True),
+                    ChartCurve("measured", MEASURED_ENTRY, phase_deg(measured_frf), dotted=True),
                     *model_curves(lambda model: phase_deg(model.response)),
                 ),
             ),
@@ -340,11 +349,11 @@ def _type_page(
                     _NARROW_CHART_SIZE,
                     band_hz,
                     magnitude,
-                    _MEASURED_MAGNITUDE_KEY,
+                    _MEASURED_MAGNITUDE_ENTRY,
                     *short_keys,
                 ),
                 (
-                    ChartCurve("measured", _MEASURED_MAGNITUDE_KEY, magnitude_db(measured_frf)),
+                    ChartCurve("measured", _MEASURED_MAGNITUDE_ENTRY, magnitude_db(measured_frf)),
                     *model_curves(lambda model: magnitude_db(measured_frf - model.response)),
                 ),
             ),
@@ -450,7 +459,7 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
     )
     band_hz = float(grid_hz[0]), float(grid_hz[-1])
     magnitude = _axis_of_responses(measured_frf, [model])
-    key, name = Key(shown_model.name.removeprefix("the "), ORANGE, 2.0), "model"
+    key, name = LegendEntry(shown_model.name.removeprefix("the "), ORANGE, 2.0), "model"
     short_key = replace(key, label="model")
     entity = f"{RECORD_ENTITY}/response"
     return ChartPage(
@@ -460,10 +469,10 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
                 "Magnitude of torque over angle, whole record, "
                 f"{shown_model.name.removeprefix('the ')}",
                 response_chart(
-                    f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_KEY, key
+                    f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_ENTRY, key
                 ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured_frf)),
+                    ChartCurve("measured", MEASURED_ENTRY, magnitude_db(measured_frf)),
                     ChartCurve(name, key, magnitude_db(model)),
                 ),
             ),
@@ -474,11 +483,11 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
                     _NARROW_CHART_SIZE,
                     band_hz,
                     PHASE_AXIS,
-                    MEASURED_KEY,
+                    MEASURED_ENTRY,
                     short_key,
                 ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured_frf), dotted=True),
+                    ChartCurve("measured", MEASURED_ENTRY, phase_deg(measured_frf), dotted=True),
                     ChartCurve(name, key, phase_deg(model)),
                 ),
             ),
@@ -489,11 +498,11 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
                     _NARROW_CHART_SIZE,
                     band_hz,
                     magnitude,
-                    _MEASURED_MAGNITUDE_KEY,
+                    _MEASURED_MAGNITUDE_ENTRY,
                     short_key,
                 ),
                 (
-                    ChartCurve("measured", _MEASURED_MAGNITUDE_KEY, magnitude_db(measured_frf)),
+                    ChartCurve("measured", _MEASURED_MAGNITUDE_ENTRY, magnitude_db(measured_frf)),
                     ChartCurve(name, key, magnitude_db(measured_frf - model)),
                 ),
             ),

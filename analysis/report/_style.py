@@ -174,19 +174,19 @@ class Picture:
         It is the SVG image, which can be searched and is sharp on paper. It is the PNG image if the
         SVG image is more than twice as large, as with many sessions' responses.
         """
-        kind, content = "png", self.png
+        image_format, content = "png", self.png
         if self.svg is not None and len(self.svg) < 2 * len(self.png):
-            kind, content = "svg+xml", self.svg
-        return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
+            image_format, content = "svg+xml", self.svg
+        return f"data:image/{image_format};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def render_figure(figure: Figure, kind: FigureFormat) -> bytes:
+def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
     """Return a figure as the bytes of a PNG, SVG or PDF file; call it within `styled`.
 
     Parameters
     ----------
     figure : Figure
-    kind : {"png", "svg", "pdf"}
+    file_format : {"png", "svg", "pdf"}
         Format of the file. SVG contains text as text, and the same identifiers each time. PDF
         embeds TrueType fonts, as journals require.
     """
@@ -196,14 +196,17 @@ def render_figure(figure: Figure, kind: FigureFormat) -> bytes:
                 # Else it is placed clear of the ticks, which are laid out twice more for it.
                 axis.set_label_coords(0, 0)
     buffer = io.BytesIO()
-    if kind == "png":
+    if file_format == "png":
         # Fast compression: a tenth more bytes for a quarter of the time.
         figure.savefig(
-            buffer, format=kind, dpi=DPI, pil_kwargs={"compress_level": _PNG_COMPRESSION_LEVEL}
+            buffer,
+            format=file_format,
+            dpi=DPI,
+            pil_kwargs={"compress_level": _PNG_COMPRESSION_LEVEL},
         )
     else:
         with rc_context(_VECTOR_FORMAT_SETTINGS):
-            figure.savefig(buffer, format=kind, metadata=_OMITTED_METADATA[kind])
+            figure.savefig(buffer, format=file_format, metadata=_OMITTED_METADATA[file_format])
     return buffer.getvalue()
 
 
@@ -226,8 +229,8 @@ def save(figure: Figure, path: Path) -> bytes:
     OutputError
         If the file exists or cannot be written.
     """
-    (kind,) = (name for name in FIGURE_FORMATS if path.suffix == f".{name}")
-    content = render_figure(figure, kind)
+    (file_format,) = (name for name in FIGURE_FORMATS if path.suffix == f".{name}")
+    content = render_figure(figure, file_format)
     write_new(path, content)
     return content
 
@@ -251,11 +254,15 @@ def save_picture(
     OutputError
         If a file exists or cannot be written.
     """
-    kinds: set[FigureFormat] = {"png", "svg", *formats}
-    content = {kind: render_figure(figure, kind) for kind in FIGURE_FORMATS if kind in kinds}
-    for kind in formats:
+    file_formats: set[FigureFormat] = {"png", "svg", *formats}
+    content = {
+        file_format: render_figure(figure, file_format)
+        for file_format in FIGURE_FORMATS
+        if file_format in file_formats
+    }
+    for file_format in formats:
         # A name may have its own dots.
-        write_new(stem.with_name(f"{stem.name}.{kind}"), content[kind])
+        write_new(stem.with_name(f"{stem.name}.{file_format}"), content[file_format])
     return Picture(stem.name, description, content["png"], content["svg"])
 
 

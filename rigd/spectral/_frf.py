@@ -107,8 +107,8 @@ class FrequencyResponse:
         ``exp(j omega (output_delay - input_delay))``.
         """
         advance_s = output_delay_s - input_delay_s
-        shift = np.exp(2j * np.pi * advance_s * self.frequency_hz)
-        return replace(self, response=self.response * shift)
+        phase_shift = np.exp(2j * np.pi * advance_s * self.frequency_hz)
+        return replace(self, response=self.response * phase_shift)
 
 
 def checked_records(

@@ -117,7 +117,7 @@ class Scene:
     @property
     def last_response(self) -> LastResponse | None:
         """Frequency response of this session so far, to compare a later session with."""
-        return self.response_charts.as_last(self._subject)
+        return self.response_charts.as_last_response(self._subject)
 
     def frame(self) -> list[Drawing]:
         """Return functions that draw the window of a new connection with all contents so far."""

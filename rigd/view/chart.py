@@ -81,7 +81,7 @@ class Axis:
 
 
 @dataclass(frozen=True, slots=True)
-class Key:
+class LegendEntry:
     """Entry of a chart's legend: label and style of a curve or a shaded area.
 
     Attributes
@@ -123,7 +123,7 @@ class Chart:
     height: float
     x: Axis
     y: Axis
-    legend: tuple[Key, ...] = ()
+    legend: tuple[LegendEntry, ...] = ()
     left: float = _LEFT_MARGIN
     right: float = _RIGHT_MARGIN
 
@@ -182,7 +182,7 @@ class Chart:
         stream: "RecordingStream",
         name: str,
         strips: Sequence[Real],
-        key: Key,
+        key: LegendEntry,
         *,
         static: bool = False,
         dotted: bool = False,
@@ -387,7 +387,7 @@ class Chart:
             static=static,
         )
 
-    def _legend_positions(self) -> list[tuple[Key, float, float]]:
+    def _legend_positions(self) -> list[tuple[LegendEntry, float, float]]:
         """Return the legend's entries with positions above the frame, aligned to the right."""
         _, top, right, _ = self.frame
         entries = []

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from rigd.beam import Beam, Damping, transfer
 from rigd.session.layout import Status
 from rigd.spectral import RunningEstimate, RunningResponse, segmentation_of
-from rigd.view.chart import Axis, Chart, Key, Thinning, decades, steps
+from rigd.view.chart import Axis, Chart, LegendEntry, Thinning, decades, steps
 from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE
 
 if TYPE_CHECKING:
@@ -113,17 +113,17 @@ SIZES: Final = {
 }
 """Width and height of each chart's canvas in points, by entity path."""
 
-MEASURED_KEY: Final = Key("measured", SKY_BLUE)
+MEASURED_ENTRY: Final = LegendEntry("measured", SKY_BLUE)
 """Legend entry of the measured response."""
-UNCERTAIN_KEY: Final = Key("low coherence", GREY)
+UNCERTAIN_ENTRY: Final = LegendEntry("low coherence", GREY)
 """Legend entry of the measured response with a coherence below `LOW_COHERENCE`."""
-MODEL_KEY: Final = Key("nominal model", ORANGE, width=3.0)
+MODEL_ENTRY: Final = LegendEntry("nominal model", ORANGE, width=3.0)
 """Legend entry of the response of the nominal model."""
-LAST_KEY: Final = Key("last session", PURPLE)
+LAST_SESSION_ENTRY: Final = LegendEntry("last session", PURPLE)
 """Legend entry of the response of the last session of the same specimen."""
-COHERENCE_KEY: Final = Key("coherence", GREEN)
+COHERENCE_ENTRY: Final = LegendEntry("coherence", GREEN)
 """Legend entry of the coherence."""
-NOT_ESTIMATED_KEY: Final = Key("not estimated", GREY, is_area=True)
+NOT_ESTIMATED_ENTRY: Final = LegendEntry("not estimated", GREY, is_area=True)
 """Legend entry of the frequency bands that the reference has not excited so far."""
 
 LOW_COHERENCE: Final = 0.8
@@ -191,7 +191,7 @@ class _ResponseCurve:
 
     chart: Chart
     """Chart that contains the curve."""
-    key: Key
+    key: LegendEntry
     """Label and style of the curve."""
     values: Callable[["FrequencyResponse"], Real]
     """Function from an estimated response to the values of the curve."""
@@ -218,14 +218,16 @@ class ResponseCharts:
         model_db = magnitude_db(model)
         magnitude = magnitude_axis(model_db.min() - 3.0, model_db.max() + 6.0)
         damping_is_known = subject.damping is not None
-        extra_keys = ((MODEL_KEY,) if damping_is_known else ()) + ((LAST_KEY,) if last else ())
-        keys = (MEASURED_KEY, UNCERTAIN_KEY, *extra_keys)
+        extra_keys = ((MODEL_ENTRY,) if damping_is_known else ()) + (
+            (LAST_SESSION_ENTRY,) if last else ()
+        )
+        keys = (MEASURED_ENTRY, UNCERTAIN_ENTRY, *extra_keys)
         # The title of the view names the quantity.
         axis_with_short_title = replace(magnitude, title="dB re 1 N·m/rad")
         self._response_curves = (
             *(
                 _ResponseCurve(
-                    _chart(entity, axis, *keys), MEASURED_KEY, _magnitude_db, magnitude_db
+                    _chart(entity, axis, *keys), MEASURED_ENTRY, _magnitude_db, magnitude_db
                 )
                 for entity, axis in (
                     (OVERVIEW_MAGNITUDE_ENTITY, axis_with_short_title),
@@ -233,10 +235,12 @@ class ResponseCharts:
                 )
             ),
             _ResponseCurve(
-                _chart(PHASE_ENTITY, PHASE_AXIS, *keys), MEASURED_KEY, _phase_deg, phase_deg
+                _chart(PHASE_ENTITY, PHASE_AXIS, *keys), MEASURED_ENTRY, _phase_deg, phase_deg
             ),
             _ResponseCurve(
-                _chart(COHERENCE_ENTITY, COHERENCE_AXIS, COHERENCE_KEY), COHERENCE_KEY, _coherence
+                _chart(COHERENCE_ENTITY, COHERENCE_AXIS, COHERENCE_ENTRY),
+                COHERENCE_ENTRY,
+                _coherence,
             ),
         )
         self._delays_s = {
@@ -284,7 +288,7 @@ class ResponseCharts:
                     stream,
                     "model",
                     self._models[response_curve.chart.entity],
-                    MODEL_KEY,
+                    MODEL_ENTRY,
                     static=True,
                 )
             if response_curve.chart.entity in self._last_curves:
@@ -292,7 +296,7 @@ class ResponseCharts:
                     stream,
                     "last",
                     self._last_curves[response_curve.chart.entity],
-                    LAST_KEY,
+                    LAST_SESSION_ENTRY,
                     static=True,
                     order=1,
                 )
@@ -341,7 +345,7 @@ class ResponseCharts:
             if response_curve.from_complex:
                 # The whole curve lies beneath, so that there is no gap at a change of colour.
                 uncertain_curve = self._uncertain.get(chart.entity, ())
-                chart.draw_curve(stream, "uncertain", uncertain_curve, UNCERTAIN_KEY)
+                chart.draw_curve(stream, "uncertain", uncertain_curve, UNCERTAIN_ENTRY)
             measured_curve = self._curves.get(chart.entity, ())
             chart.draw_curve(stream, "measured", measured_curve, response_curve.key, order=1)
             ends_hz = (FIRST_HZ, *self._excited_hz, LAST_HZ)
@@ -349,9 +353,9 @@ class ResponseCharts:
                 _SHADE_NAMES, ends_hz[::2], ends_hz[1::2], strict=True
             ):
                 chart.move_shade(stream, name, first_hz, last_hz)
-        self.chart(COHERENCE_ENTITY).draw_note(stream, self._note, COHERENCE_KEY.color)
+        self.chart(COHERENCE_ENTITY).draw_note(stream, self._note, COHERENCE_ENTRY.color)
 
-    def as_last(self, subject: "Subject") -> LastResponse | None:
+    def as_last_response(self, subject: "Subject") -> LastResponse | None:
         """Return the last update for comparison with a later session; None without an update.
 
         Parameters
@@ -467,7 +471,11 @@ def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
 
 
 def response_chart(
-    entity: str, size: tuple[float, float], band_hz: tuple[float, float], y: Axis, *keys: Key
+    entity: str,
+    size: tuple[float, float],
+    band_hz: tuple[float, float],
+    y: Axis,
+    *keys: LegendEntry,
 ) -> Chart:
     """Return a chart with a logarithmic frequency axis.
 
@@ -489,13 +497,13 @@ def response_chart(
     return Chart(entity, *size, frequency, y, keys)
 
 
-def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
+def _chart(entity: str, y: Axis, *keys: LegendEntry) -> Chart:
     """Return a chart of the frequency response, with a legend entry for bands without estimate."""
     size = SIZES[entity]
     if (
-        LAST_KEY not in keys or size[0] > _MOST_WIDTH_FOR_FOUR_ENTRIES
+        LAST_SESSION_ENTRY not in keys or size[0] > _MOST_WIDTH_FOR_FOUR_ENTRIES
     ):  # there is room for another entry
-        keys = (*keys, NOT_ESTIMATED_KEY)
+        keys = (*keys, NOT_ESTIMATED_ENTRY)
     return response_chart(entity, size, (FIRST_HZ, LAST_HZ), y, *keys)
 
 

@@ -148,9 +148,9 @@ def test_where_the_coherence_is_low_the_response_is_grey(subject, shown):
 
 def test_the_last_session_s_response_is_drawn_beneath(subject, shown):
     before = ResponseCharts(replace(subject, name="before", specimen="A"))
-    assert before.as_last(subject) is None
+    assert before.as_last_response(subject) is None
     before.update(0, estimate(subject))
-    last = before.as_last(replace(subject, name="before", specimen="A"))
+    last = before.as_last_response(replace(subject, name="before", specimen="A"))
     assert (last.session, last.specimen) == ("before", "A")
     charts = ResponseCharts(subject, last)
     found = shown([charts.draw_frames])
