@@ -53,6 +53,7 @@ def indices_of_record_fit(
     Parameters
     ----------
     fit : RecordFit
+        Whole-record fit.
     welch_analysis : WelchAnalysis
         Welch fits of the same record.
 
@@ -100,6 +101,7 @@ def response_fit_percent(analysis: WelchAnalysis, model: FittedModel) -> float:
     Parameters
     ----------
     analysis : WelchAnalysis
+        Welch fits of a record.
     model : FittedModel
         One of the analysis's fitted models.
     """
@@ -351,6 +353,7 @@ def document_text(content: Mapping[str, Any], *, ascii_only: bool = False) -> st
     Parameters
     ----------
     content : mapping
+        Document, without NaN and infinite numbers.
     ascii_only : bool
         Whether other characters are escaped, for a stream of unknown encoding.
     """

@@ -75,7 +75,7 @@ def _fraction(numerator: Formula, denominator: Formula) -> Formula:
 def _function_of(function: str, argument: Formula) -> Formula:
     """Return a function with several letters, such as sin, of an argument in brackets."""
     function_name = Formula(f"<mi>{function}</mi><mo>&#x2061;</mo>", rf"\{function}")
-    return _join(function_name, _OPEN, argument, _CLOSE)
+    return _join(function_name, _OPENING_BRACKET, argument, _CLOSING_BRACKET)
 
 
 def _join(*parts: Formula) -> Formula:
@@ -83,30 +83,32 @@ def _join(*parts: Formula) -> Formula:
     return reduce(Formula.__add__, parts)
 
 
-_S: Final = _variable("s")
-_L: Final = _variable("L")
-_G: Final = _variable("G")
-_EI: Final = _variable("E") + _variable("I")
-_BETA: Final = _variable("β", r"\beta")
-_ZETA, _ALPHA = _variable("ζ", r"\zeta"), _variable("α", r"\alpha")
-_GAMMA, _LAMBDA = _variable("γ", r"\gamma"), _variable("λ", r"\lambda")
-_PLUS, _MINUS, _EQUALS = _operator("+"), _operator("−", "-"), _operator("=")
-_OPEN, _CLOSE = _operator("("), _operator(")")
-_ONE, _TWO = _number_formula("1"), _number_formula("2")
-_OF_S: Final = _OPEN + _S + _CLOSE
+_S_SYMBOL: Final = _variable("s")
+"""Symbols, signs and numbers of the equations as formulas."""
+_L_SYMBOL: Final = _variable("L")
+_G_SYMBOL: Final = _variable("G")
+_EI_SYMBOLS: Final = _variable("E") + _variable("I")
+_BETA_SYMBOL: Final = _variable("β", r"\beta")
+_ZETA_SYMBOL, _ALPHA_SYMBOL = _variable("ζ", r"\zeta"), _variable("α", r"\alpha")
+_GAMMA_SYMBOL, _LAMBDA_SYMBOL = _variable("γ", r"\gamma"), _variable("λ", r"\lambda")
+_PLUS_SIGN, _MINUS_SIGN, _EQUALS_SIGN = _operator("+"), _operator("−", "-"), _operator("=")
+_OPENING_BRACKET, _CLOSING_BRACKET = _operator("("), _operator(")")
+_NUMBER_ONE, _NUMBER_TWO = _number_formula("1"), _number_formula("2")
+_ARGUMENT_S: Final = _OPENING_BRACKET + _S_SYMBOL + _CLOSING_BRACKET
 """Formula "(s)", the argument of transfer functions."""
 
 
 _TORQUE_OVER_ANGLE: Final = _fraction(
-    _subscript(_variable("Γ", r"\Gamma"), Formula("<mtext>coup</mtext>", r"\mathrm{coup}")) + _OF_S,
-    _subscript(_variable("Θ", r"\Theta"), _variable("m")) + _OF_S,
+    _subscript(_variable("Γ", r"\Gamma"), Formula("<mtext>coup</mtext>", r"\mathrm{coup}"))
+    + _ARGUMENT_S,
+    _subscript(_variable("Θ", r"\Theta"), _variable("m")) + _ARGUMENT_S,
 )
-"""Formula of the coupling torque over the motor angle, as Laplace transforms."""
+"""Formula of the coupling torque over the motor angle, both as Laplace transforms."""
 
 
 def _damping_term(coefficient: Formula, order: Formula, *, is_first_order: bool) -> Formula:
     """Return a damping term: coefficient times s, or times s to a fractional power."""
-    return coefficient + (_S if is_first_order else _power(_S, order))
+    return coefficient + (_S_SYMBOL if is_first_order else _power(_S_SYMBOL, order))
 
 
 def _elastic_factor(structure: Structure) -> Formula | None:
@@ -114,61 +116,79 @@ def _elastic_factor(structure: Structure) -> Formula | None:
     if not structure.internal:
         return None
     return _join(
-        _ONE, _PLUS, _damping_term(_ZETA, _ALPHA, is_first_order="alpha" not in structure.free)
+        _NUMBER_ONE,
+        _PLUS_SIGN,
+        _damping_term(_ZETA_SYMBOL, _ALPHA_SYMBOL, is_first_order="alpha" not in structure.free),
     )
 
 
 def _inertial_terms(structure: Structure) -> Formula:
     """Return ``rho/EI s^2 + gamma s^lambda`` with the terms of the structure."""
-    ratio = _fraction(_variable("ρ", r"\rho"), _EI)
+    ratio = _fraction(_variable("ρ", r"\rho"), _EI_SYMBOLS)
     # In display size although it is inside a fraction.
     displayed_ratio = f'<mstyle displaystyle="true">{ratio.mathml}</mstyle>'
-    inertia = Formula(displayed_ratio, ratio.tex.replace("frac", "dfrac")) + _power(_S, _TWO)
+    inertia = Formula(displayed_ratio, ratio.tex.replace("frac", "dfrac")) + _power(
+        _S_SYMBOL, _NUMBER_TWO
+    )
     if not structure.external:
         return inertia
     return _join(
         inertia,
-        _PLUS,
-        _damping_term(_GAMMA, _LAMBDA, is_first_order="lambda" not in structure.free),
+        _PLUS_SIGN,
+        _damping_term(_GAMMA_SYMBOL, _LAMBDA_SYMBOL, is_first_order="lambda" not in structure.free),
     )
 
 
 def _beam_equations(structure: Structure) -> tuple[Formula, Formula]:
     """Return Eq. 25 of the reference paper, and the equation of its beta."""
-    elastic_factor, z = _elastic_factor(structure), _BETA + _L
+    elastic_factor, z = _elastic_factor(structure), _BETA_SYMBOL + _L_SYMBOL
     sin, cos, sinh, cosh = (_function_of(name, z) for name in ("sin", "cos", "sinh", "cosh"))
-    stiffness = _EI if elastic_factor is None else _join(_EI, _OPEN, elastic_factor, _CLOSE)
-    numerator = _join(sin, cosh, _MINUS, cos, sinh)
-    denominator = _join(_ONE, _PLUS, cos, cosh)
+    stiffness = (
+        _EI_SYMBOLS
+        if elastic_factor is None
+        else _join(_EI_SYMBOLS, _OPENING_BRACKET, elastic_factor, _CLOSING_BRACKET)
+    )
+    numerator = _join(sin, cosh, _MINUS_SIGN, cos, sinh)
+    denominator = _join(_NUMBER_ONE, _PLUS_SIGN, cos, cosh)
     response = _join(
-        _G, _OF_S, _EQUALS, _MINUS, stiffness, _BETA, _fraction(numerator, denominator)
+        _G_SYMBOL,
+        _ARGUMENT_S,
+        _EQUALS_SIGN,
+        _MINUS_SIGN,
+        stiffness,
+        _BETA_SYMBOL,
+        _fraction(numerator, denominator),
     )
     inertial_terms = _inertial_terms(structure)
     minus_beta_to_4 = (
-        (_OPEN + inertial_terms + _CLOSE)
+        (_OPENING_BRACKET + inertial_terms + _CLOSING_BRACKET)
         if elastic_factor is None
         else _fraction(inertial_terms, elastic_factor)
     )
-    return response, _join(_power(_BETA, _number_formula("4")), _EQUALS, _MINUS, minus_beta_to_4)
+    return response, _join(
+        _power(_BETA_SYMBOL, _number_formula("4")), _EQUALS_SIGN, _MINUS_SIGN, minus_beta_to_4
+    )
 
 
 def _measured_equation(fit: RecordFit) -> Formula:
     """Return the equation of the measured torque over angle: beam, tool inertia and channels."""
-    beam = _G + _OF_S
+    beam = _G_SYMBOL + _ARGUMENT_S
     names = fit.parameters
-    beam_and_tool = _join(beam, _PLUS, _variable("J"), _power(_S, _TWO))
-    delay_factor = _power(_variable("e"), _join(_MINUS, _variable("τ", r"\tau"), _S))
+    beam_and_tool = _join(beam, _PLUS_SIGN, _variable("J"), _power(_S_SYMBOL, _NUMBER_TWO))
+    delay_factor = _power(_variable("e"), _join(_MINUS_SIGN, _variable("τ", r"\tau"), _S_SYMBOL))
     formula = _join(
         _operator("[", r"\left["), beam_and_tool, _operator("]", r"\right]"), delay_factor
     )
-    time = _variable("T") + _S
+    time = _variable("T") + _S_SYMBOL
     if "filter_time_constant_s" in names:
-        formula += _fraction(_ONE, _join(_ONE, _PLUS, time))
+        formula += _fraction(_NUMBER_ONE, _join(_NUMBER_ONE, _PLUS_SIGN, time))
     if "second_order_filter_time_constant_s" in names:
-        root = Formula(f"<msqrt>{_TWO.mathml}</msqrt>", r"\sqrt{2}")
-        square = _power(_variable("T"), _TWO) + _power(_S, _TWO)
-        formula += _fraction(_ONE, _join(_ONE, _PLUS, root, time, _PLUS, square))
-    return _join(_TORQUE_OVER_ANGLE, _EQUALS, formula)
+        root = Formula(f"<msqrt>{_NUMBER_TWO.mathml}</msqrt>", r"\sqrt{2}")
+        square = _power(_variable("T"), _NUMBER_TWO) + _power(_S_SYMBOL, _NUMBER_TWO)
+        formula += _fraction(
+            _NUMBER_ONE, _join(_NUMBER_ONE, _PLUS_SIGN, root, time, _PLUS_SIGN, square)
+        )
+    return _join(_TORQUE_OVER_ANGLE, _EQUALS_SIGN, formula)
 
 
 def _modal_equation() -> Formula:
@@ -176,7 +196,7 @@ def _modal_equation() -> Formula:
     k, n, background = _variable("k"), _variable("n"), BACKGROUND - 1
     over_modes = Formula(f"<munder><mo>∑</mo>{k.row.mathml}</munder>", rf"\sum_{k.row.tex}")
     highest_power = _number_formula(str(background))
-    from_zero = _join(n, _EQUALS, _number_formula("0"))
+    from_zero = _join(n, _EQUALS_SIGN, _number_formula("0"))
     over_powers = Formula(
         f"<munderover><mo>∑</mo>{from_zero.row.mathml}{highest_power.row.mathml}</munderover>",
         rf"\sum_{from_zero.row.tex}^{highest_power.row.tex}",
@@ -186,11 +206,14 @@ def _modal_equation() -> Formula:
         (_variable("R"), _variable("p")),
         (_conjugate_variable("R"), _conjugate_variable("p")),
     ):
-        terms.append(_fraction(_subscript(residue, k), _join(_S, _MINUS, _subscript(pole, k))))
+        terms.append(
+            _fraction(_subscript(residue, k), _join(_S_SYMBOL, _MINUS_SIGN, _subscript(pole, k)))
+        )
     first, second = terms
     return _join(
-        _TORQUE_OVER_ANGLE, _EQUALS, over_modes, _OPEN, first, _PLUS, second, _CLOSE, _PLUS,
-        over_powers, _subscript(_variable("b"), n), _power(_S, n),
+        _TORQUE_OVER_ANGLE, _EQUALS_SIGN, over_modes, _OPENING_BRACKET, first, _PLUS_SIGN, second,
+        _CLOSING_BRACKET, _PLUS_SIGN,
+        over_powers, _subscript(_variable("b"), n), _power(_S_SYMBOL, n),
     )  # fmt: skip
 
 

@@ -182,6 +182,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
     Parameters
     ----------
     analysis : WelchAnalysis
+        Welch fits of a record.
     unsupported_orders : collection of str
         Orders that the whole record does not support. They are marked.
     """

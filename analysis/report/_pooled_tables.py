@@ -127,6 +127,7 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
     Parameters
     ----------
     campaign : CampaignResult
+        Results of all sessions.
     only_estimate : PooledEstimate, optional
         Estimate to show. Without it, as in the files, all estimates are in the table, followed by
         the structures that are not pooled, without values.

@@ -90,6 +90,7 @@ def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
     measured_frf : FrequencyResponse
         Empirical transfer function estimate, which includes the delay between the channels.
     model : ShownModel
+        Model of the record, with the modes that get an enlarged panel.
     """
     first_hz, last_hz = float(measured_frf.frequency_hz[0]), float(measured_frf.frequency_hz[-1])
     visible_modes = [mode for mode in model.modes if first_hz < mode.frequency_hz < last_hz]
@@ -358,6 +359,7 @@ def residual_figure(model: ShownModel, analysis: RecordAnalysis) -> Figure:
     Parameters
     ----------
     model : ShownModel
+        Model of the record, with its whitened residual.
     analysis : RecordAnalysis
         Analysis of the record, with the noise and the bins of the model's residual.
     """

@@ -611,6 +611,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     Parameters
     ----------
     result : RecordResult
+        Results of the session's record.
     path : Path
         New file, with the suffix ``.rrd``.
 

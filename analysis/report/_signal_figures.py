@@ -146,6 +146,7 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
     Parameters
     ----------
     record : Record
+        Record of angle and torque.
     model : ShownModel
         Model of the torque, with the modes that get an enlarged panel.
     highest_hz : float

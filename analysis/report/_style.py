@@ -186,6 +186,7 @@ def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
     Parameters
     ----------
     figure : Figure
+        Figure to render.
     file_format : {"png", "svg", "pdf"}
         Format of the file. SVG contains text as text, and the same identifiers each time. PDF
         embeds TrueType fonts, as journals require.
@@ -216,6 +217,7 @@ def save(figure: Figure, path: Path) -> bytes:
     Parameters
     ----------
     figure : Figure
+        Figure to write.
     path : Path
         New file, with the suffix of a figure format.
 
@@ -243,11 +245,13 @@ def save_picture(
     Parameters
     ----------
     figure : Figure
+        Figure to write.
     stem : Path
         Path of the new files without their suffixes.
     description : str
         Caption of the picture.
     formats : collection of str
+        Formats of the files. PNG and SVG are rendered for the page in any case.
 
     Raises
     ------
@@ -280,7 +284,9 @@ def envelope(
     x : ndarray, shape (n,)
         Increasing values; positive if `logarithmic`.
     y : ndarray, shape (n,)
+        Values of the line.
     columns : int
+        Number of intervals.
     logarithmic : bool
         Whether the intervals are equal in log x, for a logarithmic axis.
 

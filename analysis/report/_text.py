@@ -44,6 +44,7 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
     Parameters
     ----------
     result : RecordResult
+        Results of one record.
     verbose : bool
         Whether all tables are included. Otherwise the text contains the verdict, the modes and the
         parameters of damping and beam, or without a whole-record fit the Welch fits.

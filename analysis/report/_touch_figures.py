@@ -65,6 +65,7 @@ def touch_figure(touch: Touch, estimate: TouchEstimate) -> Figure:
     Parameters
     ----------
     touch : Touch
+        Detected touch.
     estimate : TouchEstimate
         Estimate of this touch.
     """

@@ -63,6 +63,7 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
     Parameters
     ----------
     record : Record
+        Record with the measured torque.
     analysis : RecordAnalysis
         Analysis of the record, with its noise and with the band to which the result is limited.
 
@@ -127,10 +128,15 @@ class NearlyUniformBeam:
     Attributes
     ----------
     structure : Structure
+        Structure with both orders free.
     plant : Plant
+        Estimated beam, damping and delay.
     parameters : mapping of str to float
+        Values of the parameters by name.
     determined : tuple of str
+        Names of the parameters in the covariance's order.
     covariance : ndarray, shape (7, 7)
+        Covariance of the parameters; of positive ones by their logarithms.
     """
 
     structure: Structure
@@ -204,11 +210,13 @@ class ResponseBand:
     Attributes
     ----------
     frequency_hz : ndarray, shape (n,)
+        Frequencies of the response.
     response : ndarray of complex, shape (n,)
         Torque per angle in N·m/rad, without a delay between the channels.
     log_magnitude_std : ndarray, shape (n,)
         Standard deviation of ln |response|, which is the relative one of the magnitude.
     phase_std_rad : ndarray, shape (n,)
+        Standard deviation of the phase.
     """
 
     frequency_hz: Real
@@ -227,6 +235,7 @@ def response_band(fit: Estimate, frequency_hz: Real) -> ResponseBand:
     Parameters
     ----------
     fit : Estimate
+        Fitted plant with the covariance of its parameters.
     frequency_hz : ndarray, shape (n,)
         Positive.
 
@@ -262,6 +271,7 @@ def modal_response_band(fit: ModalFit, frequency_hz: Real, delay_s: float = 0.0)
     Parameters
     ----------
     fit : ModalFit
+        Modal model with the covariance of its parameters.
     frequency_hz : ndarray, shape (n,)
         Positive.
     delay_s : float
@@ -322,6 +332,7 @@ class LossFactors:
     Attributes
     ----------
     frequency_hz : ndarray, shape (n,)
+        Frequencies of the loss factors.
     internal, external : LossFactor or None
         Loss in the material and loss to the surroundings; None if the structure does not include
         it.
@@ -341,6 +352,7 @@ def loss_factors(fit: Estimate, frequency_hz: Real) -> LossFactors:
     Parameters
     ----------
     fit : Estimate
+        Fitted plant with the covariance of its parameters.
     frequency_hz : ndarray, shape (n,)
         Positive.
 

@@ -71,6 +71,7 @@ def campaign_tables(
     Parameters
     ----------
     campaign : CampaignResult
+        Results of all sessions.
     with_paper : bool
         Whether the paper's own numbers are included.
     verbose : bool
@@ -126,7 +127,9 @@ def campaign_page(
     Parameters
     ----------
     campaign : CampaignResult
+        Results of all sessions.
     pictures : sequence of Picture
+        Figures of the campaign.
     made_at : datetime
         Date and time of the report, with a time zone.
     with_paper : bool
@@ -260,6 +263,7 @@ def write_campaign(
     Parameters
     ----------
     campaign : CampaignResult
+        Results of all sessions.
     folder : Path
         Existing folder that contains none of these files.
     with_paper : bool

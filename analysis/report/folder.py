@@ -47,6 +47,7 @@ def report_folders(
     Parameters
     ----------
     files : sequence of Path
+        Session files that are analysed.
     report : Path, optional
         Requested folder. With one file it is that file's report; with several files it contains one
         folder per file, named like the file. Default: ``NAME.report`` next to each file, or if that

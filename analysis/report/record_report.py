@@ -48,13 +48,15 @@ def record_page(
     pictures : sequence of Picture
         Figures of the whole-record fits. The table of modes follows the first figure.
     modes : Table
+        Table of the modes.
     record_tables : sequence of Table
         Tables of the whole-record fits.
     made_at : datetime
         Date and time of the report, with a time zone.
     paper_pictures : sequence of Picture, optional
+        Figures of the Welch fits.
     paper_tables : sequence of Table, optional
-        Figures and tables of the Welch fits. Without tables, their section is omitted.
+        Tables of the Welch fits. Without tables, the section of the Welch fits is omitted.
 
     Returns
     -------
@@ -340,6 +342,7 @@ def write_report(
     Parameters
     ----------
     result : RecordResult
+        Results of the record.
     folder : Path
         Existing folder that contains none of these files.
     on_step : callable, optional

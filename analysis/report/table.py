@@ -121,6 +121,7 @@ class Table:
     name : str
         Name of the CSV file without suffix, and key of the list of rows in JSON.
     caption : str
+        Title of the table.
     columns : tuple of Column
         Columns for people, in their order. The first one identifies the row.
     rows : tuple of mapping of str to Entry

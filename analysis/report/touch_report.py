@@ -39,6 +39,7 @@ def touches_table(sessions: Sequence[TouchedSession]) -> Table:
     Parameters
     ----------
     sessions : sequence of TouchedSession
+        Sessions with their touches.
     """
     has_several_sessions = len(sessions) > 1
     columns = (
@@ -106,6 +107,7 @@ def session_lines(session: TouchedSession) -> list[str]:
     Parameters
     ----------
     session : TouchedSession
+        Session with its touches.
     """
     count = len(session.touches)
     touch_count_text = "no touch" if count == 0 else "1 touch" if count == 1 else f"{count} touches"
@@ -133,6 +135,7 @@ def touches_document(
     Parameters
     ----------
     sessions : sequence of TouchedSession
+        Sessions with their touches.
     errors : mapping of str to str
         Message for each file that could not be analysed.
 

@@ -196,10 +196,7 @@ def _read_rows(folder: Path, on_progress: Callable[[float], None] | None) -> lis
 def _find_session_files(folder: Path) -> dict[str, _SessionFiles]:
     """Return the session files of a folder by name, with their quick looks and last reports.
 
-    Raises
-    ------
-    LibraryError
-        If the path is not a folder, or the folder cannot be read.
+    It raises LibraryError if the path is not a folder or the folder cannot be read.
     """
     session_files: dict[str, _SessionFiles] = {}
     quick_looks: dict[str, Path] = {}

@@ -394,6 +394,7 @@ def welch_response(
     Parameters
     ----------
     input_, output : array_like, shape (n,)
+        Records of input and output.
     rate_hz : float
         Sampling rate.
     segment_length, overlap : int
@@ -471,7 +472,9 @@ def fft_response(
     Parameters
     ----------
     input_, output : array_like, shape (n,)
+        Records of input and output.
     rate_hz : float
+        Sampling rate.
     nfft : int, optional
         Number of samples of the transform, at least n. The records are padded with zeros. Default
         n.
@@ -538,6 +541,7 @@ def instrumental_response(
     reference : array_like, shape (n,)
         Reference of the control loop, in any unit and with any delay: both cancel.
     input_, output : array_like, shape (n,)
+        Records of input and output.
     rate_hz, segment_length, overlap, nfft
         See `rigd.spectral.welch_response`.
 

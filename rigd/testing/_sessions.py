@@ -71,6 +71,7 @@ def beam_torque(
     angle_rad : array (n,)
         Angle of the motor, at rest before the first sample.
     rate_hz : float
+        Sampling rate.
     beam, damping
         Parameters of the beam. Default: those of the reference paper.
     tool_inertia_kg_m2 : float
@@ -207,6 +208,7 @@ def write_session(
     path : Path
         New file. An existing file is not overwritten.
     signals : Signals
+        Signals to write.
     beam : Beam
         Beam whose parameters the file states.
     metadata : mapping of str to str, optional

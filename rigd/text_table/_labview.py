@@ -27,6 +27,7 @@ class LabviewHead:
     Attributes
     ----------
     separator : str
+        Character between the cells of the table.
     last_line : int
         Number of the head's last line, from 1.
     channels : mapping of str to tuple of str

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 Real = npt.NDArray[np.float64]
+"""Array of real numbers."""
 
 
 # Chart
