@@ -271,7 +271,7 @@ def best_figure(campaign: CampaignResult) -> Figure:
 def _new_response_figure(
     campaign: CampaignResult, width_in: float, height_in: float, heading: str
 ) -> Figure:
-    """Return a figure with a heading on the sessions and on the estimate of their responses."""
+    """Return an empty figure whose title states the sessions and the response estimator."""
     count = len(campaign.sessions)
     drawn_sessions_text = (
         "" if count <= _MOST_DRAWN_SESSIONS else f", {_MOST_DRAWN_SESSIONS} of them drawn"

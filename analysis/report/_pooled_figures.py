@@ -147,7 +147,7 @@ def damping_figure(campaign: CampaignResult) -> Figure:
 
 
 def _source_of_modes(campaign: CampaignResult, pooled_estimate: PooledEstimate) -> str:
-    """Return the name of the model to which the modes belong."""
+    """Return the name of the model from which the modes are computed."""
     is_modal = campaign.modal is not None and campaign.modal.leads
     return "modal model" if is_modal else f"type {pooled_estimate.name}"
 
@@ -317,7 +317,7 @@ def _draw_sessions(
     phase: Axes,
     grid_hz: NDArray[np.float64],
 ) -> float:
-    """Draw the response of each session; return the lowest magnitude worth showing, in dB."""
+    """Draw the response of each session; return the lower limit of their magnitudes in dB."""
     from analysis.identify import ResponseGrid
 
     lowest_db = np.inf

@@ -121,7 +121,7 @@ _SQUARE_MM_PER_SQUARE_M: Final = 1e6
 
 
 def _modes_source(headline: Headline) -> str:
-    """Return the name of the model to which the reported modes belong."""
+    """Return the name of the model from which the reported modes are computed."""
     return (
         "modal model"
         if any(m.source == "modal" for m in headline.modes)

@@ -103,7 +103,7 @@ def _with_mark_notes_only(table: Table, caption: str = "") -> Table:
 
 
 def _warning_lines(sentences: Iterable[str]) -> list[Text]:
-    """Return warnings as yellow lines."""
+    """Return warning sentences as yellow lines of text."""
     return [Text(f"Warning: {sentence}", style="yellow") for sentence in sentences]
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _LARGEST_LIST_BYTES: Final = 10_000_000
 """Largest size of a list of files that is read, in bytes: a hundred thousand files."""
-LIST: Final = "SHA256SUMS"
+CHECKSUM_LIST_NAME: Final = "SHA256SUMS"
 """Name of the file that lists a report's files with their checksums."""
 
 _RESULT_KEYS: Final = frozenset(("versions", "headlines", "fits"))
@@ -183,7 +183,7 @@ def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
         if overwrite and not _is_free(folder):
             _replace_report(folder, temporary_folder, checksums)
             return
-        (temporary_folder / LIST).write_text(_list_text(checksums), encoding="utf-8")
+        (temporary_folder / CHECKSUM_LIST_NAME).write_text(_list_text(checksums), encoding="utf-8")
         try:
             temporary_folder.rename(folder)
         except OSError as error:
@@ -242,10 +242,10 @@ def _replace_file(path: Path, content: bytes) -> None:
 
 def _require_free_or_report(folder: Path) -> None:
     """Raise OutputExistsError if a folder is neither free nor an earlier report."""
-    if not _is_free(folder) and not (folder.is_dir() and (folder / LIST).is_file()):
+    if not _is_free(folder) and not (folder.is_dir() and (folder / CHECKSUM_LIST_NAME).is_file()):
         raise OutputExistsError(
             f"--overwrite replaces reports of an analysis, and {folder} is not one: it has no list "
-            f"of its files ({LIST}). Choose another folder with --report, or move it away."
+            f"of its files ({CHECKSUM_LIST_NAME}). Choose another folder with --report, or move it away."
         )
 
 
@@ -269,7 +269,7 @@ def _replace_report(
             name: earlier_checksums.get(name, set()) | checksums.get(name, set())
             for name in {*earlier_checksums, *checksums}
         }
-        _replace_file(folder / LIST, _list_text(all_checksums).encode())
+        _replace_file(folder / CHECKSUM_LIST_NAME, _list_text(all_checksums).encode())
         for name in checksums:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (temporary_folder / name).replace(folder / name)
@@ -278,7 +278,7 @@ def _replace_report(
                 (folder / name).unlink()
                 with suppress(OSError):  # folders that are not empty stay
                     (folder / name).parent.rmdir()
-        _replace_file(folder / LIST, _list_text(checksums).encode())
+        _replace_file(folder / CHECKSUM_LIST_NAME, _list_text(checksums).encode())
     except OSError as error:
         raise OutputError(
             f"The report {folder} cannot be replaced: {error.strerror or error}."
@@ -301,11 +301,11 @@ def _read_list(folder: Path) -> dict[str, set[str]]:
     """
     checksums: dict[str, set[str]] = {}
     try:
-        for line in read_text(folder / LIST, _LARGEST_LIST_BYTES).splitlines():
+        for line in read_text(folder / CHECKSUM_LIST_NAME, _LARGEST_LIST_BYTES).splitlines():
             checksum, _, name = line.partition("  ")
             checksums.setdefault(name, set()).add(checksum)
     except DocumentError as error:
-        raise OutputError(f"{folder / LIST} {error}.") from error
+        raise OutputError(f"{folder / CHECKSUM_LIST_NAME} {error}.") from error
     return checksums
 
 

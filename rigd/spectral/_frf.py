@@ -321,11 +321,11 @@ class CrossSpectra:
 
     @classmethod
     def of_zero_segments(cls, bins: int) -> "CrossSpectra":
-        """Return sums of zero segments."""
+        """Return spectra that are zero in each bin, to which segments can be added."""
         return cls(np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.complex128))
 
     def copy(self) -> "CrossSpectra":
-        """Return an independent copy of the sums."""
+        """Return an independent copy of the summed spectra."""
         return CrossSpectra(self.sxx.copy(), self.syy.copy(), self.sxy.copy(), self.segments)
 
     def add(self, fx: NDArray[np.complex128], fy: NDArray[np.complex128]) -> None:

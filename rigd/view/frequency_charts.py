@@ -33,7 +33,7 @@ _STALE_STATUS: Final = Status.ANGLE_STALE | Status.WRENCH_STALE
 
 
 class SweepResponse:
-    """Running estimate of the response torque over angle during a sweep, by Welch's method.
+    """Running estimate of the frequency response torque over angle in a sweep (Welch's method).
 
     The segments are the default ones of `analyze`.
 
