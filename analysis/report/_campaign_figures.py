@@ -334,7 +334,7 @@ def draw_session(
         linewidth=0.5, alpha=alpha, rasterized=True,
     )  # fmt: skip
     point_indices = style.log_spaced_indices(frequency_hz, most_dots)
-    # Dots: a line would run up and down wherever noise wraps the phase.
+    # Dots, because a line would jump wherever noise wraps the phase.
     phase.plot(
         frequency_hz[point_indices], phase_deg(response[point_indices]), ".", markersize=0.8,
         color=SESSION_COLOR, rasterized=True,
@@ -389,7 +389,7 @@ def validation_figure(campaign: CampaignResult) -> Figure:
             _ROW_HEIGHT_IN * len(models) / height_in,
         )
     )
-    rng = np.random.default_rng(0)  # equal errors are then side by side
+    rng = np.random.default_rng(0)  # random offsets put equal errors side by side
     for row, (_, _, weighting, errors) in enumerate(models):
         color = style.GREEN if weighting is None else colors[weighting]
         values = 100 * np.array([session_error.error for session_error in errors])

@@ -191,7 +191,7 @@ def record_entries(
                 "damping_ratio": mode.damping_ratio.value,
                 "damping_ratio_std": mode.damping_ratio.std,
             }
-            # Those reported first: they are what narrow sweeps are planned by.
+            # The reported modes come first, because narrow sweeps are planned from them.
             for name, _ in names
             if name["selected"]
             for mode in whole_record.headline.modes

@@ -125,7 +125,7 @@ def _elastic_factor(structure: Structure) -> Formula | None:
 def _inertial_terms(structure: Structure) -> Formula:
     """Return ``rho/EI s^2 + gamma s^lambda`` with the terms of the structure."""
     ratio = _fraction(_variable("ρ", r"\rho"), _EI_SYMBOLS)
-    # In display size although it is inside a fraction.
+    # In display style, although the ratio is inside a fraction.
     displayed_ratio = f'<mstyle displaystyle="true">{ratio.mathml}</mstyle>'
     inertia = Formula(displayed_ratio, ratio.tex.replace("frac", "dfrac")) + _power(
         _S_SYMBOL, _NUMBER_TWO

@@ -57,7 +57,7 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
         height_ratios=(*(1.0,) * rows, 0.22),
     )  # fmt: skip
     lines = line_styles(settings.weightings)
-    # Room for the scores above the highest peak.
+    # The scores need room above the highest peak.
     limits_db = style.db_limits(
         [analysis.response.response], [model.response for model in analysis.models],
         headroom_db=5.0 * len(settings.weightings),
@@ -132,7 +132,7 @@ def _draw_type_panel(
             **line_style,
         )
         if label.startswith("measured"):
-            # Dots: a line would run up and down wherever noise wraps the phase.
+            # Dots, because a line would jump wherever noise wraps the phase.
             point_indices = style.log_spaced_indices(at_hz, 2 * _CURVE_COLUMNS)
             style.dots(
                 phase,

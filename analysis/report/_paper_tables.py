@@ -63,7 +63,7 @@ def welch_method_text(campaign: CampaignResult) -> str:
     counts = [session.segments for session in campaign.sessions]
     low, high = min(counts), max(counts)
     segments = f"{low}" if low == high else f"{low} to {high}"
-    # Of the settings as used, no length is left open to depend on the rate.
+    # The settings state all lengths, so that the rate has no effect.
     return estimate_text(settings.estimator, settings.segmentation(PAPER_RATE_HZ), segments)
 
 

@@ -74,7 +74,7 @@ class _PooledFit:
     @classmethod
     def of(cls, pooled_estimate: PooledEstimate) -> _PooledFit:
         """Return a pooled estimate with its covariance enlarged for a small number of sessions."""
-        # Bands are 1.96 standard deviations wide, and Student's t of few sessions is more.
+        # Bands are 1.96 standard deviations wide, but Student's t of a few sessions is larger.
         interval_ratio = student_t_quantile(0.95, pooled_estimate.sessions - 1) / NORMAL_95
         return cls(
             structure=STRUCTURES[pooled_estimate.structure],

@@ -210,7 +210,7 @@ def _pooled_row(
     if not is_reported:
         value = mark_cell(value)
     else:
-        # Let the eye stop at what can be used only.
+        # Only usable values are bold, so that they catch the eye.
         value = (
             grey_cell(value)
             if homogeneity.is_mixed(parameter.name)

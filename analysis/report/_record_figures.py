@@ -259,7 +259,7 @@ def loss_figure(
         axes.axvspan(edge_hz, end_hz, color="#F4F4F4", linewidth=0, zorder=0)
     style.frequency_axis(axes, axis_hz)
     mode_loss_factors = [2 * mode.damping_ratio for mode in modes]
-    # Of curves what they mostly are: a total may rise without bound towards an end.
+    # A quantile of each curve, because a total may rise without bound towards an end.
     top = max(
         [*mode_loss_factors, *(float(np.nanquantile(value, 0.98)) for value in drawn_values)],
         default=1.0,

@@ -389,7 +389,7 @@ def _parameter_row(
         (parameter.value, parameter.std or None, *_interval_ends(parameter)), parameter.std, factor
     )
     if values_with_scales:
-        # A parameter that goes with no scale has the same interval with them.
+        # A parameter that depends on no scale has the same interval with scales.
         with_scales = values_with_scales.get(name, parameter)
         cells += estimate_cells(
             (with_scales.std or None, *_interval_ends(with_scales)), with_scales.std, factor
@@ -421,7 +421,7 @@ def _loss_factor_row(headline: Headline, loss_factor: ReportedLossFactor) -> tup
     symbol = "ζ ω^α sin(απ/2)" if internal else "γ ω^λ sin(λπ/2) / (ρ/EI ω²)"
     flag = size.flag
     if loss_factor.omega_rad_s is None:
-        # Without its frequency a size is the coefficient for an order that was only assumed.
+        # Without a pivot frequency the value is the coefficient for an order that was only assumed.
         flag = flag or headline.parameters["zeta" if internal else "gamma"].flag
         symbol = symbol[0]
     value, std, low, high = _quantity_cells(size)

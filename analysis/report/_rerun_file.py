@@ -290,7 +290,7 @@ def _type_page(
     """Return the page of a model type: magnitude, phase and residuals of its models."""
     models = [model for model in analysis.models if model.fit.structure.name == name]
     keys = [keys_by_weighting[model.fit.weighting] for model in models]
-    # Shorter on the narrow charts: in full they would run into the title of the axis.
+    # Short labels on the narrow charts, because long ones would overlap the axis title.
     label_format = "weights {}" if len(models) <= _MOST_MODELS_WITH_LONG_LABEL else "{}"
     short_keys = [
         replace(key, label=label_format.format(model.fit.weighting))
@@ -570,7 +570,7 @@ def _lines_view(lines: Lines, end_s: float, largest_value: float) -> rrb.TimeSer
         names=lines.names,
         colors=lines.colors,
         widths=lines.widths,
-        # The default averages what falls on one pixel, and so understates peaks.
+        # The default averages the values of a pixel, which understates peaks.
         aggregation_policy="MinMax",
     )
     return rrb.TimeSeriesView(

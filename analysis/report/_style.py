@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
     from analysis.results import FigureFormat
 
-# Of its cache of fonts, which is slow to make or just being made by another process: no figure
-# suffers, and it means nothing to the reader of a log.
+# This hides messages about the font cache, which is slow to build or is being built by another
+# process. They affect no figure and mean nothing to the reader of a log.
 logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
 
 BLUE: Final = "#0072B2"
@@ -85,8 +85,8 @@ _MATPLOTLIB_SETTINGS: Final[dict[Any, Any]] = {
     "axes.titlesize": 9.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
-    # The default position, as no axis is on top: the search for labels in the way takes a tenth of
-    # all drawing.
+    # The default position. No axis is on top, and the search for overlapping labels takes a tenth
+    # of the drawing time.
     "axes.titley": 1.0,
     "axes.labelcolor": INK,
     "axes.edgecolor": "#9A9A9A",
@@ -194,7 +194,7 @@ def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             if not axis.get_label_text():
-                # Else it is placed clear of the ticks, which are laid out twice more for it.
+                # Otherwise the empty label is placed clear of the ticks, which takes two more layouts.
                 axis.set_label_coords(0, 0)
     buffer = io.BytesIO()
     if file_format == "png":
@@ -265,7 +265,7 @@ def save_picture(
         if file_format in file_formats
     }
     for file_format in formats:
-        # A name may have its own dots.
+        # The suffix is appended, because a name may contain dots.
         write_new(stem.with_name(f"{stem.name}.{file_format}"), content[file_format])
     return Picture(stem.name, description, content["png"], content["svg"])
 

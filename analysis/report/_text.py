@@ -79,7 +79,7 @@ def _main_results(whole_record: WholeRecord) -> RenderableType:
     rows = [
         row for name, row in zip(names, parameters.rows, strict=True) if name not in _RIG_PARAMETERS
     ]
-    # Room for one column of words.
+    # The terminal has room for one column of text.
     omitted_column = "meaning" if any(row["remark"] for row in rows) else "remark"
     columns = tuple(column for column in parameters.columns if column.key != omitted_column)
     short_table = replace(parameters, columns=columns, rows=tuple(rows))

@@ -77,7 +77,7 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
     in_band = (frequency_hz >= analysis.frequency_hz[0]) & (
         frequency_hz <= analysis.frequency_hz[-1]
     )
-    # A line is not an excitation, and what is compared has none.
+    # A narrow-band disturbance is not an excitation, and the compared bins contain none.
     nearest_bins = np.searchsorted(analysis.frequency_hz, frequency_hz[in_band])
     in_band[in_band] = analysis.compared[np.minimum(nearest_bins, analysis.compared.size - 1)]
     power = np.abs(np.fft.rfft(torque)[in_band]) ** 2 * 2 / (torque.size * record.rate_hz)
@@ -246,7 +246,7 @@ def response_band(fit: Estimate, frequency_hz: Real) -> ResponseBand:
     are fixed, or that the data do not determine, count as known.
     """
     plant: Plant = replace(fit.plant, delay_s=0.0)
-    # The delay turns the measured phase, not that of beam and clamp.
+    # The delay changes the measured phase, but not that of beam and clamp.
     indices = [i for i, name in enumerate(fit.determined) if name != "delay_s"]
     parameter_names = [fit.determined[i] for i in indices]
     response, *derivatives = ResponseGrid(2j * np.pi * frequency_hz).evaluate(
@@ -283,7 +283,7 @@ def modal_response_band(fit: ModalFit, frequency_hz: Real, delay_s: float = 0.0)
     derivatives = []
     for pole, residue in zip(fit.model.poles_rad_s, fit.model.residues, strict=True):
         ratio = -pole.real / abs(pole)
-        # By ln frequency and ln damping ratio; those of the residue are residue and j residue
+        # By ln frequency and ln damping ratio. Those by the residue are residue and j residue.
         pole_derivatives = (pole, -ratio * pole.imag / (1 - ratio * ratio) ** 1.5)
         pole_term, conjugate_term = 1 / (s - pole), 1 / (s - pole.conjugate())
         derivatives += [
@@ -437,6 +437,6 @@ def _standard_deviations(gradient: Real, covariance: Real) -> Real:
 
 def _logarithmic_limits(value: Real, log_std: Real) -> tuple[Real, Real]:
     """Return the limits of a value's 95 % interval, which is symmetric in the logarithm."""
-    # An undetermined one may overflow: its band is then everything.
+    # An undetermined value may overflow. Its band then includes everything.
     factor = np.exp(np.minimum(NORMAL_95 * log_std, 300.0))
     return value / factor, value * factor

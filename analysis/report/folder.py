@@ -245,7 +245,8 @@ def _require_free_or_report(folder: Path) -> None:
     if not _is_free(folder) and not (folder.is_dir() and (folder / CHECKSUM_LIST_NAME).is_file()):
         raise OutputExistsError(
             f"--overwrite replaces reports of an analysis, and {folder} is not one: it has no list "
-            f"of its files ({CHECKSUM_LIST_NAME}). Choose another folder with --report, or move it away."
+            f"of its files ({CHECKSUM_LIST_NAME}). Choose another folder with --report, or move "
+            "it away."
         )
 
 

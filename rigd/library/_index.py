@@ -126,7 +126,7 @@ class Index:
         except sqlite3.Error as error:
             if error.sqlite_errorcode & 0xFF not in _DAMAGE_ERROR_CODES:
                 return  # a folder that cannot be written to, a full disk, a lock held for long
-            with contextlib.suppress(OSError, sqlite3.Error):  # the files have everything
+            with contextlib.suppress(OSError, sqlite3.Error):  # the session files contain all data
                 self._path.unlink()
                 self._store(rows, missing_files)
 

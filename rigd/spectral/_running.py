@@ -401,7 +401,7 @@ class LowBins:
     def __init__(self, length: int, nfft: int, bins: int) -> None:
         self._bins, self._nfft = bins, nfft
         size = _fast_length(length + bins - 1)
-        # A real transform takes half the time of a complex one, of which there would be two.
+        # A real transform takes half the time of a complex one, and two of these would be needed.
         self._all = np.empty(nfft // 2 + 1, dtype=np.complex128) if nfft < 4 * size else None
         if self._all is not None:
             return

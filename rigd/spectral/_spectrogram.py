@@ -51,7 +51,7 @@ class RunningSpectrogram:
         bins = bins_up_to(last_hz, self._nfft, rate_hz)
         self.frequency_hz = np.arange(bins) * rate_hz / self._nfft
         window = np.hanning(length)
-        # One-sided: the half of an amplitude at the negative frequency is added.
+        # One-sided spectrum: half of each amplitude is at the negative frequency.
         self._window = window * (2.0 / window.sum())
         self._segments = Segments(
             1,

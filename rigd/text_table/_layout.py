@@ -340,9 +340,8 @@ def _layout_below_titles(
         if all(name in raw_titles for name in names if _column_number(name) is None)
         else plain_titles
     )
-    if len(plain_titles) < len(
-        raw_titles
-    ):  # a single mark may be that of a comment or the title of an index
+    # "#" or "%" alone may mark a comment or be the title of an index.
+    if len(plain_titles) < len(raw_titles):
         next_row = _next_row(rows, titles_row)
         titles = (
             raw_titles

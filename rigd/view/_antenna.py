@@ -112,9 +112,9 @@ class Antenna:
         trail_shapes = max(1, round(shape_hz * TRAIL_S))
         self._tips_m: collections.deque[float] = collections.deque(maxlen=trail_shapes)
         self._to_scale = subject.excitation in _UNSCALED_EXCITATIONS
-        self._newest: tuple[int, Real] | None = None  # tick; time and angle
+        self._newest: tuple[int, Real] | None = None  # tick, time and angle of the newest sample
         self._waiting: Real = np.zeros((0, 2))  # times and angles since the last shape
-        self._trail: list[_TimedLines] = []  # not yet sent
+        self._trail: list[_TimedLines] = []  # lines that are not sent yet
         self._shapes: collections.deque[_TimedLines] = collections.deque(
             maxlen=round(_STORED_LINES_S * DRAWN_HZ)
         )

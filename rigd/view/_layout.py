@@ -287,7 +287,8 @@ def _plot(view: TimeView) -> "rrb.TimeSeriesView":
         # The default averages the values of a pixel, which understates peaks.
         aggregation_policy="MinMax",
     )
-    # Invisible, but within the axis. Curves with the same name have one entry in the legend.
+    # The points are invisible, but extend the axis. Curves with the same name have one entry in the
+    # legend.
     ticks = rr.SeriesPoints(
         names=[plot.curves[0].label], colors=[plot.curves[0].color], marker_sizes=[0.0]
     )
@@ -471,10 +472,10 @@ class Scale:
                 for point in axis.take(*interval)
             ]
             if points:
-                drawings.append(self._send_tick_points(axis.view.ticks, points))
+                drawings.append(self._tick_points_drawing(axis.view.ticks, points))
         return drawings
 
-    def _send_tick_points(self, component: str, points: Sequence[_CurvePoint]) -> "Drawing":
+    def _tick_points_drawing(self, component: str, points: Sequence[_CurvePoint]) -> "Drawing":
         """Return the function that sends invisible points (time, value) of one axis."""
         times_ns, values = zip(*points, strict=True)
         columns = {component: np.array(values)[:, None]}
@@ -482,7 +483,7 @@ class Scale:
 
 
 class _AxisExtremes:
-    """Extremes of a plot within its time window, and the invisible points added last."""
+    """Least and greatest plotted value in a time window, and the invisible points sent last."""
 
     def __init__(self, view: "TimeView") -> None:
         self.view = view
@@ -528,7 +529,7 @@ class _RunningMaximum:
 
     def __init__(self, window_ns: int) -> None:
         self._window_ns = window_ns
-        # Each is greater than all later ones.
+        # Each value is greater than all later ones.
         self._marks: collections.deque[_CurvePoint] = collections.deque()
 
     def take(self, t_ns: int, value: float) -> _CurvePoint:
@@ -561,7 +562,7 @@ def missing_ticks(
         Values to add below and above the plotted values; None if none is needed on that side.
     """
     if 0.0 <= high - low < least_span and max(-low, high) < _MOST_VALUE_TO_AXIS_RATIO * least_span:
-        # In steps, so that noise does not move the axis.
+        # The ends are multiples of a step, so that noise does not move the axis.
         step = least_span / 2
         first_multiple, last_multiple = math.floor(low / step), math.ceil(high / step)
         if last_multiple - first_multiple < 2:

@@ -195,7 +195,7 @@ def draw_session(
     outcome = session.outcome or {}
     state = ended(outcome.get("outcome", "no outcome"), outcome.get("reason", ""))
     scene.state(0, replace(state, over=False))
-    # Hide the time of drawing.
+    # The viewer shows session time only, not the time of drawing.
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.send_recording_start_time_nanos(session.start_utc_ns)

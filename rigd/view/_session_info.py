@@ -121,8 +121,8 @@ def sweep_of(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
     segments
         First tick and end (exclusive) of each segment by its name; one of them is the sweep.
     """
-    # The segments of a search after its scan do not sweep the band. The first of two sweeps is the
-    # one that a chirp without a way back has.
+    # After its scan, the segments of a search do not sweep the band. The first of two sweeps is the
+    # same as the only sweep of other chirps.
     return next(segments[name] for name in ("scan", "there", "sweep") if name in segments)
 
 
@@ -244,7 +244,7 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
     """Send a line of the session's log to Rerun."""
     import rerun as rr
 
-    # In milliseconds: more digits are hard to read.
+    # The time has milliseconds only, because more digits are hard to read.
     stream.set_time(TIMELINE, duration=1e-3 * round(1e-6 * note.t_ns))
     text = "\n".join(
         line

@@ -237,7 +237,7 @@ def gauge_text(label: str, gauge: Gauge) -> str:
         return f"{label} unknown"
     if gauge.limit is None:
         return f"{label} {gauge.value:.3g} {gauge.unit}"
-    # To a thousandth of the limit, with a constant number of digits.
+    # The resolution is a thousandth of the limit, with a constant number of digits.
     digits = max(0, 3 - math.floor(math.log10(gauge.limit)))
     return f"{label} {gauge.value:.{digits}f} of {gauge.limit:.3g} {gauge.unit}"
 

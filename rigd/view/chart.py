@@ -500,7 +500,7 @@ class Thinning:
         edges[-1] = np.nextafter(last, np.inf)
         bounds = np.unique(np.searchsorted(grid, edges))
         starts, sizes = bounds[:-1], np.diff(bounds)
-        offsets = np.arange(sizes.max(initial=1))  # also without any group
+        offsets = np.arange(sizes.max(initial=1))  # 1 if there is no group
         return cls(grid, starts[:, None] + np.where(offsets < sizes[:, None], offsets, 0))
 
     def strips(self, values: Real) -> list[Real]:

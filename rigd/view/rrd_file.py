@@ -123,7 +123,7 @@ def check_rrd_file(path: Path) -> None:
 
 @contextlib.contextmanager
 def _translate_write_errors(path: Path, temporary_path: Path) -> Iterator[None]:
-    """Raise RrdFileError instead of errors that occur while a file is written."""
+    """Raise RrdFileError within the context instead of errors from writing a file."""
     try:
         yield
     except FileExistsError:
