@@ -194,7 +194,7 @@ def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             if not axis.get_label_text():
-                # Otherwise the empty label is placed clear of the ticks, which takes two more layouts.
+                # Otherwise the empty label is placed clear of the ticks: two more layouts.
                 axis.set_label_coords(0, 0)
     buffer = io.BytesIO()
     if file_format == "png":
