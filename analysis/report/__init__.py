@@ -1,8 +1,8 @@
-"""Output of an analysis for people and programs: tables, figures, a JSON document.
+"""Output of an analysis for people and programs: tables, figures, pages and JSON documents.
 
-Each table is described once, as a `Table` (in the modules ``_…_tables``), and rendered for the
-terminal, for a page, as CSV and as JSON. Pages are the files in ``templates``, which `_page` fills;
-no other module of this package uses them.
+Each table is defined once, as a `Table` (in the modules ``_…_tables``), and rendered for the
+terminal, for a page, as CSV and as JSON. The pages are the files in ``templates``, which are filled
+by `_page`. No other module of this package uses them.
 """
 
 import lazy_loader as lazy

@@ -1,4 +1,4 @@
-"""A campaign as one JSON document, without NaN: unknown values are null."""
+"""Results of a campaign as one JSON document, without NaN: unknown values are null."""
 
 from __future__ import annotations
 
@@ -20,26 +20,27 @@ if TYPE_CHECKING:
 
 
 def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Any]:
-    """Collect everything.
+    """Return the results of a campaign as one JSON document.
 
     Parameters
     ----------
     campaign : Campaign
         Results of all sessions.
     with_paper : bool
-        Whether the paper's numbers are included.
+        Whether the paper's own numbers are included in the tables.
 
     Returns
     -------
     dict
-        ``headlines`` of each session and, with ``file`` null, of all together; ``validity`` of the
-        linear model for the worst of the sessions; ``verdict`` on all sessions (null without
-        whole-record estimates), ``files`` with each one's own, ``errors`` (files left out, and
-        why), ``one_specimen`` and the ``groups`` in which sessions lie if they are not, ``trials``
-        of the validation requested, done and lost, ``fits`` and ``modes`` as of single sessions,
-        and the tables by the names of their CSV files. Finite numbers only.
+        ``headlines`` of each session and, with ``file`` null, of all sessions together;
+        ``validity`` of the linear model for the least valid session; ``verdict`` on all sessions
+        (null without whole-record estimates); ``files`` with the verdict on each; ``errors`` (files
+        that are left out, and why); ``one_specimen``, and the ``groups`` of sessions if they are
+        not of one specimen; ``trials`` of the validation: how many were requested, completed and
+        lost; ``fits`` and ``modes`` of single sessions; and the tables by the names of their CSV
+        files. All numbers are finite.
     """
-    leading = campaign.homogeneity.leading
+    leading_quantity = campaign.homogeneity.leading
     content: dict[str, Any] = finite(
         {
             "versions": versions(),
@@ -49,39 +50,42 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
             "settings": asdict(campaign.settings) | {"record_band_hz": campaign.record_band_hz},
             "files": [
                 {
-                    "file": str(each.path),
-                    "validity": each.validity.as_json(),
-                    "warnings": each.warnings,
-                    "welch_segments": each.segments or None,
-                    "verdict": None if each.verdict is None else each.verdict.as_json(),
+                    "file": str(session.path),
+                    "validity": session.validity.as_json(),
+                    "warnings": session.warnings,
+                    "welch_segments": session.segments or None,
+                    "verdict": None if session.verdict is None else session.verdict.as_json(),
                 }
-                for each in campaign.sessions
+                for session in campaign.sessions
             ],
             "one_specimen": campaign.homogeneity.one_specimen,
-            "groups": leading and {"quantity": leading.quantity, "files": leading.groups},
+            "groups": leading_quantity
+            and {"quantity": leading_quantity.quantity, "files": leading_quantity.groups},
             "trials": {
                 "asked": campaign.trials,
                 "done": campaign.trials - len(campaign.lost_trials),
                 "lost": [
-                    {"file": str(each.path), "reason": each.reason} for each in campaign.lost_trials
+                    {"file": str(trial.path), "reason": trial.reason}
+                    for trial in campaign.lost_trials
                 ],
             },
             "errors": [
-                {"file": str(each.path), "message": each.message} for each in campaign.failures
+                {"file": str(failure.path), "message": failure.message}
+                for failure in campaign.failures
             ],
             "fits": [
                 fit
-                for each in campaign.sessions
+                for session in campaign.sessions
                 for fit in (
-                    *(_welch_fit(each, welch) for welch in each.welch_fits),
-                    *(_record_fit(each, estimate) for estimate in each.record_estimates),
+                    *(_welch_fit_json(session, welch) for welch in session.welch_fits),
+                    *(_record_fit_json(session, estimate) for estimate in session.record_estimates),
                 )
             ],
             "modes": [
-                _mode(each, estimate, mode)
-                for each in campaign.sessions
-                for estimate in each.record_estimates
-                if estimate.name == each.selected
+                _mode_json(session, estimate, mode)
+                for session in campaign.sessions
+                for estimate in session.record_estimates
+                if estimate.name == session.selected
                 for mode in estimate.modes
             ],
             **{
@@ -93,41 +97,50 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
     return content
 
 
-def _name(session: SessionAnalysis, estimator: str, structure: str) -> dict[str, Any]:
+def _fit_identity(session: SessionAnalysis, estimator: str, structure: str) -> dict[str, Any]:
+    """Return the keys that identify a session's fit: file, estimator, type and weighting."""
     return {
         "file": str(session.path), "estimator": estimator, "type": structure, "weighting": None,
     }  # fmt: skip
 
 
-def _welch_fit(session: SessionAnalysis, fit: WelchFit) -> dict[str, Any]:
+def _welch_fit_json(session: SessionAnalysis, fit: WelchFit) -> dict[str, Any]:
+    """Return the JSON object of a session's Welch fit."""
     return {
-        **_name(session, "welch", fit.structure),
+        **_fit_identity(session, "welch", fit.structure),
         "weighting": fit.weighting,
         "parameters": fit.parameters,
-        "std": fit.std and _of_free(fit.std, STRUCTURES[fit.structure].free),
+        "std": fit.std and _std_of_free_parameters(fit.std, STRUCTURES[fit.structure].free),
         "cost": fit.cost,
         "at_bounds": fit.at_bounds,
         "indices": None if fit.indices is None else asdict(fit.indices),
     }
 
 
-def _record_fit(session: SessionAnalysis, fit: RecordEstimate) -> dict[str, Any]:
+def _record_fit_json(session: SessionAnalysis, fit: RecordEstimate) -> dict[str, Any]:
+    """Return the JSON object of a session's whole-record fit."""
     return {
-        **_name(session, "record", fit.structure),
+        **_fit_identity(session, "record", fit.structure),
         "candidate": fit.name,
         "parameters": fit.parameters,
-        "std": _of_free(fit.std, fit.free),
+        "std": _std_of_free_parameters(fit.std, fit.free),
         "cost": fit.cost,
         "at_bounds": fit.at_bounds,
         "indices": asdict(fit.indices),
     }
 
 
-def _of_free(std: Mapping[str, float | None], free: Collection[str]) -> dict[str, float | None]:
-    """Replace the standard deviations of fixed parameters, which were not estimated, by None."""
-    return {name: value if name in free else None for name, value in std.items()}
+def _std_of_free_parameters(
+    std: Mapping[str, float | None], free_parameters: Collection[str]
+) -> dict[str, float | None]:
+    """Return standard deviations with None for fixed parameters, which were not estimated."""
+    return {name: value if name in free_parameters else None for name, value in std.items()}
 
 
-def _mode(session: SessionAnalysis, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:
+def _mode_json(session: SessionAnalysis, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:
+    """Return the JSON object of a mode of a session's whole-record fit."""
     values = asdict(mode)
-    return _name(session, "record", fit.structure) | {"mode": values.pop("number"), **values}
+    return _fit_identity(session, "record", fit.structure) | {
+        "mode": values.pop("number"),
+        **values,
+    }

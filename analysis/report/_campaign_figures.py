@@ -1,4 +1,4 @@
-"""Figures of a campaign: distances, pooled estimates, responses, validation."""
+"""Figures of a campaign: indices of the models, pooled estimates, responses, validation."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from analysis.campaigns.sentences import MIXTURE_MARK, label, probability, title
 from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._frf_figure import line_styles
-from analysis.report._paper_tables import welch_text
-from analysis.report._pooled_tables import exactly, used
-from analysis.report.table import MARK, unreported
+from analysis.report._paper_tables import welch_method_text
+from analysis.report._pooled_tables import exact_condition_text, session_count_text
+from analysis.report.table import NOT_REPORTED_MARK, unreported_parameters
 from rigd.view.frequency_charts import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
@@ -27,12 +27,14 @@ if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult, NominalModel, SessionAnalysis
     from analysis.campaigns.pooling import PooledParameter
 
-_PANELS: Final = (
+_INDEX_PANELS: Final = (
     ("mse", "(a) Mean square error", "MSE ((N·m/rad)²)"),
     ("wmse", "(b) Mean square error, weighted with 1/ω", "WMSE ((N·m/rad)²)"),
     ("md", "(c) Maximum deviation", "MD (N·m/rad)"),
 )
-_FLIER_SIZE: Final = 3.0
+"""Index, heading and axis label of each panel of the figure of indices."""
+_MARK_SIZE_PT: Final = 3.0
+"""Size of the marks of means and outliers, in points."""
 
 
 def index_figure(campaign: CampaignResult) -> Figure:
@@ -43,7 +45,9 @@ def index_figure(campaign: CampaignResult) -> Figure:
 
     types = list(dict.fromkeys(model.structure for model in campaign.nominal))
     weightings = list(dict.fromkeys(model.weighting for model in campaign.nominal))
-    colors = {name: line["color"] for name, line in line_styles(tuple(weightings)).items()}
+    colors = {
+        name: line_style["color"] for name, line_style in line_styles(tuple(weightings)).items()
+    }
     width_in, height_in = 13.0, 4.9
     figure = style.new_figure(
         width_in, height_in,
@@ -53,26 +57,28 @@ def index_figure(campaign: CampaignResult) -> Figure:
     grid = figure.add_gridspec(
         1, 3, left=0.055, right=0.99, top=1 - 1.2 / height_in, bottom=0.45 / height_in, wspace=0.2
     )
-    width = 0.72 / len(weightings)
-    for column, (index, heading, axis_label) in enumerate(_PANELS):
+    box_width = 0.72 / len(weightings)
+    for column, (index, heading, axis_label) in enumerate(_INDEX_PANELS):
         axes = figure.add_subplot(grid[column])
         for model in campaign.nominal:
             offset = weightings.index(model.weighting) - (len(weightings) - 1) / 2
-            position = types.index(model.structure) + offset * width
-            values = np.array([getattr(each, index) for each in model.indices])
+            position = types.index(model.structure) + offset * box_width
+            values = np.array(
+                [getattr(session_indices, index) for session_indices in model.indices]
+            )
             color = colors[model.weighting]
             axes.boxplot(
-                [values], positions=[position], widths=0.8 * width, patch_artist=True,
+                [values], positions=[position], widths=0.8 * box_width, patch_artist=True,
                 showmeans=True, manage_ticks=False,
                 boxprops={"facecolor": "white", "edgecolor": color},
                 whiskerprops={"color": color}, capprops={"color": color},
                 medianprops={"color": "#C00000", "linewidth": 1.2},
                 meanprops={
                     "marker": "o", "markerfacecolor": style.GREEN, "markeredgecolor": style.GREEN,
-                    "markersize": _FLIER_SIZE,
+                    "markersize": _MARK_SIZE_PT,
                 },
                 flierprops={
-                    "marker": "x", "markeredgecolor": color, "markersize": _FLIER_SIZE,
+                    "marker": "x", "markeredgecolor": color, "markersize": _MARK_SIZE_PT,
                 },
             )  # fmt: skip
         axes.set_yscale("log")
@@ -83,116 +89,141 @@ def index_figure(campaign: CampaignResult) -> Figure:
         axes.grid(visible=False, axis="x")
         axes.set_title(heading)
         axes.set_ylabel(axis_label)
-    keys = [Patch(facecolor="white", edgecolor=colors[w], label=f"weights {w}") for w in weightings]
-    marks = [
+    weighting_entries = [
+        Patch(facecolor="white", edgecolor=colors[w], label=f"weights {w}") for w in weightings
+    ]
+    mark_entries = [
         Line2D([], [], color="#C00000", label="median"),
         Line2D([], [], color=style.GREEN, marker="o", linestyle="", markersize=4, label="mean"),
     ]
-    style.legend(figure, [*keys, *marks], columns=len(keys) + 2)
+    style.legend(figure, [*weighting_entries, *mark_entries], columns=len(weighting_entries) + 2)
     return figure
 
 
-_COLUMNS: Final = 4
-INTERVAL: Final = "#C3DCED"
-"""Colour of an interval: the pooled line's blue, but light and opaque."""
+_PANELS_PER_ROW: Final = 4
+"""Number of panels in a row of the pooled figure."""
+INTERVAL_COLOR: Final = "#C3DCED"
+"""Colour of an interval: the blue of pooled lines, but light and opaque."""
 
 
 def pooled_figure(campaign: CampaignResult) -> Figure:
-    """Draw each session's estimate with its 95 % interval over the pooled one, freest structure."""
+    """Draw each session's estimate of every parameter with its interval, over the pooled one.
+
+    The figure shows the freest structure that the sessions support.
+    """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     estimate = campaign.headline
     assert estimate is not None
-    withheld = campaign.verdict.withheld if campaign.verdict else ()
-    doubtful = unreported(STRUCTURES[estimate.structure], withheld)
-    note = f"  ·  {MARK} not reported: not supported by the data" if doubtful else ""
-    if any(campaign.homogeneity.is_mixed(each.name) for each in estimate.parameters):
-        note += f"  ·  {MIXTURE_MARK} mean of a mixture"
-    rows = -(-len(estimate.parameters) // _COLUMNS)
+    unsupported_orders = campaign.verdict.withheld if campaign.verdict else ()
+    not_reported = unreported_parameters(STRUCTURES[estimate.structure], unsupported_orders)
+    subtitle_note = (
+        f"  ·  {NOT_REPORTED_MARK} not reported: not supported by the data" if not_reported else ""
+    )
+    if any(campaign.homogeneity.is_mixed(parameter.name) for parameter in estimate.parameters):
+        subtitle_note += f"  ·  {MIXTURE_MARK} mean of a mixture"
+    rows = -(-len(estimate.parameters) // _PANELS_PER_ROW)
     width_in, height_in = 13.0, 2.6 * rows + 1.35
     figure = style.new_figure(
         width_in, height_in,
         title(
-            f"{used(estimate, campaign)} — pooled whole-record estimate, type {estimate.name}",
+            f"{session_count_text(estimate, campaign)} — pooled whole-record estimate, type "
+            f"{estimate.name}",
             campaign.homogeneity,
         ),
-        f"freest type that the sessions support{exactly(campaign)}  ·  "
+        f"freest type that the sessions support{exact_condition_text(campaign)}  ·  "
         f"residual {estimate.misfit:.3g} times the noise  ·  p: p-value of Cochran's Q"
-        f"{note}",
+        f"{subtitle_note}",
     )  # fmt: skip
     grid = figure.add_gridspec(
-        rows, _COLUMNS, left=0.06, right=0.99, top=1 - 1.2 / height_in, bottom=0.5 / height_in,
-        wspace=0.42, hspace=0.4,
+        rows, _PANELS_PER_ROW, left=0.06, right=0.99, top=1 - 1.2 / height_in,
+        bottom=0.5 / height_in, wspace=0.42, hspace=0.4,
     )  # fmt: skip
     for number, parameter in enumerate(estimate.parameters):
-        axes = figure.add_subplot(grid[number // _COLUMNS, number % _COLUMNS])
-        _panel(campaign, estimate.name, parameter, axes, reported=parameter.name not in doubtful)
-        if number + _COLUMNS >= len(estimate.parameters):
+        axes = figure.add_subplot(grid[number // _PANELS_PER_ROW, number % _PANELS_PER_ROW])
+        _draw_parameter_panel(
+            campaign, estimate.name, parameter, axes, reported=parameter.name not in not_reported
+        )
+        if number + _PANELS_PER_ROW >= len(estimate.parameters):
             axes.set_xlabel("Session", labelpad=1)
-    marks = [
+    legend_entries = [
         Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
                label="session, ± 1.96 of its standard deviation"),
         Line2D([], [], color=style.BLUE, label="pooled"),
-        Patch(facecolor=INTERVAL, label="its 95 % interval"),
-        Patch(facecolor=style.SHADE, label="95 % prediction interval"),
+        Patch(facecolor=INTERVAL_COLOR, label="its 95 % interval"),
+        Patch(facecolor=style.SHADE_COLOR, label="95 % prediction interval"),
     ]  # fmt: skip
-    style.legend(figure, marks, columns=4)
+    style.legend(figure, legend_entries, columns=4)
     return figure
 
 
-def _panel(
+def _draw_parameter_panel(
     campaign: CampaignResult, name: str, parameter: PooledParameter, axes: Axes, *, reported: bool
 ) -> None:
+    """Draw the sessions' estimates of a parameter over its pooled and prediction interval."""
     symbol, factor, _ = label(parameter.name)
-    positions, values, spreads = [], [], []
+    positions, values, half_widths = [], [], []
     for number, session in enumerate(campaign.sessions, start=1):
-        for each in session.record_estimates:
-            std = each.std.get(parameter.name)
-            if each.name == name and std is not None:
+        for estimate in session.record_estimates:
+            std = estimate.std.get(parameter.name)
+            if estimate.name == name and std is not None:
                 positions.append(number)
-                values.append(factor * each.parameters[parameter.name])
-                spreads.append(1.96 * factor * std)
-    axes.axhspan(*(factor * end for end in parameter.next_interval), color=style.SHADE, zorder=0.5)
+                values.append(factor * estimate.parameters[parameter.name])
+                half_widths.append(1.96 * factor * std)
+    axes.axhspan(
+        *(factor * end for end in parameter.next_interval), color=style.SHADE_COLOR, zorder=0.5
+    )
     axes.axhspan(
         *(factor * end for end in parameter.interval),
-        color=INTERVAL if reported else style.FAINT,
+        color=INTERVAL_COLOR if reported else style.FAINT,
         zorder=0.6,
     )
-    ink, line = (style.INK, style.BLUE) if reported else (style.GREY, style.GREY)
-    axes.axhline(factor * parameter.value, color=line)
+    session_color, pooled_color = (style.INK, style.BLUE) if reported else (style.GREY, style.GREY)
+    axes.axhline(factor * parameter.value, color=pooled_color)
     axes.errorbar(
-        positions, values, yerr=spreads, fmt="o", markersize=2.6, color=ink, linewidth=0.8
+        positions,
+        values,
+        yerr=half_widths,
+        fmt="o",
+        markersize=2.6,
+        color=session_color,
+        linewidth=0.8,
     )
-    mark = "" if reported else MARK
-    mark += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
-    chance = f"p = {probability(parameter.chance)}".replace("= <", "<")
-    axes.set_title(f"{symbol}{mark}   {chance}")
+    marks = "" if reported else NOT_REPORTED_MARK
+    marks += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
+    p_value_text = f"p = {probability(parameter.chance)}".replace("= <", "<")
+    axes.set_title(f"{symbol}{marks}   {p_value_text}")
     axes.set_ylabel(with_unit(parameter.name))
     axes.set_xlim(0.3, len(campaign.sessions) + 0.7)
     axes.set_xticks(np.unique(np.linspace(1, len(campaign.sessions), 6).round().astype(int)))
     axes.ticklabel_format(axis="y", useOffset=False)
 
 
-_MOST_POINTS: Final = 500
+_PANEL_COLUMNS: Final = 500
+"""Number of columns into which a response is decimated in a small panel."""
 _WIDE_COLUMNS: Final = 1500
-_MOST_LINES: Final = 40
-"""Most sessions drawn: more would not be distinguishable."""
-SESSION: Final = "#A8A8A8"
+"""Number of columns into which a response is decimated in a wide panel."""
+_MOST_DRAWN_SESSIONS: Final = 40
+"""Largest number of sessions whose responses are drawn: more would not be distinguishable."""
+SESSION_COLOR: Final = "#A8A8A8"
 """Colour of a single session's response."""
-_PAIR: Final[tuple[dict[str, Any], ...]] = (
+_BEST_MODEL_STYLES: Final[tuple[dict[str, Any], ...]] = (
     {"color": style.BLUE, "linestyle": "-"},
     {"color": style.VERMILION, "linestyle": (0, (4, 2))},
 )
+"""Line styles of the two best models."""
 
 
 def nominal_figure(campaign: CampaignResult) -> Figure:
-    """Draw every type's nominal models over all measured responses (Figure 6)."""
+    """Draw the nominal models of every type over all measured responses (Figure 6)."""
     types = list(dict.fromkeys(model.structure for model in campaign.nominal))
     columns = min(len(types), 4 if len(types) > 6 else 3)
     rows = -(-len(types) // columns)
     width_in, height_in = max(4.4 * columns, 9.0), 3.75 * rows + 1.35
-    figure = _figure(campaign, width_in, height_in, "frequency responses and nominal models")
+    figure = _new_response_figure(
+        campaign, width_in, height_in, "frequency responses and nominal models"
+    )
     grid = figure.add_gridspec(
         rows, columns, left=0.62 / width_in, right=1 - 0.2 / width_in,
         top=1 - 1.15 / height_in, bottom=0.55 / height_in, wspace=0.12, hspace=0.24,
@@ -205,10 +236,10 @@ def nominal_figure(campaign: CampaignResult) -> Figure:
     for name, magnitude, phase in panels:
         models = [model for model in campaign.nominal if model.structure == name]
         styles = [(f"nominal, weights {m.weighting}", lines[m.weighting]) for m in models]
-        handles |= _response_panel(campaign, magnitude, phase, models, styles, _MOST_POINTS)
+        handles |= _draw_responses(campaign, magnitude, phase, models, styles, _PANEL_COLUMNS)
     for phase in figure.axes[1::2][-columns:]:
         phase.set_xlabel("Frequency (Hz)", labelpad=1)
-    _legend(figure, handles)
+    _add_legend(figure, handles)
     return figure
 
 
@@ -217,7 +248,7 @@ def best_figure(campaign: CampaignResult) -> Figure:
     models = best_models(campaign.nominal)
     width_in, height_in = 10.0, 6.6
     names = " and ".join(f"type {m.structure} ({m.weighting})" for m in models)
-    figure = _figure(campaign, width_in, height_in, f"nominal models of {names}")
+    figure = _new_response_figure(campaign, width_in, height_in, f"nominal models of {names}")
     grid = figure.add_gridspec(
         2, 1, left=0.62 / width_in, right=1 - 0.2 / width_in, top=1 - 0.95 / height_in,
         bottom=0.55 / height_in, height_ratios=(2.2, 1.0), hspace=0.07,
@@ -225,29 +256,34 @@ def best_figure(campaign: CampaignResult) -> Figure:
     magnitude, phase = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
     styles = [
         (f"nominal type {m.structure}, weights {m.weighting}", line_style)
-        for m, line_style in zip(models, _PAIR, strict=False)
+        for m, line_style in zip(models, _BEST_MODEL_STYLES, strict=False)
     ]
-    handles = _response_panel(campaign, magnitude, phase, models, styles, _WIDE_COLUMNS)
+    handles = _draw_responses(campaign, magnitude, phase, models, styles, _WIDE_COLUMNS)
     magnitude.set_ylim(_db_limits(campaign, models))
     style.response_axes(magnitude, phase)
     style.frequency_axis(magnitude, campaign.settings.band_hz, labels=False)
     style.frequency_axis(phase, campaign.settings.band_hz)
     phase.set_xlabel("Frequency (Hz)", labelpad=1)
-    _legend(figure, handles)
+    _add_legend(figure, handles)
     return figure
 
 
-def _figure(campaign: CampaignResult, width_in: float, height_in: float, what: str) -> Figure:
+def _new_response_figure(
+    campaign: CampaignResult, width_in: float, height_in: float, heading: str
+) -> Figure:
+    """Return an empty figure whose title states the sessions and the response estimator."""
     count = len(campaign.sessions)
-    drawn = "" if count <= _MOST_LINES else f", {_MOST_LINES} of them drawn"
+    drawn_sessions_text = (
+        "" if count <= _MOST_DRAWN_SESSIONS else f", {_MOST_DRAWN_SESSIONS} of them drawn"
+    )
     return style.new_figure(
-        width_in, height_in, f"{count} sessions — {what}",
-        f"coupling torque over motor angle, {welch_text(campaign)}{drawn}  ·  "
+        width_in, height_in, f"{count} sessions — {heading}",
+        f"coupling torque over motor angle, {welch_method_text(campaign)}{drawn_sessions_text}  ·  "
         "a nominal model has the mean of the sessions' parameters",
     )  # fmt: skip
 
 
-def _response_panel(
+def _draw_responses(
     campaign: CampaignResult,
     magnitude: Axes,
     phase: Axes,
@@ -255,6 +291,7 @@ def _response_panel(
     styles: Sequence[tuple[str, dict[str, Any]]],
     columns: int,
 ) -> dict[str, Line2D]:
+    """Draw all sessions' responses and the models over them; return the lines by label."""
     handles: dict[str, Line2D] = {}
     frequency_hz = campaign.sessions[0].frequency_hz
     for session in shown_sessions(campaign):
@@ -263,19 +300,23 @@ def _response_panel(
         )
     for model, (name, line_style) in zip(models, styles, strict=True):
         (handles[name],) = magnitude.plot(
-            *_line(frequency_hz, magnitude_db(model.response), columns), **line_style, linewidth=1.3
+            *_decimated_line(frequency_hz, magnitude_db(model.response), columns),
+            **line_style,
+            linewidth=1.3,
         )
         phase.plot(
-            *_line(frequency_hz, phase_deg(model.response), columns), **line_style, linewidth=1.3
+            *_decimated_line(frequency_hz, phase_deg(model.response), columns),
+            **line_style,
+            linewidth=1.3,
         )
     return handles
 
 
 def shown_sessions(campaign: CampaignResult) -> list[SessionAnalysis]:
-    """Choose sessions to be drawn together, spread over the campaign."""
+    """Return the sessions to draw together, evenly spread over the campaign."""
     last = len(campaign.sessions) - 1
-    chosen = np.unique(np.linspace(0, last, _MOST_LINES).round().astype(int))
-    return [campaign.sessions[number] for number in chosen]
+    session_indices = np.unique(np.linspace(0, last, _MOST_DRAWN_SESSIONS).round().astype(int))
+    return [campaign.sessions[number] for number in session_indices]
 
 
 def draw_session(
@@ -284,70 +325,88 @@ def draw_session(
     frequency_hz: NDArray[np.float64],
     response: NDArray[np.complex128],
     columns: int,
-    dots: int,
+    most_dots: int,
     alpha: float = 1.0,
 ) -> Line2D:
-    """Draw one session's response behind those of all; return the line of its magnitude."""
+    """Draw one session's response in the background and return the line of its magnitude."""
     (line,) = magnitude.plot(
-        *_line(frequency_hz, magnitude_db(response), columns), color=SESSION, linewidth=0.5,
-        alpha=alpha, rasterized=True,
+        *_decimated_line(frequency_hz, magnitude_db(response), columns), color=SESSION_COLOR,
+        linewidth=0.5, alpha=alpha, rasterized=True,
     )  # fmt: skip
-    few = style.spread(frequency_hz, dots)
-    # Dots: a line would run up and down wherever noise wraps the phase.
+    point_indices = style.log_spaced_indices(frequency_hz, most_dots)
+    # Dots, because a line would jump wherever noise wraps the phase.
     phase.plot(
-        frequency_hz[few], phase_deg(response[few]), ".", markersize=0.8, color=SESSION,
-        rasterized=True,
+        frequency_hz[point_indices], phase_deg(response[point_indices]), ".", markersize=0.8,
+        color=SESSION_COLOR, rasterized=True,
     )  # fmt: skip
     return line
 
 
-def _line(
+def _decimated_line(
     frequency_hz: NDArray[np.float64], values: NDArray[np.float64], columns: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return frequencies and values decimated to a number of columns of a logarithmic axis."""
     return style.envelope(frequency_hz, values, columns, logarithmic=True)
 
 
-def _legend(figure: Figure, handles: dict[str, Line2D]) -> None:
-    legend = style.legend(figure, list(handles.values()), list(handles), columns=len(handles))
-    legend.get_lines()[0].set_linewidth(1.5)
+def _add_legend(figure: Figure, handles: dict[str, Line2D]) -> None:
+    """Add a legend to a figure and thicken the line of the measured responses in it."""
+    figure_legend = style.legend(
+        figure, list(handles.values()), list(handles), columns=len(handles)
+    )
+    figure_legend.get_lines()[0].set_linewidth(1.5)
 
 
 def _db_limits(campaign: CampaignResult, models: Sequence[NominalModel]) -> tuple[float, float]:
-    measured = [session.response for session in campaign.sessions]
-    return style.db_limits(measured, [model.response for model in models], room_db=3.0)
+    """Return magnitude limits in dB that contain all sessions' responses and the models' peaks."""
+    measured_frf = [session.response for session in campaign.sessions]
+    return style.db_limits(measured_frf, [model.response for model in models], headroom_db=3.0)
 
 
-_ROW_IN: Final = 0.27
+_ROW_HEIGHT_IN: Final = 0.27
+"""Height of a model's row in the validation figure, in inches."""
 
 
 def validation_figure(campaign: CampaignResult) -> Figure:
-    """Draw every left-out session's error, model by model, the best at the top."""
+    """Draw the prediction error of every left-out session by model, the best model at the top."""
     from matplotlib.lines import Line2D
 
     models = by_model(campaign.validation)
     weightings = campaign.settings.weightings
-    colors = {w: line["color"] for w, line in line_styles(weightings).items()}
-    width_in, height_in = 9.0, _ROW_IN * len(models) + 1.75
+    colors = {w: line_style["color"] for w, line_style in line_styles(weightings).items()}
+    width_in, height_in = 9.0, _ROW_HEIGHT_IN * len(models) + 1.75
     figure = style.new_figure(
-        width_in, height_in, f"{_predicted(campaign)} sessions — leave-one-out validation",
+        width_in, height_in,
+        f"{_predicted_sessions_text(campaign)} sessions — leave-one-out validation",
         "rms of predicted minus measured torque over that of the measured torque, "
         f"{campaign.record_band_hz[0]:g} to {campaign.record_band_hz[1]:g} Hz",
     )  # fmt: skip
     axes = figure.add_axes(
-        (2.0 / width_in, 0.5 / height_in, 1 - 2.2 / width_in, _ROW_IN * len(models) / height_in)
+        (
+            2.0 / width_in,
+            0.5 / height_in,
+            1 - 2.2 / width_in,
+            _ROW_HEIGHT_IN * len(models) / height_in,
+        )
     )
-    rng = np.random.default_rng(0)  # equal errors are then side by side
+    rng = np.random.default_rng(0)  # random offsets put equal errors side by side
     for row, (_, _, weighting, errors) in enumerate(models):
         color = style.GREEN if weighting is None else colors[weighting]
-        values = 100 * np.array([each.error for each in errors])
+        values = 100 * np.array([session_error.error for session_error in errors])
         axes.plot(
             values, row + rng.uniform(-0.18, 0.18, values.size), "o", color=color, markersize=2.6,
             alpha=0.6,
         )  # fmt: skip
-        own = [each.own_error for each in errors if each.own_error is not None]
-        if own:
-            axes.plot([100 * float(np.mean(own))], [row], "|", color=style.INK, markersize=11)
-    axes.set_yticks(range(len(models)), [_name(*model[:3]) for model in models])
+        own_errors = [
+            session_error.own_error
+            for session_error in errors
+            if session_error.own_error is not None
+        ]
+        if own_errors:
+            axes.plot(
+                [100 * float(np.mean(own_errors))], [row], "|", color=style.INK, markersize=11
+            )
+    axes.set_yticks(range(len(models)), [_model_label(*model[:3]) for model in models])
     axes.set_ylim(len(models) - 0.4, -0.6)
     axes.set_xscale("log")
     low, high = axes.get_xlim()
@@ -367,10 +426,16 @@ def validation_figure(campaign: CampaignResult) -> Figure:
     return figure
 
 
-def _predicted(campaign: CampaignResult) -> str:
-    done = campaign.trials - len(campaign.lost_trials)
-    return f"{done} of {campaign.trials}" if campaign.lost_trials else str(done)
+def _predicted_sessions_text(campaign: CampaignResult) -> str:
+    """Return how many of the sessions were predicted, as text."""
+    completed_trials = campaign.trials - len(campaign.lost_trials)
+    return (
+        f"{completed_trials} of {campaign.trials}"
+        if campaign.lost_trials
+        else str(completed_trials)
+    )
 
 
-def _name(_method: str, structure: str, weighting: str | None) -> str:
+def _model_label(_method: str, structure: str, weighting: str | None) -> str:
+    """Return the label of a model in the validation figure."""
     return f"{structure}: {'whole record' if weighting is None else f'Welch, {weighting}'}"

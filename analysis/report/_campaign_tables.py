@@ -1,7 +1,4 @@
-"""Tables of a campaign for the terminal, its page, CSV and JSON: which there are, and the lists.
-
-Lists are those of the sessions and of the predictions.
-"""
+"""Tables of a campaign for terminal, page, CSV and JSON: which are shown, and lists of sessions."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ import numpy as np
 
 from analysis.campaigns import by_model
 from analysis.campaigns.sentences import label, lost_trials
-from analysis.report._paper_tables import NAMES, paper_tables
+from analysis.report._paper_tables import FIT_NAME_COLUMNS, paper_tables
 from analysis.report._pooled_tables import (
     homogeneity_table,
     likely_estimates,
@@ -20,10 +17,10 @@ from analysis.report._pooled_tables import (
     pooled_table,
     specimens_table,
     structures_table,
-    tolerant_table,
+    tolerance_table,
     uniform_beam_table,
 )
-from analysis.report.table import ABSENT, WORDS, Cell, Column, Entry, Row, Table
+from analysis.report.table import ABSENT_TEXT, TEXT_FORMAT, Cell, Column, Entry, Row, Table
 from rigd.session.user_metadata import META_PREFIX
 from rigd.units import suffix_of, unit_of
 
@@ -33,19 +30,19 @@ if TYPE_CHECKING:
 
 def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     """Return the tables of the whole records for terminal and page, the most important first."""
-    found = campaign.homogeneity
+    homogeneity = campaign.homogeneity
     estimates = likely_estimates(campaign)
-    scatter = [homogeneity_table(campaign)] if found.quantities else []
+    scatter_tables = [homogeneity_table(campaign)] if homogeneity.quantities else []
     return (
         session_list_table(campaign),
-        *([specimens_table(campaign)] if len(found.specimens) > 1 else []),
-        *(scatter if found.mixed else []),
+        *([specimens_table(campaign)] if len(homogeneity.specimens) > 1 else []),
+        *(scatter_tables if homogeneity.mixed else []),
         *headline_tables(campaign),
         *([uniform_beam_table(campaign)] if campaign.modal else []),
-        *(pooled_table(campaign, each) for each in estimates[1:]),
+        *(pooled_table(campaign, estimate) for estimate in estimates[1:]),
         *([structures_table(campaign)] if campaign.structures else []),
         *([validation_summary(campaign)] if campaign.validation else []),
-        *([] if found.mixed else scatter),
+        *([] if homogeneity.mixed else scatter_tables),
     )
 
 
@@ -55,18 +52,18 @@ def main_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 
 def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
-    """Return the main tables: modes, parameters with a tolerance of the geometry, pooled fit."""
-    made = (
+    """Return the main tables: pooled modes, parameters with a tolerance, and the pooled fit."""
+    candidates = (
         modes_table(campaign),
-        tolerant_table(campaign),
-        *(pooled_table(campaign, each) for each in likely_estimates(campaign)[:1]),
+        tolerance_table(campaign),
+        *(pooled_table(campaign, estimate) for estimate in likely_estimates(campaign)[:1]),
     )
-    return tuple(table for table in made if table.rows)
+    return tuple(table for table in candidates if table.rows)
 
 
 def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Table]:
-    """Return every table of the files by its name, without empty ones."""
-    made = (
+    """Return the tables that are written to files, by name, except empty ones."""
+    candidates = (
         *paper_tables(campaign, with_paper=with_paper),
         session_list_table(campaign),
         sessions_welch_table(campaign),
@@ -74,68 +71,77 @@ def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[st
         structures_table(campaign),
         *([specimens_table(campaign)] if len(campaign.homogeneity.specimens) > 1 else []),
         homogeneity_table(campaign),
-        tolerant_table(campaign),
+        tolerance_table(campaign),
         uniform_beam_table(campaign),
         pooled_table(campaign),
         modes_table(campaign),
         validation_table(campaign),
     )
-    return {table.name: table for table in made if table.rows}
+    return {table.name: table for table in candidates if table.rows}
 
 
 def session_list_table(campaign: CampaignResult) -> Table:
-    """Return the table of all files, excluded ones last."""
+    """Return the table of all files with the metadata that they state, excluded files last."""
 
     def text_cell(text: str) -> Cell:
-        return Cell(text, text or ABSENT)
+        return Cell(text, text or ABSENT_TEXT)
 
     headings = ("file", "recorded (UTC)", "specimen", "operator", "note")
     keys = ("file", "start_utc", "specimen", "operator", "note")
-    stated = (
-        *(each.experiment for each in campaign.sessions),
-        *(each.experiment for each in campaign.failures),
+    experiments = (
+        *(session.experiment for session in campaign.sessions),
+        *(session.experiment for session in campaign.failures),
     )
-    added = dict.fromkeys(name for its in stated if its for name in its.added)
+    metadata_names = dict.fromkeys(
+        name for experiment in experiments if experiment for name in experiment.added
+    )
     return Table.of(
         "session_list",
         "Sessions, as their files state them",
         (
-            *(Column(heading, key, WORDS) for heading, key in zip(headings, keys, strict=True)),
-            *map(_added_column, added),
-            Column("used", "used", WORDS),
+            *(
+                Column(heading, key, TEXT_FORMAT)
+                for heading, key in zip(headings, keys, strict=True)
+            ),
+            *map(_added_column, metadata_names),
+            Column("used", "used", TEXT_FORMAT),
         ),
         (
             (
-                Cell(str(each.path), each.name),
-                text_cell(its.start_utc if its else ""),
-                text_cell(its.label if its else ""),
-                text_cell(its.operator if its else ""),
-                text_cell(its.note if its else ""),
-                *(_added_cell(its.added.get(name) if its else None) for name in added),
-                used,
+                Cell(str(session.path), session.name),
+                text_cell(experiment.start_utc if experiment else ""),
+                text_cell(experiment.label if experiment else ""),
+                text_cell(experiment.operator if experiment else ""),
+                text_cell(experiment.note if experiment else ""),
+                *(
+                    _added_cell(experiment.added.get(name) if experiment else None)
+                    for name in metadata_names
+                ),
+                is_used,
             )
-            for used, group in ((True, campaign.sessions), (False, campaign.failures))
-            for each in group
-            for its in (each.experiment,)
+            for is_used, group in ((True, campaign.sessions), (False, campaign.failures))
+            for session in group
+            for experiment in (session.experiment,)
         ),
     )
 
 
 def _added_column(name: str) -> Column:
-    """Column of metadata that users added, with the unit that its name ends in."""
+    """Return the column of metadata that users added, with the unit from its name."""
     unit = unit_of(name)
-    words = name.removesuffix(suffix_of(name)).replace("_", " ")
-    return Column(f"{words} ({unit})" if unit else words, f"{META_PREFIX}{name}", WORDS)
+    heading = name.removesuffix(suffix_of(name)).replace("_", " ")
+    return Column(f"{heading} ({unit})" if unit else heading, f"{META_PREFIX}{name}", TEXT_FORMAT)
 
 
 def _added_cell(value: float | str | None) -> Cell:
+    """Return the cell of a metadata value that users added; a dash if there is none."""
     if value is None:
-        return Cell(None, ABSENT)
+        return Cell(None, ABSENT_TEXT)
     return Cell(value, value if isinstance(value, str) else f"{value:g}")
 
 
 def sessions_welch_table(campaign: CampaignResult) -> Table:
-    """Every session's Welch fits, and the distance of the nominal models."""
+    """Return the table of every session's Welch fits, with the distance from the nominal models."""
     rows = [
         {
             "file": str(session.path),
@@ -149,75 +155,84 @@ def sessions_welch_table(campaign: CampaignResult) -> Table:
         for index, session in enumerate(campaign.sessions)
         for fit, model in zip(session.welch_fits, campaign.nominal, strict=True)
     ]
-    return _for_programs("sessions_welch", rows)
+    return _file_only_table("sessions_welch", rows)
 
 
 def sessions_record_table(campaign: CampaignResult) -> Table:
-    """Every session's whole-record fits."""
+    """Return the table of every session's whole-record fits."""
     rows = [
         {
             "file": str(session.path),
-            "type": each.structure,
-            **each.parameters,
+            "type": estimate.structure,
+            **estimate.parameters,
             **{
-                _std_key(name): value if name in each.free else None
-                for name, value in each.std.items()
+                _std_key(name): value if name in estimate.free else None
+                for name, value in estimate.std.items()
             },
-            "cost": each.cost,
-            "degrees_of_freedom": each.degrees_of_freedom,
-            "bic": each.bic,
-            "at_bounds": " ".join(each.at_bounds),
+            "cost": estimate.cost,
+            "degrees_of_freedom": estimate.degrees_of_freedom,
+            "bic": estimate.bic,
+            "at_bounds": " ".join(estimate.at_bounds),
         }
         for session in campaign.sessions
-        for each in session.record_estimates
+        for estimate in session.record_estimates
     ]
-    return _for_programs("sessions_record", rows)
+    return _file_only_table("sessions_record", rows)
 
 
 def _std_key(parameter: str) -> str:
-    """Return the name of a parameter's standard deviation, with the unit last: ``delay_std_s``."""
+    """Return the key of a parameter's standard deviation, with the unit last: ``delay_std_s``."""
     unit = suffix_of(parameter)
     return f"{parameter.removesuffix(unit)}_std{unit}"
 
 
-def _for_programs(name: str, rows: list[dict[str, Any]]) -> Table:
-    """Make a table of files only."""
+def _file_only_table(name: str, rows: list[dict[str, Any]]) -> Table:
+    """Return a table that is written to files only."""
     return Table(name, "", (), tuple(rows))
 
 
 def validation_table(campaign: CampaignResult) -> Table:
-    """Return the errors of each session predicted from the others, then the lost trials."""
+    """Return the table of errors when each session is predicted from the others.
+
+    The trials that failed follow.
+    """
     rows: list[dict[str, Any]] = [
         {
-            "file": str(each.path),
-            "method": each.method,
-            "type": each.name,
-            "weighting": each.weighting,
-            "error": each.error,
-            "own_error": each.own_error,
-            "nrmse_percent": None if each.own_error is None else 100 * (1 - each.own_error),
+            "file": str(prediction.path),
+            "method": prediction.method,
+            "type": prediction.name,
+            "weighting": prediction.weighting,
+            "error": prediction.error,
+            "own_error": prediction.own_error,
+            "nrmse_percent": None
+            if prediction.own_error is None
+            else 100 * (1 - prediction.own_error),
             "lost": None,
         }
-        for each in campaign.validation
+        for prediction in campaign.validation
     ]
-    rows += [{"file": str(each.path), "lost": each.reason} for each in campaign.lost_trials]
-    return _for_programs("validation", rows)
+    rows += [{"file": str(trial.path), "lost": trial.reason} for trial in campaign.lost_trials]
+    return _file_only_table("validation", rows)
 
 
 def validation_summary(campaign: CampaignResult) -> Table:
-    """Fit, and leave-one-out error, of each model over the sessions, the best model first."""
+    """Return the table of each model's fit and leave-one-out error, the best model first."""
     rows: list[Row] = []
     for method, name, weighting, errors in by_model(campaign.validation):
-        values = [each.error for each in errors]
-        own = [each.own_error for each in errors if each.own_error is not None]
+        values = [session_error.error for session_error in errors]
+        own_errors = [
+            session_error.own_error
+            for session_error in errors
+            if session_error.own_error is not None
+        ]
         rows.append(
             {
                 "method": method,
                 "type": name,
                 "weighting": weighting or "",
                 "sessions": f"{len(values)} of {campaign.trials}",
-                "nrmse_percent": 100 * (1 - float(np.mean(own))) if own else None,
-                "own_error": float(np.mean(own)) if own else None,
+                "nrmse_percent": 100 * (1 - float(np.mean(own_errors))) if own_errors else None,
+                "own_error": float(np.mean(own_errors)) if own_errors else None,
                 "error": float(np.mean(values)),
                 "worst": max(values),
             }
@@ -226,7 +241,8 @@ def validation_summary(campaign: CampaignResult) -> Table:
         "validation",
         "Leave-one-out validation: rms error of the torque, mean over the sessions",
         (
-            Column("method", "method", WORDS), *NAMES, Column("sessions", "sessions"),
+            Column("method", "method", TEXT_FORMAT), *FIT_NAME_COLUMNS,
+            Column("sessions", "sessions"),
             Column("fit (NRMSE, %)", "nrmse_percent", ".2f"),
             Column("in-sample error (%)", "own_error", ".2f", 100.0),
             Column("leave-one-out error (%)", "error", ".2f", 100.0),
@@ -242,50 +258,55 @@ def validation_summary(campaign: CampaignResult) -> Table:
 
 
 def sessions_table(campaign: CampaignResult) -> Table:
-    """Return the table of sessions with their own verdicts, then those left out."""
-    leading = campaign.homogeneity.leading
-    groups = leading.groups if leading else ()
-    group_of = {name: f"{index}" for index, names in enumerate(groups, 1) for name in names}
+    """Return the table of verdicts on single sessions, then the files that were left out."""
+    leading_quantity = campaign.homogeneity.leading
+    groups = leading_quantity.groups if leading_quantity else ()
+    group_by_file = {name: f"{index}" for index, names in enumerate(groups, 1) for name in names}
     name = campaign.headline.name if campaign.headline else None
-    tried = {
-        each.path: each
-        for each in campaign.validation
-        if (each.method, each.name) == ("record", name)
+    trials_by_path = {
+        prediction.path: prediction
+        for prediction in campaign.validation
+        if (prediction.method, prediction.name) == ("record", name)
     }
 
     def row(session: SessionAnalysis) -> tuple[Entry, ...]:
-        verdict, trial = session.verdict, tried.get(session.path)
-        own = trial.own_error if trial else None
-        found = [each.kind for each in verdict.findings] if verdict else []
+        verdict, trial = session.verdict, trials_by_path.get(session.path)
+        own_error = trial.own_error if trial else None
+        finding_kinds = [finding.kind for finding in verdict.findings] if verdict else []
         return (
             session.name,
-            f"type {session.selected}" if session.selected else ABSENT,
-            None if own is None else 100 * (1 - own),
+            f"type {session.selected}" if session.selected else ABSENT_TEXT,
+            None if own_error is None else 100 * (1 - own_error),
             trial.error if trial else None,
-            ABSENT if verdict is None else "noise" if verdict.adequate else "more than noise",
-            ", ".join(dict.fromkeys(found)) or ABSENT,
+            ABSENT_TEXT if verdict is None else "noise" if verdict.adequate else "more than noise",
+            ", ".join(dict.fromkeys(finding_kinds)) or ABSENT_TEXT,
         )
 
     left_out: list[tuple[Entry, ...]] = [
-        (each.name, "left out", None, None, ABSENT, each.message) for each in campaign.failures
+        (failure.name, "left out", None, None, ABSENT_TEXT, failure.message)
+        for failure in campaign.failures
     ]
     return Table.of(
         "sessions",
         "Sessions, each by itself",
         (
-            Column("file", "file", WORDS), Column("selects", "selected", WORDS),
-            Column("fit (NRMSE, %)" if tried else "", "nrmse_percent", ".2f"),
-            Column("leave-one-out error (%)" if tried else "", "error", ".2f", 100.0),
-            Column("residual", "left", WORDS),
-            Column("other effects", "findings", WORDS),
-            Column("group" if groups else "", "group", WORDS),
+            Column("file", "file", TEXT_FORMAT), Column("selects", "selected", TEXT_FORMAT),
+            Column("fit (NRMSE, %)" if trials_by_path else "", "nrmse_percent", ".2f"),
+            Column("leave-one-out error (%)" if trials_by_path else "", "error", ".2f", 100.0),
+            Column("residual", "left", TEXT_FORMAT),
+            Column("other effects", "findings", TEXT_FORMAT),
+            Column("group" if groups else "", "group", TEXT_FORMAT),
         ),
         (
-            (*cells, group_of.get(str(cells[0]), ABSENT))
-            for cells in (*map(row, campaign.sessions), *left_out)
+            (*row_cells, group_by_file.get(str(row_cells[0]), ABSENT_TEXT))
+            for row_cells in (*map(row, campaign.sessions), *left_out)
         ),
         (
-            *((f"Fit and error: of type {name}.",) if tried else ()),
-            *((f"Group: by the {label(leading.quantity)[0]}.",) if leading and groups else ()),
+            *((f"Fit and error: of type {name}.",) if trials_by_path else ()),
+            *(
+                (f"Group: by the {label(leading_quantity.quantity)[0]}.",)
+                if leading_quantity and groups
+                else ()
+            ),
         ),
     )  # fmt: skip

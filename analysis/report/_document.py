@@ -1,10 +1,10 @@
-"""The results as one JSON document, without NaN: unknown values are null.
+"""Results of an analysis as one JSON document, without NaN: unknown values are null.
 
-The paper's indices, Eqs. (28) to (30), of any fit against either measured response.
+The document also contains the paper's indices, Eqs. (28) to (30), of every fit.
 
-A fit on the whole record was never made to suit Welch's estimate, and the truth does not suit it
-either: that estimate is biased at the resonances. So each fit is also compared with the whole
-record's ratio of transforms, which is noisy but not biased.
+A whole-record fit does not minimise the distance to Welch's estimate, and that estimate is biased
+at the resonances, so that even the true model differs from it. Each fit is therefore also compared
+with the ratio of the whole record's transforms, which is noisy but not biased.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from analysis.models import FrequencyResponseModel
 from analysis.paper import fit_indices
 from analysis.report._shown_model import ShownModel
 from analysis.report.bands import loss_estimate, loss_factors, supported_band_hz
-from analysis.report.table import unreported
+from analysis.report.table import unreported_parameters
 from analysis.results import finite
 from analysis.statistics import nrmse_percent
 
@@ -38,74 +38,87 @@ if TYPE_CHECKING:
     from analysis.results import RecordResult, WholeRecord
     from rigd.spectral import FrequencyResponse
 
+    # Values of the paper's indices by name: mse, wmse, md.
     IndexValues = dict[str, float | None]
 
 NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
-"""Indices of a fit without a measured response to compare with."""
+"""Indices of a fit for which there is no measured response to compare with."""
 
 
-def indices_of_record_fit(fit: RecordFit, welch: WelchAnalysis) -> tuple[IndexValues, IndexValues]:
-    """Compute the indices of a whole-record fit in the band of the Welch fits.
+def indices_of_record_fit(
+    fit: RecordFit, welch_analysis: WelchAnalysis
+) -> tuple[IndexValues, IndexValues]:
+    """Return the paper's indices of a whole-record fit, in the band of the Welch fits.
 
     Parameters
     ----------
     fit : RecordFit
-    welch : WelchAnalysis
+        Whole-record fit.
+    welch_analysis : WelchAnalysis
         Welch fits of the same record.
 
     Returns
     -------
     welch, whole_record : dict
-        ``mse`` and ``wmse`` in (N·m/rad)², ``md`` in N·m/rad: against Welch's estimate, on the
-        bins of the paper's fits, and against the empirical transfer function estimate.
+        ``mse`` and ``wmse`` in (N·m/rad)², ``md`` in N·m/rad. The first are the distance to Welch's
+        estimate, on the bins of the paper's fits; the second are the distance to the empirical
+        transfer function estimate.
     """
-    record = welch.record
+    record = welch_analysis.record
     # The delay stated in the file has been removed from the responses.
-    stated_s = record.torque_delay_s - record.angle_delay_s
-    plant = replace(fit.plant, delay_s=fit.plant.delay_s - stated_s)
+    stated_delay_s = record.torque_delay_s - record.angle_delay_s
+    plant = replace(fit.plant, delay_s=fit.plant.delay_s - stated_delay_s)
 
-    def against(measured: FrequencyResponse) -> IndexValues:
-        (model,) = ResponseGrid(2j * np.pi * measured.frequency_hz).evaluate(plant, ())
-        return _indices(measured, model)
+    def indices_against(measured_frf: FrequencyResponse) -> IndexValues:
+        (model,) = ResponseGrid(2j * np.pi * measured_frf.frequency_hz).evaluate(plant, ())
+        return _fit_indices(measured_frf, model)
 
-    return against(welch.response), against(welch.whole_record)
-
-
-def whole_record_indices(welch: WelchAnalysis) -> list[IndexValues]:
-    """Compute the paper's fits' against the whole record's ratio, in their order."""
-    measured, record = welch.whole_record, welch.record
-    grid = FrequencyResponseModel(measured.frequency_hz, record.beam, record.tool_inertia_kg_m2)
-    return [_indices(measured, grid.evaluate(model.fit.damping)) for model in welch.models]
+    return indices_against(welch_analysis.response), indices_against(welch_analysis.whole_record)
 
 
-def _indices(measured: FrequencyResponse, model: NDArray[np.complex128]) -> IndexValues:
-    known = np.isfinite(measured.response)
-    if not known.any():
+def whole_record_indices(welch_analysis: WelchAnalysis) -> list[IndexValues]:
+    """Return the indices of each Welch fit against the ratio of the whole record's transforms."""
+    measured_frf, record = welch_analysis.whole_record, welch_analysis.record
+    grid = FrequencyResponseModel(measured_frf.frequency_hz, record.beam, record.tool_inertia_kg_m2)
+    return [
+        _fit_indices(measured_frf, grid.evaluate(model.fit.damping))
+        for model in welch_analysis.models
+    ]
+
+
+def _fit_indices(measured_frf: FrequencyResponse, model: NDArray[np.complex128]) -> IndexValues:
+    """Return the paper's indices MSE, WMSE and MD of a model, against a measured response."""
+    is_finite = np.isfinite(measured_frf.response)
+    if not is_finite.any():
         return NOT_COMPARED
-    omega = 2 * np.pi * measured.frequency_hz[known]
-    return asdict(fit_indices(omega, measured.response[known], model[known]))
+    omega = 2 * np.pi * measured_frf.frequency_hz[is_finite]
+    return asdict(fit_indices(omega, measured_frf.response[is_finite], model[is_finite]))
 
 
 def response_fit_percent(analysis: WelchAnalysis, model: FittedModel) -> float:
-    """Fit of a Welch fit's model to the response that it was fitted to (`nrmse_percent`).
+    """Return how well a Welch fit reproduces its response, in percent (`nrmse_percent`).
 
     Parameters
     ----------
     analysis : WelchAnalysis
+        Welch fits of a record.
     model : FittedModel
-        One of its models.
+        One of the analysis's fitted models.
     """
-    measured = analysis.response.response
-    known = np.isfinite(measured)
-    measured, modelled = measured[known], model.response[known]
-    return nrmse_percent(measured - modelled, measured - measured.mean())
+    measured_frf = analysis.response.response
+    is_finite = np.isfinite(measured_frf)
+    measured_frf, modelled_frf = measured_frf[is_finite], model.response[is_finite]
+    return nrmse_percent(measured_frf - modelled_frf, measured_frf - measured_frf.mean())
 
 
 _CURVE_POINTS = 200
+"""Number of frequencies at which the document states response and loss factors."""
 
 
-def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str, Any]:
-    """Collect the whole-record results of one record.
+def record_entries(
+    whole_record: WholeRecord, welch_analysis: WelchAnalysis | None
+) -> dict[str, Any]:
+    """Return the entries of the JSON document for one whole record.
 
     Returns
     -------
@@ -123,46 +136,49 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
     names = [
         (
             {
-                "file": str(whole.record.path),
+                "file": str(whole_record.record.path),
                 "estimator": "record",
                 "type": fit.structure.name,
                 "weighting": None,
                 "candidate": name,
-                "selected": name == whole.headline.name,
+                "selected": name == whole_record.headline.name,
             },
             fit,
         )
-        for name, fit in whole.fits.items()
+        for name, fit in whole_record.fits.items()
     ]
     indices = [
-        (NOT_COMPARED, NOT_COMPARED) if welch is None else indices_of_record_fit(fit, welch)
+        (NOT_COMPARED, NOT_COMPARED)
+        if welch_analysis is None
+        else indices_of_record_fit(fit, welch_analysis)
         for _, fit in names
     ]
     return {
-        "headline": whole.headline_json(),
+        "headline": whole_record.headline_json(),
         "fits": [
             {
                 **name,
                 "free": [*fit.interval],
                 "parameters": dict(fit.parameters),
-                "withheld": sorted(unreported(fit.structure, whole.unsupported)),
+                "withheld": sorted(unreported_parameters(fit.structure, whole_record.unsupported)),
                 "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
                 "interval_95": {
-                    key: None if ends is None else list(ends) for key, ends in fit.interval.items()
+                    key: None if interval is None else list(interval)
+                    for key, interval in fit.interval.items()
                 },
                 "cost": fit.cost,
                 "degrees_of_freedom": fit.degrees_of_freedom,
                 "at_bounds": list(fit.at_bounds),
-                "nrmse_percent": whole.analysis.fit_percent(fit),
+                "nrmse_percent": whole_record.analysis.fit_percent(fit),
                 "determined": list(fit.determined),
                 "covariance": fit.covariance.tolist(),
-                "internal_size": _size(fit.internal),
-                "external_size": _size(fit.external),
+                "internal_size": _damping_size_json(fit.internal),
+                "external_size": _damping_size_json(fit.external),
                 "ringing": {**asdict(fit.ringing), "significant": fit.ringing.significant},
-                "indices": of_welch,
-                "indices_whole_record": of_record,
+                "indices": welch_indices,
+                "indices_whole_record": record_indices,
             }
-            for (name, fit), (of_welch, of_record) in zip(names, indices, strict=True)
+            for (name, fit), (welch_indices, record_indices) in zip(names, indices, strict=True)
         ],
         "modes": [
             {
@@ -175,48 +191,52 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
                 "damping_ratio": mode.damping_ratio.value,
                 "damping_ratio_std": mode.damping_ratio.std,
             }
-            # Those reported first: they are what narrow sweeps are planned by.
+            # The reported modes come first, because narrow sweeps are planned from them.
             for name, _ in names
             if name["selected"]
-            for mode in whole.headline.modes
+            for mode in whole_record.headline.modes
         ],
         "records": [
             {
-                "file": str(whole.record.path),
-                "selected": whole.headline.name,
-                "verdict": list(whole.verdict.sentences),
-                "experiments": list(whole.verdict.experiments),
-                "withheld": sorted(whole.withheld),
+                "file": str(whole_record.record.path),
+                "selected": whole_record.headline.name,
+                "verdict": list(whole_record.verdict.sentences),
+                "experiments": list(whole_record.verdict.experiments),
+                "withheld": sorted(whole_record.withheld),
                 "orders": {
-                    each.order: {
-                        "status": each.status,
-                        "value": each.value,
-                        "interval_95": None if each.interval is None else list(each.interval),
+                    order.order: {
+                        "status": order.status,
+                        "value": order.value,
+                        "interval_95": None if order.interval is None else list(order.interval),
                     }
-                    for each in whole.orders
+                    for order in whole_record.orders
                 },
-                "band_hz": list(whole.band_hz),
-                "fixed": list(whole.fixed),
-                "hum": [asdict(line) for line in whole.analysis.lines],
-                "curves": _curves(whole),
+                "band_hz": list(whole_record.band_hz),
+                "fixed": list(whole_record.fixed),
+                "hum": [asdict(line) for line in whole_record.analysis.lines],
+                "curves": _curves_json(whole_record),
             }
         ],
     }
 
 
-def _size(size: DampingSize | None) -> dict[str, Any] | None:
+def _damping_size_json(size: DampingSize | None) -> dict[str, Any] | None:
+    """Return a damping size as a JSON object; null if there is none."""
     return None if size is None else asdict(size)
 
 
-def _curves(whole: WholeRecord) -> dict[str, Any]:
-    """Tabulate the response of the model shown first, and loss factors, over the band."""
-    first_hz, last_hz = whole.band_hz
+def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
+    """Return the displayed model's response and the loss factors over the band, as JSON lists."""
+    first_hz, last_hz = whole_record.band_hz
     frequency_hz = np.geomspace(max(first_hz, last_hz / 200), last_hz, _CURVE_POINTS)
-    model, beam = ShownModel.of(whole.headline, whole.record), loss_estimate(whole)
+    model, beam = (
+        ShownModel.of(whole_record.headline, whole_record.record),
+        loss_estimate(whole_record),
+    )
     band = model.band(frequency_hz)
     low, high = band.magnitude_limits()
-    factors = None if beam is None else loss_factors(beam, frequency_hz)
-    supported_hz = supported_band_hz(whole)
+    factors_over_frequency = None if beam is None else loss_factors(beam, frequency_hz)
+    supported_hz = supported_band_hz(whole_record)
     return {
         "model": "beam" if model.modal is None else "modal",
         "frequency_hz": frequency_hz.tolist(),
@@ -226,13 +246,20 @@ def _curves(whole: WholeRecord) -> dict[str, Any]:
         "phase_rad": np.angle(band.response).tolist(),
         "phase_std_rad": band.phase_std_rad.tolist(),
         "loss_factor_supported_hz": None if supported_hz is None else list(supported_hz),
-        "loss_factor": None if factors is None else _factor(factors.total),
-        "internal_loss_factor": None if factors is None else _factor(factors.internal),
-        "external_loss_factor": None if factors is None else _factor(factors.external),
+        "loss_factor": None
+        if factors_over_frequency is None
+        else _loss_factor_json(factors_over_frequency.total),
+        "internal_loss_factor": None
+        if factors_over_frequency is None
+        else _loss_factor_json(factors_over_frequency.internal),
+        "external_loss_factor": None
+        if factors_over_frequency is None
+        else _loss_factor_json(factors_over_frequency.external),
     }
 
 
-def _factor(factor: LossFactor | None) -> dict[str, list[float]] | None:
+def _loss_factor_json(factor: LossFactor | None) -> dict[str, list[float]] | None:
+    """Return a loss factor with its 95 % band as JSON lists; null if there is none."""
     if factor is None:
         return None
     low, high = factor.limits()
@@ -242,54 +269,66 @@ def _factor(factor: LossFactor | None) -> dict[str, list[float]] | None:
 def document(
     results: Sequence[RecordResult], errors: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Collect the results of all files.
+    """Return the results of all files as one JSON document.
 
     Parameters
     ----------
     results : sequence of RecordResult
-        The entries of whole records follow those of the Welch method.
+        Results of each file. The entries of whole-record fits follow those of the Welch fits.
     errors : mapping of str to str, optional
         Message for each file that could not be analysed.
 
     Returns
     -------
     dict
-        ``versions``, ``headlines`` (what each whole record says, with flags), ``files`` (what was
-        read, how exact the linear model is for it, and how the Welch method estimated it),
-        ``fits``, ``modes``, ``peaks``, ``records``, ``errors``: lists of objects that name their
-        file. Finite numbers only.
+        Lists of objects that name their file: ``headlines`` (result of each whole record, with
+        flags), ``files`` (properties of the record, validity of the linear model, and settings of
+        the Welch method), ``fits``, ``modes``, ``peaks``, ``records`` and ``errors``; and
+        ``versions``. All numbers are finite.
     """
-    of_records = [record_entries(each.whole, each.welch) for each in results if each.whole]
-    by_welch = [(each.welch, each.unsupported) for each in results if each.welch]
+    record_entries_by_file = [
+        record_entries(result.whole, result.welch) for result in results if result.whole
+    ]
+    welch_analyses = [(result.welch, result.unsupported) for result in results if result.welch]
     content: dict[str, Any] = finite(
         {
             "versions": versions(),
             "files": [
-                {**facts, "validity": each.validity.as_json()}
-                for each, facts in (
-                    *((each, _file(each.welch)) for each in results if each.welch),
+                {**file_facts, "validity": result.validity.as_json()}
+                for result, file_facts in (
                     *(
-                        (each, _record_facts(each.record, each.warnings))
-                        for each in results
-                        if each.welch is None
+                        (result, _welch_file_json(result.welch))
+                        for result in results
+                        if result.welch
+                    ),
+                    *(
+                        (result, _record_facts(result.record, result.warnings))
+                        for result in results
+                        if result.welch is None
                     ),
                 )
             ],
             "fits": [
-                *(fit for analysis, withheld in by_welch for fit in _fits(analysis, withheld)),
-                *(fit for entries in of_records for fit in entries["fits"]),
+                *(
+                    fit
+                    for analysis, unsupported_orders in welch_analyses
+                    for fit in _welch_fits_json(analysis, unsupported_orders)
+                ),
+                *(fit for entries in record_entries_by_file for fit in entries["fits"]),
             ],
             "modes": [
                 *(
                     mode
-                    for analysis, _ in by_welch
+                    for analysis, _ in welch_analyses
                     for model in analysis.models
-                    for mode in _modes(analysis, model)
+                    for mode in _welch_modes_json(analysis, model)
                 ),
-                *(mode for entries in of_records for mode in entries["modes"]),
+                *(mode for entries in record_entries_by_file for mode in entries["modes"]),
             ],
-            "headlines": [entries["headline"] for entries in of_records],
-            "records": [record for entries in of_records for record in entries["records"]],
+            "headlines": [entries["headline"] for entries in record_entries_by_file],
+            "records": [
+                record for entries in record_entries_by_file for record in entries["records"]
+            ],
             "peaks": [
                 {
                     "file": str(analysis.record.path),
@@ -297,7 +336,7 @@ def document(
                     "frequency_hz": None if peak is None else peak.frequency_hz,
                     "magnitude_db": None if peak is None else peak.magnitude_db,
                 }
-                for analysis, _ in by_welch
+                for analysis, _ in welch_analyses
                 for number, peak in enumerate(analysis.peaks, start=1)
             ],
             "errors": [
@@ -309,18 +348,20 @@ def document(
 
 
 def document_text(content: Mapping[str, Any], *, ascii_only: bool = False) -> str:
-    """Write a document as JSON, with a newline at its end.
+    """Return a document as JSON text with a newline at its end.
 
     Parameters
     ----------
     content : mapping
+        Document, without NaN and infinite numbers.
     ascii_only : bool
-        Whether other characters are escaped, for a stream that may have any encoding.
+        Whether other characters are escaped, for a stream of unknown encoding.
     """
     return json.dumps(content, indent=2, ensure_ascii=ascii_only, allow_nan=False) + "\n"
 
 
-def _file(analysis: WelchAnalysis) -> dict[str, Any]:
+def _welch_file_json(analysis: WelchAnalysis) -> dict[str, Any]:
+    """Return the JSON object of a file with a Welch analysis, including the settings."""
     settings, response = analysis.settings, analysis.response
     return {
         **_record_facts(analysis.record, analysis.warnings),
@@ -337,6 +378,7 @@ def _file(analysis: WelchAnalysis) -> dict[str, Any]:
 
 
 def _record_facts(record: Record, warnings: Sequence[str]) -> dict[str, Any]:
+    """Return the JSON object of a record: rate, samples, beam, delays, gaps and warnings."""
     return {
         "file": str(record.path),
         "outcome": record.outcome,
@@ -356,22 +398,31 @@ def _record_facts(record: Record, warnings: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _fits(analysis: WelchAnalysis, withheld: Collection[str]) -> list[dict[str, Any]]:
+def _welch_fits_json(
+    analysis: WelchAnalysis, unsupported_orders: Collection[str]
+) -> list[dict[str, Any]]:
+    """Return the JSON objects of a record's Welch fits."""
     indices = whole_record_indices(analysis)
     return [
-        {**_fit(analysis, model, withheld), "indices_whole_record": of_record}
-        for model, of_record in zip(analysis.models, indices, strict=True)
+        {
+            **_welch_fit_json(analysis, model, unsupported_orders),
+            "indices_whole_record": indices_of_record,
+        }
+        for model, indices_of_record in zip(analysis.models, indices, strict=True)
     ]
 
 
-def _fit(analysis: WelchAnalysis, model: FittedModel, withheld: Collection[str]) -> dict[str, Any]:
+def _welch_fit_json(
+    analysis: WelchAnalysis, model: FittedModel, unsupported_orders: Collection[str]
+) -> dict[str, Any]:
+    """Return the JSON object of one Welch fit."""
     fit = model.fit
     return {
-        **_name(analysis, model),
+        **_fit_identity(analysis, model),
         "frf": analysis.settings.estimator,
         "free": list(fit.structure.free),
         "parameters": dict(fit.parameters),
-        "withheld": sorted(unreported(fit.structure, withheld)),
+        "withheld": sorted(unreported_parameters(fit.structure, unsupported_orders)),
         # Fixed parameters have no standard deviation: they were not estimated.
         "std": None
         if fit.std is None
@@ -383,16 +434,20 @@ def _fit(analysis: WelchAnalysis, model: FittedModel, withheld: Collection[str])
     }
 
 
-def _modes(analysis: WelchAnalysis, model: FittedModel) -> list[dict[str, Any]]:
-    """Return the modes from the poles, each with its peak and that peak's deviation."""
-    found = []
+def _welch_modes_json(analysis: WelchAnalysis, model: FittedModel) -> list[dict[str, Any]]:
+    """Return the JSON objects of a Welch fit's modes and of the resonance peaks near them.
+
+    A mode is computed from the poles of the fitted model. Each object also states the deviation of
+    the model's peak from the measured one.
+    """
+    modes = []
     for number, (peak, deviation) in enumerate(
         zip(model.peaks, model.deviations, strict=True), start=1
     ):
         mode = model.modes[number - 1] if model.modes else None
-        found.append(
+        modes.append(
             {
-                **_name(analysis, model),
+                **_fit_identity(analysis, model),
                 "mode": number,
                 "frequency_hz": None if mode is None else mode.frequency_hz,
                 "natural_frequency_rad_s": None if mode is None else mode.natural_frequency_rad_s,
@@ -407,10 +462,11 @@ def _modes(analysis: WelchAnalysis, model: FittedModel) -> list[dict[str, Any]]:
                 ),
             }
         )
-    return found
+    return modes
 
 
-def _name(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
+def _fit_identity(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
+    """Return the keys that identify a Welch fit: file, estimator, type and weighting."""
     return {
         "file": str(analysis.record.path),
         "estimator": "welch",
@@ -420,7 +476,7 @@ def _name(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computed the results."""
+    """Return the versions of rigd, Python and NumPy that computed the results."""
     return {
         "rigd": rigd.__version__,
         "python": platform.python_version(),

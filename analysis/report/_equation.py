@@ -1,4 +1,4 @@
-"""The model of a record as an equation with the terms that were selected, as MathML and LaTeX."""
+"""Equations of a record's model, with the terms of its structure, as MathML and LaTeX."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from analysis.identify import BACKGROUND
 from analysis.models import STRUCTURES
-from analysis.report.table import ABSENT, WORDS, Column, Table
+from analysis.report.table import ABSENT_TEXT, TEXT_FORMAT, Column, Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -18,225 +18,293 @@ if TYPE_CHECKING:
 
 
 class Formula(NamedTuple):
-    """One formula in two languages: presentation MathML without its root, and LaTeX."""
+    """Mathematical formula as presentation MathML, without its root element, and as LaTeX."""
 
     mathml: str
     tex: str
 
     def __add__(self, other: object) -> Formula:
-        """Set one behind the other."""
+        """Return this formula followed by another one."""
         if not isinstance(other, Formula):
             return NotImplemented
         return Formula(self.mathml + other.mathml, f"{self.tex} {other.tex}")
 
     @property
     def row(self) -> Formula:
-        """The formula as one argument of another."""
+        """Formula grouped so that it can be one argument of another formula."""
         return Formula(f"<mrow>{self.mathml}</mrow>", f"{{{self.tex}}}")
 
 
-def _name(letter: str, tex: str = "") -> Formula:
+def _variable(letter: str, tex: str = "") -> Formula:
+    """Return a variable, from its letter and its LaTeX command."""
     return Formula(f"<mi>{letter}</mi>", tex or letter)
 
 
-def _sign(text: str, tex: str = "") -> Formula:
+def _operator(text: str, tex: str = "") -> Formula:
+    """Return an operator or bracket, from its character and its LaTeX command."""
     return Formula(f"<mo>{text}</mo>", tex or text)
 
 
-def _number(text: str) -> Formula:
+def _number_formula(text: str) -> Formula:
+    """Return a number as a formula."""
     return Formula(f"<mn>{text}</mn>", text)
 
 
 def _power(base: Formula, exponent: Formula) -> Formula:
-    up = exponent.row
-    return Formula(f"<msup>{base.row.mathml}{up.mathml}</msup>", f"{base.tex}^{up.tex}")
+    """Return a formula raised to the power of another formula."""
+    exponent_group = exponent.row
+    return Formula(
+        f"<msup>{base.row.mathml}{exponent_group.mathml}</msup>", f"{base.tex}^{exponent_group.tex}"
+    )
 
 
-def _indexed(base: Formula, index: Formula) -> Formula:
-    down = index.row
-    return Formula(f"<msub>{base.row.mathml}{down.mathml}</msub>", f"{base.tex}_{down.tex}")
+def _subscript(base: Formula, index: Formula) -> Formula:
+    """Return a formula with another formula as its subscript."""
+    index_group = index.row
+    return Formula(
+        f"<msub>{base.row.mathml}{index_group.mathml}</msub>", f"{base.tex}_{index_group.tex}"
+    )
 
 
-def _over(above: Formula, below: Formula) -> Formula:
-    a, b = above.row, below.row
+def _fraction(numerator: Formula, denominator: Formula) -> Formula:
+    """Return the fraction of two formulas."""
+    a, b = numerator.row, denominator.row
     return Formula(f"<mfrac>{a.mathml}{b.mathml}</mfrac>", rf"\frac{a.tex}{b.tex}")
 
 
-def _of(function: str, argument: Formula) -> Formula:
-    """Apply a function whose name has several letters to an argument in brackets."""
-    word = Formula(f"<mi>{function}</mi><mo>&#x2061;</mo>", rf"\{function}")
-    return _joined(word, _OPEN, argument, _CLOSE)
+def _function_of(function: str, argument: Formula) -> Formula:
+    """Return a function with several letters, such as sin, of an argument in brackets."""
+    function_name = Formula(f"<mi>{function}</mi><mo>&#x2061;</mo>", rf"\{function}")
+    return _join(function_name, _OPENING_BRACKET, argument, _CLOSING_BRACKET)
 
 
-def _joined(*parts: Formula) -> Formula:
+def _join(*parts: Formula) -> Formula:
+    """Return a formula that consists of several formulas, one after the other."""
     return reduce(Formula.__add__, parts)
 
 
-_S: Final = _name("s")
-_L: Final = _name("L")
-_G: Final = _name("G")
-_EI: Final = _name("E") + _name("I")
-_BETA: Final = _name("β", r"\beta")
-_ZETA, _ALPHA = _name("ζ", r"\zeta"), _name("α", r"\alpha")
-_GAMMA, _LAMBDA = _name("γ", r"\gamma"), _name("λ", r"\lambda")
-_PLUS, _MINUS, _IS = _sign("+"), _sign("−", "-"), _sign("=")
-_OPEN, _CLOSE = _sign("("), _sign(")")
-_ONE, _TWO = _number("1"), _number("2")
-_OF_S: Final = _OPEN + _S + _CLOSE
+_S_SYMBOL: Final = _variable("s")
+"""Symbols, signs and numbers of the equations as formulas."""
+_L_SYMBOL: Final = _variable("L")
+_G_SYMBOL: Final = _variable("G")
+_EI_SYMBOLS: Final = _variable("E") + _variable("I")
+_BETA_SYMBOL: Final = _variable("β", r"\beta")
+_ZETA_SYMBOL, _ALPHA_SYMBOL = _variable("ζ", r"\zeta"), _variable("α", r"\alpha")
+_GAMMA_SYMBOL, _LAMBDA_SYMBOL = _variable("γ", r"\gamma"), _variable("λ", r"\lambda")
+_PLUS_SIGN, _MINUS_SIGN, _EQUALS_SIGN = _operator("+"), _operator("−", "-"), _operator("=")
+_OPENING_BRACKET, _CLOSING_BRACKET = _operator("("), _operator(")")
+_NUMBER_ONE, _NUMBER_TWO = _number_formula("1"), _number_formula("2")
+_ARGUMENT_S: Final = _OPENING_BRACKET + _S_SYMBOL + _CLOSING_BRACKET
+"""Formula "(s)", the argument of transfer functions."""
 
 
-_TORQUE_OVER_ANGLE: Final = _over(
-    _indexed(_name("Γ", r"\Gamma"), Formula("<mtext>coup</mtext>", r"\mathrm{coup}")) + _OF_S,
-    _indexed(_name("Θ", r"\Theta"), _name("m")) + _OF_S,
+_TORQUE_OVER_ANGLE: Final = _fraction(
+    _subscript(_variable("Γ", r"\Gamma"), Formula("<mtext>coup</mtext>", r"\mathrm{coup}"))
+    + _ARGUMENT_S,
+    _subscript(_variable("Θ", r"\Theta"), _variable("m")) + _ARGUMENT_S,
 )
+"""Formula of the coupling torque over the motor angle, both as Laplace transforms."""
 
 
-def _term(coefficient: Formula, order: Formula, *, integer: bool) -> Formula:
-    return coefficient + (_S if integer else _power(_S, order))
+def _damping_term(coefficient: Formula, order: Formula, *, is_first_order: bool) -> Formula:
+    """Return a damping term: coefficient times s, or times s to a fractional power."""
+    return coefficient + (_S_SYMBOL if is_first_order else _power(_S_SYMBOL, order))
 
 
-def _elastic(structure: Structure) -> Formula | None:
-    """``1 + zeta s^alpha`` with what the structure has of it; None without internal damping."""
+def _elastic_factor(structure: Structure) -> Formula | None:
+    """Return the factor ``1 + zeta s^alpha`` of a structure; None without internal damping."""
     if not structure.internal:
         return None
-    return _joined(_ONE, _PLUS, _term(_ZETA, _ALPHA, integer="alpha" not in structure.free))
+    return _join(
+        _NUMBER_ONE,
+        _PLUS_SIGN,
+        _damping_term(_ZETA_SYMBOL, _ALPHA_SYMBOL, is_first_order="alpha" not in structure.free),
+    )
 
 
-def _inertial(structure: Structure) -> Formula:
-    ratio = _over(_name("ρ", r"\rho"), _EI)
-    # In display size although it is inside a fraction.
-    large = f'<mstyle displaystyle="true">{ratio.mathml}</mstyle>'
-    inertia = Formula(large, ratio.tex.replace("frac", "dfrac")) + _power(_S, _TWO)
+def _inertial_terms(structure: Structure) -> Formula:
+    """Return ``rho/EI s^2 + gamma s^lambda`` with the terms of the structure."""
+    ratio = _fraction(_variable("ρ", r"\rho"), _EI_SYMBOLS)
+    # In display style, although the ratio is inside a fraction.
+    displayed_ratio = f'<mstyle displaystyle="true">{ratio.mathml}</mstyle>'
+    inertia = Formula(displayed_ratio, ratio.tex.replace("frac", "dfrac")) + _power(
+        _S_SYMBOL, _NUMBER_TWO
+    )
     if not structure.external:
         return inertia
-    return _joined(inertia, _PLUS, _term(_GAMMA, _LAMBDA, integer="lambda" not in structure.free))
+    return _join(
+        inertia,
+        _PLUS_SIGN,
+        _damping_term(_GAMMA_SYMBOL, _LAMBDA_SYMBOL, is_first_order="lambda" not in structure.free),
+    )
 
 
-def _of_beam(structure: Structure) -> tuple[Formula, Formula]:
-    """Eq. 25 with its beta."""
-    elastic, z = _elastic(structure), _BETA + _L
-    sin, cos, sinh, cosh = (_of(name, z) for name in ("sin", "cos", "sinh", "cosh"))
-    stiffness = _EI if elastic is None else _joined(_EI, _OPEN, elastic, _CLOSE)
-    above = _joined(sin, cosh, _MINUS, cos, sinh)
-    below = _joined(_ONE, _PLUS, cos, cosh)
-    response = _joined(_G, _OF_S, _IS, _MINUS, stiffness, _BETA, _over(above, below))
-    inertial = _inertial(structure)
-    loaded = (_OPEN + inertial + _CLOSE) if elastic is None else _over(inertial, elastic)
-    return response, _joined(_power(_BETA, _number("4")), _IS, _MINUS, loaded)
+def _beam_equations(structure: Structure) -> tuple[Formula, Formula]:
+    """Return Eq. 25 of the reference paper, and the equation of its beta."""
+    elastic_factor, z = _elastic_factor(structure), _BETA_SYMBOL + _L_SYMBOL
+    sin, cos, sinh, cosh = (_function_of(name, z) for name in ("sin", "cos", "sinh", "cosh"))
+    stiffness = (
+        _EI_SYMBOLS
+        if elastic_factor is None
+        else _join(_EI_SYMBOLS, _OPENING_BRACKET, elastic_factor, _CLOSING_BRACKET)
+    )
+    numerator = _join(sin, cosh, _MINUS_SIGN, cos, sinh)
+    denominator = _join(_NUMBER_ONE, _PLUS_SIGN, cos, cosh)
+    response = _join(
+        _G_SYMBOL,
+        _ARGUMENT_S,
+        _EQUALS_SIGN,
+        _MINUS_SIGN,
+        stiffness,
+        _BETA_SYMBOL,
+        _fraction(numerator, denominator),
+    )
+    inertial_terms = _inertial_terms(structure)
+    minus_beta_to_4 = (
+        (_OPENING_BRACKET + inertial_terms + _CLOSING_BRACKET)
+        if elastic_factor is None
+        else _fraction(inertial_terms, elastic_factor)
+    )
+    return response, _join(
+        _power(_BETA_SYMBOL, _number_formula("4")), _EQUALS_SIGN, _MINUS_SIGN, minus_beta_to_4
+    )
 
 
-def _measured(fit: RecordFit) -> Formula:
-    """Torque over angle as measured: beam, tool and channels."""
-    beam = _G + _OF_S
+def _measured_equation(fit: RecordFit) -> Formula:
+    """Return the equation of the measured torque over angle: beam, tool inertia and channels."""
+    beam = _G_SYMBOL + _ARGUMENT_S
     names = fit.parameters
-    inside = _joined(beam, _PLUS, _name("J"), _power(_S, _TWO))
-    late = _power(_name("e"), _joined(_MINUS, _name("τ", r"\tau"), _S))
-    found = _joined(_sign("[", r"\left["), inside, _sign("]", r"\right]"), late)
-    time = _name("T") + _S
+    beam_and_tool = _join(beam, _PLUS_SIGN, _variable("J"), _power(_S_SYMBOL, _NUMBER_TWO))
+    delay_factor = _power(_variable("e"), _join(_MINUS_SIGN, _variable("τ", r"\tau"), _S_SYMBOL))
+    formula = _join(
+        _operator("[", r"\left["), beam_and_tool, _operator("]", r"\right]"), delay_factor
+    )
+    time = _variable("T") + _S_SYMBOL
     if "filter_time_constant_s" in names:
-        found += _over(_ONE, _joined(_ONE, _PLUS, time))
+        formula += _fraction(_NUMBER_ONE, _join(_NUMBER_ONE, _PLUS_SIGN, time))
     if "second_order_filter_time_constant_s" in names:
-        root = Formula(f"<msqrt>{_TWO.mathml}</msqrt>", r"\sqrt{2}")
-        square = _power(_name("T"), _TWO) + _power(_S, _TWO)
-        found += _over(_ONE, _joined(_ONE, _PLUS, root, time, _PLUS, square))
-    return _joined(_TORQUE_OVER_ANGLE, _IS, found)
+        root = Formula(f"<msqrt>{_NUMBER_TWO.mathml}</msqrt>", r"\sqrt{2}")
+        square = _power(_variable("T"), _NUMBER_TWO) + _power(_S_SYMBOL, _NUMBER_TWO)
+        formula += _fraction(
+            _NUMBER_ONE, _join(_NUMBER_ONE, _PLUS_SIGN, root, time, _PLUS_SIGN, square)
+        )
+    return _join(_TORQUE_OVER_ANGLE, _EQUALS_SIGN, formula)
 
 
-def _modal() -> Formula:
-    """Modal model: poles and residues, and a background."""
-    k, n, background = _name("k"), _name("n"), BACKGROUND - 1
+def _modal_equation() -> Formula:
+    """Return the equation of the modal model: poles and residues, and background terms."""
+    k, n, background = _variable("k"), _variable("n"), BACKGROUND - 1
     over_modes = Formula(f"<munder><mo>∑</mo>{k.row.mathml}</munder>", rf"\sum_{k.row.tex}")
-    limit = _number(str(background))
-    from_zero = _joined(n, _IS, _number("0"))
+    highest_power = _number_formula(str(background))
+    from_zero = _join(n, _EQUALS_SIGN, _number_formula("0"))
     over_powers = Formula(
-        f"<munderover><mo>∑</mo>{from_zero.row.mathml}{limit.row.mathml}</munderover>",
-        rf"\sum_{from_zero.row.tex}^{limit.row.tex}",
+        f"<munderover><mo>∑</mo>{from_zero.row.mathml}{highest_power.row.mathml}</munderover>",
+        rf"\sum_{from_zero.row.tex}^{highest_power.row.tex}",
     )
     terms = []
-    for residue, pole in ((_name("R"), _name("p")), (_conjugate("R"), _conjugate("p"))):
-        terms.append(_over(_indexed(residue, k), _joined(_S, _MINUS, _indexed(pole, k))))
+    for residue, pole in (
+        (_variable("R"), _variable("p")),
+        (_conjugate_variable("R"), _conjugate_variable("p")),
+    ):
+        terms.append(
+            _fraction(_subscript(residue, k), _join(_S_SYMBOL, _MINUS_SIGN, _subscript(pole, k)))
+        )
     first, second = terms
-    return _joined(
-        _TORQUE_OVER_ANGLE, _IS, over_modes, _OPEN, first, _PLUS, second, _CLOSE, _PLUS,
-        over_powers, _indexed(_name("b"), n), _power(_S, n),
+    return _join(
+        _TORQUE_OVER_ANGLE, _EQUALS_SIGN, over_modes, _OPENING_BRACKET, first, _PLUS_SIGN, second,
+        _CLOSING_BRACKET, _PLUS_SIGN,
+        over_powers, _subscript(_variable("b"), n), _power(_S_SYMBOL, n),
     )  # fmt: skip
 
 
-def _conjugate(letter: str) -> Formula:
+def _conjugate_variable(letter: str) -> Formula:
+    """Return a letter with an overline, for the complex conjugate."""
     return Formula(f"<mover><mi>{letter}</mi><mo>¯</mo></mover>", rf"\bar{{{letter}}}")
 
 
-def equations(whole: WholeRecord) -> tuple[Formula, ...]:
-    """Write the models of a record: the modal one if there is one, and the beam's.
+def equations(whole_record: WholeRecord) -> tuple[Formula, ...]:
+    """Return the equations of a record's models: of the modal model, if there is one, and the beam.
 
     Returns
     -------
     tuple of Formula
-        Modal model; what was measured of a beam, Eq. 25 of the paper, and its beta: with the terms
-        that the structure has.
+        Modal model, if there is one; measured response of a beam; Eq. 25 of the reference paper,
+        and its beta. They contain the terms of the structure.
     """
-    modal = () if whole.headline.modal is None else (_modal(),)
-    return *modal, _measured(whole.fit), *_of_beam(_structure(whole))
+    modal_equations = () if whole_record.headline.modal is None else (_modal_equation(),)
+    return (
+        *modal_equations,
+        _measured_equation(whole_record.fit),
+        *_beam_equations(_reported_structure(whole_record)),
+    )
 
 
-def _structure(whole: WholeRecord) -> Structure:
-    """Structure of the parameters reported: with a tolerance of the geometry both orders."""
-    return whole.fit.structure if whole.headline.tolerant is None else STRUCTURES["VI"]
+def _reported_structure(whole_record: WholeRecord) -> Structure:
+    """Return the structure of the reported parameters.
+
+    With a tolerance of the geometry it is the structure with both orders free.
+    """
+    return (
+        whole_record.fit.structure if whole_record.headline.tolerant is None else STRUCTURES["VI"]
+    )
 
 
-_EXTRAS: Final = {
+_EFFECT_DEFINITIONS: Final = {
     "tip_mass_kg": "G is that of a beam with the mass m at its tip",
     "filter_time_constant_s": "T is the time constant of the torque channel's filter",
     "second_order_filter_time_constant_s": "T is the reciprocal corner of the torque channel's "
     "filter (Butterworth)",
     "drag": "the drag ½ ρ_air C_D d v |v| per length also acts on the beam (ρ_air 1.2 kg/m³)",
 }
+"""Definitions of the symbols of additional effects, by parameter name."""
 
 
-def definitions(whole: WholeRecord) -> str:
-    """Define the symbols of the equations that no table has."""
-    parts = [
+def definitions(whole_record: WholeRecord) -> str:
+    """Return a text that defines the symbols of the equations that no table explains."""
+    statements = [
         "On the left coupling torque over motor angle, as Laplace transforms",
-        f"L = {whole.record.beam.length_m:g} m is the length from the axis to the tip",
+        f"L = {whole_record.record.beam.length_m:g} m is the length from the axis to the tip",
         "powers of s are principal values",
     ]
-    if whole.headline.modal is not None:
-        parts[1:1] = [
+    if whole_record.headline.modal is not None:
+        statements[1:1] = [
             "first the modal model with a pole p and a residue R of each mode, which the modes are "
             "of, below it the beam's, which the parameters are of",
         ]
-    names = whole.headline.parameters
-    parts += [words for name, words in _EXTRAS.items() if name in names]
-    return f"{'; '.join(parts)}. The numbers are in the table of the parameters."
+    names = whole_record.headline.parameters
+    statements += [definition for name, definition in _EFFECT_DEFINITIONS.items() if name in names]
+    return f"{'; '.join(statements)}. The numbers are in the table of the parameters."
 
 
-def types_table(whole: WholeRecord) -> Table:
-    """Return the table of damping types: terms, and number of parameters."""
-    words = {False: "fractional", True: "integer"}
+def types_table(whole_record: WholeRecord) -> Table:
+    """Return the table of the damping types with their internal and external terms."""
+    order_words = {False: "fractional", True: "integer"}
 
     def rows() -> Iterator[tuple[str, str, str, str]]:
         for structure in STRUCTURES.values():
-            described, terms = [], []
-            for present, what, coefficient, order, symbol in (
+            descriptions, terms = [], []
+            for is_present, damping_name, coefficient, order, symbol in (
                 (structure.internal, "internal", "ζ", "alpha", "α"),
                 (structure.external, "external", "γ", "lambda", "λ"),
             ):
-                integer = order not in structure.free
+                is_first_order = order not in structure.free
                 terms.append(
-                    f"{coefficient} s{'' if integer else '^' + symbol}" if present else ABSENT
+                    f"{coefficient} s{'' if is_first_order else '^' + symbol}"
+                    if is_present
+                    else ABSENT_TEXT
                 )
-                if present:
-                    described.append(f"{what} of {words[integer]} order")
-            yield structure.name, terms[0], terms[1], ", ".join(described)
+                if is_present:
+                    descriptions.append(f"{damping_name} of {order_words[is_first_order]} order")
+            yield structure.name, terms[0], terms[1], ", ".join(descriptions)
 
     return Table.of(
         "types",
         "Types of damping",
         (
-            Column("Type", "type", WORDS),
-            Column("Internal", "internal", WORDS),
-            Column("External", "external", WORDS),
-            Column("Damping", "damping", WORDS),
+            Column("Type", "type", TEXT_FORMAT),
+            Column("Internal", "internal", TEXT_FORMAT),
+            Column("External", "external", TEXT_FORMAT),
+            Column("Damping", "damping", TEXT_FORMAT),
         ),
         rows(),
         (
@@ -244,12 +312,12 @@ def types_table(whole: WholeRecord) -> Table:
             'ρ/EI s². I to VI as in the paper, VII as its conclusions propose. "Modes free": each '
             "mode with its own stiffness. The marked type is that of the numbers reported.",
         ),
-        selected=list(STRUCTURES).index(_structure(whole).name),
+        selected=list(STRUCTURES).index(_reported_structure(whole_record).name),
     )
 
 
 def mathml(formula: Formula) -> str:
-    """Write a formula for a page, with its LaTeX as annotation."""
+    """Return a formula as a MathML element for a page, with its LaTeX as annotation."""
     return (
         f'<math display="block"><semantics><mrow>{formula.mathml}</mrow>'
         f'<annotation encoding="application/x-tex">{formula.tex}</annotation></semantics></math>'
@@ -257,7 +325,7 @@ def mathml(formula: Formula) -> str:
 
 
 def latex(formulas: tuple[Formula, ...]) -> str:
-    r"""Write formulas as a block ``align`` of LaTeX's amsmath."""
-    lines = (each.tex.replace(" = ", " &= ", 1) for each in formulas)
+    r"""Return formulas as an ``align`` environment of LaTeX's amsmath."""
+    lines = (formula.tex.replace(" = ", " &= ", 1) for formula in formulas)
     body = " \\\\\n  ".join(lines)
     return f"\\begin{{align}}\n  {body}\n\\end{{align}}\n"

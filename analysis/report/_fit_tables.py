@@ -1,4 +1,4 @@
-"""Tables of fits: all structures on the whole record, and the Welch method's fits."""
+"""Tables of the fits of one record: all whole-record fits, and all Welch fits."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from analysis.models import QUANTITIES
 from analysis.paper import LARGEST_SHIFT
 from analysis.report._document import response_fit_percent
 from analysis.report.table import (
-    ABSENT,
-    WORDS,
+    ABSENT_TEXT,
+    TEXT_FORMAT,
     Cell,
     Column,
     Entry,
     Table,
-    estimate,
+    estimate_cells,
     footnotes,
-    greyed,
-    marked,
-    number,
-    unreported,
+    grey_cell,
+    mark_cell,
+    number_cell,
+    unreported_parameters,
 )
 
 if TYPE_CHECKING:
@@ -33,43 +33,49 @@ if TYPE_CHECKING:
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.results import WholeRecord
 
-_DAMPING: Final = ("zeta", "alpha", "gamma", "lambda")
-_ON_THE_EDGE: Final = "* at the limit of the search range: not determined by the data."
+_DAMPING_PARAMETERS: Final = ("zeta", "alpha", "gamma", "lambda")
+"""Names of the damping parameters."""
+_AT_LIMIT_NOTE: Final = "* at the limit of the search range: not determined by the data."
+"""Note on estimates at the limit of the search range."""
 
 
-def structures_table(whole: WholeRecord) -> Table:
-    """Return the comparison of all fits; orders that the data do not support are marked."""
-    lowest = min(fit.cost for fit in whole.fits.values())
-    withheld = whole.unsupported
-    delta_bic = whole.delta_bic
-    status = dict(whole.headline.structures)
+def structures_table(whole_record: WholeRecord) -> Table:
+    """Return the table of all whole-record fits; orders without support are marked."""
+    lowest_cost = min(fit.cost for fit in whole_record.fits.values())
+    unsupported_orders = whole_record.unsupported
+    delta_bic = whole_record.delta_bic
+    status_by_name = dict(whole_record.headline.structures)
     rows: list[tuple[Entry, ...]] = []
-    for name, fit in whole.fits.items():
-        its = status.get(name, "")
-        damping = _damping_cells(
-            fit.structure, fit.parameters, fit.std, withheld=withheld, at_bounds=fit.at_bounds
+    for name, fit in whole_record.fits.items():
+        fit_status = status_by_name.get(name, "")
+        damping_cells = _damping_cells(
+            fit.structure,
+            fit.parameters,
+            fit.std,
+            unsupported_orders=unsupported_orders,
+            at_bounds=fit.at_bounds,
         )
         rows.append(
             (
                 name,
-                its,
-                *(map(_left_out, damping) if its == "excluded" else damping),
+                fit_status,
+                *(map(_hidden_cell, damping_cells) if fit_status == "excluded" else damping_cells),
                 *([delta_bic[name]] if delta_bic else []),
-                whole.analysis.fit_percent(fit),
+                whole_record.analysis.fit_percent(fit),
                 fit.cost / fit.degrees_of_freedom,
                 fit.free_parameters,
                 fit.cost,
-                fit.cost - lowest,
+                fit.cost - lowest_cost,
                 fit.degrees_of_freedom,
-                " ".join(sorted(unreported(fit.structure, withheld))),
+                " ".join(sorted(unreported_parameters(fit.structure, unsupported_orders))),
             )
         )
     return Table.of(
         "structures",
         "All structures on the whole record",
         (
-            Column("Type", "type", WORDS),
-            Column("", "status", WORDS),
+            Column("Type", "type", TEXT_FORMAT),
+            Column("", "status", TEXT_FORMAT),
             *_damping_columns(),
             *([Column("ΔBIC", "delta_bic")] if delta_bic else []),
             Column("Fit (%)", "nrmse_percent", ".2f"),
@@ -78,40 +84,44 @@ def structures_table(whole: WholeRecord) -> Table:
             Column("", "cost"),
             Column("", "cost_above_lowest"),
             Column("", "degrees_of_freedom"),
-            Column("", "not_reported", WORDS),
+            Column("", "not_reported", TEXT_FORMAT),
         ),
         rows,
         (
-            *footnotes(withheld),
+            *footnotes(unsupported_orders),
             "ΔBIC: Bayesian information criterion above the lowest; 10 = decisive. Fit: NRMSE "
             "of the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power "
             "over that of the noise, 1 if nothing but noise is left. Free: number of free "
             "parameters, those of rig and beam included. * rests on the edge of the range "
-            f"searched. The marked row is {_marked_row(whole)}. What the record excludes "
+            f"searched. The marked row is {_marked_row(whole_record)}. What the record excludes "
             "has numbers in the CSV file only, beside the sums of squares.",
         ),
-        selected=list(whole.fits).index(whole.headline.name),
+        selected=list(whole_record.fits).index(whole_record.headline.name),
     )
 
 
-def _marked_row(whole: WholeRecord) -> str:
+def _marked_row(whole_record: WholeRecord) -> str:
+    """Return to which values the marked row belongs, for the note of the table."""
     return (
-        "the one reported" if whole.headline.exact is None else f"of the values {EXACT_CONDITION}"
+        "the one reported"
+        if whole_record.headline.exact is None
+        else f"of the values {EXACT_CONDITION}"
     )
 
 
-def _left_out(cell: Cell) -> Cell:
-    """Return a cell that shows a number to programs only."""
-    return cell if cell.value is None else replace(cell, text=ABSENT, doubtful=True)
+def _hidden_cell(cell: Cell) -> Cell:
+    """Return a cell that shows a dash to people but contains its number for programs."""
+    return cell if cell.value is None else replace(cell, text=ABSENT_TEXT, doubtful=True)
 
 
 def _damping_columns() -> list[Column]:
-    """Value and standard deviation of each parameter of the damping."""
+    """Return the columns of value and standard deviation of each damping parameter."""
     return [
         column
-        for name in _DAMPING
+        for name in _DAMPING_PARAMETERS
         for column in (
-            Column(_heading(name), name), Column("std", f"{name}_std", spread=True),
+            Column(_parameter_heading(name), name),
+            Column("std", f"{name}_std", std_of_previous=True),
         )
     ]  # fmt: skip
 
@@ -121,102 +131,121 @@ def _damping_cells(
     parameters: Mapping[str, float],
     std: Mapping[str, float | None] | None,
     *,
-    withheld: Collection[str] = (),
+    unsupported_orders: Collection[str] = (),
     at_bounds: Collection[str] = (),
 ) -> list[Cell]:
-    """Fill these columns: fixed values have no standard deviation, absent ones a dash."""
-    doubtful = unreported(structure, withheld)
-    shown: list[Cell] = []
-    for name in _DAMPING:
+    """Return the cells of the damping parameters' values and standard deviations.
+
+    Fixed values have no standard deviation. Parameters that the structure does not have are dashes.
+    """
+    not_reported = unreported_parameters(structure, unsupported_orders)
+    cells: list[Cell] = []
+    for name in _DAMPING_PARAMETERS:
         if not structure.has(name):
-            shown += [number(None), number(None)]
+            cells += [number_cell(None), number_cell(None)]
             continue
-        its_std = std[name] if std is not None and name in structure.free else None
-        value, spread = estimate((parameters[name], its_std), its_std, QUANTITIES[name][3])
+        parameter_std = std[name] if std is not None and name in structure.free else None
+        value, std_cell = estimate_cells(
+            (parameters[name], parameter_std), parameter_std, QUANTITIES[name][3]
+        )
         if name in at_bounds:
             value = replace(value, text=f"{value.text}*")
-        shown += [marked(value), greyed(spread)] if name in doubtful else [value, spread]
-    return shown
+        cells += (
+            [mark_cell(value), grey_cell(std_cell)] if name in not_reported else [value, std_cell]
+        )
+    return cells
 
 
-def _heading(name: str) -> str:
-    """Symbol with its power of ten; the units, which depend on the orders, would be too long."""
+def _parameter_heading(name: str) -> str:
+    """Return the heading of a damping parameter: symbol and power of ten.
+
+    The units are omitted, because they depend on the orders and would be too long.
+    """
     symbol, _meaning, unit, factor = QUANTITIES[name]
     return symbol if factor == 1.0 else f"{symbol} ({unit.split()[0]})"
 
 
-_NAMES: Final = (Column("Type", "type", WORDS), Column("Weights", "weighting", WORDS))
-_INDICES: Final = ("mse", "wmse", "md")
+_NAME_COLUMNS: Final = (
+    Column("Type", "type", TEXT_FORMAT),
+    Column("Weights", "weighting", TEXT_FORMAT),
+)
+"""Columns that identify a Welch fit: type and weighting."""
+_INDEX_NAMES: Final = ("mse", "wmse", "md")
+"""Names of the paper's indices."""
 _INDEX_UNITS: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
+"""Note on the units of the indices."""
 
 
-def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> Table:
-    """Parameters and indices of every Welch fit.
+def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str] = ()) -> Table:
+    """Return the table of every Welch fit's parameters and indices.
 
     Parameters
     ----------
     analysis : WelchAnalysis
-    withheld : collection of str
-        Orders that the whole record does not support: they are marked.
+        Welch fits of a record.
+    unsupported_orders : collection of str
+        Orders that the whole record does not support. They are marked.
     """
     fits = [model.fit for model in analysis.models]
     return Table.of(
         "welch_fits",
         "Fits to Welch's estimate, as in the paper",
         (
-            *_NAMES,
+            *_NAME_COLUMNS,
             *_damping_columns(),
             Column("Fit (%)", "nrmse_percent", ".2f"),
-            *(Column(name.upper(), name) for name in _INDICES),
+            *(Column(name.upper(), name) for name in _INDEX_NAMES),
         ),
         (
             (
-                *_names(model),
+                *_type_and_weighting(model),
                 *_damping_cells(
-                    fit.structure, fit.parameters, fit.std, withheld=withheld,
+                    fit.structure, fit.parameters, fit.std, unsupported_orders=unsupported_orders,
                     at_bounds=fit.at_bounds,
                 ),
                 response_fit_percent(analysis, model),
-                *(getattr(model.indices, name) for name in _INDICES),
+                *(getattr(model.indices, name) for name in _INDEX_NAMES),
             )
             for fit, model in zip(fits, analysis.models, strict=True)
         ),
         (
-            *footnotes(withheld),
+            *footnotes(unsupported_orders),
             f"Fit: NRMSE of the complex response in the band. {_INDEX_UNITS} std (±): one standard "
             "deviation, from the scatter of the response about the model. The bias of Welch's "
             "estimate on a chirp, which the window smears at the resonances, is not in it and is "
             "often larger: whole-record fits do not have it.",
-            *([_ON_THE_EDGE] if any(fit.at_bounds for fit in fits) else []),
+            *([_AT_LIMIT_NOTE] if any(fit.at_bounds for fit in fits) else []),
         ),
         grouped=True,
     )  # fmt: skip
 
 
 def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
-    """Mean and standard deviation over the files of each fit's parameters and indices."""
+    """Return the table of each Welch fit's mean and standard deviation over several files."""
     rows: list[tuple[Entry, ...]] = []
     for models in zip(*(analysis.models for analysis in analyses), strict=True):
         fits = [model.fit for model in models]
         parameters, indices = (
-            {key: [values[key] for values in of_files] for key in keys}
-            for keys, of_files in (
-                (_DAMPING, [fit.parameters for fit in fits]),
-                (_INDICES, [asdict(model.indices) for model in models]),
+            {key: [values[key] for values in results_of_files] for key in keys}
+            for keys, results_of_files in (
+                (_DAMPING_PARAMETERS, [fit.parameters for fit in fits]),
+                (_INDEX_NAMES, [asdict(model.indices) for model in models]),
             )
         )
         rows.append(
             (
-                *_names(models[0]),
+                *_type_and_weighting(models[0]),
                 *_damping_cells(
                     fits[0].structure,
                     {name: fmean(values) for name, values in parameters.items()},
-                    {name: _stdev(values) for name, values in parameters.items()},
+                    {name: _stdev_or_nan(values) for name, values in parameters.items()},
                 ),
                 *(
                     cell
                     for values in indices.values()
-                    for cell in estimate((fmean(values), _stdev(values)), _stdev(values))
+                    for cell in estimate_cells(
+                        (fmean(values), _stdev_or_nan(values)), _stdev_or_nan(values)
+                    )
                 ),
             )
         )
@@ -224,13 +253,13 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
         "welch_summary",
         f"Mean ± standard deviation over {len(analyses)} files",
         (
-            *_NAMES,
+            *_NAME_COLUMNS,
             *_damping_columns(),
             *(
                 column
-                for name in _INDICES
+                for name in _INDEX_NAMES
                 for column in (
-                    Column(name.upper(), name), Column("std", f"{name}_std", spread=True),
+                    Column(name.upper(), name), Column("std", f"{name}_std", std_of_previous=True),
                 )
             ),
         ),
@@ -240,18 +269,20 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
     )  # fmt: skip
 
 
-def _stdev(values: list[float]) -> float:
+def _stdev_or_nan(values: list[float]) -> float:
+    """Return the standard deviation of several values; NaN for a single one."""
     return stdev(values) if len(values) > 1 else math.nan
 
 
-def _names(model: FittedModel) -> tuple[str, str]:
+def _type_and_weighting(model: FittedModel) -> tuple[str, str]:
+    """Return the type and the weighting of a Welch fit."""
     return model.fit.structure.name, model.fit.weighting
 
 
 def peaks_table(analysis: WelchAnalysis) -> Table:
-    """Return the measured resonant peaks, and the deviations of each model's peaks."""
+    """Return the table of measured resonance peaks and each model's deviations from them."""
     modes = range(1, len(analysis.peaks) + 1)
-    measured = (
+    measured_values = (
         *(2 * math.pi * p.frequency_hz if p else None for p in analysis.peaks),
         *(p.magnitude_db if p else None for p in analysis.peaks),
     )
@@ -259,15 +290,15 @@ def peaks_table(analysis: WelchAnalysis) -> Table:
         "welch_peaks",
         "Resonant peaks of Welch's estimate, and deviations of the models' peaks from them",
         (
-            *_NAMES,
+            *_NAME_COLUMNS,
             *(Column(f"ω{n} (rad/s)", f"omega_{n}_rad_s", ".3f") for n in modes),
             *(Column(f"M{n} (dB)", f"magnitude_{n}_db", ".3f") for n in modes),
         ),
         (
-            ("measured", "", *measured),
+            ("measured", "", *measured_values),
             *(
                 (
-                    *_names(model),
+                    *_type_and_weighting(model),
                     *(d.frequency_rad_s if d else None for d in model.deviations),
                     *(d.magnitude_db if d else None for d in model.deviations),
                 )
@@ -280,49 +311,54 @@ def peaks_table(analysis: WelchAnalysis) -> Table:
     )
 
 
-_LEFT: Final = "‡"
+_FAR_MODE_MARK: Final = "‡"
+"""Mark of modes that are far from the undamped beam's."""
 
 
 def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
-    """Frequencies and damping ratios of the modes from each model's poles; None without any.
+    """Return the table of modes from each Welch fit's poles; None if no fit has modes.
 
-    Modes that are not the antenna's are marked, or left out.
+    Modes that are not the antenna's are marked or omitted.
     """
     models = analysis.models
     modes = max((len(model.modes) for model in models), default=0)
     if not modes:
         return None
 
-    def cells(model: FittedModel, name: str, form: str, factor: float = 1.0) -> list[Cell]:
-        made = []
-        for mode, followed in zip(model.modes, model.followed, strict=True):
-            cell = number(getattr(mode, name) if mode.damping_ratio < 1 else None, form, factor)
-            if cell.value is not None and not followed:
-                cell = greyed(replace(cell, text=cell.text + _LEFT))
-            made.append(cell)
-        return made or [number(None)] * modes
+    def cells(model: FittedModel, name: str, number_format: str, factor: float = 1.0) -> list[Cell]:
+        mode_cells = []
+        for mode, is_followed in zip(model.modes, model.followed, strict=True):
+            cell = number_cell(
+                getattr(mode, name) if mode.damping_ratio < 1 else None, number_format, factor
+            )
+            if cell.value is not None and not is_followed:
+                cell = grey_cell(replace(cell, text=cell.text + _FAR_MODE_MARK))
+            mode_cells.append(cell)
+        return mode_cells or [number_cell(None)] * modes
 
-    shown = [each for model in models for each in zip(model.modes, model.followed, strict=True)]
-    vibrates = [mode.damping_ratio < 1 for mode, _ in shown]
+    mode_pairs = [
+        pair for model in models for pair in zip(model.modes, model.followed, strict=True)
+    ]
+    is_underdamped = [mode.damping_ratio < 1 for mode, _ in mode_pairs]
     notes = ["From the poles of the fitted model; ξ is the damping ratio."]
-    if any(not followed and mode.damping_ratio < 1 for mode, followed in shown):
+    if any(not is_followed and mode.damping_ratio < 1 for mode, is_followed in mode_pairs):
         notes.append(
-            f"{_LEFT} more than {100 * LARGEST_SHIFT:g} % off the undamped beam's: the fit does "
-            "not follow this resonance. The number only describes the fitted curve."
+            f"{_FAR_MODE_MARK} more than {100 * LARGEST_SHIFT:g} % off the undamped beam's: the "
+            "fit does not follow this resonance. The number only describes the fitted curve."
         )
-    if not all(vibrates) or not all(model.modes for model in models):
-        notes.append(f"{ABSENT} overdamped in this fit.")
+    if not all(is_underdamped) or not all(model.modes for model in models):
+        notes.append(f"{ABSENT_TEXT} overdamped in this fit.")
     return Table.of(
         "welch_modes",
         "Modes of the fits to Welch's estimate",
         (
-            *_NAMES,
+            *_NAME_COLUMNS,
             *(Column(f"f{n} (Hz)", f"frequency_{n}_hz") for n in range(1, modes + 1)),
             *(Column(f"ξ{n} (%)", f"damping_ratio_{n}") for n in range(1, modes + 1)),
         ),
         (
             (
-                *_names(model),
+                *_type_and_weighting(model),
                 *cells(model, "frequency_hz", ".4f"),
                 *cells(model, "damping_ratio", ".4g", 100.0),
             )

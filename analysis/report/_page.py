@@ -1,4 +1,4 @@
-"""Pages: the templates filled, with every text escaped and every figure inside."""
+"""HTML pages from the templates, with every text escaped and every figure embedded."""
 
 from __future__ import annotations
 
@@ -14,16 +14,20 @@ if TYPE_CHECKING:
     from datetime import datetime
 
 Facts = tuple[str, list[tuple[str, str]]]
-"""Title of a group of facts, and their names and values."""
+"""Title of a group of facts, and the name and value of each fact."""
 
 
 def page(template: str, **content: Any) -> str:  # noqa: ANN401 - what the template asks for
-    """Fill a template of this package; a name that it asks for and is not given is an error."""
+    """Return a template of this package as HTML, filled with content.
+
+    It raises an error if the template uses a name that is not in the content.
+    """
     return _environment().get_template(template).render(content)
 
 
 @cache
 def _environment() -> jinja2.Environment:
+    """Return Jinja's environment, which escapes texts and raises an error for unknown names."""
     return jinja2.Environment(
         loader=jinja2.PackageLoader("analysis.report"),
         autoescape=True,
@@ -35,7 +39,7 @@ def _environment() -> jinja2.Environment:
 
 
 def versions(made_at: datetime) -> Facts:
-    """Return date and program versions of the report."""
+    """Return the date of the report and the versions of the programs, as facts."""
     return (
         "Versions",
         [

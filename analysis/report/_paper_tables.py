@@ -1,6 +1,6 @@
-"""The paper's tables of a campaign, on request with its own numbers in parentheses.
+"""Tables of the reference paper for a campaign, optionally with the paper's numbers in parentheses.
 
-Tables 3 to 5, the numbers of its Figure 7, and the bias of the Welch fits that they rest on.
+They are Tables 3 to 5, the numbers of Figure 7, and the bias of the Welch fits.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from analysis.campaigns import best_models
 from analysis.campaigns.sentences import title
 from analysis.models import STRUCTURES, estimate_text
 from analysis.report.table import (
-    MARK,
-    WORDS,
+    NOT_REPORTED_MARK,
+    TEXT_FORMAT,
     Cell,
     Column,
     Entry,
     Row,
     Table,
-    estimate,
+    estimate_cells,
     footnotes,
-    number,
-    unreported,
+    number_cell,
+    unreported_parameters,
 )
 from rigd.spectral import PAPER_RATE_HZ
 
@@ -36,59 +36,72 @@ if TYPE_CHECKING:
 
     from analysis.campaigns import CampaignResult
 
-NAMES: Final = (Column("type", "type", WORDS), Column("weights", "weighting", WORDS))
+FIT_NAME_COLUMNS: Final = (
+    Column("type", "type", TEXT_FORMAT),
+    Column("weights", "weighting", TEXT_FORMAT),
+)
+"""Columns that identify a Welch fit: type and weighting."""
 
 
 def paper_tables(campaign: CampaignResult, *, with_paper: bool = False) -> tuple[Table, ...]:
-    """Return the tables of the Welch fits, if any; on request with the paper's own numbers."""
+    """Return the paper's tables from the campaign's Welch fits; nothing without Welch fits.
+
+    On request they contain the paper's own numbers in parentheses.
+    """
     if not campaign.nominal:
         return ()
     return (
-        *(make(campaign, with_paper=with_paper) for make in (table3, table4, table5)),
+        *(make_table(campaign, with_paper=with_paper) for make_table in (table3, table4, table5)),
         indices_table(campaign),
         *([bias_table(campaign)] if campaign.welch_biases else []),
     )
 
 
-def welch_text(campaign: CampaignResult) -> str:
-    """Describe how the frequency responses of the sessions were estimated."""
+def welch_method_text(campaign: CampaignResult) -> str:
+    """Return how the sessions' frequency responses were estimated, as text."""
     settings = campaign.settings
-    counts = [each.segments for each in campaign.sessions]
+    counts = [session.segments for session in campaign.sessions]
     low, high = min(counts), max(counts)
     segments = f"{low}" if low == high else f"{low} to {high}"
-    # Of the settings as used, no length is left open to depend on the rate.
+    # The settings state all lengths, so that the rate has no effect.
     return estimate_text(settings.estimator, settings.segmentation(PAPER_RATE_HZ), segments)
 
 
 _STATISTICS: Final = ("mean", "median", "std", "min", "max")
-_TABLE_3: Final = {"zeta": ("ζ (10⁻⁴ s^α)", 1e4), "alpha": ("α", 1.0),
+"""Statistics of a parameter over the sessions, as in Table 3."""
+_TABLE_3_HEADINGS: Final = {"zeta": ("ζ (10⁻⁴ s^α)", 1e4), "alpha": ("α", 1.0),
                    "gamma": ("γ (10⁻¹ s^λ/m⁴)", 10.0), "lambda": ("λ", 1.0)}  # fmt: skip
-"""Heading and factor of each parameter, the powers of ten of the paper's Table 3."""
-_ON_THE_EDGE: Final = "*n: at the limit of the search range in n sessions."
-_IN_PARENTHESES: Final = "In parentheses: the paper's."
+"""Heading and factor of each parameter in Table 3, with the paper's powers of ten."""
+_AT_LIMIT_NOTE: Final = "*n: at the limit of the search range in n sessions."
+"""Note on estimates at the limit of the search range."""
+_PARENTHESES_NOTE: Final = "In parentheses: the paper's."
+"""Note on the numbers in parentheses."""
 
 
 def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
-    """Statistics of the parameters."""
+    """Return the table of each parameter's statistics over the sessions (Table 3)."""
     rows: list[Row] = []
-    for each in campaign.statistics:
-        symbol, factor = _TABLE_3[each.parameter]
-        theirs: dict[str, float | None] = {}
+    for statistics in campaign.statistics:
+        symbol, factor = _TABLE_3_HEADINGS[statistics.parameter]
+        paper_values: dict[str, float | None] = {}
         if with_paper:
-            papers = papers_table3().get((each.structure, each.weighting, each.parameter))
-            theirs = {name: getattr(papers, name, None) for name in _STATISTICS}
-        values = [getattr(each, name) for name in _STATISTICS]
-        shown = dict(zip(_STATISTICS, estimate(values, each.std, factor), strict=True))
+            paper_row = published_table3().get(
+                (statistics.structure, statistics.weighting, statistics.parameter)
+            )
+            paper_values = {name: getattr(paper_row, name, None) for name in _STATISTICS}
+        values = [getattr(statistics, name) for name in _STATISTICS]
+        cells = dict(zip(_STATISTICS, estimate_cells(values, statistics.std, factor), strict=True))
         rows.append(
             {
-                "type": each.structure,
-                "weighting": each.weighting,
+                "type": statistics.structure,
+                "weighting": statistics.weighting,
                 "parameter": Cell(
-                    each.parameter, f"{symbol} *{each.at_bounds}" if each.at_bounds else symbol
+                    statistics.parameter,
+                    f"{symbol} *{statistics.at_bounds}" if statistics.at_bounds else symbol,
                 ),
-                **_with_papers(shown, theirs, ".4g", factor),
-                "at_bounds": each.at_bounds,
-                **_papers(theirs),
+                **_cells_with_paper_values(cells, paper_values, ".4g", factor),
+                "at_bounds": statistics.at_bounds,
+                **_paper_entries(paper_values),
                 "mixture": campaign.homogeneity.mixed,
             }
         )
@@ -99,56 +112,61 @@ def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
             campaign.homogeneity,
         ),
         (
-            *NAMES,
-            Column("parameter", "parameter", WORDS),
+            *FIT_NAME_COLUMNS,
+            Column("parameter", "parameter", TEXT_FORMAT),
             *(Column(name, name) for name in _STATISTICS),
         ),
         tuple(rows),
         (
-            f"{welch_text(campaign)}; {campaign.settings.band_hz[0]:g} to "
+            f"{welch_method_text(campaign)}; {campaign.settings.band_hz[0]:g} to "
             f"{campaign.settings.band_hz[1]:g} Hz.",
-            *([_ON_THE_EDGE] if any(each.at_bounds for each in campaign.statistics) else []),
-            *([_IN_PARENTHESES] if with_paper else []),
+            *(
+                [_AT_LIMIT_NOTE]
+                if any(statistics.at_bounds for statistics in campaign.statistics)
+                else []
+            ),
+            *([_PARENTHESES_NOTE] if with_paper else []),
         ),
         grouped=True,
     )
 
 
-_PEAKS: Final = {"frequency_rad_s": "ω{} (rad/s)", "magnitude_db": "M{} (dB)"}
+_PEAK_HEADINGS: Final = {"frequency_rad_s": "ω{} (rad/s)", "magnitude_db": "M{} (dB)"}
+"""Headings of the deviations of a resonance peak, with the number of the mode."""
 
 
 def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
-    """Mean deviation of the resonant peaks; types in columns, as in the paper."""
+    """Return the table of the resonance peaks' mean deviations (Table 4)."""
     types = list(dict.fromkeys(model.structure for model in campaign.nominal))
     weightings = list(dict.fromkeys(model.weighting for model in campaign.nominal))
     deviations = {
-        (quantity, each.mode, model.weighting, model.structure): getattr(each, quantity)
-        for quantity in _PEAKS
+        (quantity, deviation.mode, model.weighting, model.structure): getattr(deviation, quantity)
+        for quantity in _PEAK_HEADINGS
         for model in campaign.nominal
-        for each in model.deviations
+        for deviation in model.deviations
     }
     rows: list[Row] = []
     for quantity, mode, weighting in sorted(
         {key[:3] for key in deviations}, key=lambda key: (*key[:2], weightings.index(key[2]))
     ):
-        its = (quantity, mode, weighting)
-        shown = {
-            each: number(deviations[*its, each], ".3g")
-            for each in types
-            if (*its, each) in deviations
+        row_key = (quantity, mode, weighting)
+        cells = {
+            type_name: number_cell(deviations[*row_key, type_name], ".3g")
+            for type_name in types
+            if (*row_key, type_name) in deviations
         }
-        theirs = {
-            each: papers_table4().get((each, weighting, quantity, mode))
-            for each in shown
+        paper_values = {
+            each_type: published_table4().get((each_type, weighting, quantity, mode))
+            for each_type in cells
             if with_paper
         }
         rows.append(
             {
-                "quantity": Cell(quantity, _PEAKS[quantity].format(mode)),
+                "quantity": Cell(quantity, _PEAK_HEADINGS[quantity].format(mode)),
                 "mode": mode,
                 "weighting": weighting,
-                **_with_papers(shown, theirs, ".3f"),
-                **_papers(theirs),
+                **_cells_with_paper_values(cells, paper_values, ".3f"),
+                **_paper_entries(paper_values),
                 "mixture": campaign.homogeneity.mixed,
             }
         )
@@ -159,52 +177,57 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
             campaign.homogeneity,
         ),
         (
-            Column("peak", "quantity", WORDS),
-            Column("weights", "weighting", WORDS),
-            *(Column(f"type {each}", each) for each in types),
+            Column("peak", "quantity", TEXT_FORMAT),
+            Column("weights", "weighting", TEXT_FORMAT),
+            *(Column(f"type {type_name}", type_name) for type_name in types),
         ),
         tuple(rows),
         (
             "A nominal model has the mean of the sessions' parameters.",
-            *([_IN_PARENTHESES] if with_paper else []),
+            *([_PARENTHESES_NOTE] if with_paper else []),
         ),
         grouped=True,
     )
 
 
-_TABLE_5: Final = {"alpha": 1.0, "zeta": 1e5, "lambda": 1.0, "gamma": 1e2}
-"""Factor of each parameter in Table 5."""
+_TABLE_5_FACTORS: Final = {"alpha": 1.0, "zeta": 1e5, "lambda": 1.0, "gamma": 1e2}
+"""Factor of each parameter in Table 5, with the paper's powers of ten."""
 
 
 def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
-    """Parameters and performance of the two best nominal models."""
+    """Return the table of the two best nominal models' parameters and WMSE (Table 5)."""
     rows: list[Row] = []
     std = {
-        (each.structure, each.weighting, each.parameter): each.std for each in campaign.statistics
+        (statistics.structure, statistics.weighting, statistics.parameter): statistics.std
+        for statistics in campaign.statistics
     }
     for model in best_models(campaign.nominal):
-        paper_wmse = papers_wmse().get((model.structure, model.weighting))
-        theirs = {"wmse": paper_wmse} if with_paper else {}
+        paper_wmse = published_wmse().get((model.structure, model.weighting))
+        paper_values = {"wmse": paper_wmse} if with_paper else {}
         rows.append(
             {
                 "type": model.structure,
                 "weighting": model.weighting,
                 **{
-                    name: estimate(
-                        [value], std.get((model.structure, model.weighting, name)), _TABLE_5[name]
+                    name: estimate_cells(
+                        [value],
+                        std.get((model.structure, model.weighting, name)),
+                        _TABLE_5_FACTORS[name],
                     )[0]
                     for name, value in model.parameters.items()
                 },
-                **_with_papers({"wmse": number(model.mean_wmse)}, theirs, ".3f"),
+                **_cells_with_paper_values(
+                    {"wmse": number_cell(model.mean_wmse)}, paper_values, ".3f"
+                ),
                 **{
                     name: value
-                    for each in model.deviations
+                    for deviation in model.deviations
                     for name, value in (
-                        (f"mdr_omega_{each.mode}_rad_s", each.frequency_rad_s),
-                        (f"mdr_magnitude_{each.mode}_db", each.magnitude_db),
+                        (f"mdr_omega_{deviation.mode}_rad_s", deviation.frequency_rad_s),
+                        (f"mdr_magnitude_{deviation.mode}_db", deviation.magnitude_db),
                     )
                 },
-                **_papers(theirs),
+                **_paper_entries(paper_values),
                 "mixture": campaign.homogeneity.mixed,
             }
         )
@@ -215,41 +238,44 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
             campaign.homogeneity,
         ),
         (
-            *NAMES, Column("α", "alpha"), Column("ζ (10⁻⁵ s^α)", "zeta"),
+            *FIT_NAME_COLUMNS, Column("α", "alpha"), Column("ζ (10⁻⁵ s^α)", "zeta"),
             Column("λ", "lambda"), Column("γ (10⁻² s^λ/m⁴)", "gamma"),
             Column("WMSE ((N·m/rad)²)", "wmse"),
         ),
         tuple(rows),
-        (_IN_PARENTHESES,) if with_paper else (),
+        (_PARENTHESES_NOTE,) if with_paper else (),
     )  # fmt: skip
 
 
-_INDICES: Final = {
+_INDEX_HEADINGS: Final = {
     "mse": "MSE ((N·m/rad)²)", "wmse": "WMSE ((N·m/rad)²)", "md": "MD (N·m/rad)",
 }  # fmt: skip
+"""Headings of the paper's indices."""
 
 
 def indices_table(campaign: CampaignResult) -> Table:
-    """Distance of each nominal model from the sessions' responses: the numbers of Figure 7."""
+    """Return the table of the nominal models' distances from the sessions, as in Figure 7."""
     rows: list[Row] = []
     for model in campaign.nominal:
         row: dict[str, Entry] = {"type": model.structure, "weighting": model.weighting}
-        for index in _INDICES:
-            values = np.array([getattr(each, index) for each in model.indices])
+        for index in _INDEX_HEADINGS:
+            values = np.array(
+                [getattr(session_indices, index) for session_indices in model.indices]
+            )
             std = float(values.std(ddof=1)) if values.size > 1 else None
-            row[index], row[f"{index}_std"] = estimate((float(values.mean()), std), std)
+            row[index], row[f"{index}_std"] = estimate_cells((float(values.mean()), std), std)
             row[f"{index}_median"] = float(np.median(values))
         rows.append({**row, "mixture": campaign.homogeneity.mixed})
     return Table(
         "nominal_indices",
         title("Distance of the nominal models from the sessions", campaign.homogeneity),
         (
-            *NAMES,
+            *FIT_NAME_COLUMNS,
             *(
                 column
-                for index, heading in _INDICES.items()
+                for index, heading in _INDEX_HEADINGS.items()
                 for column in (
-                    Column(heading, index), Column("std", f"{index}_std", spread=True)
+                    Column(heading, index), Column("std", f"{index}_std", std_of_previous=True)
                 )
             ),
         ),
@@ -260,30 +286,37 @@ def indices_table(campaign: CampaignResult) -> Table:
 
 
 def bias_table(campaign: CampaignResult) -> Table:
-    """Bias of the Welch fits against the pooled whole-record estimates."""
-    withheld = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
+    """Return the table of the Welch fits' bias relative to pooled whole-record estimates."""
+    unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
     rows: list[Row] = []
-    for fits in campaign.welch_biases:
-        doubtful = unreported(STRUCTURES[fits.structure], withheld)
-        for each in fits.parameters:
-            symbol, factor = _TABLE_3[each.parameter]
-            welch = estimate((each.welch, each.welch_std), each.welch_std, factor)
-            record = estimate((each.record, each.record_std), each.record_std, factor)
+    for fit_bias in campaign.welch_biases:
+        not_reported = unreported_parameters(STRUCTURES[fit_bias.structure], unsupported_orders)
+        for parameter in fit_bias.parameters:
+            symbol, factor = _TABLE_3_HEADINGS[parameter.parameter]
+            welch = estimate_cells(
+                (parameter.welch, parameter.welch_std), parameter.welch_std, factor
+            )
+            record = estimate_cells(
+                (parameter.record, parameter.record_std), parameter.record_std, factor
+            )
             cells: dict[str, Entry] = dict(
                 zip(("welch", "welch_std", "record", "record_std"), (*welch, *record), strict=True)
             )
             rows.append(
                 {
-                    "type": fits.structure,
-                    "weighting": fits.weighting,
-                    "parameter": Cell(each.parameter, symbol + MARK * (each.parameter in doubtful)),
+                    "type": fit_bias.structure,
+                    "weighting": fit_bias.weighting,
+                    "parameter": Cell(
+                        parameter.parameter,
+                        symbol + NOT_REPORTED_MARK * (parameter.parameter in not_reported),
+                    ),
                     **cells,
-                    "bias": estimate((each.bias,), each.bias_std, factor)[0],
-                    "bias_std": each.bias_std,
-                    "significant": each.significant,
-                    "reported": each.parameter not in doubtful,
-                    "wmse": fits.wmse,
-                    "record_wmse": fits.record_wmse,
+                    "bias": estimate_cells((parameter.bias,), parameter.bias_std, factor)[0],
+                    "bias_std": parameter.bias_std,
+                    "significant": parameter.significant,
+                    "reported": parameter.parameter not in not_reported,
+                    "wmse": fit_bias.wmse,
+                    "record_wmse": fit_bias.record_wmse,
                     "mixture": campaign.homogeneity.mixed,
                 }
             )
@@ -291,37 +324,42 @@ def bias_table(campaign: CampaignResult) -> Table:
         "welch_bias",
         title("Bias of the Welch fits against the whole records", campaign.homogeneity),
         (
-            *NAMES, Column("parameter", "parameter", WORDS),
-            Column("Welch, mean", "welch"), Column("std", "welch_std", spread=True),
-            Column("whole records", "record"), Column("std", "record_std", spread=True),
-            Column("difference", "bias"), Column("significant", "significant", WORDS),
+            *FIT_NAME_COLUMNS, Column("parameter", "parameter", TEXT_FORMAT),
+            Column("Welch, mean", "welch"), Column("std", "welch_std", std_of_previous=True),
+            Column("whole records", "record"), Column("std", "record_std", std_of_previous=True),
+            Column("difference", "bias"), Column("significant", "significant", TEXT_FORMAT),
         ),
         tuple(rows),
         (
             "Types whose whole-record residual is noise. Significant: other than zero at the 0.1 % "
             "level. A bias is the same in every session: it does not show in the std of Table 3.",
-            *footnotes(withheld),
+            *footnotes(unsupported_orders),
         ),
         grouped=True,
     )  # fmt: skip
 
 
-def _with_papers(
-    shown: Mapping[str, Cell], theirs: Mapping[str, float | None], form: str, factor: float = 1.0
+def _cells_with_paper_values(
+    cells: Mapping[str, Cell],
+    paper_values: Mapping[str, float | None],
+    number_format: str,
+    factor: float = 1.0,
 ) -> dict[str, Entry]:
-    """Add the paper's numbers that there are, in parentheses."""
-    papers = {name: number(value, form, factor) for name, value in theirs.items()}
+    """Return cells with the paper's numbers added in parentheses, where the paper states one."""
+    paper_cells = {
+        name: number_cell(value, number_format, factor) for name, value in paper_values.items()
+    }
     return {
-        name: replace(cell, text=f"{cell.text} ({papers[name].text})")
-        if theirs.get(name) is not None
+        name: replace(cell, text=f"{cell.text} ({paper_cells[name].text})")
+        if paper_values.get(name) is not None
         else cell
-        for name, cell in shown.items()
+        for name, cell in cells.items()
     }
 
 
-def _papers(theirs: Mapping[str, float | None]) -> dict[str, Entry]:
-    """Give the paper's numbers to programs, too."""
-    return {f"paper_{name}": value for name, value in theirs.items()}
+def _paper_entries(paper_values: Mapping[str, float | None]) -> dict[str, Entry]:
+    """Return the paper's numbers as table entries for files; their keys begin with ``paper_``."""
+    return {f"paper_{name}": value for name, value in paper_values.items()}
 
 
 # The paper's own numbers: "Fractional-Order Models of Damping Phenomena in a Flexible Sensing
@@ -330,7 +368,7 @@ def _papers(theirs: Mapping[str, float | None]) -> dict[str, Entry]:
 
 @dataclass(frozen=True, slots=True)
 class PaperStatistics:
-    """One row of Table 3."""
+    """Row of the paper's Table 3: statistics of one parameter over the paper's twenty sessions."""
 
     mean: float
     median: float
@@ -340,36 +378,44 @@ class PaperStatistics:
 
 
 @cache
-def papers_table3() -> Mapping[tuple[str, str, str], PaperStatistics]:
-    """Statistics by type, weighting and parameter."""
+def published_table3() -> Mapping[tuple[str, str, str], PaperStatistics]:
+    """Return the paper's Table 3, by type, weighting and parameter."""
     return {
         (row["type"], row["weighting"], row["parameter"]): PaperStatistics(
             **{name: float(row[name]) for name in ("mean", "median", "std", "min", "max")}
         )
-        for row in _rows_of("paper_table3.csv")
+        for row in _read_data_rows("paper_table3.csv")
     }
 
 
 @cache
-def papers_table4() -> Mapping[tuple[str, str, str, int], float]:
-    """Mean deviations by type, weighting, quantity (as `MeanPeakDeviation` names it) and mode."""
+def published_table4() -> Mapping[tuple[str, str, str, int], float]:
+    """Return the paper's Table 4, by type, weighting, quantity and mode.
+
+    The names of the quantities are those of `MeanPeakDeviation`.
+    """
     names = ("quantity", "mode", "weighting")
     return {
         (structure, row["weighting"], row["quantity"], int(row["mode"])): float(value)
-        for row in _rows_of("paper_table4.csv")
+        for row in _read_data_rows("paper_table4.csv")
         for structure, value in row.items()
         if structure not in names
     }
 
 
 @cache
-def papers_wmse() -> Mapping[tuple[str, str], float]:
-    """Weighted mean square error of the two best models, by type and weighting."""
+def published_wmse() -> Mapping[tuple[str, str], float]:
+    """Return the paper's weighted mean square error of its two best models.
+
+    The keys are type and weighting.
+    """
     return {
-        (row["type"], row["weighting"]): float(row["wmse"]) for row in _rows_of("paper_table5.csv")
+        (row["type"], row["weighting"]): float(row["wmse"])
+        for row in _read_data_rows("paper_table5.csv")
     }
 
 
-def _rows_of(name: str) -> list[dict[str, str]]:
+def _read_data_rows(name: str) -> list[dict[str, str]]:
+    """Return the rows of a data file of this package, by column name."""
     text = files("analysis.report").joinpath("data", name).read_text(encoding="utf-8")
     return list(csv.DictReader(text.splitlines()))

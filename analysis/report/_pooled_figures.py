@@ -1,4 +1,4 @@
-"""Figures of a campaign's pooled estimate: damping against frequency, frequency response."""
+"""Figures of a campaign's pooled estimate: damping over frequency, frequency response."""
 
 from __future__ import annotations
 
@@ -10,8 +10,13 @@ import numpy as np
 from analysis.campaigns.sentences import title
 from analysis.models import ESTIMATOR_WORDS, STRUCTURES
 from analysis.report import _style as style
-from analysis.report._campaign_figures import INTERVAL, SESSION, draw_session, shown_sessions
-from analysis.report._pooled_tables import exactly, used
+from analysis.report._campaign_figures import (
+    INTERVAL_COLOR,
+    SESSION_COLOR,
+    draw_session,
+    shown_sessions,
+)
+from analysis.report._pooled_tables import exact_condition_text, session_count_text
 from analysis.report.bands import dense_grid, loss_factors, response_band
 from analysis.statistics import NORMAL_95, student_t_quantile
 from rigd.view.frequency_charts import magnitude_db, phase_deg
@@ -28,18 +33,20 @@ if TYPE_CHECKING:
     from analysis.identify import ModeEstimate, Plant
     from analysis.models import Structure
 
-_FREEST: Final = "VI"
-"""Type with both dampings, of free orders."""
+_FREEST_TYPE: Final = "VI"
+"""Damping structure with internal and external damping, both of free order."""
 
-_POINTS: Final = 400
-_COLUMNS: Final = 1500
-_MARGIN: Final = 1.6
-"""Ratio of the axis's ends to the outermost modes."""
+_LOSS_FACTOR_POINTS: Final = 400
+"""Number of frequencies at which the pooled loss factor is drawn."""
+_RESPONSE_COLUMNS: Final = 1500
+"""Number of columns into which the sessions' responses are decimated."""
+_AXIS_END_RATIO: Final = 1.6
+"""Ratio by which the frequency axis extends beyond the first and the last mode."""
 
 
 @dataclass(frozen=True, slots=True)
 class _PooledFit:
-    """Pooled estimate as `analysis.report.bands` takes an estimate."""
+    """Pooled estimate of a campaign in the form of an `Estimate` of `analysis.report.bands`."""
 
     structure: Structure
     plant: Plant
@@ -49,33 +56,35 @@ class _PooledFit:
 
     @classmethod
     def of_campaign(cls, campaign: CampaignResult) -> _PooledFit | None:
-        """Take the estimate that parameters are of; None where the modal constants have none."""
-        modal, pooled = campaign.modal, campaign.headline
-        tolerant = modal.tolerant if modal else None
-        if tolerant is None:
+        """Return the estimate to which a campaign's parameters belong; None if there is none."""
+        modal_result, pooled = campaign.modal, campaign.headline
+        tolerant_estimate = modal_result.tolerant if modal_result else None
+        if tolerant_estimate is None:
             return None if pooled is None else cls.of(pooled)
-        if tolerant.basis == "none":
+        if tolerant_estimate.basis == "none":
             return None
         return cls(
-            structure=STRUCTURES[_FREEST],
-            plant=tolerant.plant,
-            parameters=tolerant.values,
-            determined=tuple(tolerant.std),
-            covariance=tolerant.covariance,
+            structure=STRUCTURES[_FREEST_TYPE],
+            plant=tolerant_estimate.plant,
+            parameters=tolerant_estimate.values,
+            determined=tuple(tolerant_estimate.std),
+            covariance=tolerant_estimate.covariance,
         )
 
     @classmethod
-    def of(cls, pooled: PooledEstimate) -> _PooledFit:
-        # Bands are 1.96 standard deviations wide, and Student's t of few sessions is more.
-        widened = student_t_quantile(0.95, pooled.sessions - 1) / NORMAL_95
+    def of(cls, pooled_estimate: PooledEstimate) -> _PooledFit:
+        """Return a pooled estimate with its covariance enlarged for a small number of sessions."""
+        # Bands are 1.96 standard deviations wide, but Student's t of a few sessions is larger.
+        interval_ratio = student_t_quantile(0.95, pooled_estimate.sessions - 1) / NORMAL_95
         return cls(
-            structure=STRUCTURES[pooled.structure],
-            plant=pooled.plant,
+            structure=STRUCTURES[pooled_estimate.structure],
+            plant=pooled_estimate.plant,
             parameters={
-                **pooled.plant.parameters, **{each.name: each.value for each in pooled.parameters},
+                **pooled_estimate.plant.parameters,
+                **{parameter.name: parameter.value for parameter in pooled_estimate.parameters},
             },
-            determined=tuple(each.name for each in pooled.parameters),
-            covariance=widened**2 * pooled.covariance,
+            determined=tuple(parameter.name for parameter in pooled_estimate.parameters),
+            covariance=interval_ratio**2 * pooled_estimate.covariance,
         )  # fmt: skip
 
 
@@ -83,118 +92,139 @@ class _PooledFit:
 
 
 def damping_figure(campaign: CampaignResult) -> Figure:
-    """Draw the damping ratios of all sessions' modes against frequency, with the pooled ones.
+    """Draw the damping ratios of all sessions' modes over frequency, with the pooled values.
 
-    On top all modes, and between them half the loss factor of the pooled estimate with its 95 %
-    band; below each mode enlarged.
+    The upper panel shows all modes, and between them half the loss factor of the pooled estimate
+    with its 95 % band. The lower panels show each mode enlarged.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    pooled = campaign.headline
-    assert pooled is not None
-    modes, sessions = campaign.modes, _sessions_of_modes(campaign, pooled)
+    pooled_estimate = campaign.headline
+    assert pooled_estimate is not None
+    modes, sessions = campaign.modes, _session_count_of_modes(campaign, pooled_estimate)
     width_in, height_in = 11.0, 6.6
     figure = style.new_figure(
         width_in, height_in,
-        title(f"Damping against frequency, {used(pooled, campaign)}", campaign.homogeneity),
-        f"{_source(campaign, pooled)}  ·  curve: half the pooled loss factor between the modes  ·  "
-        "below: each mode, frequency from the pooled mean",
+        title(
+            f"Damping against frequency, {session_count_text(pooled_estimate, campaign)}",
+            campaign.homogeneity,
+        ),
+        f"{_source_of_modes(campaign, pooled_estimate)}  ·  curve: half the pooled loss factor "
+        "between the modes  ·  below: each mode, frequency from the pooled mean",
     )  # fmt: skip
     grid = figure.add_gridspec(
         2, len(modes), left=0.075, right=0.985, top=1 - 0.95 / height_in, bottom=0.5 / height_in,
         height_ratios=(1.25, 1.0), hspace=0.32, wspace=0.28,
     )  # fmt: skip
     axes = figure.add_subplot(grid[0, :])
-    _curve(axes, modes, _PooledFit.of_campaign(campaign))
+    _draw_loss_factor(axes, modes, _PooledFit.of_campaign(campaign))
     for column, mode in enumerate(modes):
-        own = _mode_of_sessions(campaign, pooled, mode)
+        session_modes = _session_estimates_of_mode(campaign, pooled_estimate, mode)
         axes.plot(
-            [each.frequency_hz for each in own], [100 * each.damping_ratio for each in own], "o",
+            [session_mode.frequency_hz for session_mode in session_modes],
+            [100 * session_mode.damping_ratio for session_mode in session_modes], "o",
             color=style.INK, markersize=3.0,
         )  # fmt: skip
-        _pooled_mode(axes, mode, sessions)
-        _enlarged(figure.add_subplot(grid[1, column]), mode, own, sessions)
+        _draw_pooled_mode(axes, mode, sessions)
+        _draw_enlarged_mode(figure.add_subplot(grid[1, column]), mode, session_modes, sessions)
     figure.axes[1].set_ylabel("Damping ratio (%)")
-    style.frequency_axis(axes, (modes[0].frequency_hz / _MARGIN, modes[-1].frequency_hz * _MARGIN))
+    style.frequency_axis(
+        axes, (modes[0].frequency_hz / _AXIS_END_RATIO, modes[-1].frequency_hz * _AXIS_END_RATIO)
+    )
     axes.set_ylim(bottom=0.0)
     axes.margins(y=0.1)
     axes.set_ylabel("Damping ratio (%)")
     axes.set_xlabel("Frequency (Hz)", labelpad=1)
-    marks = [
+    legend_entries = [
         Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
                label="session, ± 1.96 of its standard deviation"),
         Line2D([], [], color=style.BLUE, marker="D", markersize=4, label="pooled"),
-        Patch(facecolor=INTERVAL, label="its 95 % interval"),
+        Patch(facecolor=INTERVAL_COLOR, label="its 95 % interval"),
     ]  # fmt: skip
-    style.legend(figure, marks, columns=3)
+    style.legend(figure, legend_entries, columns=3)
     return figure
 
 
-def _source(campaign: CampaignResult, pooled: PooledEstimate) -> str:
-    """Name the model that the modes are of."""
-    of_modal_model = campaign.modal is not None and campaign.modal.leads
-    return "modal model" if of_modal_model else f"type {pooled.name}"
+def _source_of_modes(campaign: CampaignResult, pooled_estimate: PooledEstimate) -> str:
+    """Return the name of the model from which the modes are computed."""
+    is_modal = campaign.modal is not None and campaign.modal.leads
+    return "modal model" if is_modal else f"type {pooled_estimate.name}"
 
 
-def _sessions_of_modes(campaign: CampaignResult, pooled: PooledEstimate) -> int:
-    modal = campaign.modal
-    return modal.sessions if modal is not None and modal.leads else pooled.sessions
+def _session_count_of_modes(campaign: CampaignResult, pooled_estimate: PooledEstimate) -> int:
+    """Return the number of sessions from which the modes are pooled."""
+    modal_result = campaign.modal
+    return (
+        modal_result.sessions
+        if modal_result is not None and modal_result.leads
+        else pooled_estimate.sessions
+    )
 
 
-def _mode_of_sessions(
-    campaign: CampaignResult, pooled: PooledEstimate, mode: PooledMode
+def _session_estimates_of_mode(
+    campaign: CampaignResult, pooled_estimate: PooledEstimate, mode: PooledMode
 ) -> list[ModeEstimate]:
-    """Return one mode of every session, by the model that the pooled one is of."""
+    """Return the estimates of one mode from every session, by the pooled mode's model."""
     if mode.source == "modal":
-        shown = (each.modal for each in campaign.sessions)
-        return [each.mode(mode.number) for each in shown if each and mode.number in each.visible]
+        modal_fits = (session.modal for session in campaign.sessions)
+        return [
+            modal_fit.mode(mode.number)
+            for modal_fit in modal_fits
+            if modal_fit and mode.number in modal_fit.visible
+        ]
     return [
-        own
+        mode_estimate
         for session in campaign.sessions
-        for each in session.record_estimates
-        for own in each.modes
-        if each.name == pooled.name and own.number == mode.number
+        for estimate in session.record_estimates
+        for mode_estimate in estimate.modes
+        if estimate.name == pooled_estimate.name and mode_estimate.number == mode.number
     ]
 
 
-def _curve(axes: Axes, modes: Sequence[PooledMode], fit: _PooledFit | None) -> None:
-    """Draw half the loss factor between the first and the last mode: a damping ratio there."""
+def _draw_loss_factor(axes: Axes, modes: Sequence[PooledMode], fit: _PooledFit | None) -> None:
+    """Draw half the pooled loss factor, which is the damping ratio, between first and last mode."""
     if len(modes) < 2 or fit is None:
         return
-    frequency_hz = np.geomspace(modes[0].frequency_hz, modes[-1].frequency_hz, _POINTS)
-    total = loss_factors(fit, frequency_hz).total
-    low, high = total.limits()
-    axes.fill_between(frequency_hz, 50 * low, 50 * high, color=INTERVAL, linewidth=0)
-    axes.plot(frequency_hz, 50 * total.value, color=style.BLUE)
+    frequency_hz = np.geomspace(modes[0].frequency_hz, modes[-1].frequency_hz, _LOSS_FACTOR_POINTS)
+    total_loss_factor = loss_factors(fit, frequency_hz).total
+    low, high = total_loss_factor.limits()
+    axes.fill_between(frequency_hz, 50 * low, 50 * high, color=INTERVAL_COLOR, linewidth=0)
+    axes.plot(frequency_hz, 50 * total_loss_factor.value, color=style.BLUE)
 
 
-def _pooled_mode(axes: Axes, mode: PooledMode, sessions: int) -> None:
+def _draw_pooled_mode(axes: Axes, mode: PooledMode, sessions: int) -> None:
     """Draw a pooled mode with the 95 % interval of its damping ratio."""
-    half = 100 * student_t_quantile(0.95, sessions - 1) * mode.damping_ratio_std
+    half_width_percent = 100 * student_t_quantile(0.95, sessions - 1) * mode.damping_ratio_std
     axes.errorbar(
-        [mode.frequency_hz], [100 * mode.damping_ratio], yerr=[half], fmt="D",
+        [mode.frequency_hz], [100 * mode.damping_ratio], yerr=[half_width_percent], fmt="D",
         color=style.BLUE, markersize=4.0, capsize=3.0, elinewidth=1.0, zorder=4,
     )  # fmt: skip
 
 
-def _enlarged(axes: Axes, mode: PooledMode, own: Sequence[ModeEstimate], sessions: int) -> None:
-    """Draw one mode of every session, with both deviations, over the pooled intervals."""
+def _draw_enlarged_mode(
+    axes: Axes, mode: PooledMode, session_modes: Sequence[ModeEstimate], sessions: int
+) -> None:
+    """Draw one mode of every session with its intervals, over the pooled 95 % intervals."""
     from matplotlib.patches import Rectangle
 
     t = student_t_quantile(0.95, sessions - 1)
-    half_mhz, half = 1e3 * t * mode.frequency_std_hz, 100 * t * mode.damping_ratio_std
+    half_width_mhz, half_width_percent = (
+        1e3 * t * mode.frequency_std_hz,
+        100 * t * mode.damping_ratio_std,
+    )
     axes.add_patch(
         Rectangle(
-            (-half_mhz, 100 * mode.damping_ratio - half), 2 * half_mhz, 2 * half,
-            facecolor=INTERVAL, edgecolor="none", zorder=1,
+            (-half_width_mhz, 100 * mode.damping_ratio - half_width_percent),
+            2 * half_width_mhz, 2 * half_width_percent, facecolor=INTERVAL_COLOR,
+            edgecolor="none", zorder=1,
         )
     )  # fmt: skip
     axes.errorbar(
-        [1e3 * (each.frequency_hz - mode.frequency_hz) for each in own],
-        [100 * each.damping_ratio for each in own],
-        xerr=[1e3 * NORMAL_95 * each.frequency_std_hz for each in own],
-        yerr=[100 * NORMAL_95 * each.damping_ratio_std for each in own],
+        [1e3 * (session_mode.frequency_hz - mode.frequency_hz) for session_mode in session_modes],
+        [100 * session_mode.damping_ratio for session_mode in session_modes],
+        xerr=[1e3 * NORMAL_95 * session_mode.frequency_std_hz for session_mode in session_modes],
+        yerr=[100 * NORMAL_95 * session_mode.damping_ratio_std for session_mode in session_modes],
         fmt="o", color=style.INK, markersize=2.6, linewidth=0.8, zorder=3,
     )  # fmt: skip
     axes.plot([0.0], [100 * mode.damping_ratio], "D", color=style.BLUE, markersize=4.0, zorder=4)
@@ -211,28 +241,31 @@ def _enlarged(axes: Axes, mode: PooledMode, own: Sequence[ModeEstimate], session
 def response_figure(campaign: CampaignResult) -> Figure:
     """Draw the pooled estimate's frequency response with its 95 % band over the sessions'.
 
-    Those are measured ones where Welch's method suits the sessions, otherwise those of the
-    sessions' own whole-record fits.
+    The sessions' responses are the measured ones if Welch's method is applicable to the sessions,
+    otherwise those of the sessions' own whole-record fits.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    pooled = campaign.headline
-    assert pooled is not None
+    pooled_estimate = campaign.headline
+    assert pooled_estimate is not None
     peaks_hz = [mode.frequency_hz for mode in campaign.modes]
-    first_hz, last_hz = _band_hz(campaign, peaks_hz)
-    band = response_band(_PooledFit.of(pooled), dense_grid(first_hz, last_hz, peaks_hz))
-    measured = bool(campaign.sessions[0].frequency_hz.size)
+    first_hz, last_hz = _response_band_hz(campaign, peaks_hz)
+    band = response_band(_PooledFit.of(pooled_estimate), dense_grid(first_hz, last_hz, peaks_hz))
+    is_measured = bool(campaign.sessions[0].frequency_hz.size)
     width_in, height_in = 11.0, 6.6
     figure = style.new_figure(
         width_in, height_in,
-        title(f"Pooled frequency response, {used(pooled, campaign)}", campaign.homogeneity),
+        title(
+            f"Pooled frequency response, {session_count_text(pooled_estimate, campaign)}",
+            campaign.homogeneity,
+        ),
         "coupling torque over motor angle, without delays  ·  pooled: type "
-        f"{pooled.name}{exactly(campaign)}"
+        f"{pooled_estimate.name}{exact_condition_text(campaign)}"
         + (
             f"  ·  sessions: {ESTIMATOR_WORDS[campaign.settings.estimator]}, which a fast sweep "
             "biases at the resonances"
-            if measured
+            if is_measured
             else ""
         ),
     )  # fmt: skip
@@ -241,10 +274,10 @@ def response_figure(campaign: CampaignResult) -> Figure:
         height_ratios=(2.4, 1.0, 0.8), hspace=0.1,
     )  # fmt: skip
     magnitude, phase, width = (figure.add_subplot(grid[row]) for row in range(3))
-    lowest_db = _draw_sessions(campaign, pooled, magnitude, phase, band.frequency_hz)
-    low, high = (magnitude_db(each.astype(complex)) for each in band.magnitude_limits())
+    lowest_db = _draw_sessions(campaign, pooled_estimate, magnitude, phase, band.frequency_hz)
+    low, high = (magnitude_db(limit.astype(complex)) for limit in band.magnitude_limits())
     modelled_db = magnitude_db(band.response)
-    magnitude.fill_between(band.frequency_hz, low, high, color=INTERVAL, linewidth=0)
+    magnitude.fill_between(band.frequency_hz, low, high, color=INTERVAL_COLOR, linewidth=0)
     magnitude.plot(band.frequency_hz, modelled_db, color=style.BLUE)
     magnitude.set_ylim(min(lowest_db, float(np.quantile(modelled_db, 0.02))) - 5,
                        float(modelled_db.max()) + 5)  # fmt: skip
@@ -257,18 +290,21 @@ def response_figure(campaign: CampaignResult) -> Figure:
     for axes in (magnitude, phase, width):
         style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width)
     figure.align_ylabels()
-    marks = [
-        Line2D([], [], color=SESSION, linewidth=1.5,
-               label=f"sessions, {'measured' if measured else 'each by its own fit'}"),
+    legend_entries = [
+        Line2D([], [], color=SESSION_COLOR, linewidth=1.5,
+               label=f"sessions, {'measured' if is_measured else 'each by its own fit'}"),
         Line2D([], [], color=style.BLUE, label="pooled"),
-        Patch(facecolor=INTERVAL, label="its 95 % band"),
+        Patch(facecolor=INTERVAL_COLOR, label="its 95 % band"),
     ]  # fmt: skip
-    style.legend(figure, marks, columns=3)
+    style.legend(figure, legend_entries, columns=3)
     return figure
 
 
-def _band_hz(campaign: CampaignResult, peaks_hz: Sequence[float]) -> tuple[float, float]:
-    """Axis of the response: the band of the fits, from well below the first mode on."""
+def _response_band_hz(campaign: CampaignResult, peaks_hz: Sequence[float]) -> tuple[float, float]:
+    """Return the lowest and highest frequency of the response figure.
+
+    It is the band of the fits, but not below a quarter of the first mode's frequency.
+    """
     first_hz, last_hz = campaign.record_band_hz
     lowest_hz = min([last_hz / 4, *(peak / 4 for peak in peaks_hz)])
     return max(first_hz, lowest_hz), last_hz
@@ -276,23 +312,27 @@ def _band_hz(campaign: CampaignResult, peaks_hz: Sequence[float]) -> tuple[float
 
 def _draw_sessions(
     campaign: CampaignResult,
-    pooled: PooledEstimate,
+    pooled_estimate: PooledEstimate,
     magnitude: Axes,
     phase: Axes,
     grid_hz: NDArray[np.float64],
 ) -> float:
-    """Draw what each session has; return the least magnitude worth showing, in dB."""
+    """Draw the response of each session; return the lower limit of their magnitudes in dB."""
     from analysis.identify import ResponseGrid
 
-    lowest = np.inf
+    lowest_db = np.inf
     for session in shown_sessions(campaign):
         frequency_hz, response = session.frequency_hz, session.response
         if not frequency_hz.size:
-            own = [each for each in session.record_estimates if each.name == pooled.name]
-            if not own:
+            estimates = [
+                estimate
+                for estimate in session.record_estimates
+                if estimate.name == pooled_estimate.name
+            ]
+            if not estimates:
                 continue
             frequency_hz = grid_hz
-            response = ResponseGrid(2j * np.pi * grid_hz).evaluate(own[0].plant, ())[0]
-        lowest = min(lowest, float(np.quantile(magnitude_db(response), 0.005)))
-        draw_session(magnitude, phase, frequency_hz, response, _COLUMNS, _COLUMNS)
-    return lowest
+            response = ResponseGrid(2j * np.pi * grid_hz).evaluate(estimates[0].plant, ())[0]
+        lowest_db = min(lowest_db, float(np.quantile(magnitude_db(response), 0.005)))
+        draw_session(magnitude, phase, frequency_hz, response, _RESPONSE_COLUMNS, _RESPONSE_COLUMNS)
+    return lowest_db

@@ -1,4 +1,4 @@
-"""Tables of what all sessions give together, and of whether they are of one specimen."""
+"""Tables of the estimates pooled over all sessions, and of the sessions' homogeneity."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from analysis.campaigns.sentences import (
 from analysis.identify.headline import EXACT_CONDITION
 from analysis.models import STRUCTURES
 from analysis.report.table import (
-    MARK,
-    WORDS,
+    NOT_REPORTED_MARK,
+    TEXT_FORMAT,
     Cell,
     Column,
     Entry,
     Row,
     Table,
-    count,
-    estimate,
+    count_cell,
+    estimate_cells,
     footnotes,
-    greyed,
-    marked,
-    number,
-    unreported,
+    grey_cell,
+    mark_cell,
+    number_cell,
+    unreported_parameters,
 )
 from rigd.units import decimals
 
@@ -41,35 +41,42 @@ if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult, Heterogeneity, Homogeneity, RankedStructure
     from analysis.campaigns.pooling import PooledEstimate, PooledParameter
 
-_PARTICIPATION: Final = (
+_INERTIA_COLUMNS: Final = (
     Column("inertia (10⁻⁶ kg·m²)", "participation_kg_m2"),
-    Column("std", "participation_std_kg_m2", spread=True),
+    Column("std", "participation_std_kg_m2", std_of_previous=True),
 )
-NOT_POOLED: Final = (
+"""Columns of a mode's effective inertia and its standard deviation."""
+NOT_POOLED_NOTE: Final = (
     "In grey: not pooled, as fewer than two sessions determine its damping or not all were fitted."
 )
+"""Note on the structures that are not pooled, for the table of structures."""
 
 
 def structures_table(campaign: CampaignResult) -> Table:
-    """All structures on all whole records together, those pooled first, the lowest BIC first."""
+    """Return the table of all structures' joint fits to all sessions.
 
-    def row(each: RankedStructure) -> Row:
-        grey: Callable[[Cell], Cell] = (lambda cell: cell) if each.pooled else greyed
+    Pooled structures come first. The lowest BIC is first in either group.
+    """
+
+    def row(ranked_structure: RankedStructure) -> Row:
+        as_grey: Callable[[Cell], Cell] = (
+            (lambda cell: cell) if ranked_structure.pooled else grey_cell
+        )
         return {
-            "type": Cell(each.structure, each.name),
-            "fitted": grey(count(each.fitted)),
-            "sessions": grey(count(each.determined)),
-            "bic_above_lowest": grey(number(each.bic_above_lowest, ".1f")),
-            "misfit": grey(number(each.misfit)),
-            "selected_alone": grey(count(each.selected_alone)),
-            "pooled": each.pooled,
+            "type": Cell(ranked_structure.structure, ranked_structure.name),
+            "fitted": as_grey(count_cell(ranked_structure.fitted)),
+            "sessions": as_grey(count_cell(ranked_structure.determined)),
+            "bic_above_lowest": as_grey(number_cell(ranked_structure.bic_above_lowest, ".1f")),
+            "misfit": as_grey(number_cell(ranked_structure.misfit)),
+            "selected_alone": as_grey(count_cell(ranked_structure.selected_alone)),
+            "pooled": ranked_structure.pooled,
         }
 
     return Table(
         "structures",
         title("Structures, whole records of all sessions together", campaign.homogeneity),
         (
-            Column("type", "type", WORDS),
+            Column("type", "type", TEXT_FORMAT),
             Column("sessions fitted", "fitted"),
             Column("damping determined in", "sessions"),
             Column("selected in", "selected_alone"),
@@ -80,173 +87,210 @@ def structures_table(campaign: CampaignResult) -> Table:
         (
             "Damping and stiffness corrections have one value for all sessions, with a "
             "between-session variance where they differ; settings of the rig have one per session.",
-            *(() if all(each.pooled for each in campaign.structures) else (NOT_POOLED,)),
+            *(
+                ()
+                if all(ranked_structure.pooled for ranked_structure in campaign.structures)
+                else (NOT_POOLED_NOTE,)
+            ),
         ),
         selected=0 if campaign.pooled else None,
     )
 
 
 def likely_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
-    """Return the headline's estimate, and the one of the lowest BIC, which is conditional."""
-    found = {each.name: each for each in (campaign.headline, *campaign.pooled[:1]) if each}
-    return list(found.values())
+    """Return the reported pooled estimate, and the one with the lowest BIC if it differs."""
+    estimates_by_name = {
+        estimate.name: estimate
+        for estimate in (campaign.headline, *campaign.pooled[:1])
+        if estimate
+    }
+    return list(estimates_by_name.values())
 
 
-def used(estimate: PooledEstimate, campaign: CampaignResult) -> str:
-    """Say of how many sessions an estimate is, and of how many it is not."""
-    every = len(campaign.sessions)
-    return f"{estimate.sessions}{f' of {every}' if estimate.sessions < every else ''} sessions"
+def session_count_text(estimate: PooledEstimate, campaign: CampaignResult) -> str:
+    """Return the number of sessions in an estimate as text, such as "7 of 10 sessions"."""
+    session_total = len(campaign.sessions)
+    return (
+        f"{estimate.sessions}{f' of {session_total}' if estimate.sessions < session_total else ''}"
+        " sessions"
+    )
 
 
-def exactly(campaign: CampaignResult) -> str:
-    """Return the condition of the types' pooled estimates, nothing where they are the headline."""
+def exact_condition_text(campaign: CampaignResult) -> str:
+    """Return the condition under which a pooled estimate holds; empty without a condition."""
     return f", {EXACT_CONDITION}" if campaign.modal and campaign.modal.leads else ""
 
 
-def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -> Table:
-    """Pooled whole-record estimates, the headline's first, then the lowest BIC first.
+def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None = None) -> Table:
+    """Return the table of pooled estimates: the reported one first, then by increasing BIC.
 
     Parameters
     ----------
     campaign : CampaignResult
-    only : PooledEstimate, optional
-        The one to be shown. Without it, as in the files, all of them, and behind them what is not
-        pooled, without values.
+        Results of all sessions.
+    only_estimate : PooledEstimate, optional
+        Estimate to show. Without it, as in the files, all estimates are in the table, followed by
+        the structures that are not pooled, without values.
     """
-    withheld = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
-    found, headline = campaign.homogeneity, campaign.headline
+    unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
+    homogeneity, headline = campaign.homogeneity, campaign.headline
     columns = (
-        Column("parameter", "parameter", WORDS),
-        Column("pooled", "value"), Column("std", "std", spread=True),
+        Column("parameter", "parameter", TEXT_FORMAT),
+        Column("pooled", "value"), Column("std", "std", std_of_previous=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
         Column("one session's std", "within_std"), Column("between sessions", "between_std"),
         Column("p", "p_value"),
     )  # fmt: skip
-    if only is None:
-        pooled = sorted(campaign.pooled, key=lambda each: each is not headline)
+    if only_estimate is None:
+        ordered_estimates = sorted(campaign.pooled, key=lambda item: item is not headline)
         rows = [
-            _pooled_row(estimate, each, campaign, withheld)
-            for estimate in pooled
-            for each in estimate.parameters
+            _pooled_row(estimate, parameter, campaign, unsupported_orders)
+            for estimate in ordered_estimates
+            for parameter in estimate.parameters
         ]
         rows += [
             {
-                "type": each.structure,
-                "name": each.name,
+                "type": structure.structure,
+                "name": structure.name,
                 "headline": False,
-                "sessions": each.determined,
-                "misfit": each.misfit,
+                "sessions": structure.determined,
+                "misfit": structure.misfit,
                 "parameter": parameter,
                 "reported": False,
             }
-            for each in campaign.structures
-            if not each.pooled
-            for parameter in STRUCTURES[each.structure].free
+            for structure in campaign.structures
+            if not structure.pooled
+            for parameter in STRUCTURES[structure.structure].free
         ]
         return Table("pooled", "Pooled whole-record estimates", columns, tuple(rows))
     role = "freest structure"
-    if only is not headline:
+    if only_estimate is not headline:
         role = "lowest BIC; valid only if it is the true one"
-    role += exactly(campaign)
+    role += exact_condition_text(campaign)
     notes = [
         "One session's std: standard deviation that a typical session states. Between sessions: "
         "standard deviation between sessions beyond that (τ). p: p-value of Cochran's Q. "
-        f"Residual {only.misfit:.4g} times the noise."
+        f"Residual {only_estimate.misfit:.4g} times the noise."
     ]
-    if unreported(STRUCTURES[only.structure], withheld):
-        notes += footnotes(withheld)
-    if any(found.is_mixed(each.name) for each in only.parameters):
+    if unreported_parameters(STRUCTURES[only_estimate.structure], unsupported_orders):
+        notes += footnotes(unsupported_orders)
+    if any(homogeneity.is_mixed(parameter.name) for parameter in only_estimate.parameters):
         notes.append(MIXTURE_NOTE)
     return Table(
-        f"pooled_{only.name.replace(', ', '_').replace(' ', '_')}",
-        title(f"Pooled over {used(only, campaign)}: type {only.name} ({role})", found),
+        f"pooled_{only_estimate.name.replace(', ', '_').replace(' ', '_')}",
+        title(
+            f"Pooled over {session_count_text(only_estimate, campaign)}: "
+            f"type {only_estimate.name} ({role})",
+            homogeneity,
+        ),
         columns,
-        tuple(_pooled_row(only, each, campaign, withheld) for each in only.parameters),
+        tuple(
+            _pooled_row(only_estimate, parameter, campaign, unsupported_orders)
+            for parameter in only_estimate.parameters
+        ),
         tuple(notes),
     )
 
 
 def _pooled_row(
-    pooled: PooledEstimate,
-    each: PooledParameter,
+    pooled_estimate: PooledEstimate,
+    parameter: PooledParameter,
     campaign: CampaignResult,
-    withheld: Collection[str],
+    unsupported_orders: Collection[str],
 ) -> Row:
-    found = campaign.homogeneity
-    _, factor, _ = label(each.name)
-    value, std, low, high = estimate((each.value, each.std, *each.interval), each.std, factor)
-    reported = each.name not in unreported(STRUCTURES[pooled.structure], withheld)
-    if not reported:
-        value = marked(value)
+    """Return the row of a parameter in the table of pooled estimates."""
+    homogeneity = campaign.homogeneity
+    _, factor, _ = label(parameter.name)
+    value, std, low, high = estimate_cells(
+        (parameter.value, parameter.std, *parameter.interval), parameter.std, factor
+    )
+    is_reported = parameter.name not in unreported_parameters(
+        STRUCTURES[pooled_estimate.structure], unsupported_orders
+    )
+    if not is_reported:
+        value = mark_cell(value)
     else:
-        # Let the eye stop at what can be used only.
-        value = greyed(value) if found.is_mixed(each.name) else replace(value, strong=True)
+        # Only usable values are bold, so that they catch the eye.
+        value = (
+            grey_cell(value)
+            if homogeneity.is_mixed(parameter.name)
+            else replace(value, strong=True)
+        )
     return {
-        "type": pooled.structure,
-        "name": pooled.name,
-        "headline": pooled is campaign.headline,
-        "sessions": pooled.sessions,
-        "bic": pooled.bic,
-        "misfit": pooled.misfit,
-        "parameter": Cell(each.name, with_mark(with_unit(each.name), each.name, found)),
+        "type": pooled_estimate.structure,
+        "name": pooled_estimate.name,
+        "headline": pooled_estimate is campaign.headline,
+        "sessions": pooled_estimate.sessions,
+        "bic": pooled_estimate.bic,
+        "misfit": pooled_estimate.misfit,
+        "parameter": Cell(
+            parameter.name, with_mark(with_unit(parameter.name), parameter.name, homogeneity)
+        ),
         "value": value,
         "std": std,
         "low_95": low,
         "high_95": high,
-        "within_std": number(each.within_std, ".2g", factor),
-        "between_std": number(each.between_std, ".2g", factor),
-        "p_value": chance_cell(each.chance),
-        "next_low_95": each.next_interval[0],
-        "next_high_95": each.next_interval[1],
-        "reported": reported,
-        "mixture": found.is_mixed(each.name),
+        "within_std": number_cell(parameter.within_std, ".2g", factor),
+        "between_std": number_cell(parameter.between_std, ".2g", factor),
+        "p_value": chance_cell(parameter.chance),
+        "next_low_95": parameter.next_interval[0],
+        "next_high_95": parameter.next_interval[1],
+        "reported": is_reported,
+        "mixture": homogeneity.is_mixed(parameter.name),
     }
 
 
-def tolerant_table(campaign: CampaignResult) -> Table:
-    """Parameters of all sessions with a tolerance of the geometry, with those of an exact beam.
+def tolerance_table(campaign: CampaignResult) -> Table:
+    """Return the table of parameters with a tolerance of the geometry.
 
-    Without rows where no tolerance is stated.
+    It also contains the parameters of an exactly uniform beam. It has no rows if no tolerance is
+    stated.
     """
-    modal, numbers = campaign.modal, campaign_numbers(campaign)
-    tolerant = modal.tolerant if modal else None
+    modal_result, numbers = campaign.modal, campaign_numbers(campaign)
+    tolerant_estimate = modal_result.tolerant if modal_result else None
     columns = (
-        Column("parameter", "parameter", WORDS), Column("value", "value"),
-        Column("std", "std", spread=True),
+        Column("parameter", "parameter", TEXT_FORMAT), Column("value", "value"),
+        Column("std", "std", std_of_previous=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
-        Column(EXACT_CONDITION, "exact"), Column("std", "exact_std", spread=True),
+        Column(EXACT_CONDITION, "exact"), Column("std", "exact_std", std_of_previous=True),
     )  # fmt: skip
-    if modal is None or tolerant is None or numbers is None:
+    if modal_result is None or tolerant_estimate is None or numbers is None:
         return Table("parameters", "", columns, ())
-    exact = numbers.exact.parameters if numbers.exact else {}
+    exact_parameters = numbers.exact.parameters if numbers.exact else {}
     rows: list[Row] = []
     for name, quantity in numbers.parameters.items():
         _, factor, _ = label(name)
         low, high = quantity.interval_95 or (None, None)
-        value, *others = estimate(
+        value, *others = estimate_cells(
             (quantity.value, quantity.std, low, high), quantity.std or None, factor
         )
-        its = exact.get(name)
-        of_exact = estimate((its.value, its.std), its.std, factor) if its else (None, None)
+        exact_value = exact_parameters.get(name)
+        exact_cells = (
+            estimate_cells((exact_value.value, exact_value.std), exact_value.std, factor)
+            if exact_value
+            else (None, None)
+        )
         rows.append(
             {
                 "parameter": Cell(name, with_mark(with_unit(name), name, campaign.homogeneity)),
-                "value": marked(value) if quantity.flag else replace(value, strong=True),
+                "value": mark_cell(value) if quantity.flag else replace(value, strong=True),
                 **dict(zip(("std", "low_95", "high_95"), others, strict=True)),
-                **dict(zip(("exact", "exact_std"), of_exact, strict=True)),
-                "uniformity_percent": 100 * tolerant.uniformity,
-                "basis": tolerant.basis,
+                **dict(zip(("exact", "exact_std"), exact_cells, strict=True)),
+                "uniformity_percent": 100 * tolerant_estimate.uniformity,
+                "basis": tolerant_estimate.basis,
                 "flag": quantity.flag,
             }
         )
-    flags = dict.fromkeys(each.flag for each in numbers.parameters.values() if each.flag)
+    flags = dict.fromkeys(
+        parameter.flag for parameter in numbers.parameters.values() if parameter.flag
+    )
     return Table(
         "parameters",
         title(
-            f"Parameters from the modal constants of {modal.sessions} sessions"
+            f"Parameters from the modal constants of {modal_result.sessions} sessions"
             + (
-                f", uniform to {100 * tolerant.uniformity:g} %"
-                if tolerant.basis == "geometry"
+                f", uniform to {100 * tolerant_estimate.uniformity:g} %"
+                if tolerant_estimate.basis == "geometry"
                 else ""
             ),
             campaign.homogeneity,
@@ -256,35 +300,39 @@ def tolerant_table(campaign: CampaignResult) -> Table:
         (
             "The tolerance of the geometry is common to all sessions: more of them do not reduce "
             "it.",
-            *(f"{MARK} {flag}." for flag in flags),
+            *(f"{NOT_REPORTED_MARK} {flag}." for flag in flags),
         ),
     )
 
 
 def uniform_beam_table(campaign: CampaignResult) -> Table:
-    """Modal constants of all sessions against those of the uniform beam that fits best."""
-    modal, found = campaign.modal, campaign.homogeneity
-    test = modal.uniform_beam if modal else None
+    """Return the table of pooled modal constants and those of the best uniform beam."""
+    modal_result, homogeneity = campaign.modal, campaign.homogeneity
+    test = modal_result.uniform_beam if modal_result else None
     rows: list[Row] = []
     for constant in test.as_json()["constants"] if test else ():
-        measured, std, predicted = (constant[key] for key in ("measured", "std", "predicted"))
-        value, spread, theirs = estimate((measured, std, predicted), std)
+        measured_value, std, predicted_value = (
+            constant[key] for key in ("measured", "std", "predicted")
+        )
+        measured_cell, std_cell, predicted_cell = estimate_cells(
+            (measured_value, std, predicted_value), std
+        )
         rows.append(
             {
                 "mode": constant["mode"],
                 "constant": Cell(constant["name"], constant["name"].replace("_", " ")),
-                "measured": value,
-                "std": spread,
-                "predicted": theirs,
-                "deviation": (measured - predicted) / std,
+                "measured": measured_cell,
+                "std": std_cell,
+                "predicted": predicted_cell,
+                "deviation": (measured_value - predicted_value) / std,
             }
         )
     return Table(
         "uniform_beam",
-        title("Modal constants, and those of the uniform beam that fits best", found),
+        title("Modal constants, and those of the uniform beam that fits best", homogeneity),
         (
-            Column("mode", "mode"), Column("constant", "constant", WORDS),
-            Column("measured", "measured"), Column("std", "std", spread=True),
+            Column("mode", "mode"), Column("constant", "constant", TEXT_FORMAT),
+            Column("measured", "measured"), Column("std", "std", std_of_previous=True),
             Column("uniform beam", "predicted"), Column("difference (std)", "deviation", ".1f"),
         ),
         tuple(rows),
@@ -292,47 +340,49 @@ def uniform_beam_table(campaign: CampaignResult) -> Table:
 
 
 def modes_table(campaign: CampaignResult) -> Table:
-    """Modes over all sessions."""
-    found = campaign.homogeneity
+    """Return the table of pooled modes: means and standard deviations between sessions."""
+    homogeneity = campaign.homogeneity
     rows: list[Row] = []
     for mode in campaign.modes:
-        shown: dict[str, Entry] = {"mode": mode.number}
-        for name, std, between, factor in (
+        cells: dict[str, Entry] = {"mode": mode.number}
+        for name, std, between_std_name, factor in (
             ("frequency_hz", "frequency_std_hz", "frequency_between_std_hz", 1.0),
             ("damping_ratio", "damping_ratio_std", "damping_ratio_between_std", 100.0),
         ):
-            its = getattr(mode, std)
-            mean, shown[std] = estimate((getattr(mode, name), its), its, factor)
-            text = with_mark(mean.text, f"{name}_{mode.number}", found)
-            shown[name] = replace(mean, text=text)
-            shown[between] = number(getattr(mode, between), ".2g", factor)
-        its = mode.participation_std_kg_m2
-        value, spread = estimate((mode.participation_kg_m2, its), its, 1e6)
-        shown |= {"participation_kg_m2": value, "participation_std_kg_m2": spread}
+            std_value = getattr(mode, std)
+            mean, cells[std] = estimate_cells((getattr(mode, name), std_value), std_value, factor)
+            text = with_mark(mean.text, f"{name}_{mode.number}", homogeneity)
+            cells[name] = replace(mean, text=text)
+            cells[between_std_name] = number_cell(getattr(mode, between_std_name), ".2g", factor)
+        std_value = mode.participation_std_kg_m2
+        inertia_cell, std_cell = estimate_cells(
+            (mode.participation_kg_m2, std_value), std_value, 1e6
+        )
+        cells |= {"participation_kg_m2": inertia_cell, "participation_std_kg_m2": std_cell}
         rows.append(
             {
-                **shown,
+                **cells,
                 "source": mode.source,
-                "frequency_mixture": found.is_mixed(f"frequency_hz_{mode.number}"),
-                "damping_ratio_mixture": found.is_mixed(f"damping_ratio_{mode.number}"),
+                "frequency_mixture": homogeneity.is_mixed(f"frequency_hz_{mode.number}"),
+                "damping_ratio_mixture": homogeneity.is_mixed(f"damping_ratio_{mode.number}"),
             }
         )
-    mixed = any(row["frequency_mixture"] or row["damping_ratio_mixture"] for row in rows)
+    has_mixture = any(row["frequency_mixture"] or row["damping_ratio_mixture"] for row in rows)
     return Table(
         "pooled_modes",
-        title("Modes with locked hub (clamped–free), mean of the sessions", found),
+        title("Modes with locked hub (clamped–free), mean of the sessions", homogeneity),
         (
             Column("mode", "mode"),
             Column("frequency (Hz)", "frequency_hz"),
-            Column("std", "frequency_std_hz", spread=True),
+            Column("std", "frequency_std_hz", std_of_previous=True),
             Column("between sessions", "frequency_between_std_hz"),
             Column("damping ratio (%)", "damping_ratio"),
-            Column("std", "damping_ratio_std", spread=True),
+            Column("std", "damping_ratio_std", std_of_previous=True),
             Column("between sessions", "damping_ratio_between_std"),
-            *(_PARTICIPATION if any(row["source"] == "modal" for row in rows) else ()),
+            *(_INERTIA_COLUMNS if any(row["source"] == "modal" for row in rows) else ()),
         ),
         tuple(rows),
-        (MIXTURE_NOTE,) if mixed else (),
+        (MIXTURE_NOTE,) if has_mixture else (),
     )
 
 
@@ -340,82 +390,86 @@ def modes_table(campaign: CampaignResult) -> Table:
 
 
 def specimens_table(campaign: CampaignResult) -> Table:
-    """Specimens as the files state them, the one of this campaign first."""
+    """Return the table of specimens as the files state them, the campaign's first."""
     specimens = campaign.homogeneity.specimens
     return Table(
         "specimens",
         "Specimens, as the files state them",
         (
-            Column("this report's", "here", WORDS),
-            *(Column(key, key, WORDS) for key in in_dispute(specimens)),
+            Column("this report's", "here", TEXT_FORMAT),
+            *(Column(key, key, TEXT_FORMAT) for key in in_dispute(specimens)),
             Column("files", "files"),
-            Column("their names", "names", WORDS),
+            Column("their names", "names", TEXT_FORMAT),
         ),
         tuple(
             {
-                **{key: Cell(value, fact_text(key, value)) for key, value in each.facts.items()},
-                "files": len(each.files),
-                "here": each is specimens[0],
-                "names": Cell(" ".join(each.files), ", ".join(each.files)),
+                **{
+                    key: Cell(value, fact_text(key, value)) for key, value in specimen.facts.items()
+                },
+                "files": len(specimen.files),
+                "here": specimen is specimens[0],
+                "names": Cell(" ".join(specimen.files), ", ".join(specimen.files)),
             }
-            for each in specimens
+            for specimen in specimens
         ),
         selected=0,
     )
 
 
 def homogeneity_table(campaign: CampaignResult) -> Table:
-    """Scatter of each mode and parameter between sessions."""
-    found = campaign.homogeneity
+    """Return the table of each mode's and parameter's scatter between the sessions."""
+    homogeneity = campaign.homogeneity
 
-    def row(each: Heterogeneity) -> Row:
-        _, factor, _ = label(each.quantity)
+    def row(scatter: Heterogeneity) -> Row:
+        _, factor, _ = label(scatter.quantity)
         return {
             "quantity": Cell(
-                each.quantity, with_mark(with_unit(each.quantity), each.quantity, found)
+                scatter.quantity,
+                with_mark(with_unit(scatter.quantity), scatter.quantity, homogeneity),
             ),
-            "sessions": len(each.values),
-            "mean": number(each.mean, f".{_digits(each)}f", factor),
-            "between_std": number(each.between_std, ".2g", factor),
-            "between_in_own_std": each.own_stds,
-            "cochran_q": each.cochran_q,
-            "i_squared": replace(number(each.i_squared), text=percent(each.i_squared)),
-            "p_value": chance_cell(each.chance),
-            "mixture": each.mixed,
+            "sessions": len(scatter.values),
+            "mean": number_cell(scatter.mean, f".{_decimals_of_scatter(scatter)}f", factor),
+            "between_std": number_cell(scatter.between_std, ".2g", factor),
+            "between_in_own_std": scatter.own_stds,
+            "cochran_q": scatter.cochran_q,
+            "i_squared": replace(number_cell(scatter.i_squared), text=percent(scatter.i_squared)),
+            "p_value": chance_cell(scatter.chance),
+            "mixture": scatter.mixed,
         }
 
     return Table(
         "homogeneity",
-        f"Homogeneity of the sessions{f', by type {found.structure}' if found.structure else ''}",
+        "Homogeneity of the sessions"
+        f"{f', by type {homogeneity.structure}' if homogeneity.structure else ''}",
         (
-            Column("quantity", "quantity", WORDS), Column("sessions", "sessions"),
+            Column("quantity", "quantity", TEXT_FORMAT), Column("sessions", "sessions"),
             Column("mean", "mean"), Column("between sessions", "between_std"),
             Column("τ/s", "between_in_own_std", ".3g"),
             Column("Cochran's Q", "cochran_q", ".3g"),
             Column("I²", "i_squared"), Column("p", "p_value"),
         ),
-        tuple(map(row, found.quantities)),
+        tuple(map(row, homogeneity.quantities)),
         (
             "Between sessions: standard deviation beyond the sessions' own uncertainties (τ). τ/s: "
             "the same over a typical session's own. I²: its share of the variance. p: p-value of "
             "Cochran's Q.",
-            *([MIXTURE_NOTE] if found.mixed else []),
+            *([MIXTURE_NOTE] if homogeneity.mixed else []),
         ),
     )  # fmt: skip
 
 
-def _digits(each: Heterogeneity) -> int:
-    """Decimals that show the scatter, or what a session states as its uncertainty."""
-    _, factor, _ = label(each.quantity)
-    seen = factor * max(each.between_std, min(std for _, _, std in each.values))
-    return min(decimals(seen), 9)
+def _decimals_of_scatter(scatter: Heterogeneity) -> int:
+    """Return the number of decimals that show the scatter or the sessions' own uncertainty."""
+    _, factor, _ = label(scatter.quantity)
+    smallest_visible = factor * max(scatter.between_std, min(std for _, _, std in scatter.values))
+    return min(decimals(smallest_visible), 9)
 
 
 def chance_cell(chance: float) -> Cell:
-    """Show a probability that may be too small for a number."""
-    return replace(number(chance), text=probability(chance))
+    """Return a cell with a p-value, which may be too small to write as a number."""
+    return replace(number_cell(chance), text=probability(chance))
 
 
-def with_mark(text: str, quantity: str, found: Homogeneity) -> str:
-    """Mark a text if sessions differ in the quantity in kind."""
-    return f"{text} {MIXTURE_MARK}" if found.is_mixed(quantity) else text
+def with_mark(text: str, quantity: str, homogeneity: Homogeneity) -> str:
+    """Return a text with the mark of a mixture, if the sessions differ in kind in the quantity."""
+    return f"{text} {MIXTURE_MARK}" if homogeneity.is_mixed(quantity) else text

@@ -1,13 +1,12 @@
 """Figures of a whole record: frequency response, uniformity, loss factor, residual.
 
-Loss factor against frequency with its 95 % band: the damping as a function, not as parameters.
+The loss factor over frequency, with its 95 % band, shows the damping as a function. The parameters
+of a fractional damping are correlated and hard to compare, but their joint effect at one frequency
+is not.
 
-The parameters of a fractional damping are correlated and hard to compare; their combined effect at
-one frequency is neither.
-
-Residual of the torque: its spectrum, whether it is white, and when it is large. A correct model
-leaves noise. A residual at a resonance, or while the sweep passes one, shows a deficiency of the
-model.
+The residual of the torque is shown by its spectrum, by a test for whiteness and over time. A
+correct model leaves noise. A residual at a resonance, or while the sweep passes a resonance, shows
+a deficiency of the model.
 """
 
 from __future__ import annotations
@@ -43,10 +42,10 @@ if TYPE_CHECKING:
     from rigd.spectral import FrequencyResponse
 
 
-_LABEL_IN: Final = 0.15
-"""Height of a label with the space that it needs."""
-_LABELS_CLOSE: Final = 1 / math.log10(2.0)
-"""Labels for which a decade must have room to be labelled at 1, 2 and 5."""
+_LABEL_HEIGHT_IN: Final = 0.15
+"""Height of a tick label with the space around it, in inches."""
+_LEAST_LABELS_PER_DECADE: Final = 1 / math.log10(2.0)
+"""Number of labels per decade for which there must be room, so that 1, 2 and 5 are labelled."""
 
 
 def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
@@ -57,78 +56,108 @@ def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
         axes.yaxis.set_major_locator(MaxNLocator(4))
     else:
         height_in = axes.bbox.height / axes.figure.dpi
-        room = height_in / (_LABEL_IN * math.log10(high / low))
-        digits = (1.0, 2.0, 5.0) if high < 1000 * low and room > _LABELS_CLOSE else (1.0,)
+        labels_per_decade = height_in / (_LABEL_HEIGHT_IN * math.log10(high / low))
+        digits = (
+            (1.0, 2.0, 5.0)
+            if high < 1000 * low and labels_per_decade > _LEAST_LABELS_PER_DECADE
+            else (1.0,)
+        )
         axes.yaxis.set_major_locator(LogLocator(subs=digits, numticks=12))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _position: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-_BAND: Final = "#8CC4E8"
-_PALE: Final = "#BDBDBD"
-_POINTS: Final = 900
+_BAND_COLOR: Final = "#8CC4E8"
+"""Colour of the 95 % band of a response."""
+_MEASURED_COLOR: Final = "#BDBDBD"
+"""Colour of the measured response behind the model."""
+_RESPONSE_POINTS: Final = 900
+"""Number of columns or points of the measured response in the panel of the whole band."""
 _DETAIL_POINTS: Final = 161
-_DETAIL_WIDTHS: Final = 6.0
-"""Half-widths of a resonance that its detail shows to either side."""
+"""Number of points of the model's response in the enlarged panel of a mode."""
+_DETAIL_TO_HALF_WIDTH: Final = 6.0
+"""Frequency range of a mode's enlarged panel to either side, in half-widths of the resonance."""
 
-_NARROWEST: Final = 0.006
-"""Least half of a detail, relative to the mode's frequency."""
+_LEAST_RELATIVE_DETAIL: Final = 0.006
+"""Least frequency range of a mode's enlarged panel to either side, relative to the frequency."""
 
 
-def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
-    """Draw magnitude, phase, the band's width, and a detail of every mode.
+def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
+    """Draw magnitude, phase and width of the 95 % band, and an enlarged panel of every mode.
 
     Parameters
     ----------
-    measured : FrequencyResponse
-        Empirical transfer function estimate, with the delay between the channels in it.
+    measured_frf : FrequencyResponse
+        Empirical transfer function estimate, which includes the delay between the channels.
     model : ShownModel
+        Model of the record, with the modes that get an enlarged panel.
     """
-    first_hz, last_hz = float(measured.frequency_hz[0]), float(measured.frequency_hz[-1])
-    shown = [mode for mode in model.modes if first_hz < mode.frequency_hz < last_hz]
-    grid_hz = dense_grid(first_hz, last_hz, [mode.frequency_hz for mode in shown])
+    first_hz, last_hz = float(measured_frf.frequency_hz[0]), float(measured_frf.frequency_hz[-1])
+    visible_modes = [mode for mode in model.modes if first_hz < mode.frequency_hz < last_hz]
+    grid_hz = dense_grid(first_hz, last_hz, [mode.frequency_hz for mode in visible_modes])
     band = model.band(grid_hz)
-    seen = measured.response * np.exp(2j * np.pi * model.delay_s * measured.frequency_hz)
+    measured_without_delay = measured_frf.response * np.exp(
+        2j * np.pi * model.delay_s * measured_frf.frequency_hz
+    )
     figure = style.new_figure(9.0, 6.4)
-    count = max(len(shown), 1)
+    panel_count = max(len(visible_modes), 1)
     grid = figure.add_gridspec(
-        2, count, left=0.085, right=0.985, top=0.95, bottom=0.075, hspace=0.27, wspace=0.22,
+        2, panel_count, left=0.085, right=0.985, top=0.95, bottom=0.075, hspace=0.27, wspace=0.22,
         height_ratios=(3.4, 1.0),
     )  # fmt: skip
-    whole = grid[0, :].subgridspec(3, 1, height_ratios=(2.4, 1.0, 0.8), hspace=0.1)
-    magnitude, phase, width = (figure.add_subplot(whole[row]) for row in range(3))
-    _magnitude(magnitude, measured.frequency_hz, seen, band, _PALE)
-    modelled_db = magnitude_db(band.response)
-    bottom = min(
-        float(np.quantile(magnitude_db(seen), 0.005)), float(np.quantile(modelled_db, 0.05))
+    upper_grid = grid[0, :].subgridspec(3, 1, height_ratios=(2.4, 1.0, 0.8), hspace=0.1)
+    magnitude, phase, width_axes = (figure.add_subplot(upper_grid[row]) for row in range(3))
+    _draw_magnitude(
+        magnitude, measured_frf.frequency_hz, measured_without_delay, band, _MEASURED_COLOR
     )
-    magnitude.set_ylim(bottom - 5, float(modelled_db.max()) + 5)
-    few = style.spread(measured.frequency_hz, _POINTS)
+    modelled_db = magnitude_db(band.response)
+    lowest_db = min(
+        float(np.quantile(magnitude_db(measured_without_delay), 0.005)),
+        float(np.quantile(modelled_db, 0.05)),
+    )
+    magnitude.set_ylim(lowest_db - 5, float(modelled_db.max()) + 5)
+    point_indices = style.log_spaced_indices(measured_frf.frequency_hz, _RESPONSE_POINTS)
     style.dots(
-        phase, measured.frequency_hz[few], phase_deg(seen[few]), size_pt=2.0, color=style.GREY
+        phase,
+        measured_frf.frequency_hz[point_indices],
+        phase_deg(measured_without_delay[point_indices]),
+        size_pt=2.0,
+        color=style.GREY,
     )
     phase.plot(band.frequency_hz, phase_deg(band.response), color=style.BLUE)
     style.response_axes(magnitude, phase)
     half_percent = 100 * NORMAL_95 * band.log_magnitude_std
-    width.plot(band.frequency_hz, half_percent, color=style.BLUE, linewidth=1.0)
-    plain_logarithmic(width, 0.8 * half_percent.min(), 1.4 * half_percent.max())
-    width.set_ylabel("Band (± %)")
-    width.set_xlabel("Frequency (Hz)", labelpad=1)
-    for axes in (magnitude, phase, width):
-        style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width)
-    for column, mode in enumerate(shown):
-        detail = figure.add_subplot(grid[1, column])
-        limits = _detail(mode, measured.frequency_hz)
-        near = (measured.frequency_hz >= limits[0]) & (measured.frequency_hz <= limits[1])
-        close = model.band(np.linspace(*limits, _DETAIL_POINTS))
-        _magnitude(detail, measured.frequency_hz[near], seen[near], close, style.GREY)
-        detail.set_xlim(limits)
-        detail.set_ylim(style.limits(magnitude_db(seen[near]), magnitude_db(close.response)))
-        detail.set_title(f"Mode {mode.number}", fontweight="normal", fontsize=8.5)
-        detail.set_facecolor("#FCFAF4")
-        detail.set_xlabel("Frequency (Hz)", labelpad=1)
+    width_axes.plot(band.frequency_hz, half_percent, color=style.BLUE, linewidth=1.0)
+    plain_logarithmic(width_axes, 0.8 * half_percent.min(), 1.4 * half_percent.max())
+    width_axes.set_ylabel("Band (± %)")
+    width_axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    for axes in (magnitude, phase, width_axes):
+        style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width_axes)
+    for column, mode in enumerate(visible_modes):
+        detail_axes = figure.add_subplot(grid[1, column])
+        detail_limits_hz = _detail_range_hz(mode, measured_frf.frequency_hz)
+        in_detail = (measured_frf.frequency_hz >= detail_limits_hz[0]) & (
+            measured_frf.frequency_hz <= detail_limits_hz[1]
+        )
+        detail_band = model.band(np.linspace(*detail_limits_hz, _DETAIL_POINTS))
+        _draw_magnitude(
+            detail_axes,
+            measured_frf.frequency_hz[in_detail],
+            measured_without_delay[in_detail],
+            detail_band,
+            style.GREY,
+        )
+        detail_axes.set_xlim(detail_limits_hz)
+        detail_axes.set_ylim(
+            style.limits(
+                magnitude_db(measured_without_delay[in_detail]), magnitude_db(detail_band.response)
+            )
+        )
+        detail_axes.set_title(f"Mode {mode.number}", fontweight="normal", fontsize=8.5)
+        detail_axes.set_facecolor("#FCFAF4")
+        detail_axes.set_xlabel("Frequency (Hz)", labelpad=1)
         if column == 0:
-            detail.set_ylabel("Magnitude (dB)")
+            detail_axes.set_ylabel("Magnitude (dB)")
     figure.legend(
         *magnitude.get_legend_handles_labels(), loc="upper right", bbox_to_anchor=(0.985, 0.995),
         ncols=3, borderaxespad=0.0,
@@ -136,21 +165,23 @@ def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
     return figure
 
 
-def _magnitude(
+def _draw_magnitude(
     axes: Axes,
     frequency_hz: NDArray[np.float64],
-    measured: NDArray[np.complex128],
+    measured_frf: NDArray[np.complex128],
     band: ResponseBand,
     color: str,
 ) -> None:
-    """Draw the measured magnitude, the model's over it, and its band."""
+    """Draw the measured magnitude, the model's magnitude over it, and the model's 95 % band."""
     axes.plot(
-        *style.envelope(frequency_hz, magnitude_db(measured), _POINTS, logarithmic=True),
+        *style.envelope(
+            frequency_hz, magnitude_db(measured_frf), _RESPONSE_POINTS, logarithmic=True
+        ),
         color=color, linewidth=0.8, label="measured",
     )  # fmt: skip
-    low, high = (magnitude_db(each.astype(complex)) for each in band.magnitude_limits())
+    low, high = (magnitude_db(limit.astype(complex)) for limit in band.magnitude_limits())
     axes.fill_between(
-        band.frequency_hz, low, high, color=_BAND, linewidth=0, alpha=0.6,
+        band.frequency_hz, low, high, color=_BAND_COLOR, linewidth=0, alpha=0.6,
         label="95 % band of the model",
     )  # fmt: skip
     axes.plot(
@@ -159,23 +190,27 @@ def _magnitude(
     )  # fmt: skip
 
 
-def _detail(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the range shown of a mode, at least one bin of a short record."""
+def _detail_range_hz(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the frequency range of a mode's enlarged panel, with at least one bin."""
     spacing_hz = float(np.diff(frequency_hz).max())
-    relative_width = max(_DETAIL_WIDTHS * mode.damping_ratio, _NARROWEST)
+    relative_width = max(_DETAIL_TO_HALF_WIDTH * mode.damping_ratio, _LEAST_RELATIVE_DETAIL)
     half_hz = max(relative_width * mode.frequency_hz, spacing_hz)
     lowest_hz = float(frequency_hz[0]) / 2
     return max(mode.frequency_hz - half_hz, lowest_hz), mode.frequency_hz + half_hz
 
 
 _LOSS_POINTS: Final = 400
+"""Number of frequencies at which the loss factors are drawn."""
 _CURVE_STYLES: Final = {
     "internal (material)": (style.VERMILION, (0, (4, 2))),
     "external (surroundings)": (style.GREEN, (0, (1, 1.2))),
     "total": (style.BLUE, "-"),
 }
-_SPAN: Final = 300.0
-"""Largest ratio of the axis's ends: still smaller values do not matter for the total."""
+"""Colour and dash of each loss factor's curve by its label."""
+_MOST_LOSS_AXIS_RATIO: Final = 300.0
+"""Largest ratio of the ends of the loss factor's axis.
+
+Smaller loss factors do not matter for the total."""
 
 
 def loss_figure(
@@ -184,48 +219,55 @@ def loss_figure(
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     *,
-    withheld: Collection[str] = (),
-    doubtful: Collection[int] = (),
+    unsupported_orders: Collection[str] = (),
+    flagged_modes: Collection[int] = (),
 ) -> Figure:
     """Draw internal, external and total loss factor, and twice the damping ratio of each mode.
 
     Parameters
     ----------
     modes : sequence of ModeEstimate
-        Those that are drawn.
+        Modes to draw as points.
     beam : Estimate or None
-        Beam of the curves; None: no beam explains the losses.
+        Beam whose loss factors are drawn; None: no beam explains the losses, and no curve is drawn.
     axis_hz : tuple of float
-        First and last frequency of the axis, positive.
+        Lowest and highest frequency of the axis, positive.
     supported_hz : tuple of float or None
-        Band in which the data support the curves: there are none beyond. None: nowhere.
-    withheld : collection of str
-        Orders that the data do not support: then the total is not split into its parts.
-    doubtful : collection of int
-        Modes whose damping ratio carries a flag: their points are hollow.
+        Frequency band in which the data support the curves. No curve is drawn outside it. None: the
+        data nowhere support the curves.
+    unsupported_orders : collection of str
+        Orders that the data do not support. If there is one, the total is not split into its parts.
+    flagged_modes : collection of int
+        Numbers of the modes whose damping ratio is flagged. Their points are hollow.
     """
     figure = style.new_figure(9.0, 3.6)
     axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))
-    drawn = _curves(axes, beam, axis_hz, supported_hz, withheld)
-    for label, filled in (("modes", True), ("modes, doubtful", False)):
-        few = [mode for mode in modes if (mode.number not in doubtful) is filled]
-        if few:
+    drawn_values = _draw_loss_factors(axes, beam, axis_hz, supported_hz, unsupported_orders)
+    for label, is_filled in (("modes", True), ("modes, doubtful", False)):
+        drawn_modes = [mode for mode in modes if (mode.number not in flagged_modes) is is_filled]
+        if drawn_modes:
             axes.errorbar(
-                [mode.frequency_hz for mode in few], [2 * mode.damping_ratio for mode in few],
-                [2 * NORMAL_95 * mode.damping_ratio_std for mode in few],
+                [mode.frequency_hz for mode in drawn_modes],
+                [2 * mode.damping_ratio for mode in drawn_modes],
+                [2 * NORMAL_95 * mode.damping_ratio_std for mode in drawn_modes],
                 fmt="o", color=style.INK, markersize=4.0, capsize=3.0, elinewidth=1.0,
-                markerfacecolor=style.INK if filled else "white", label=label, zorder=5,
+                markerfacecolor=style.INK if is_filled else "white", label=label, zorder=5,
             )  # fmt: skip
     modes_hz = [mode.frequency_hz for mode in modes]
-    beyond = [] if beam is None else _beyond(axis_hz, supported_hz, modes_hz)
-    for edge_hz, end_hz in beyond:
+    grey_bands_hz = [] if beam is None else _unsupported_ranges_hz(axis_hz, supported_hz, modes_hz)
+    for edge_hz, end_hz in grey_bands_hz:
         axes.axvspan(edge_hz, end_hz, color="#F4F4F4", linewidth=0, zorder=0)
     style.frequency_axis(axes, axis_hz)
-    points = [2 * mode.damping_ratio for mode in modes]
-    # Of curves what they mostly are: a total may rise without bound towards an end.
-    top = max([*points, *(float(np.nanquantile(value, 0.98)) for value in drawn)], default=1.0)
-    low = min([*points, *(float(np.nanmin(value)) for value in drawn)], default=top)
-    plain_logarithmic(axes, max(low / 2, 3 * top / _SPAN), 3 * top)
+    mode_loss_factors = [2 * mode.damping_ratio for mode in modes]
+    # A quantile of each curve, because a total may rise without bound towards an end.
+    top = max(
+        [*mode_loss_factors, *(float(np.nanquantile(value, 0.98)) for value in drawn_values)],
+        default=1.0,
+    )
+    low = min(
+        [*mode_loss_factors, *(float(np.nanmin(value)) for value in drawn_values)], default=top
+    )
+    plain_logarithmic(axes, max(low / 2, 3 * top / _MOST_LOSS_AXIS_RATIO), 3 * top)
     axes.set_ylabel("Loss factor (1)")
     axes.set_xlabel("Frequency (Hz)", labelpad=1)
     handles, labels = axes.get_legend_handles_labels()
@@ -237,44 +279,62 @@ def loss_figure(
     return figure
 
 
-def _curves(
+def _draw_loss_factors(
     axes: Axes,
     beam: Estimate | None,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
-    withheld: Collection[str],
+    unsupported_orders: Collection[str],
 ) -> list[NDArray[np.float64]]:
-    """Draw the loss factors where the data support them; return the values drawn."""
+    """Draw the loss factors where the data support them, and return the drawn values."""
     if supported_hz is None or beam is None:
         return []
     first_hz, last_hz = max(axis_hz[0], supported_hz[0]), min(axis_hz[1], supported_hz[1])
     if first_hz >= last_hz:
         return []
-    factors = loss_factors(beam, np.geomspace(first_hz, last_hz, _LOSS_POINTS))
+    loss_factors_over_frequency = loss_factors(beam, np.geomspace(first_hz, last_hz, _LOSS_POINTS))
     curves = dict(
-        zip(_CURVE_STYLES, (factors.internal, factors.external, factors.total), strict=True)
+        zip(
+            _CURVE_STYLES,
+            (
+                loss_factors_over_frequency.internal,
+                loss_factors_over_frequency.external,
+                loss_factors_over_frequency.total,
+            ),
+            strict=True,
+        )
     )
-    both = None not in curves.values()
-    drawn = []
+    has_both_parts = None not in curves.values()
+    drawn_values = []
     for (label, factor), order in zip(curves.items(), ("alpha", "lambda", None), strict=True):
         # If one part is unknown, the parts are not distinguished; alone, a part is the total.
-        if factor is None or (order is not None and (not both or withheld)):
+        if factor is None or (order is not None and (not has_both_parts or unsupported_orders)):
             continue
         color, dash = _CURVE_STYLES[label]
         axes.fill_between(
-            factors.frequency_hz, *factor.limits(), color=color, alpha=0.2, linewidth=0
+            loss_factors_over_frequency.frequency_hz,
+            *factor.limits(),
+            color=color,
+            alpha=0.2,
+            linewidth=0,
         )
-        axes.plot(factors.frequency_hz, factor.value, color=color, linestyle=dash, label=label)
-        drawn.append(factor.value)
-    return drawn
+        axes.plot(
+            loss_factors_over_frequency.frequency_hz,
+            factor.value,
+            color=color,
+            linestyle=dash,
+            label=label,
+        )
+        drawn_values.append(factor.value)
+    return drawn_values
 
 
-def _beyond(
+def _unsupported_ranges_hz(
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     modes_hz: list[float],
 ) -> list[tuple[float, float]]:
-    """Parts of the axis outside the modes, or outside of what is drawn if that is less."""
+    """Return the frequency ranges to shade: outside the modes and outside the supported band."""
     if not modes_hz:
         return [axis_hz]
     first_hz, last_hz = modes_hz[0], modes_hz[-1]
@@ -283,47 +343,53 @@ def _beyond(
     return [(axis_hz[0], first_hz), (last_hz, axis_hz[1])]
 
 
-_BINS_A_POINT: Final = 24
-_SMOOTH_POINTS: Final = 600
-_STRETCHES: Final = 120
-"""At most: a short record has fewer independent values."""
+_BINS_PER_POINT: Final = 24
+"""Number of bins whose mean is one point of the residual's spectrum."""
+_NOISE_MODEL_POINTS: Final = 600
+"""Number of points of the noise model's curve."""
+_MOST_INTERVALS: Final = 120
+"""Largest number of intervals in which the residual's power over time is shown.
+
+A short record has fewer independent values."""
 
 
 def residual_figure(model: ShownModel, analysis: RecordAnalysis) -> Figure:
-    """Draw the residual's spectrum, its cumulative periodogram, and its power in time.
+    """Draw the residual's spectrum, its cumulative periodogram, and its power over time.
 
     Parameters
     ----------
     model : ShownModel
+        Model of the record, with its whitened residual.
     analysis : RecordAnalysis
-        With the noise and the bins of its residual.
+        Analysis of the record, with the noise and the bins of the model's residual.
     """
     figure = style.new_figure(9.0, 4.8)
     grid = figure.add_gridspec(
         2, 2, left=0.085, right=0.985, top=0.94, bottom=0.095, hspace=0.45, wspace=0.19,
     )  # fmt: skip
-    _spectrum(figure.add_subplot(grid[0, :]), model, analysis)
-    _cumulative(figure.add_subplot(grid[1, 0]), model, analysis)
-    _in_time(figure.add_subplot(grid[1, 1]), model, analysis)
+    _draw_spectrum(figure.add_subplot(grid[0, :]), model, analysis)
+    _draw_cumulative_periodogram(figure.add_subplot(grid[1, 0]), model, analysis)
+    _draw_power_over_time(figure.add_subplot(grid[1, 1]), model, analysis)
     return figure
 
 
-def _spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+    """Draw the spectrum of the residual with the noise model, the modes and the hum."""
     frequency_hz = analysis.frequency_hz
     density = analysis.noise_nm2_per_hz * np.abs(model.residual) ** 2 / 2
-    counted = analysis.compared
-    bins = np.flatnonzero(counted)
-    blocks = np.array_split(bins, max(bins.size // _BINS_A_POINT, 1))
+    is_compared = analysis.compared
+    compared_bins = np.flatnonzero(is_compared)
+    blocks = np.array_split(compared_bins, max(compared_bins.size // _BINS_PER_POINT, 1))
     middle_hz = [float(frequency_hz[block].mean()) for block in blocks]
-    rms = [1e3 * float(np.sqrt(density[block].mean())) for block in blocks]
+    rms_values = [1e3 * float(np.sqrt(density[block].mean())) for block in blocks]
     axes.plot(
-        middle_hz, rms, ".", color=style.VERMILION, markersize=3.5,
-        label=f"residual, mean of {_BINS_A_POINT} bins",
+        middle_hz, rms_values, ".", color=style.VERMILION, markersize=3.5,
+        label=f"residual, mean of {_BINS_PER_POINT} bins",
     )  # fmt: skip
-    few = slice(None, None, max(frequency_hz.size // _SMOOTH_POINTS, 1))
+    point_slice = slice(None, None, max(frequency_hz.size // _NOISE_MODEL_POINTS, 1))
     axes.plot(
-        frequency_hz[few], 1e3 * np.sqrt(analysis.noise_nm2_per_hz[few]), color=style.BLUE,
-        label="noise model",
+        frequency_hz[point_slice], 1e3 * np.sqrt(analysis.noise_nm2_per_hz[point_slice]),
+        color=style.BLUE, label="noise model",
     )  # fmt: skip
     for mode in model.modes:
         axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
@@ -334,7 +400,7 @@ def _spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
             ha="center", fontsize=7.5, color=style.PURPLE,
         )  # fmt: skip
         axes.axvline(line.frequency_hz, color=style.PURPLE, linewidth=1.0, linestyle=":")
-    plain_logarithmic(axes, min(rms) / 1.6, max(rms) * 1.6)
+    plain_logarithmic(axes, min(rms_values) / 1.6, max(rms_values) * 1.6)
     axes.set_xlim(0.0, frequency_hz[-1])
     axes.set_title("Spectrum (grey: modes)")
     axes.set_ylabel("Torque (mN·m/√Hz)")
@@ -342,21 +408,29 @@ def _spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
 
 
-def _cumulative(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
-    counted = analysis.compared
-    power = np.abs(model.residual[counted]) ** 2
+def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+    """Draw the residual's cumulative periodogram less that of white noise, with its 95 % range."""
+    is_compared = analysis.compared
+    power = np.abs(model.residual[is_compared]) ** 2
     cumulative = np.cumsum(power) / power.sum()
-    uniform = np.arange(1, power.size + 1) / power.size
-    frequency_hz = analysis.frequency_hz[counted]
-    half = 100 * KOLMOGOROV_95 / np.sqrt(power.size)
-    axes.axhspan(-half, half, color=style.SHADE, linewidth=0, zorder=0, label="95 % of white noise")
-    difference = 100 * (cumulative - uniform)
+    uniform_distribution = np.arange(1, power.size + 1) / power.size
+    frequency_hz = analysis.frequency_hz[is_compared]
+    half_range_percent = 100 * KOLMOGOROV_95 / np.sqrt(power.size)
+    axes.axhspan(
+        -half_range_percent,
+        half_range_percent,
+        color=style.SHADE_COLOR,
+        linewidth=0,
+        zorder=0,
+        label="95 % of white noise",
+    )
+    difference = 100 * (cumulative - uniform_distribution)
     axes.plot(*style.envelope(frequency_hz, difference, 400), color=style.VERMILION)
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7)
     for mode in model.modes:
         axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
-    reach = 1.25 * max(half, float(np.abs(difference).max()))
-    axes.set_ylim(-reach, reach)
+    axis_limit = 1.25 * max(half_range_percent, float(np.abs(difference).max()))
+    axes.set_ylim(-axis_limit, axis_limit)
     axes.set_xlim(0.0, frequency_hz[-1])
     axes.set_title("Cumulative periodogram less that of white noise")
     axes.set_ylabel("Difference (% of power)")
@@ -364,16 +438,17 @@ def _cumulative(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None
     axes.legend(loc="lower right", borderaxespad=0.1)
 
 
-def _in_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+def _draw_power_over_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+    """Draw the power of the whitened residual over time, with the 95 % range of white noise."""
     times_s, power = residual_power(analysis, model.residual)
-    half = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
+    half_range = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
     axes.axhspan(
-        max(1 - half, 0.0), 1 + half, color=style.SHADE, linewidth=0, zorder=0,
+        max(1 - half_range, 0.0), 1 + half_range, color=style.SHADE_COLOR, linewidth=0, zorder=0,
         label="95 % of white noise",
     )  # fmt: skip
     axes.plot(times_s, power, ".-", color=style.VERMILION, linewidth=0.7, markersize=3.0)
     axes.set_xlim(0.0, times_s[-1] + times_s[0])
-    axes.set_ylim(0.0, 1.15 * max(float(power.max()), 1 + half))
+    axes.set_ylim(0.0, 1.15 * max(float(power.max()), 1 + half_range))
     axes.set_title("Power in time, whitened")
     axes.set_ylabel("Over the mean of noise (1)")
     axes.set_xlabel("Time from the record's start (s)", labelpad=1)
@@ -383,31 +458,32 @@ def _in_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
 def residual_power(
     analysis: RecordAnalysis, residual: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the power of the whitened residual in intervals of the record, 1 for pure noise.
+    """Return the whitened residual's power in intervals of the record; it is 1 for pure noise.
 
-    The residual's spectrum in the band, transformed back, is the complex envelope of the whitened
-    residual; K bins give K independent values over the record.
+    The inverse transform of the residual's spectrum in the band is the complex envelope of the
+    whitened residual. K bins give K independent values over the record.
 
     Returns
     -------
     times_s, power : ndarray, shape (intervals,)
-        Middles of the intervals from the first sample compared on, and mean power in them.
+        Time of the middle of each interval since the first compared sample, and mean power in the
+        interval.
     """
     spacing_hz = float(analysis.frequency_hz[1] - analysis.frequency_hz[0])
     bins = residual.size
     envelope = np.abs(np.fft.ifft(residual)) ** 2 * bins / 2
     envelope *= bins / np.count_nonzero(analysis.compared)
-    stretches = min(_STRETCHES, bins)
+    interval_count = min(_MOST_INTERVALS, bins)
     power: NDArray[np.float64] = np.array(
-        [part.mean() for part in np.array_split(envelope, stretches)]
+        [interval.mean() for interval in np.array_split(envelope, interval_count)]
     )
-    times_s = (np.arange(stretches, dtype=np.float64) + 0.5) / (stretches * spacing_hz)
+    times_s = (np.arange(interval_count, dtype=np.float64) + 0.5) / (interval_count * spacing_hz)
     return times_s, power
 
 
 @dataclass(frozen=True, slots=True)
 class Illustration:
-    """A figure, the name of its files, and its description."""
+    """Figure of a report with the name of its files and its description."""
 
     name: str
     figure: Figure
@@ -415,23 +491,25 @@ class Illustration:
 
 
 FIGURES: Final = ("record_frf", UNIFORMITY, "loss_factor", "residual", "record_signals")
-"""Names of the figures; the second is left out where too few modes show for the test."""
+"""File names of a whole record's figures.
+
+The second figure is omitted if too few modes are visible for the test."""
 
 
-def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
-    """Draw the figures one after the other; within `style.styled`."""
+def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
+    """Yield the figures of a whole record, drawn one after the other; call it within `styled`."""
     from analysis.report._signal_figures import signals_figure
 
-    highest_hz, headline = whole.band_hz[1], whole.headline
-    model = ShownModel.of(headline, whole.record)
-    analysis = model.compared(whole.analysis)
+    highest_hz, headline = whole_record.band_hz[1], whole_record.headline
+    model = ShownModel.of(headline, whole_record.record)
+    analysis = model.compared(whole_record.analysis)
     modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
-    frf, _, loss, residual, signals = FIGURES
-    measured = measured_response(whole)
+    frf, _, loss_name, residual_name, signals_name = FIGURES
+    measured_frf = measured_response(whole_record)
     delay = "delay" if model.modal is None else "the delay that the file states"
     yield Illustration(
         frf,
-        frf_figure(measured, model),
+        frf_figure(measured_frf, model),
         "Frequency response from motor angle to coupling torque: magnitude and phase, measured "
         f"(empirical transfer function estimate, {delay} removed) and of {model.name}; half-width "
         f"of the model's 95 % band; details of the modes ({modes} Hz). The band is narrower than "
@@ -440,23 +518,23 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
     test = headline.uniform_beam
     if test is not None and test.p_value is not None:
         yield Illustration(UNIFORMITY, uniformity_figure(test), uniformity_description(test))
-    beam = loss_estimate(whole)
-    doubtful = [mode.number for mode in headline.modes if mode.damping_ratio.flag is not None]
+    beam = loss_estimate(whole_record)
+    flagged_modes = [mode.number for mode in headline.modes if mode.damping_ratio.flag is not None]
     yield Illustration(
-        loss,
+        loss_name,
         loss_figure(
             model.modes,
             beam,
-            (float(measured.frequency_hz[0]), highest_hz),
-            supported_band_hz(whole),
-            withheld=whole.withheld,
-            doubtful=doubtful,
+            (float(measured_frf.frequency_hz[0]), highest_hz),
+            supported_band_hz(whole_record),
+            unsupported_orders=whole_record.withheld,
+            flagged_modes=flagged_modes,
         ),
-        _loss_description(whole, drawn=beam is not None),
+        _loss_description(whole_record, has_curves=beam is not None),
     )
     power = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
     yield Illustration(
-        residual,
+        residual_name,
         residual_figure(model, analysis),
         f"Residual of the torque, measured minus that of {model.name}: its spectrum beside the "
         "noise model; its cumulative periodogram, which stays in the shaded range in 95 of 100 "
@@ -465,69 +543,76 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
         "noise.",
     )
     yield Illustration(
-        signals,
-        signals_figure(whole.record, model, highest_hz),
+        signals_name,
+        signals_figure(whole_record.record, model, highest_hz),
         f"Motor angle; coupling torque from 0 to {highest_hz:g} Hz, measured and as {model.name} "
-        f"predicts it from the measured angle (fit {model.fit_percent(whole.analysis):.2f} % "
-        "NRMSE); residual; below, where each mode rings most.",
+        "predicts it from the measured angle "
+        f"(fit {model.fit_percent(whole_record.analysis):.2f} % NRMSE); residual; below, "
+        "where each mode rings most.",
     )
 
 
-def _loss_description(whole: WholeRecord, *, drawn: bool) -> str:
+def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
+    """Return the caption of the loss factor's figure."""
     points = "twice the damping ratio of each mode with its 95 % interval"
-    reasons = _reasons(whole.headline)
-    if not drawn:
+    reasons = _reasons_of_hollow_points(whole_record.headline)
+    if not has_curves:
         return (
             f"Loss factor over frequency: {points}. There is no curve, because no beam with one "
             f"internal and one external order explains the losses.{reasons}"
         )
-    shown = f"Loss factor over frequency with 95 % bands, {_curve(whole)}; points: {points}. "
-    if whole.withheld:
-        return shown + (
+    beginning = (
+        f"Loss factor over frequency with 95 % bands, {_describe_curve_model(whole_record)}; "
+        f"points: {points}. "
+    )
+    if whole_record.withheld:
+        return beginning + (
             "It is of all damping, not split into internal and external, and drawn between the "
             "modes that show only: elsewhere (grey), and for either part, an order that the data "
             f"do not support would decide.{reasons}"
         )
-    return shown + (
+    return beginning + (
         "At a mode the loss factor is about twice the damping ratio. Between the modes the model "
         "interpolates, outside them (grey) it extrapolates; where the torque does not stand out of "
         f"the noise nothing is drawn.{reasons}"
     )
 
 
-def _curve(whole: WholeRecord) -> str:
-    """Name the beam of the loss factors."""
-    tolerant = whole.headline.tolerant
-    if tolerant is None:
-        return f"type {whole.headline.name}"
-    if tolerant.basis == "losses":
+def _describe_curve_model(whole_record: WholeRecord) -> str:
+    """Return to which beam the curves of the loss factors belong, for the figure's caption."""
+    tolerant_estimate = whole_record.headline.tolerant
+    if tolerant_estimate is None:
+        return f"type {whole_record.headline.name}"
+    if tolerant_estimate.basis == "losses":
         return "of both dampings by damping ratios and residue phases alone"
-    percent = 100 * tolerant.uniformity
+    percent = 100 * tolerant_estimate.uniformity
     return f"of a beam whose modes lie where those of a uniform one do, to {percent:g} %"
 
 
-def _reasons(headline: Headline) -> str:
-    """Describe why points are hollow."""
+def _reasons_of_hollow_points(headline: Headline) -> str:
+    """Return why points are hollow, for the figure's caption; empty if none are."""
     reasons = dict.fromkeys(
         mode.damping_ratio.flag for mode in headline.modes if mode.shown and mode.damping_ratio.flag
     )
     return f" Hollow points are doubtful: {'; '.join(map(str, reasons))}." if reasons else ""
 
 
-def measured_response(whole: WholeRecord) -> FrequencyResponse:
-    """Empirical transfer function estimate, from well below the first mode to the band's end.
+def measured_response(whole_record: WholeRecord) -> FrequencyResponse:
+    """Return the empirical transfer function estimate from below the first mode to the band's end.
 
-    The delay between the channels is still in it.
+    It still includes the delay between the channels.
     """
-    record = whole.record
+    record = whole_record.record
     angle = record.angle_rad - (record.rest_angle_rad or 0.0)
     response = fft_response(angle, record.torque_nm, record.rate_hz, fast_length(len(angle)))
-    first_mode_hz = float(undamped_frequencies_rad_s(whole.fit.plant.beam, 1)[0]) / (2 * np.pi)
-    first_hz, last_hz = whole.band_hz
+    first_mode_hz = float(undamped_frequencies_rad_s(whole_record.fit.plant.beam, 1)[0]) / (
+        2 * np.pi
+    )
+    first_hz, last_hz = whole_record.band_hz
     response = response.band(max(first_hz, min(first_mode_hz / 4, last_hz / 4)), last_hz)
-    known = np.isfinite(response.response)
+    is_finite = np.isfinite(response.response)
     return replace(
         response,
-        frequency_hz=response.frequency_hz[known],
-        response=response.response[known],
+        frequency_hz=response.frequency_hz[is_finite],
+        response=response.response[is_finite],
     )

@@ -1,4 +1,4 @@
-"""Tables of a record: modes, parameters, loss factors, damping by amplitude."""
+"""Tables of one record: modes, parameters, loss factors, and damping by amplitude."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from analysis.models import QUANTITIES
 from analysis.report._scales import scale_notes
 from analysis.report._shown_model import ShownModel
 from analysis.report.table import (
-    MARK,
-    WORDS,
+    NOT_REPORTED_MARK,
+    TEXT_FORMAT,
     Cell,
     Column,
     Entry,
     Table,
-    count,
-    estimate,
-    greyed,
-    marked,
-    number,
+    count_cell,
+    estimate_cells,
+    grey_cell,
+    mark_cell,
+    number_cell,
 )
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
@@ -38,61 +38,68 @@ if TYPE_CHECKING:
     from analysis.results import WholeRecord
 
 _STRONG_CORRELATION: Final = 0.9
-_MARKED: Final = (
-    f"{MARK} not a property of the antenna, for the reason in the remark: do not interpret. The "
-    "number only describes the fitted curve."
+"""Least magnitude of a correlation of two parameters that is shown in bold."""
+_MARK_NOTE: Final = (
+    f"{NOT_REPORTED_MARK} not a property of the antenna, for the reason in the remark: do not "
+    "interpret. The number only describes the fitted curve."
 )
+"""Note that explains the mark of flagged parameters."""
 
 
-def modes_table(whole: WholeRecord) -> Table:
-    """Frequencies, damping ratios and effective inertias; those that are doubtful are marked."""
-    headline = whole.headline
-    known = any(mode.participation is not None for mode in headline.modes)
+def modes_table(whole_record: WholeRecord) -> Table:
+    """Return the table of modes: frequencies, damping ratios and effective inertias.
+
+    Modes with a doubtful damping ratio are marked.
+    """
+    headline = whole_record.headline
+    has_inertias = any(mode.participation is not None for mode in headline.modes)
     rows: list[tuple[Entry, ...]] = []
     for mode in headline.modes:
-        cells = *_mode_cells(mode), *_inertia(mode.participation)
+        cells = *_mode_cells(mode), *_inertia_cells(mode.participation)
         if mode.damping_ratio.flag is None:
             rows.append((mode.number, *cells, mode.source))
         else:
-            rows.append((marked(count(mode.number)), *map(greyed, cells), mode.source))
+            rows.append((mark_cell(count_cell(mode.number)), *map(grey_cell, cells), mode.source))
     return Table.of(
         "modes",
         f"Modes with locked hub (clamped–free): {_modes_source(headline)}",
         (
-            *_MODE,
-            Column("Inertia (kg·mm²)" if known else "", "participation_kg_m2"),
-            Column("std" if known else "", "participation_std_kg_m2"),
-            Column("Source" if known else "", "source", WORDS),
+            *_MODE_COLUMNS,
+            Column("Inertia (kg·mm²)" if has_inertias else "", "participation_kg_m2"),
+            Column("std" if has_inertias else "", "participation_std_kg_m2"),
+            Column("Source" if has_inertias else "", "source", TEXT_FORMAT),
         ),
         rows,
         (
             "Intervals are statistical only; no torque scale, length or density acts on "
             "frequencies and damping ratios.",
-            *_modal_notes(whole),
-            *_reasons(mode.damping_ratio for mode in headline.modes),
+            *_modal_notes(whole_record),
+            *_reason_notes(mode.damping_ratio for mode in headline.modes),
         ),
     )
 
 
-def exact_modes_table(whole: WholeRecord) -> Table | None:
-    """Modes of a uniform beam that predicts the modal constants; None without one."""
-    headline = whole.headline
-    test, exact = headline.uniform_beam, headline.exact
-    if test is None or exact is None or test.status != "passed":
+def exact_modes_table(whole_record: WholeRecord) -> Table | None:
+    """Return the table of a uniform beam's modes; None if no such beam explains the record."""
+    headline = whole_record.headline
+    test, exact_estimates = headline.uniform_beam, headline.exact
+    if test is None or exact_estimates is None or test.status != "passed":
         return None
-    modes = [mode for mode in exact.modes if mode.shown and mode.damping_ratio.flag is None]
+    modes = [
+        mode for mode in exact_estimates.modes if mode.shown and mode.damping_ratio.flag is None
+    ]
     if not modes:
         return None
     return Table.of(
         "exact_geometry_modes",
-        f"Modes {EXACT_CONDITION}: type {exact.name}",
-        _MODE,
+        f"Modes {EXACT_CONDITION}: type {exact_estimates.name}",
+        _MODE_COLUMNS,
         ((mode.number, *_mode_cells(mode)) for mode in modes),
         ("A condition: narrower than the modal model, and right only if the beam is uniform.",),
     )
 
 
-_MODE: Final = (
+_MODE_COLUMNS: Final = (
     Column("Mode", "mode"),
     Column("Frequency (Hz)", "frequency_hz"),
     Column("std (Hz)", "frequency_std_hz"),
@@ -101,18 +108,20 @@ _MODE: Final = (
     Column("95 % from (%)", "damping_ratio_low_95"),
     Column("to (%)", "damping_ratio_high_95"),
 )
+"""Columns of a mode's frequency and damping ratio with their uncertainties."""
 
 
 def _mode_cells(mode: ReportedMode) -> tuple[Cell, ...]:
-    """Fill the columns of `_MODE` but for the number."""
+    """Return the cells of a mode's frequency and damping ratio, without the mode's number."""
     return *_quantity_cells(mode.frequency_hz)[:2], *_quantity_cells(mode.damping_ratio, 100.0)
 
 
-_SQUARE_MM: Final = 1e6
+_SQUARE_MM_PER_SQUARE_M: Final = 1e6
+"""Number of square millimetres in a square metre."""
 
 
 def _modes_source(headline: Headline) -> str:
-    """Name the model that the modes of a headline are of."""
+    """Return the name of the model from which the reported modes are computed."""
     return (
         "modal model"
         if any(m.source == "modal" for m in headline.modes)
@@ -120,139 +129,164 @@ def _modes_source(headline: Headline) -> str:
     )
 
 
-def _inertia(participation: ReportedValue | None) -> tuple[Cell, Cell]:
+def _inertia_cells(participation: ReportedValue | None) -> tuple[Cell, Cell]:
+    """Return the cells of a mode's effective inertia and of its standard deviation."""
     if participation is None:
-        return number(None), number(None)
-    value, std, *_ = _quantity_cells(participation, _SQUARE_MM)
+        return number_cell(None), number_cell(None)
+    value, std, *_ = _quantity_cells(participation, _SQUARE_MM_PER_SQUARE_M)
     return value, std
 
 
-def _modal_notes(whole: WholeRecord) -> Iterator[str]:
-    """Describe the fit of the modal model, and its resonances that are not the beam's."""
-    modal = whole.headline.modal
-    if modal is None:
+def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
+    """Yield notes on the fit of the modal model and on its resonances that are not the beam's."""
+    modal_fit = whole_record.headline.modal
+    if modal_fit is None:
         return
     yield (
         "Inertia: effective inertia about the motor axis that takes part in the mode; it is "
         "proportional to the torque scale."
     )
-    percent = ShownModel.of(whole.headline, whole.record).fit_percent(whole.analysis)
+    percent = ShownModel.of(whole_record.headline, whole_record.record).fit_percent(
+        whole_record.analysis
+    )
     yield f"Fit of the modal model {percent:.2f} % (NRMSE)."
-    found = [
+    further_hz = [
         f"{frequency_hz:.4g}"
-        for mode, frequency_hz in zip(modal.numbers, modal.model.frequencies_hz, strict=True)
+        for mode, frequency_hz in zip(
+            modal_fit.numbers, modal_fit.model.frequencies_hz, strict=True
+        )
         if mode == 0
     ]
-    if found:
+    if further_hz:
         yield (
-            f"The modal model has a further resonance at {listed(found)} Hz, which is not one of "
-            "the beam's (sensor, mount)."
+            f"The modal model has a further resonance at {listed(further_hz)} Hz, which is not one "
+            "of the beam's (sensor, mount)."
         )
 
 
-def parameters_table(whole: WholeRecord) -> Table:
-    """All parameters with their uncertainty; those with a flag are marked, with the reason.
+def parameters_table(whole_record: WholeRecord) -> Table:
+    """Return the table of all parameters with uncertainties; flagged ones are marked.
 
-    Where the file states how well the scales are known, the intervals that include them are shown
-    with the statistical ones.
+    If the file states the uncertainties of the scales, the table also contains intervals that
+    include them. The last column states the reason for a mark.
     """
-    headline = whole.headline
-    combined = whole.combined
+    headline = whole_record.headline
+    values_with_scales = whole_record.combined
     including_scales = (
         Column("", "combined_std"),
         Column("with scales: from", "combined_low_95"),
         Column("to", "combined_high_95"),
     )
-    fit = ""
+    fit_note = ""
     if headline.tolerant is None:
-        fit = f" Fit {whole.analysis.fit_percent(headline.fit):.2f} % (NRMSE)."
+        fit_note = f" Fit {whole_record.analysis.fit_percent(headline.fit):.2f} % (NRMSE)."
     return Table.of(
         "parameters",
-        f"Parameters{_condition(headline)}",
-        (*_PARAMETER, *(including_scales if combined else ()), _REMARK),
+        f"Parameters{_condition_text(headline)}",
+        (*_PARAMETER_COLUMNS, *(including_scales if values_with_scales else ()), _REMARK_COLUMN),
         (
-            _parameter_row(name, headline.parameters[name], combined, fixed=_fixed(headline, name))
+            _parameter_row(
+                name,
+                headline.parameters[name],
+                values_with_scales,
+                is_fixed=_is_fixed(headline, name),
+            )
             for name in parameter_names(headline)
         ),
-        (f"{_STD}{fit}", *scale_notes(whole), *((_MARKED,) if headline.flags else ())),
+        (
+            f"{_UNCERTAINTY_NOTE}{fit_note}",
+            *scale_notes(whole_record),
+            *((_MARK_NOTE,) if headline.flags else ()),
+        ),
     )
 
 
-_PARAMETER: Final = (
-    Column("Parameter", "parameter", WORDS),
-    Column("Meaning", "meaning", WORDS),
-    Column("Unit", "unit", WORDS),
+_PARAMETER_COLUMNS: Final = (
+    Column("Parameter", "parameter", TEXT_FORMAT),
+    Column("Meaning", "meaning", TEXT_FORMAT),
+    Column("Unit", "unit", TEXT_FORMAT),
     Column("Value", "value"),
     Column("std", "std"),
     Column("95 % from", "low_95"),
     Column("to", "high_95"),
 )
-_REMARK: Final = Column("Remark", "remark", WORDS)
-_STD: Final = (
+"""Columns of a parameter: symbol, meaning, unit, value and uncertainty."""
+_REMARK_COLUMN: Final = Column("Remark", "remark", TEXT_FORMAT)
+"""Column with the reason for a parameter's mark."""
+_UNCERTAINTY_NOTE: Final = (
     "std is one standard deviation; intervals of ρ/EI and EI, and on an exactly uniform beam those "
     "of ζ and γ, are symmetric in the logarithm. The CSV file has SI units."
 )
+"""Note on standard deviations and intervals."""
 
 
 def parameter_names(headline: Headline) -> tuple[str, ...]:
-    """Return the names of a headline's parameters: damping, beam, rig."""
-    first = () if headline.exact is None else headline.exact.parameters
-    return tuple(dict.fromkeys((*(name for name in first if name in headline.parameters),
+    """Return the names of the reported parameters in the order damping, beam, rig."""
+    exact_parameters = () if headline.exact is None else headline.exact.parameters
+    return tuple(dict.fromkeys((*(name for name in exact_parameters if name in headline.parameters),
                                 *headline.parameters)))  # fmt: skip
 
 
-def _condition(headline: Headline) -> str:
-    """Describe the condition under which the parameters of a table hold."""
-    found = headline.tolerant
-    if found is None:
+def _condition_text(headline: Headline) -> str:
+    """Return the condition under which a table's parameters hold, for the table's caption."""
+    tolerant_estimate = headline.tolerant
+    if tolerant_estimate is None:
         exact = "" if headline.modal is None else f", {EXACT_CONDITION}"
         return f", type {headline.name}{exact}"
-    if found.basis == "geometry":
-        percent = 100 * found.uniformity
+    if tolerant_estimate.basis == "geometry":
+        percent = 100 * tolerant_estimate.uniformity
         return f" if each mode lies where that of a uniform beam does, to {percent:g} %"
-    if found.basis == "losses":
+    if tolerant_estimate.basis == "losses":
         return " by damping ratios and residue phases alone, whatever the positions of the modes"
     return " of the beam that fits the losses best: it does not explain them"
 
 
-def exact_geometry_table(whole: WholeRecord) -> Table | None:
-    """Parameters on condition that the beam is exactly uniform; None where these are reported."""
-    exact = whole.headline.exact
-    if exact is None:
+def exact_geometry_table(whole_record: WholeRecord) -> Table | None:
+    """Return the table of an exactly uniform beam's parameters.
+
+    It is None if the main table shows these parameters.
+    """
+    exact_estimates = whole_record.headline.exact
+    if exact_estimates is None:
         return None
-    flags = [each.flag for each in exact.parameters.values() if each.flag]
+    flags = [parameter.flag for parameter in exact_estimates.parameters.values() if parameter.flag]
     return Table.of(
         "exact_geometry",
-        f"Parameters {EXACT_CONDITION}: type {exact.name}",
-        (*_PARAMETER, _REMARK),
+        f"Parameters {EXACT_CONDITION}: type {exact_estimates.name}",
+        (*_PARAMETER_COLUMNS, _REMARK_COLUMN),
         (
-            _parameter_row(name, each, {}, fixed=_fixed(whole.headline, name, exact=True))
-            for name, each in exact.parameters.items()
+            _parameter_row(
+                name, parameter, {}, is_fixed=_is_fixed(whole_record.headline, name, exact=True)
+            )
+            for name, parameter in exact_estimates.parameters.items()
         ),
         (
             "A condition, not a result: no antenna is known to be uniform to 1e-5. "
-            f"Fit {whole.analysis.fit_percent(whole.fit):.2f} % (NRMSE).",
-            *((_MARKED,) if flags else ()),
+            f"Fit {whole_record.analysis.fit_percent(whole_record.fit):.2f} % (NRMSE).",
+            *((_MARK_NOTE,) if flags else ()),
         ),
     )
 
 
-def _fixed(headline: Headline, name: str, *, exact: bool = False) -> bool:
-    """Whether a parameter was held at a value in the fit that it is of."""
+def _is_fixed(headline: Headline, name: str, *, exact: bool = False) -> bool:
+    """Return whether a parameter was held at a fixed value in its fit."""
     if headline.tolerant is not None and not exact and name in headline.tolerant.values:
         return False
     return name not in headline.fit.interval and name != "drag"
 
 
-def sizes_table(whole: WholeRecord) -> Table:
-    """Loss factors of either damping where they are uncorrelated with its order."""
-    headline = whole.headline
+def loss_factors_table(whole_record: WholeRecord) -> Table:
+    """Return the table of internal and external loss factors at their pivot frequencies.
+
+    There, the loss factor is not correlated with the order of the damping.
+    """
+    headline = whole_record.headline
     return Table.of(
         "damping_sizes",
         "Loss factor of either damping at its pivot frequency",
         (
-            Column("Damping", "damping", WORDS),
-            Column("Quantity", "quantity", WORDS),
+            Column("Damping", "damping", TEXT_FORMAT),
+            Column("Quantity", "quantity", TEXT_FORMAT),
             Column("at ω (rad/s)", "omega_rad_s"),
             Column("Value", "value"),
             Column("std", "std"),
@@ -260,44 +294,51 @@ def sizes_table(whole: WholeRecord) -> Table:
             Column("95 % from", "low_95"),
             Column("to", "high_95"),
         ),
-        (_size_row(headline, each) for each in headline.sizes),
+        (_loss_factor_row(headline, loss_factor) for loss_factor in headline.sizes),
         (
             "Coefficient and order are strongly correlated; a loss factor is known far better than "
             "either.",
-            *_reasons(each.size for each in headline.sizes),
+            *_reason_notes(loss_factor.size for loss_factor in headline.sizes),
         ),
     )
 
 
-def condition_table(whole: WholeRecord) -> Table | None:
-    """Compare the reported values with those of a simpler structure; None if none suffices."""
-    headline: Estimates = whole.headline.exact or whole.headline
-    simpler = headline.simpler
-    if simpler is None:
+def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
+    """Return the table that compares reported values with a simpler structure's.
+
+    It is None if no simpler structure is sufficient.
+    """
+    headline: Estimates = whole_record.headline.exact or whole_record.headline
+    simpler_estimates = headline.simpler
+    if simpler_estimates is None:
         return None
-    taken = " and ".join(f"{QUANTITIES[name][0]} = {at:g}" for name, at in simpler.fixed.items())
+    assumption = " and ".join(
+        f"{QUANTITIES[name][0]} = {at:g}" for name, at in simpler_estimates.fixed.items()
+    )
     rows: list[tuple[Entry, ...]] = []
-    for name, each in simpler.parameters.items():
-        symbol, _meaning, unit, factor = _described(name)
-        free = headline.parameters.get(name)
+    for name, value in simpler_estimates.parameters.items():
+        symbol, _meaning, unit, factor = _parameter_description(name)
+        free_value = headline.parameters.get(name)
         rows.append(
             (
                 Cell(name, symbol),
                 _unit_cell(unit),
-                *estimate((each.value, *_ends(each)), each.std, factor),
+                *estimate_cells((value.value, *_interval_ends(value)), value.std, factor),
                 *(
-                    [number(None)] * 3
-                    if free is None
-                    else estimate((free.value, *_ends(free)), free.std, factor)
+                    [number_cell(None)] * 3
+                    if free_value is None
+                    else estimate_cells(
+                        (free_value.value, *_interval_ends(free_value)), free_value.std, factor
+                    )
                 ),
             )
         )
     return Table.of(
         "on_condition",
-        f"If {taken or 'the rest'} is assumed: type {simpler.name} (sufficient)",
+        f"If {assumption or 'the rest'} is assumed: type {simpler_estimates.name} (sufficient)",
         (
-            Column("Parameter", "parameter", WORDS),
-            Column("Unit", "unit", WORDS),
+            Column("Parameter", "parameter", TEXT_FORMAT),
+            Column("Unit", "unit", TEXT_FORMAT),
             Column("Assumed", "value"),
             Column("95 % from", "low_95"),
             Column("to", "high_95"),
@@ -308,24 +349,25 @@ def condition_table(whole: WholeRecord) -> Table | None:
         rows,
         (
             "The intervals on the left hold only if the assumption is true"
-            + (f", and both {EXACT_CONDITION}." if whole.headline.exact else "."),
+            + (f", and both {EXACT_CONDITION}." if whole_record.headline.exact else "."),
         ),
     )
 
 
-def correlations_table(whole: WholeRecord) -> Table:
-    """Correlations of the determined parameters of the selected fit."""
-    fit = whole.fit
-    symbols = [_symbol(name) for name in fit.determined]
+def correlations_table(whole_record: WholeRecord) -> Table:
+    """Return the table of correlations between the determined parameters of the selected fit."""
+    fit = whole_record.fit
+    symbols = [_parameter_symbol(name) for name in fit.determined]
     return Table.of(
         "correlations",
-        f"Correlations of the parameters on an exactly uniform beam, type {whole.headline.name}",
+        "Correlations of the parameters on an exactly uniform beam, "
+        f"type {whole_record.headline.name}",
         (
-            Column("Parameter", "parameter", WORDS),
+            Column("Parameter", "parameter", TEXT_FORMAT),
             *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
         ),
         (
-            (Cell(name, symbol), *(_correlation(i == j, value) for j, value in enumerate(row)))
+            (Cell(name, symbol), *(_correlation_cell(i == j, value) for j, value in enumerate(row)))
             for i, (name, symbol, row) in enumerate(
                 zip(fit.determined, symbols, fit.correlation.tolist(), strict=True)
             )
@@ -335,93 +377,110 @@ def correlations_table(whole: WholeRecord) -> Table:
 
 
 def _parameter_row(
-    name: str, each: ReportedValue, combined: Mapping[str, ReportedValue], *, fixed: bool
+    name: str,
+    parameter: ReportedValue,
+    values_with_scales: Mapping[str, ReportedValue],
+    *,
+    is_fixed: bool,
 ) -> tuple[Entry, ...]:
-    symbol, meaning, unit, factor = _described(name)
-    shown = estimate((each.value, each.std or None, *_ends(each)), each.std, factor)
-    if combined:
-        # A parameter that goes with no scale has the same interval with them.
-        both = combined.get(name, each)
-        shown += estimate((both.std or None, *_ends(both)), both.std, factor)
-    if each.flag is not None:
-        shown = (marked(shown[0]), *map(greyed, shown[1:]))
+    """Return the row of a parameter in a table: symbol, meaning, unit, values and remark."""
+    symbol, meaning, unit, factor = _parameter_description(name)
+    cells = estimate_cells(
+        (parameter.value, parameter.std or None, *_interval_ends(parameter)), parameter.std, factor
+    )
+    if values_with_scales:
+        # A parameter that depends on no scale has the same interval with scales.
+        with_scales = values_with_scales.get(name, parameter)
+        cells += estimate_cells(
+            (with_scales.std or None, *_interval_ends(with_scales)), with_scales.std, factor
+        )
+    if parameter.flag is not None:
+        cells = (mark_cell(cells[0]), *map(grey_cell, cells[1:]))
     return (
         Cell(name, symbol),
         meaning,
         _unit_cell(unit),
-        *shown,
-        "fixed" if fixed else each.flag or "",
+        *cells,
+        "fixed" if is_fixed else parameter.flag or "",
     )
 
 
-_SI: Final = {"µs": "s", "ms": "s", "g": "kg", "mm": "m", "ppm": "1", "%": "1"}
+_SI_UNITS: Final = {"µs": "s", "ms": "s", "g": "kg", "mm": "m", "ppm": "1", "%": "1"}
+"""SI units of the units that tables show."""
 
 
-def _unit_cell(shown: str) -> Cell:
-    """Show a unit; for programs it is the SI unit, which their numbers have."""
-    power, _, unit = shown.rpartition(" ")
-    return Cell(_SI.get(shown, unit if power.startswith("1e") else shown), shown)
+def _unit_cell(unit_text: str) -> Cell:
+    """Return the cell of a unit, with the SI unit for programs, whose numbers are in SI units."""
+    power, _, unit = unit_text.rpartition(" ")
+    return Cell(_SI_UNITS.get(unit_text, unit if power.startswith("1e") else unit_text), unit_text)
 
 
-def _size_row(headline: Headline, each: ReportedLossFactor) -> tuple[Entry, ...]:
-    size, internal = each.size, each.damping == "internal"
+def _loss_factor_row(headline: Headline, loss_factor: ReportedLossFactor) -> tuple[Entry, ...]:
+    """Return the table row of the loss factor of internal or external damping."""
+    size, internal = loss_factor.size, loss_factor.damping == "internal"
     symbol = "ζ ω^α sin(απ/2)" if internal else "γ ω^λ sin(λπ/2) / (ρ/EI ω²)"
     flag = size.flag
-    if each.omega_rad_s is None:
-        # Without its frequency a size is the coefficient for an order that was only assumed.
+    if loss_factor.omega_rad_s is None:
+        # Without a pivot frequency the value is the coefficient for an order that was only assumed.
         flag = flag or headline.parameters["zeta" if internal else "gamma"].flag
         symbol = symbol[0]
     value, std, low, high = _quantity_cells(size)
-    relative = number(None if size.std is None else size.std / size.value, "#.2g", 100.0)
-    others: tuple[Cell, ...] = (std, relative, low, high)
+    relative_std = number_cell(None if size.std is None else size.std / size.value, "#.2g", 100.0)
+    further_cells: tuple[Cell, ...] = (std, relative_std, low, high)
     if flag is not None:
-        value, others = marked(value), tuple(map(greyed, others))
-    return (each.damping, symbol, each.omega_rad_s, value, *others)
+        value, further_cells = mark_cell(value), tuple(map(grey_cell, further_cells))
+    return (loss_factor.damping, symbol, loss_factor.omega_rad_s, value, *further_cells)
 
 
-def _quantity_cells(each: ReportedValue, factor: float = 1.0) -> tuple[Cell, ...]:
+def _quantity_cells(quantity: ReportedValue, factor: float = 1.0) -> tuple[Cell, ...]:
     """Return the cells of a quantity, its standard deviation and the ends of its interval."""
-    return estimate((each.value, each.std, *_ends(each)), each.std, factor)
+    return estimate_cells(
+        (quantity.value, quantity.std, *_interval_ends(quantity)), quantity.std, factor
+    )
 
 
-def _ends(quantity: ReportedValue) -> tuple[float | None, float | None]:
+def _interval_ends(quantity: ReportedValue) -> tuple[float | None, float | None]:
+    """Return the ends of a quantity's 95 % interval; None twice without an interval."""
     return quantity.interval_95 or (None, None)
 
 
-def _reasons(quantities: Iterable[ReportedValue]) -> tuple[str, ...]:
-    """List the meaning of each mark once."""
-    reasons = dict.fromkeys(each.flag for each in quantities if each.flag is not None)
-    return tuple(f"{MARK} {reason}." for reason in reasons)
+def _reason_notes(quantities: Iterable[ReportedValue]) -> tuple[str, ...]:
+    """Return a note for each reason for which quantities are marked."""
+    reasons = dict.fromkeys(quantity.flag for quantity in quantities if quantity.flag is not None)
+    return tuple(f"{NOT_REPORTED_MARK} {reason}." for reason in reasons)
 
 
-def _described(name: str) -> tuple[str, str, str, float]:
-    default = (_symbol(name), "stiffness beyond the uniform beam's", "%", 100.0)
+def _parameter_description(name: str) -> tuple[str, str, str, float]:
+    """Return the symbol, meaning, unit and factor of a parameter."""
+    default = (_parameter_symbol(name), "stiffness beyond the uniform beam's", "%", 100.0)
     return QUANTITIES.get(name, default)
 
 
-def _symbol(name: str) -> str:
+def _parameter_symbol(name: str) -> str:
+    """Return the symbol of a parameter; of a stiffness correction, δ and the mode's number."""
     if name in QUANTITIES:
         return QUANTITIES[name][0]
     return f"δ{name.rsplit('_', 1)[-1]}"
 
 
-def _correlation(own: bool, value: float) -> Cell:
-    shown = number(value, ".3f")
-    if own or abs(value) < _STRONG_CORRELATION:
-        return shown
-    return replace(shown, strong=True)
+def _correlation_cell(is_diagonal: bool, value: float) -> Cell:
+    """Return the cell of a correlation, in bold if it is strong and of two different parameters."""
+    cell = number_cell(value, ".3f")
+    if is_diagonal or abs(value) < _STRONG_CORRELATION:
+        return cell
+    return replace(cell, strong=True)
 
 
-def amplitude_tables(whole: WholeRecord) -> tuple[Table, ...]:
-    """Return the damping ratios of free vibration by amplitude; no table without them."""
-    found = whole.verdict.damping_with_amplitude
-    if not found:
+def amplitude_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
+    """Return a table of the damping ratio in free vibration by amplitude; nothing without data."""
+    damping_by_amplitude = whole_record.verdict.damping_with_amplitude
+    if not damping_by_amplitude:
         return ()
     rows: list[tuple[Entry, ...]] = []
-    for at in found:
-        ratio, std, half = at.damping_ratio, at.std, NORMAL_95 * at.std
-        shown = estimate((ratio, std, ratio - half, ratio + half), std, 100.0)
-        rows.append((at.mode, at.tip_amplitude_m, *shown))
+    for at in damping_by_amplitude:
+        ratio, std, half_width = at.damping_ratio, at.std, NORMAL_95 * at.std
+        cells = estimate_cells((ratio, std, ratio - half_width, ratio + half_width), std, 100.0)
+        rows.append((at.mode, at.tip_amplitude_m, *cells))
     return (
         Table.of(
             "damping_with_amplitude",

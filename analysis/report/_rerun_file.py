@@ -1,4 +1,4 @@
-"""A session with its fits as a file for Rerun's viewer."""
+"""Rerun file of a session with its fits: the live view's tabs, preceded by the results."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from analysis.report._text import analysis_tables, as_text, damping_sentences, r
 from analysis.report.folder import OutputError, OutputExistsError
 from rigd.session import read_session, read_timings
 from rigd.view import chart_page, chart_view
-from rigd.view.chart import Chart, Key, Thinning
+from rigd.view.chart import Chart, LegendEntry, Thinning
 from rigd.view.frequency_charts import (
     COHERENCE_AXIS,
-    COHERENCE_KEY,
-    MEASURED_KEY,
+    COHERENCE_ENTRY,
+    MEASURED_ENTRY,
     PHASE_AXIS,
     magnitude_axis,
     magnitude_db,
@@ -50,62 +50,84 @@ if TYPE_CHECKING:
     from analysis.results import RecordResult, WholeRecord
     from rigd.view.chart import Axis
 
+    # Array of real numbers.
     Real = NDArray[np.float64]
+    # Array of complex numbers.
     Complex = NDArray[np.complex128]
 
-RECORD: Final = "/whole_record"
+RECORD_ENTITY: Final = "/whole_record"
+"""Entity path in Rerun of the whole record's results."""
 RECORD_TITLE: Final = "Whole record"
-VERDICT: Final = f"{RECORD}/verdict"
-VERDICT_PAGE: Final = "Verdict"
-TORQUE_PAGE: Final = "Torque"
-FITS: Final = "/fits"
-TITLE: Final = "Fits"
-TABLES: Final = f"{FITS}/tables"
-MEASURED_PAGE: Final = "Measured"
-TABLES_PAGE: Final = "Tables"
+"""Title of the tab with the whole record's results."""
+VERDICT_ENTITY: Final = f"{RECORD_ENTITY}/verdict"
+"""Entity path in Rerun of the verdict."""
+VERDICT_TITLE: Final = "Verdict"
+"""Title of the tab with the verdict."""
+TORQUE_TITLE: Final = "Torque"
+"""Title of the tab with the torque over time."""
+FITS_ENTITY: Final = "/fits"
+"""Entity path in Rerun of the Welch fits."""
+FITS_TITLE: Final = "Fits"
+"""Title of the tab with the Welch fits."""
+TABLES_ENTITY: Final = f"{FITS_ENTITY}/tables"
+"""Entity path in Rerun of the tables of the Welch fits."""
+MEASURED_TITLE: Final = "Measured"
+"""Title of the tab with the measured response."""
+TABLES_TITLE: Final = "Tables"
+"""Title of the tab with the tables of the Welch fits."""
 
-_SIZE_DB: Final = Key("|measured|", GREY)
-_WIDE: Final = (1280.0, 350.0)
-_HALF: Final = (640.0, 262.0)
-"""Width and height of the canvases, in points, as they fit a window of 1280 × 800."""
+_MEASURED_MAGNITUDE_ENTRY: Final = LegendEntry("|measured|", GREY)
+"""Legend entry of the measured magnitude, with which residuals are compared."""
+_WIDE_CHART_SIZE: Final = (1280.0, 350.0)
+"""Width and height of a page's wide chart, in points, for a window of 1280 × 800."""
+_NARROW_CHART_SIZE: Final = (640.0, 262.0)
+"""Width and height of a page's narrow charts, in points, for a window of 1280 × 800."""
 
-_LINES: Final[dict[str, tuple[Color, float]]] = {"const": (ORANGE, 3.0), "omega": (VERMILION, 1.5)}
-"""Colour and width; the narrower lies over the wider, for the two are often alike."""
-_MORE_LINES: Final = ((PURPLE, 1.5), (GREEN, 1.5), (ORANGE, 1.5))
-_MOST_IN_WORDS: Final = 2
-"""Models whose keys on a narrow chart say that what they name are weights."""
-_SCALARS: Final = "Scalars:scalars"
-"""Rerun's name of the values of a plot."""
-_GROUPS: Final = 400
-"""Groups of points along the axis, two drawn per group: enough for the pixels of a view."""
+_LINES_BY_WEIGHTING: Final[dict[str, tuple[Color, float]]] = {
+    "const": (ORANGE, 3.0),
+    "omega": (VERMILION, 1.5),
+}
+"""Colour and width of a model's line by its weighting.
+
+The narrower line lies over the wider one, because the two models are often alike."""
+_FURTHER_LINES: Final = ((PURPLE, 1.5), (GREEN, 1.5), (ORANGE, 1.5))
+"""Colours and widths of the lines for further weightings."""
+_MOST_MODELS_WITH_LONG_LABEL: Final = 2
+"""Largest number of models for which the legend of a narrow chart contains the word "weights"."""
+_SCALARS_COMPONENT: Final = "Scalars:scalars"
+"""Rerun's name for the values of a plot over time."""
+_FREQUENCY_GROUPS: Final = 400
+"""Number of groups of points along the frequency axis, each drawn as two points.
+
+This is enough for the pixels of a view."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChartCurve:
-    """A curve of a chart.
+    """Curve of a chart: name, style and values.
 
     Attributes
     ----------
     name
-        Its entity in Rerun, under the chart.
+        Name of the curve under the chart's entity path in Rerun.
     key
-        Its style.
+        Label and style of the curve.
     values
-        Shape (n,), at the frequencies that were fitted.
+        Values at the frequencies of the page, shape (n,).
     dotted
-        Whether the values are drawn as points: a line would run up and down wherever noise takes a
-        phase from one end of its axis to the other.
+        Whether the values are drawn as points. A line would jump wherever noise takes the phase
+        from one end of its axis to the other.
     """
 
     name: str
-    key: Key
+    key: LegendEntry
     values: Real
     dotted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """A chart with its curves, from the lowest to the topmost."""
+    """Chart of a page with its title and its curves, from the lowest to the topmost."""
 
     title: str
     chart: Chart
@@ -114,7 +136,7 @@ class Graph:
 
 @dataclass(frozen=True, slots=True)
 class ChartPage:
-    """Charts that are seen together: a wide one over two narrow ones.
+    """Three charts that are displayed together: a wide one above two narrow ones.
 
     Attributes
     ----------
@@ -125,7 +147,7 @@ class ChartPage:
     frequency_hz
         Frequencies of all curves, shape (n,).
     band_hz
-        Ends of the axes.
+        Lowest and highest frequency of the axes.
     """
 
     title: str
@@ -137,8 +159,8 @@ class ChartPage:
 # Welch fits
 
 
-def pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
-    """Return the measured response with its coherence, and each model type with its residuals."""
+def welch_pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
+    """Return the pages of the Welch fits: the measured response, then one for each model type."""
     magnitude = _magnitude_axis(analysis)
     keys_by_weighting = line_keys(analysis.settings.weightings)
     return (
@@ -150,43 +172,46 @@ def pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
     )
 
 
-def line_keys(weightings: tuple[str, ...]) -> dict[str, Key]:
-    """Return how the models of each weighting are drawn."""
-    others = cycle(_MORE_LINES)
-    keys_by_weighting = {name: _LINES.get(name) or next(others) for name in weightings}
+def line_keys(weightings: tuple[str, ...]) -> dict[str, LegendEntry]:
+    """Return label and line style of the fitted models, by the weighting of the fit."""
+    further_lines = cycle(_FURTHER_LINES)
+    keys_by_weighting = {
+        name: _LINES_BY_WEIGHTING.get(name) or next(further_lines) for name in weightings
+    }
     return {
-        name: Key(f"model, weights {name}", color, width)
+        name: LegendEntry(f"model, weights {name}", color, width)
         for name, (color, width) in keys_by_weighting.items()
     }
 
 
-def draw(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
+def draw_welch_fits(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
     """Draw all pages of the Welch fits, which are the same at any time of the session.
 
     Parameters
     ----------
     analysis
-        Whose fits are drawn.
+        Welch fits of the session.
     tables
-        The same in numbers, as plain text.
+        Tables of the fits as plain text.
     stream
-        Receives the drawings.
+        Recording to draw into.
     """
-    for page in pages(analysis):
+    for page in welch_pages(analysis):
         _draw_page(page, stream)
-    _draw_text(TABLES, f"```\n{tables}\n```", stream)
+    _draw_text(TABLES_ENTITY, f"```\n{tables}\n```", stream)
 
 
-def tab(analysis: WelchAnalysis) -> rrb.Container:
-    """Return the tab of the Welch fits, with a tab in it for each page and for the tables."""
+def welch_fits_tab(analysis: WelchAnalysis) -> rrb.Container:
+    """Return the tab of the Welch fits, which contains tabs for each page and for the tables."""
     import rerun.blueprint as rrb
 
-    tables = rrb.TextDocumentView(name=TABLES_PAGE, origin=TABLES)
-    return rrb.Tabs(*map(_page_view, pages(analysis)), tables, name=TITLE)
+    tables = rrb.TextDocumentView(name=TABLES_TITLE, origin=TABLES_ENTITY)
+    return rrb.Tabs(*map(_page_view, welch_pages(analysis)), tables, name=FITS_TITLE)
 
 
 def _draw_page(page: ChartPage, stream: RecordingStream) -> None:
-    thinning = Thinning.logarithmic(page.frequency_hz, *page.band_hz, _GROUPS)
+    """Draw the charts of a page with their curves, reduced to the pixels of a view."""
+    thinning = Thinning.logarithmic(page.frequency_hz, *page.band_hz, _FREQUENCY_GROUPS)
     for graph in page.graphs:
         graph.chart.draw_frame(stream)
         for order, curve in enumerate(graph.curves):
@@ -197,6 +222,7 @@ def _draw_page(page: ChartPage, stream: RecordingStream) -> None:
 
 
 def _draw_text(entity: str, text: str, stream: RecordingStream) -> None:
+    """Send a Markdown text that is the same at any time of the session."""
     import rerun as rr
 
     document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
@@ -204,6 +230,8 @@ def _draw_text(entity: str, text: str, stream: RecordingStream) -> None:
 
 
 def _page_view(page: ChartPage) -> rrb.Container:
+    """Return the tab of a page: a wide chart above two narrow ones."""
+
     def view(graph: Graph) -> rrb.Spatial2DView:
         chart = graph.chart
         return chart_view(graph.title, chart.entity, (chart.width, chart.height))
@@ -212,30 +240,43 @@ def _page_view(page: ChartPage) -> rrb.Container:
 
 
 def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
+    """Return the page of the measured response: magnitude, phase and coherence."""
     response, band_hz = analysis.response, analysis.settings.band_hz
     coherence = response.coherence
     if coherence is None:
         coherence = np.full(response.frequency_hz.shape, np.nan)
-    entity = f"{FITS}/measured"
+    entity = f"{FITS_ENTITY}/measured"
     return ChartPage(
-        MEASURED_PAGE,
+        MEASURED_TITLE,
         (
             Graph(
                 "Magnitude of torque over angle, as estimated for the fits",
-                response_chart(f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY),
-                (ChartCurve("measured", MEASURED_KEY, magnitude_db(response.response)),),
+                response_chart(
+                    f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_ENTRY
+                ),
+                (ChartCurve("measured", MEASURED_ENTRY, magnitude_db(response.response)),),
             ),
             Graph(
                 "Phase of torque over angle",
-                response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY),
-                (ChartCurve("measured", MEASURED_KEY, phase_deg(response.response), dotted=True),),
+                response_chart(
+                    f"{entity}/phase", _NARROW_CHART_SIZE, band_hz, PHASE_AXIS, MEASURED_ENTRY
+                ),
+                (
+                    ChartCurve(
+                        "measured", MEASURED_ENTRY, phase_deg(response.response), dotted=True
+                    ),
+                ),
             ),
             Graph(
                 "Coherence of angle and torque",
                 response_chart(
-                    f"{entity}/coherence", _HALF, band_hz, COHERENCE_AXIS, COHERENCE_KEY
+                    f"{entity}/coherence",
+                    _NARROW_CHART_SIZE,
+                    band_hz,
+                    COHERENCE_AXIS,
+                    COHERENCE_ENTRY,
                 ),
-                (ChartCurve("coherence", COHERENCE_KEY, coherence),),
+                (ChartCurve("coherence", COHERENCE_ENTRY, coherence),),
             ),
         ),
         response.frequency_hz,
@@ -244,22 +285,23 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
 
 
 def _type_page(
-    analysis: WelchAnalysis, name: str, magnitude: Axis, keys_by_weighting: dict[str, Key]
+    analysis: WelchAnalysis, name: str, magnitude: Axis, keys_by_weighting: dict[str, LegendEntry]
 ) -> ChartPage:
+    """Return the page of a model type: magnitude, phase and residuals of its models."""
     models = [model for model in analysis.models if model.fit.structure.name == name]
     keys = [keys_by_weighting[model.fit.weighting] for model in models]
-    # Shorter on the narrow charts: in full they would run into the title of the axis.
-    form = "weights {}" if len(models) <= _MOST_IN_WORDS else "{}"
-    short = [
-        replace(key, label=form.format(model.fit.weighting))
+    # Short labels on the narrow charts, because long ones would overlap the axis title.
+    label_format = "weights {}" if len(models) <= _MOST_MODELS_WITH_LONG_LABEL else "{}"
+    short_keys = [
+        replace(key, label=label_format.format(model.fit.weighting))
         for key, model in zip(keys, models, strict=True)
     ]
-    measured, band_hz = analysis.response.response, analysis.settings.band_hz
-    entity = f"{FITS}/type_{name}"
+    measured_frf, band_hz = analysis.response.response, analysis.settings.band_hz
+    entity = f"{FITS_ENTITY}/type_{name}"
 
-    def of_models(values: Callable[[FittedModel], Real]) -> list[ChartCurve]:
+    def model_curves(values: Callable[[FittedModel], Real]) -> list[ChartCurve]:
         return [
-            ChartCurve(_plain(model.fit.weighting), key, values(model))
+            ChartCurve(_entity_name(model.fit.weighting), key, values(model))
             for key, model in zip(keys, models, strict=True)
         ]
 
@@ -273,27 +315,46 @@ def _type_page(
             Graph(
                 f"Magnitude, type {name} ({scores})",
                 response_chart(
-                    f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY, *keys
+                    f"{entity}/magnitude",
+                    _WIDE_CHART_SIZE,
+                    band_hz,
+                    magnitude,
+                    MEASURED_ENTRY,
+                    *keys,
                 ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured)),
-                    *of_models(lambda model: magnitude_db(model.response)),
+                    ChartCurve("measured", MEASURED_ENTRY, magnitude_db(measured_frf)),
+                    *model_curves(lambda model: magnitude_db(model.response)),
                 ),
             ),
             Graph(
                 "Phase",
-                response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY, *short),
+                response_chart(
+                    f"{entity}/phase",
+                    _NARROW_CHART_SIZE,
+                    band_hz,
+                    PHASE_AXIS,
+                    MEASURED_ENTRY,
+                    *short_keys,
+                ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
-                    *of_models(lambda model: phase_deg(model.response)),
+                    ChartCurve("measured", MEASURED_ENTRY, phase_deg(measured_frf), dotted=True),
+                    *model_curves(lambda model: phase_deg(model.response)),
                 ),
             ),
             Graph(
                 "Residual, measured − model",
-                response_chart(f"{entity}/residual", _HALF, band_hz, magnitude, _SIZE_DB, *short),
+                response_chart(
+                    f"{entity}/residual",
+                    _NARROW_CHART_SIZE,
+                    band_hz,
+                    magnitude,
+                    _MEASURED_MAGNITUDE_ENTRY,
+                    *short_keys,
+                ),
                 (
-                    ChartCurve("measured", _SIZE_DB, magnitude_db(measured)),
-                    *of_models(lambda model: magnitude_db(measured - model.response)),
+                    ChartCurve("measured", _MEASURED_MAGNITUDE_ENTRY, magnitude_db(measured_frf)),
+                    *model_curves(lambda model: magnitude_db(measured_frf - model.response)),
                 ),
             ),
         ),
@@ -303,47 +364,51 @@ def _type_page(
 
 
 def _magnitude_axis(analysis: WelchAnalysis) -> Axis:
-    """Return the axis that holds the peaks of all responses, and the residuals of the better ones.
+    """Return the common magnitude axis of all pages of the Welch fits.
 
-    It is the same on all pages, so that types can be compared at a glance.
+    It contains the peaks of all responses and the residuals of the better models. Being common, it
+    makes the types comparable.
     """
-    return _axis_of(analysis.response.response, [model.response for model in analysis.models])
+    return _axis_of_responses(
+        analysis.response.response, [model.response for model in analysis.models]
+    )
 
 
-def _axis_of(measured: Complex, models: Sequence[Complex]) -> Axis:
-    responses = [measured, *models]
-    shown = [measured, *(measured - model for model in models)]
+def _axis_of_responses(measured_frf: Complex, models: Sequence[Complex]) -> Axis:
+    """Return a magnitude axis for measured and modelled responses, and for their residuals."""
+    responses = [measured_frf, *models]
+    measured_and_residuals = [measured_frf, *(measured_frf - model for model in models)]
     return magnitude_axis(
-        min(float(np.nanquantile(magnitude_db(values), 0.02)) for values in shown),
+        min(float(np.nanquantile(magnitude_db(values), 0.02)) for values in measured_and_residuals),
         max(float(np.nanmax(magnitude_db(values))) for values in responses) + 3.0,
     )
 
 
-def _plain(weighting: str) -> str:
-    """Return the name of a weighting as a part of an entity's path."""
+def _entity_name(weighting: str) -> str:
+    """Return the name of a weighting in a form that an entity path can contain."""
     return "model_" + "".join(c if c.isalnum() else "_" for c in weighting)
 
 
 # Whole record
 
-_MOST_LABELS: Final = 5
-"""On either side of 0, in half the height of a window."""
+_MOST_LABELS_PER_SIDE: Final = 5
+"""Largest number of labels on either side of 0, in half the height of a window."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Curves over the session's time, in one view.
+    """Curves over the session's time in one plot: names, styles and values.
 
     Attributes
     ----------
     entity
-        Their entity in Rerun.
+        Entity path of the curves in Rerun.
     title
-        Title of the view, with the unit.
+        Title of the plot, with the unit.
     names, colors, widths
-        Style of each line, from the lowest to the topmost.
+        Name, colour and width of each line, from the lowest to the topmost.
     values
-        Computes the lines' values (n, lines) from the torque.
+        Function from the torque in the band to the lines' values (n, lines).
     """
 
     entity: str
@@ -354,9 +419,9 @@ class Lines:
     values: Callable[[TorqueInBand], Real]
 
 
-_OVER_TIME: Final = (
+_PLOTS_OVER_TIME: Final = (
     Lines(
-        f"{RECORD}/torque",
+        f"{RECORD_ENTITY}/torque",
         "Coupling torque in the band of the fit (N·m)",
         ("measured (N·m)", "model (N·m)"),
         (SKY_BLUE, ORANGE),
@@ -364,7 +429,7 @@ _OVER_TIME: Final = (
         lambda torque: np.column_stack((torque.measured, torque.modelled)),
     ),
     Lines(
-        f"{RECORD}/residual",
+        f"{RECORD_ENTITY}/residual",
         "Residual, measured − model (mN·m)",
         ("residual (mN·m)",),
         (VERMILION,),
@@ -372,49 +437,73 @@ _OVER_TIME: Final = (
         lambda torque: 1e3 * torque.residual[:, None],
     ),
 )
+"""Plots over time: torque, measured and modelled, and residual."""
 
 
-def record_page(whole: WholeRecord) -> ChartPage:
-    """Return response and residual of the fit that the numbers are of.
+def record_page(whole_record: WholeRecord) -> ChartPage:
+    """Return the page with the response and residual of the whole record's displayed model.
 
-    Measured is the ratio of the whole record's transforms, without the model's delay.
+    The measured response is the ratio of the whole record's transforms, without the model's delay.
     """
     from analysis.report._record_figures import measured_response
 
-    found, shown = measured_response(whole), ShownModel.of(whole.headline, whole.record)
-    grid_hz = found.frequency_hz
-    turned = np.exp(2j * np.pi * shown.delay_s * grid_hz)
-    measured, model = found.response * turned, shown.band(grid_hz).response
+    measured_with_delay, shown_model = (
+        measured_response(whole_record),
+        ShownModel.of(whole_record.headline, whole_record.record),
+    )
+    grid_hz = measured_with_delay.frequency_hz
+    delay_phasor = np.exp(2j * np.pi * shown_model.delay_s * grid_hz)
+    measured_frf, model = (
+        measured_with_delay.response * delay_phasor,
+        shown_model.band(grid_hz).response,
+    )
     band_hz = float(grid_hz[0]), float(grid_hz[-1])
-    magnitude = _axis_of(measured, [model])
-    key, name = Key(shown.name.removeprefix("the "), ORANGE, 2.0), "model"
-    short = replace(key, label="model")
-    entity = f"{RECORD}/response"
+    magnitude = _axis_of_responses(measured_frf, [model])
+    key, name = LegendEntry(shown_model.name.removeprefix("the "), ORANGE, 2.0), "model"
+    short_key = replace(key, label="model")
+    entity = f"{RECORD_ENTITY}/response"
     return ChartPage(
         "Response",
         (
             Graph(
-                f"Magnitude of torque over angle, whole record, {shown.name.removeprefix('the ')}",
-                response_chart(f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY, key),
+                "Magnitude of torque over angle, whole record, "
+                f"{shown_model.name.removeprefix('the ')}",
+                response_chart(
+                    f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_ENTRY, key
+                ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured)),
+                    ChartCurve("measured", MEASURED_ENTRY, magnitude_db(measured_frf)),
                     ChartCurve(name, key, magnitude_db(model)),
                 ),
             ),
             Graph(
                 "Phase",
-                response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY, short),
+                response_chart(
+                    f"{entity}/phase",
+                    _NARROW_CHART_SIZE,
+                    band_hz,
+                    PHASE_AXIS,
+                    MEASURED_ENTRY,
+                    short_key,
+                ),
                 (
-                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
+                    ChartCurve("measured", MEASURED_ENTRY, phase_deg(measured_frf), dotted=True),
                     ChartCurve(name, key, phase_deg(model)),
                 ),
             ),
             Graph(
                 "Residual, measured − model",
-                response_chart(f"{entity}/residual", _HALF, band_hz, magnitude, _SIZE_DB, short),
+                response_chart(
+                    f"{entity}/residual",
+                    _NARROW_CHART_SIZE,
+                    band_hz,
+                    magnitude,
+                    _MEASURED_MAGNITUDE_ENTRY,
+                    short_key,
+                ),
                 (
-                    ChartCurve("measured", _SIZE_DB, magnitude_db(measured)),
-                    ChartCurve(name, key, magnitude_db(measured - model)),
+                    ChartCurve("measured", _MEASURED_MAGNITUDE_ENTRY, magnitude_db(measured_frf)),
+                    ChartCurve(name, key, magnitude_db(measured_frf - model)),
                 ),
             ),
         ),
@@ -424,54 +513,54 @@ def record_page(whole: WholeRecord) -> ChartPage:
 
 
 def draw_record(
-    whole: WholeRecord, torque: TorqueInBand, tables: str, stream: RecordingStream
+    whole_record: WholeRecord, torque: TorqueInBand, tables: str, stream: RecordingStream
 ) -> None:
     """Draw the results of the whole record: verdict, response, and torque over time.
 
     Parameters
     ----------
-    whole
-        Whose selected fit is drawn.
+    whole_record
+        Whole record with its fits.
     torque
-        Torque of the record and of that fit.
+        Measured torque, and the torque of the displayed model.
     tables
-        Its tables, as plain text.
+        Tables of the record as plain text.
     stream
-        Receives the drawings.
+        Recording to draw into.
     """
     sentences = [
-        *(f"**{sentence}**" for sentence in damping_sentences(whole.headline)),
-        *whole.verdict.sentences,
-        *(f"* {advice}" for advice in whole.verdict.experiments),
+        *(f"**{sentence}**" for sentence in damping_sentences(whole_record.headline)),
+        *whole_record.verdict.sentences,
+        *(f"* {advice}" for advice in whole_record.verdict.experiments),
     ]
-    _draw_text(VERDICT, "\n\n".join((*sentences, f"```\n{tables}\n```")), stream)
-    _draw_page(record_page(whole), stream)
-    t_ns = np.round(1e9 * whole.record.time_s).astype(np.int64)
-    for lines in _OVER_TIME:
-        send_columns(stream, lines.entity, t_ns, {_SCALARS: lines.values(torque)})
+    _draw_text(VERDICT_ENTITY, "\n\n".join((*sentences, f"```\n{tables}\n```")), stream)
+    _draw_page(record_page(whole_record), stream)
+    t_ns = np.round(1e9 * whole_record.record.time_s).astype(np.int64)
+    for lines in _PLOTS_OVER_TIME:
+        send_columns(stream, lines.entity, t_ns, {_SCALARS_COMPONENT: lines.values(torque)})
 
 
-def record_tab(whole: WholeRecord, torque: TorqueInBand) -> rrb.Container:
-    """Return the tab of the whole record, with a tab in it for each of these."""
+def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container:
+    """Return the tab of the whole record, which contains tabs for verdict, response and torque."""
     import rerun.blueprint as rrb
 
-    end_s = float(whole.record.time_s[-1])
+    end_s = float(whole_record.record.time_s[-1])
     return rrb.Tabs(
-        rrb.TextDocumentView(name=VERDICT_PAGE, origin=VERDICT),
-        _page_view(record_page(whole)),
+        rrb.TextDocumentView(name=VERDICT_TITLE, origin=VERDICT_ENTITY),
+        _page_view(record_page(whole_record)),
         rrb.Vertical(
             *(
-                _lines_view(each, end_s, float(np.abs(each.values(torque)).max()))
-                for each in _OVER_TIME
+                _lines_view(lines, end_s, float(np.abs(lines.values(torque)).max()))
+                for lines in _PLOTS_OVER_TIME
             ),
-            name=TORQUE_PAGE,
+            name=TORQUE_TITLE,
         ),
         name=RECORD_TITLE,
     )
 
 
-def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesView:
-    """Return a view of the whole session, independent of the current time."""
+def _lines_view(lines: Lines, end_s: float, largest_value: float) -> rrb.TimeSeriesView:
+    """Return a plot over the whole session, independent of the current time."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -481,7 +570,7 @@ def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesVie
         names=lines.names,
         colors=lines.colors,
         widths=lines.widths,
-        # The default averages what falls on one pixel, and so understates peaks.
+        # The default averages the values of a pixel, which understates peaks.
         aggregation_policy="MinMax",
     )
     return rrb.TimeSeriesView(
@@ -490,18 +579,18 @@ def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesVie
         overrides={lines.entity: series_style},
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(lines.names) > 1),
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
-        axis_y=rrb.ScalarAxis(range=_span(largest)),
+        axis_y=rrb.ScalarAxis(range=_labelled_axis_range(largest_value)),
         time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),
     )
 
 
-def _span(largest: float) -> tuple[float, float]:
-    """Return the ends of an axis about 0 on which Rerun labels more than that.
+def _labelled_axis_range(largest_value: float) -> tuple[float, float]:
+    """Return the ends of an axis about 0 on which Rerun shows labels other than 0.
 
-    It labels multiples of a power of ten, where there is room for all of them.
+    Rerun labels multiples of a power of ten if there is room for all of them.
     """
-    step = 10.0 ** np.floor(np.log10(max(largest, 1e-12)))
-    end = 1.1 * largest if largest < _MOST_LABELS * step else 11.0 * step
+    step = 10.0 ** np.floor(np.log10(max(largest_value, 1e-12)))
+    end = 1.1 * largest_value if largest_value < _MOST_LABELS_PER_SIDE * step else 11.0 * step
     return -end, end
 
 
@@ -509,7 +598,7 @@ def _span(largest: float) -> tuple[float, float]:
 
 
 def check_rerun_file(path: Path) -> None:
-    """Raise OutputExistsError if a path is taken, or is not a name of such a file."""
+    """Raise OutputExistsError if a path exists or does not have the suffix of a Rerun file."""
     try:
         check_new(path)
     except RrdFileError as error:
@@ -517,41 +606,44 @@ def check_rerun_file(path: Path) -> None:
 
 
 def write_rerun_file(result: RecordResult, path: Path) -> None:
-    """Write the session in the layout of the live view, preceded by its results.
+    """Write a Rerun file of the session in the layout of the live view, preceded by its results.
 
     Parameters
     ----------
     result : RecordResult
+        Results of the session's record.
     path : Path
-        A new file, ``….rrd``.
+        New file, with the suffix ``.rrd``.
 
     Raises
     ------
     OutputError
-        If it cannot be written, or has appeared meanwhile.
+        If the file cannot be written, or was created meanwhile.
     rigd.session.SessionError
         If the session file cannot be read any more.
     """
     from rigd.view import draw_session
 
-    whole, welch, tabs = result.whole, result.welch, []
-    if whole is not None:
+    whole_record, welch_analysis, tabs = result.whole, result.welch, []
+    if whole_record is not None:
         from analysis.report._signal_figures import torque_in_band
 
         torque = torque_in_band(
-            whole.record, ShownModel.of(whole.headline, whole.record).transfer, whole.band_hz[1]
+            whole_record.record,
+            ShownModel.of(whole_record.headline, whole_record.record).transfer,
+            whole_record.band_hz[1],
         )
-        tabs.append(record_tab(whole, torque))
-    if welch is not None:
-        tabs.append(tab(welch))
+        tabs.append(record_tab(whole_record, torque))
+    if welch_analysis is not None:
+        tabs.append(welch_fits_tab(welch_analysis))
     session = read_session(result.record.path)
     timings = read_timings(result.record.path)
     try:
         with new_rrd_file(path) as stream:
             draw_session(stream, session, timings, front=tabs)
-            if whole is not None:
-                draw_record(whole, torque, as_text(record_tables(whole)), stream)
-            if welch is not None:
-                draw(welch, as_text(analysis_tables(result)), stream)
+            if whole_record is not None:
+                draw_record(whole_record, torque, as_text(record_tables(whole_record)), stream)
+            if welch_analysis is not None:
+                draw_welch_fits(welch_analysis, as_text(analysis_tables(result)), stream)
     except RrdFileError as error:
         raise OutputError(str(error)) from None

@@ -1,4 +1,4 @@
-"""Model of a record that is shown first: the modal model, or the beam where no mode shows."""
+"""Model that a report of a record shows: the modal model, or the beam if no mode is visible."""
 
 from __future__ import annotations
 
@@ -17,24 +17,26 @@ if TYPE_CHECKING:
     from analysis.record import Record
     from analysis.report.bands import ResponseBand
 
+    # Array of real numbers.
     Real = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class ShownModel:
-    """Model of a record that figures and curves show.
+    """Model of a record that figures and curves show: the modal model or the beam.
 
     Attributes
     ----------
     name : str
-        Name in captions.
+        Name of the model in captions.
     modal : ModalFit or None
+        Modal model; None if no mode is visible.
     beam : RecordFit
-        Shown where there is no modal model.
+        Fit of the beam, which is shown if there is no modal model.
     modes : tuple of ModeEstimate
-        Those that the record shows.
+        Modes that are visible in the record.
     stated_delay_s : float
-        Delay of the torque against the angle, by the file.
+        Delay of the torque against the angle, as the file states it.
     """
 
     name: str
@@ -45,13 +47,14 @@ class ShownModel:
 
     @classmethod
     def of(cls, headline: Headline, record: Record) -> ShownModel:
-        """Choose the model for a record.
+        """Return the model that a record's report shows, from the reported results (headline).
 
         Parameters
         ----------
         headline : Headline
             Headline of the record.
         record : Record
+            Record with the delays that its file states.
         """
         return cls(
             name=f"the model (type {headline.name})"
@@ -65,57 +68,57 @@ class ShownModel:
 
     @property
     def transfer(self) -> Plant | ModalModel:
-        """Transfer function from angle to torque, as a prediction takes it."""
+        """Transfer function from angle to torque: the modal model, or the beam's plant."""
         return self.beam.plant if self.modal is None else self.modal.model
 
     @property
     def residual(self) -> NDArray[np.complex128]:
-        """Whitened residual, shape (K,)."""
+        """Whitened residual of the displayed model, shape (K,)."""
         return self.beam.residual if self.modal is None else self.modal.residual
 
     @property
     def delay_s(self) -> float:
-        """Delay that is taken out of its response: of a beam the fitted one."""
+        """Delay to remove from the response: the fitted one of a beam, else the file's."""
         return self.beam.parameters["delay_s"] if self.modal is None else self.stated_delay_s
 
     def band(self, frequency_hz: Real) -> ResponseBand:
-        """Return its response without the delay, with the band.
+        """Return the model's response without the delay, with its 95 % band.
 
         Parameters
         ----------
         frequency_hz : ndarray, shape (n,)
-            Positive.
+            Frequencies, positive.
         """
         if self.modal is None:
             return response_band(self.beam, frequency_hz)
         return modal_response_band(self.modal, frequency_hz, self.delay_s)
 
     def compared(self, analysis: RecordAnalysis) -> RecordAnalysis:
-        """Return an analysis with the noise and the bins of the residual.
+        """Return the record's analysis with the noise and the bins of this model's residual.
 
         Parameters
         ----------
         analysis : RecordAnalysis
-            That of the record.
+            Analysis of the record.
         """
         if self.modal is None:
             return analysis
         return RecordAnalysis.of(analysis.fits, self.modal.noise, analysis.comparison)
 
     def fit_percent(self, analysis: RecordAnalysis) -> float:
-        """Fit to the measured torque in the band (NRMSE).
+        """Return the fit to the measured torque in the band, in percent (NRMSE).
 
         Parameters
         ----------
         analysis : RecordAnalysis
-            That of the record.
+            Analysis of the record.
         """
         fit = self.beam if self.modal is None else self.modal
         return self.compared(analysis).fit_percent(fit)
 
 
 def shown_modes(headline: Headline) -> tuple[ModeEstimate, ...]:
-    """Return the modes of a headline that the record shows, with their deviations."""
+    """Return the reported modes that are visible in the record, with standard deviations."""
     return tuple(
         ModeEstimate(
             number=mode.number,

@@ -1,4 +1,4 @@
-"""Figures of a record's signals, with the response of the fitted plant to its angle."""
+"""Figures of a record's angle and torque, with the torque that the fitted model predicts."""
 
 from __future__ import annotations
 
@@ -26,26 +26,31 @@ if TYPE_CHECKING:
     from analysis.record import Record
     from analysis.report._shown_model import ShownModel
 
+    # Matplotlib's properties of a line.
     LineStyle = dict[str, Any]
-    NoiseLine = tuple[NDArray[np.float64], LineStyle]
+    # Values of a signal with the style of its line.
+    StyledSignal = tuple[NDArray[np.float64], LineStyle]
 
 _PERIODS_SHOWN: Final = 12
-_SHORTEST_S: Final = 0.3
-_LARGEST_FRACTION: Final = 1 / 8
+"""Number of a mode's periods that its enlarged panel shows."""
+_LEAST_DETAIL_S: Final = 0.3
+"""Least duration that an enlarged panel shows, in seconds."""
+_MOST_DETAIL_FRACTION: Final = 1 / 8
+"""Largest duration that an enlarged panel shows, as a fraction of the record."""
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
-    """One interval of the record.
+class RecordInterval:
+    """Time interval of a record that an enlarged panel of a figure shows.
 
     Attributes
     ----------
     name
         Name of the interval.
     samples
-        Range of samples.
+        Range of the interval's samples.
     first_s, last_s
-        Its ends in the record's time.
+        Time of the first and last sample in the record.
     """
 
     name: str
@@ -54,130 +59,147 @@ class Moment:
     last_s: float
 
 
-def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
-    """Return the intervals of strongest vibration, one for each mode that the sampling shows."""
+def resonance_intervals(record: Record, count: int) -> tuple[RecordInterval, ...]:
+    """Return the interval in which each mode below the Nyquist frequency vibrates most."""
     duration_s = len(record.time_s) / record.rate_hz
-    moments = []
+    intervals = []
     modes_hz = undamped_frequencies_rad_s(record.beam, count) / (2 * math.pi)
     for number, frequency_hz in enumerate(modes_hz.tolist(), start=1):
         if frequency_hz >= record.rate_hz / 2:
             break
         centre_s = loudest_moment_s(record.torque_nm, record.rate_hz, frequency_hz)
-        length_s = min(_PERIODS_SHOWN / frequency_hz, _LARGEST_FRACTION * duration_s)
-        length_s = max(length_s, _SHORTEST_S)
+        length_s = min(_PERIODS_SHOWN / frequency_hz, _MOST_DETAIL_FRACTION * duration_s)
+        length_s = max(length_s, _LEAST_DETAIL_S)
         samples = min(round(length_s * record.rate_hz), len(record.time_s))
-        first = round((centre_s - length_s / 2) * record.rate_hz)
-        first = min(max(first, 0), len(record.time_s) - samples)
-        block = slice(first, first + samples)
-        times_s = record.time_s[block]
-        moments.append(
-            Moment(
+        first_sample = round((centre_s - length_s / 2) * record.rate_hz)
+        first_sample = min(max(first_sample, 0), len(record.time_s) - samples)
+        sample_range = slice(first_sample, first_sample + samples)
+        times_s = record.time_s[sample_range]
+        intervals.append(
+            RecordInterval(
                 name=f"Mode {number}, {frequency_hz:.3g} Hz",
-                samples=block,
+                samples=sample_range,
                 first_s=float(times_s[0]),
                 last_s=float(times_s[-1]),
             )
         )
-    return tuple(moments)
+    return tuple(intervals)
 
 
-def mark(axes: Axes, moments: tuple[Moment, ...]) -> None:
-    """Shade the intervals in the panel of the whole record, numbered from 1."""
-    for number, moment in enumerate(moments, start=1):
-        axes.axvspan(moment.first_s, moment.last_s, color=style.SHADE, linewidth=0, zorder=0)
+def shade_intervals(axes: Axes, intervals: tuple[RecordInterval, ...]) -> None:
+    """Shade time intervals in the panel of the whole record and number them from 1."""
+    for number, interval in enumerate(intervals, start=1):
+        axes.axvspan(
+            interval.first_s, interval.last_s, color=style.SHADE_COLOR, linewidth=0, zorder=0
+        )
         axes.text(
-            (moment.first_s + moment.last_s) / 2, 1.01, str(number),
+            (interval.first_s + interval.last_s) / 2, 1.01, str(number),
             transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=7.5,
             color="#8A7A4A",
         )  # fmt: skip
 
 
-def enlarge(axes: Axes, number: int, moment: Moment) -> None:
-    """Turn a panel into the enlargement of one interval, numbered like its mark."""
-    axes.set_title(f"{number}  {moment.name}", fontsize=8.5, fontweight="normal")
-    axes.set_xlim(moment.first_s, moment.last_s)
+def set_up_detail(axes: Axes, number: int, interval: RecordInterval) -> None:
+    """Set title and time axis of an enlarged panel, with the number of its interval."""
+    axes.set_title(f"{number}  {interval.name}", fontsize=8.5, fontweight="normal")
+    axes.set_xlim(interval.first_s, interval.last_s)
     axes.set_facecolor("#FCFAF4")
 
 
 @dataclass(frozen=True, slots=True)
 class TorqueInBand:
-    """Coupling torque in the band of a fit, in N·m, shape (n,) each."""
+    """Measured and modelled coupling torque in the band of a fit, in N·m, shape (n,) each."""
 
     measured: NDArray[np.float64]
     modelled: NDArray[np.float64]
 
     @property
     def residual(self) -> NDArray[np.float64]:
-        """Measured minus modelled torque."""
+        """Difference of measured and modelled torque in N·m, shape (n,)."""
         return self.measured - self.modelled
 
 
 def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float) -> TorqueInBand:
-    """Measured torque, and that of a model for the measured angle, up to `highest_hz`.
+    """Return the measured torque and the model's, limited to frequencies up to `highest_hz`.
 
-    Beyond it the measured torque is noise and the modelled one the encoder's quantisation.
+    The model's torque is computed from the measured angle. Above the limit the measured torque is
+    noise, and the model's torque is the encoder's quantisation.
     """
     angle = Measurement.of_record(record).angle_from_rest(highest_hz)
-    everything = slice(0, angle.size)
+    all_samples = slice(0, angle.size)
     band_hz = (0.0, highest_hz)
-    modelled, _ = TorquePredictor(
-        band_limited(angle, record.rate_hz, band_hz), record.rate_hz, everything
+    modelled_nm, _ = TorquePredictor(
+        band_limited(angle, record.rate_hz, band_hz), record.rate_hz, all_samples
     ).torque(plant)
-    offset = float(np.mean(record.torque_nm - modelled))
+    offset = float(np.mean(record.torque_nm - modelled_nm))
     return TorqueInBand(
         measured=band_limited(record.torque_nm - offset, record.rate_hz, band_hz),
-        modelled=modelled,
+        modelled=modelled_nm,
     )
 
 
 def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figure:
-    """Draw angle, torque (measured and modelled) and residual, with a detail of every mode.
+    """Draw the angle, the measured and modelled torque and their difference.
+
+    Below, the torques and their difference are enlarged at each mode.
 
     Parameters
     ----------
     record : Record
+        Record of angle and torque.
     model : ShownModel
-        With the modes that are enlarged.
+        Model of the torque, with the modes that get an enlarged panel.
     highest_hz : float
-        End of the band that was compared.
+        Highest frequency of the fit's band.
     """
     torque = torque_in_band(record, model.transfer, highest_hz)
-    found = replace(record, beam=model.beam.plant.beam)
+    record_of_fitted_beam = replace(record, beam=model.beam.plant.beam)
     modes = {mode.number: mode for mode in model.modes}
-    moments = tuple(
-        replace(moment, name=f"Mode {number}, {modes[number].frequency_hz:.4g} Hz")
-        for number, moment in enumerate(resonance_moments(found, max(modes, default=0)), start=1)
+    intervals = tuple(
+        replace(interval, name=f"Mode {number}, {modes[number].frequency_hz:.4g} Hz")
+        for number, interval in enumerate(
+            resonance_intervals(record_of_fitted_beam, max(modes, default=0)), start=1
+        )
         if number in modes
     )
     figure = style.new_figure(9.0, 6.8)
     grid = figure.add_gridspec(
-        2, len(moments) or 1, left=0.095, right=0.985, top=0.91, bottom=0.07, hspace=0.3,
+        2, len(intervals) or 1, left=0.095, right=0.985, top=0.91, bottom=0.07, hspace=0.3,
         wspace=0.25, height_ratios=(4.0, 1.2),
     )  # fmt: skip
-    upper = grid[0, :].subgridspec(3, 1, hspace=0.4, height_ratios=(1.1, 1.3, 0.8))
-    angle, whole, rest = (figure.add_subplot(upper[row]) for row in range(3))
-    of_angle = (
+    upper_grid = grid[0, :].subgridspec(3, 1, hspace=0.4, height_ratios=(1.1, 1.3, 0.8))
+    angle, torque_axes, residual = (figure.add_subplot(upper_grid[row]) for row in range(3))
+    angle_lines = (
         (1e3 * record.reference_rad, {"color": style.ORANGE, "label": "reference angle"}),
-        (1e3 * record.angle_rad, _THIN | {"color": style.PURPLE, "label": "measured angle"}),
+        (1e3 * record.angle_rad, _ANGLE_LINE | {"color": style.PURPLE, "label": "measured angle"}),
     )
-    of_torque = (
-        (torque.measured, _MEASURED | {"label": "measured torque"}),
-        (torque.modelled, _MODELLED | {"label": "modelled torque"}),
+    torque_lines = (
+        (torque.measured, _MEASURED_LINE | {"label": "measured torque"}),
+        (torque.modelled, _MODELLED_LINE | {"label": "modelled torque"}),
     )
-    _whole(angle, record, of_angle, "Motor angle", _ANGLE, pad=14)
-    _whole(whole, record, of_torque, "Coupling torque", _TORQUE)
-    _whole(rest, record, ((torque.residual, _RESIDUAL),), _LEFT, _TORQUE)
-    rest.set_xlabel("Time (s)", labelpad=1)
-    for axes in (angle, whole, rest):
-        axes.tick_params(labelbottom=axes is rest)
-    mark(angle, moments)
-    compared = (torque.measured, torque.modelled, torque.residual)
-    for column, moment in enumerate(moments):
+    _draw_whole_record(angle, record, angle_lines, "Motor angle", _ANGLE_LABEL, pad=14)
+    _draw_whole_record(torque_axes, record, torque_lines, "Coupling torque", _TORQUE_LABEL)
+    _draw_whole_record(
+        residual, record, ((torque.residual, _RESIDUAL_LINE),), _RESIDUAL_TITLE, _TORQUE_LABEL
+    )
+    residual.set_xlabel("Time (s)", labelpad=1)
+    for axes in (angle, torque_axes, residual):
+        axes.tick_params(labelbottom=axes is residual)
+    shade_intervals(angle, intervals)
+    detail_signals = (torque.measured, torque.modelled, torque.residual)
+    for column, interval in enumerate(intervals):
         axes = figure.add_subplot(grid[1, column])
         axes.xaxis.set_major_locator(MaxNLocator(4))
-        _detail(axes, record, zip(compared, _CLOSE, strict=True), column, moment, _TORQUE)
+        _draw_detail(
+            axes,
+            record,
+            zip(detail_signals, _DETAIL_LINES, strict=True),
+            column,
+            interval,
+            _TORQUE_LABEL,
+        )
         axes.set_xlabel("Time (s)", labelpad=1)
-    handles = [handle for axes in (angle, whole, rest) for handle in axes.get_lines()]
+    handles = [handle for axes in (angle, torque_axes, residual) for handle in axes.get_lines()]
     figure.legend(
         handles, [str(handle.get_label()) for handle in handles], loc="upper right",
         bbox_to_anchor=(0.985, 0.995), ncols=5, borderaxespad=0.0,
@@ -185,54 +207,66 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
     return figure
 
 
-_ANGLE: Final = "Angle (mrad)"
-_TORQUE: Final = "Torque (N·m)"
-_LEFT: Final = "Residual, measured − modelled"
-_THIN: Final[LineStyle] = {"linewidth": 0.7}
-_MEASURED: Final[LineStyle] = {"color": style.GREY, "linewidth": 1.0}
-_MODELLED: Final[LineStyle] = {"color": style.BLUE, "linewidth": 0.6}
-_RESIDUAL: Final[LineStyle] = {"color": style.VERMILION, "linewidth": 0.7, "label": "residual"}
-_CLOSE: Final[tuple[LineStyle, ...]] = (
+_ANGLE_LABEL: Final = "Angle (mrad)"
+"""Label of the angle's axis."""
+_TORQUE_LABEL: Final = "Torque (N·m)"
+"""Label of the torque's axis."""
+_RESIDUAL_TITLE: Final = "Residual, measured − modelled"
+"""Title of the residual's panel."""
+_ANGLE_LINE: Final[LineStyle] = {"linewidth": 0.7}
+"""Style of the measured angle."""
+_MEASURED_LINE: Final[LineStyle] = {"color": style.GREY, "linewidth": 1.0}
+"""Style of the measured torque over the whole record."""
+_MODELLED_LINE: Final[LineStyle] = {"color": style.BLUE, "linewidth": 0.6}
+"""Style of the modelled torque over the whole record."""
+_RESIDUAL_LINE: Final[LineStyle] = {"color": style.VERMILION, "linewidth": 0.7, "label": "residual"}
+"""Style of the residual over the whole record."""
+_DETAIL_LINES: Final[tuple[LineStyle, ...]] = (
     {"color": style.GREY, "linewidth": 2.6},
     {"color": style.BLUE, "linewidth": 1.0},
     {"color": style.VERMILION, "linewidth": 0.8},
 )
-"""Measured and modelled torque and residual, in a detail."""
+"""Styles of measured torque, modelled torque and residual in an enlarged panel."""
 
 
-def _whole(
+def _draw_whole_record(
     axes: Axes,
     record: Record,
-    lines: Iterable[NoiseLine],
+    lines: Iterable[StyledSignal],
     title: str,
     label: str,
     pad: float | None = None,
 ) -> None:
     """Draw signals over the whole record."""
-    drawn = tuple(lines)
-    for values, line_style in drawn:
+    decimated_line = tuple(lines)
+    for values, line_style in decimated_line:
         axes.plot(*style.envelope(record.time_s, values), **line_style)
     axes.set_title(title, pad=pad)
     axes.set_ylabel(label)
-    axes.set_ylim(style.limits(*(values for values, _ in drawn)))
+    axes.set_ylim(style.limits(*(values for values, _ in decimated_line)))
     axes.set_xlim(record.time_s[0], record.time_s[-1])
 
 
-def _detail(
-    axes: Axes, record: Record, lines: Iterable[NoiseLine], column: int, moment: Moment, label: str
+def _draw_detail(
+    axes: Axes,
+    record: Record,
+    lines: Iterable[StyledSignal],
+    column: int,
+    interval: RecordInterval,
+    label: str,
 ) -> None:
-    """Draw one interval of signals; the first panel of a row has the legend."""
+    """Draw signals in the enlarged panel of one interval. The first panel of a row has a legend."""
     for values, line_style in lines:
-        axes.plot(record.time_s[moment.samples], values[moment.samples], **line_style)
-    enlarge(axes, column + 1, moment)
+        axes.plot(record.time_s[interval.samples], values[interval.samples], **line_style)
+    set_up_detail(axes, column + 1, interval)
     if column == 0:
         axes.set_ylabel(label)
 
 
 def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
-    """Draw (a) angles and (b) torque: the whole record, and details where each mode rings most."""
+    """Draw angles (a) and torque (b) over the whole record and enlarged at each mode."""
     record = analysis.record
-    moments = resonance_moments(record, len(analysis.peaks))
+    intervals = resonance_intervals(record, len(analysis.peaks))
     sweep_s = record.sweep_samples / record.rate_hz
     parts = [
         record.metadata.get("excitation", "record"),
@@ -243,81 +277,93 @@ def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
     if record.gaps.missing_ticks:
         parts.append(f"{record.gaps.missing_ticks} missing ticks interpolated")
     figure = style.new_figure(13.0, 8.0, "Signals", "  ·  ".join(parts))
-    columns = max(len(moments), 1)
+    columns = max(len(intervals), 1)
     grid = figure.add_gridspec(
         4, columns, left=0.06, right=0.985, top=0.88, bottom=0.065, hspace=0.58, wspace=0.17,
         height_ratios=(1.25, 1.0, 1.25, 1.0),
     )  # fmt: skip
     reference_mrad, angle_mrad = 1e3 * record.reference_rad, 1e3 * record.angle_rad
     angle, torque = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[2, :])
-    of_angle = (
+    angle_lines = (
         (reference_mrad, {"color": style.ORANGE, "label": "reference"}),
-        (angle_mrad, _THIN | {"color": style.BLUE, "label": "measured"}),
+        (angle_mrad, _ANGLE_LINE | {"color": style.BLUE, "label": "measured"}),
     )
-    _whole(angle, record, of_angle, "(a) Motor angle", _ANGLE, pad=14)
+    _draw_whole_record(angle, record, angle_lines, "(a) Motor angle", _ANGLE_LABEL, pad=14)
     angle.legend(loc="lower right", bbox_to_anchor=(1.0, 1.07), ncols=2, borderaxespad=0.0)
-    green = {"color": style.GREEN}
-    of_torque = ((record.torque_nm, _THIN | green),)
-    _whole(torque, record, of_torque, "(b) Coupling torque", _TORQUE, pad=14)
+    green_line = {"color": style.GREEN}
+    torque_lines = ((record.torque_nm, _ANGLE_LINE | green_line),)
+    _draw_whole_record(torque, record, torque_lines, "(b) Coupling torque", _TORQUE_LABEL, pad=14)
     for axes in (angle, torque):
         axes.set_xlabel("Time (s)", labelpad=1)
-        mark(axes, moments)
-    near = ((reference_mrad, {"color": style.ORANGE}), (angle_mrad, {"color": style.BLUE}))
-    for column, moment in enumerate(moments):
-        above = figure.add_subplot(grid[1, column])
-        _detail(above, record, near, column, moment, _ANGLE)
-        below = figure.add_subplot(grid[3, column])
-        line_style = green | {"linewidth": 0.9}
-        _detail(below, record, ((record.torque_nm, line_style),), column, moment, _TORQUE)
-        below.set_xlabel("Time (s)", labelpad=1)
+        shade_intervals(axes, intervals)
+    detail_angle_lines = (
+        (reference_mrad, {"color": style.ORANGE}),
+        (angle_mrad, {"color": style.BLUE}),
+    )
+    for column, interval in enumerate(intervals):
+        angle_detail = figure.add_subplot(grid[1, column])
+        _draw_detail(angle_detail, record, detail_angle_lines, column, interval, _ANGLE_LABEL)
+        torque_detail = figure.add_subplot(grid[3, column])
+        line_style = green_line | {"linewidth": 0.9}
+        _draw_detail(
+            torque_detail,
+            record,
+            ((record.torque_nm, line_style),),
+            column,
+            interval,
+            _TORQUE_LABEL,
+        )
+        torque_detail.set_xlabel("Time (s)", labelpad=1)
     return figure
 
 
 def best_model(analysis: WelchAnalysis) -> FittedModel:
-    """Model with the lowest WMSE, the index by which the paper prefers one."""
+    """Return the fitted model with the lowest WMSE, by which the paper selects a model."""
     return min(analysis.models, key=lambda model: model.indices.wmse)
 
 
 def torque_figure(analysis: WelchAnalysis) -> Figure:
-    """Draw the measured torque, the modelled one and their difference, with details at the modes.
+    """Draw measured and modelled torque and their difference, also enlarged at each mode.
 
-    All three are limited to frequencies up to the band's end: beyond it the measured torque is
-    noise and the modelled one the encoder's quantisation.
+    All three are limited to frequencies up to the band's end. Above it the measured torque is
+    noise, and the modelled torque is the encoder's quantisation.
     """
     record = analysis.record
     model = best_model(analysis)
     band_hz = (0.0, analysis.settings.band_hz[1])
-    modelled = band_limited(modelled_torque(record, model.fit.damping), record.rate_hz, band_hz)
-    measured = band_limited(record.torque_nm, record.rate_hz, band_hz)
-    residual = measured - modelled
-    residual_fraction = _rms(residual) / _rms(measured) if measured.any() else np.nan
+    modelled_nm = band_limited(modelled_torque(record, model.fit.damping), record.rate_hz, band_hz)
+    measured_nm = band_limited(record.torque_nm, record.rate_hz, band_hz)
+    residual_nm = measured_nm - modelled_nm
+    residual_fraction = _rms(residual_nm) / _rms(measured_nm) if measured_nm.any() else np.nan
     figure = style.new_figure(
         13.0, 8.0, "Torque, measured and modelled",
         f"type {model.fit.structure.name}, weights {model.fit.weighting} (lowest WMSE)  ·  exact "
         f"model's response to the measured angle  ·  0 to {band_hz[1]:g} Hz  ·  residual "
-        f"{1e3 * _rms(residual):.3g} mN·m rms, {100 * residual_fraction:.3g} % of the torque, the "
-        "bias of Welch's estimate included",
+        f"{1e3 * _rms(residual_nm):.3g} mN·m rms, {100 * residual_fraction:.3g} % of the torque, "
+        "the bias of Welch's estimate included",
     )  # fmt: skip
-    moments = resonance_moments(record, len(analysis.peaks))
+    intervals = resonance_intervals(record, len(analysis.peaks))
     grid = figure.add_gridspec(
-        2, max(len(moments), 1), left=0.06, right=0.985, top=0.87, bottom=0.065, hspace=0.28,
+        2, max(len(intervals), 1), left=0.06, right=0.985, top=0.87, bottom=0.065, hspace=0.28,
         wspace=0.17, height_ratios=(1.7, 1.0),
     )  # fmt: skip
-    whole = grid[0, :].subgridspec(2, 1, hspace=0.2, height_ratios=(1.7, 1.0))
-    top, middle = figure.add_subplot(whole[0]), figure.add_subplot(whole[1])
-    of_torque = ((measured, _MEASURED), (modelled, _MODELLED))
-    _whole(top, record, of_torque, "Whole record", _TORQUE, pad=14)
+    upper_grid = grid[0, :].subgridspec(2, 1, hspace=0.2, height_ratios=(1.7, 1.0))
+    top, residual_axes = figure.add_subplot(upper_grid[0]), figure.add_subplot(upper_grid[1])
+    torque_lines = ((measured_nm, _MEASURED_LINE), (modelled_nm, _MODELLED_LINE))
+    _draw_whole_record(top, record, torque_lines, "Whole record", _TORQUE_LABEL, pad=14)
     top.tick_params(labelbottom=False)
-    _whole(middle, record, ((residual, _RESIDUAL),), _LEFT, _TORQUE)
-    middle.set_xlabel("Time (s)", labelpad=1)
-    mark(top, moments)
-    styles = (_CLOSE[0], _CLOSE[1] | {"linewidth": 1.1}, _CLOSE[2])
-    close = tuple(zip((measured, modelled, residual), styles, strict=True))
-    for column, moment in enumerate(moments):
+    _draw_whole_record(
+        residual_axes, record, ((residual_nm, _RESIDUAL_LINE),), _RESIDUAL_TITLE, _TORQUE_LABEL
+    )
+    residual_axes.set_xlabel("Time (s)", labelpad=1)
+    shade_intervals(top, intervals)
+    styles = (_DETAIL_LINES[0], _DETAIL_LINES[1] | {"linewidth": 1.1}, _DETAIL_LINES[2])
+    detail_lines = tuple(zip((measured_nm, modelled_nm, residual_nm), styles, strict=True))
+    for column, interval in enumerate(intervals):
         axes = figure.add_subplot(grid[1, column])
-        _detail(axes, record, close, column, moment, _TORQUE)
+        _draw_detail(axes, record, detail_lines, column, interval, _TORQUE_LABEL)
         axes.set_xlabel("Time (s)", labelpad=1)
-    handles = [*top.get_lines()[:2], middle.get_lines()[0]]
+    handles = [*top.get_lines()[:2], residual_axes.get_lines()[0]]
     figure.legend(
         handles, ["measured", "modelled", "residual"], loc="upper right",
         bbox_to_anchor=(0.985, 0.925), ncols=3, borderaxespad=0.0,
@@ -326,4 +372,5 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
 
 
 def _rms(values: np.ndarray) -> float:
+    """Return the root mean square of values."""
     return float(np.sqrt(np.mean(values**2)))

@@ -1,6 +1,6 @@
-"""Style of figures: palette, fonts, axes, and lines decimated to the pixels.
+"""Style of figures: colours, fonts and axes, and lines decimated to the resolution of a screen.
 
-The palette is Okabe and Ito's, distinguishable with any common colour blindness; lines that lie on
+The colours are Okabe and Ito's, distinguishable with any common colour blindness. Lines that lie on
 each other differ in dash as well as in colour.
 """
 
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
     from analysis.results import FigureFormat
 
-# Of its cache of fonts, which is slow to make or just being made by another process: no figure
-# suffers, and it means nothing to the reader of a log.
+# This hides messages about the font cache, which is slow to build or is being built by another
+# process. They affect no figure and mean nothing to the reader of a log.
 logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
 
 BLUE: Final = "#0072B2"
@@ -50,32 +50,43 @@ GREEN: Final = "#009E73"
 PURPLE: Final = "#CC79A7"
 ORANGE: Final = "#E69F00"
 INK: Final = "#222222"
+"""Colour of titles, labels and points."""
 GREY: Final = "#808080"
+"""Colour of measured curves."""
 FAINT: Final = "#D2D2D2"
-SHADE: Final = "#F0E9D8"
+"""Colour of secondary lines, such as the ratio of transforms behind Welch's estimate."""
+SHADE_COLOR: Final = "#F0E9D8"
+"""Colour of shaded areas, such as the range of white noise."""
 
 DPI: Final = 150
-_COMPRESSION: Final = 1
-_VECTOR: Final[dict[Any, Any]] = {
+"""Resolution of PNG figures, in dots per inch."""
+_PNG_COMPRESSION_LEVEL: Final = 1
+"""Compression level of PNG figures: fast, with a tenth more bytes for a quarter of the time."""
+_VECTOR_FORMAT_SETTINGS: Final[dict[Any, Any]] = {
     "svg.fonttype": "none", "svg.hashsalt": "rigd", "pdf.fonttype": 42,
 }  # fmt: skip
-_NO_METADATA: Final = {
+"""Matplotlib's settings for SVG and PDF: text stays text, and identifiers are the same each time.
+"""
+_OMITTED_METADATA: Final = {
     "svg": dict.fromkeys(("Creator", "Date", "Format", "Type")),
     "pdf": dict.fromkeys(("Creator", "CreationDate", "Producer")),
 }
-COLUMNS: Final = 1000
-"""Columns into which a line is decimated: as many as a full-width panel has pixels on a screen."""
+"""Metadata that is omitted from SVG and PDF, so that the same figure gives the same file."""
+SCREEN_COLUMNS: Final = 1000
+"""Number of columns into which a line is decimated: the pixels of a full-width panel on a screen.
+"""
 
 _FREQUENCY_TICKS_HZ: Final = tuple(
     digit * 10.0**decade for decade in range(-4, 5) for digit in (1, 2, 5)
 )
-_RC: Final[dict[Any, Any]] = {
+"""Frequencies with a tick label on a logarithmic axis, in hertz."""
+_MATPLOTLIB_SETTINGS: Final[dict[Any, Any]] = {
     "font.size": 8.5,
     "axes.titlesize": 9.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
-    # The default position, as no axis is on top: the search for labels in the way takes a tenth of
-    # all drawing.
+    # The default position. No axis is on top, and the search for overlapping labels takes a tenth
+    # of the drawing time.
     "axes.titley": 1.0,
     "axes.labelcolor": INK,
     "axes.edgecolor": "#9A9A9A",
@@ -97,21 +108,22 @@ _RC: Final[dict[Any, Any]] = {
     "path.simplify_threshold": 0.25,
     "agg.path.chunksize": 20000,
 }
+"""Matplotlib's settings for fonts, axes and lines of all figures."""
 
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Context in which figures are made and saved in this style."""
-    with rc_context(_RC), warnings.catch_warnings():
+    """Provide a context in which figures are made and saved in the style of this module."""
+    with rc_context(_MATPLOTLIB_SETTINGS), warnings.catch_warnings():
         # A file name may hold characters that the font lacks; a box in a title does no harm.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         yield
 
 
 def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str = "") -> Figure:
-    """Figure on the Agg canvas with a bold title and a grey line under it, small enough to fit.
+    """Return an empty figure with a bold title and a grey subtitle, which are shrunk to fit.
 
-    A figure that goes into a paper has none of either: its caption says what is seen.
+    A figure for a paper has no title and no subtitle, because its caption says what is seen.
     """
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
@@ -119,12 +131,12 @@ def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str
         return figure
     left, top = 0.35 / width_in, 1.0 - 0.17 / height_in
     # A file name may hold dollar signs, which are not mathematics, and bytes that are not text.
-    common: dict[str, Any] = {"va": "top", "parse_math": False}
-    title, subtitle = (each.encode("utf-8", "replace").decode() for each in (title, subtitle))
+    text_options: dict[str, Any] = {"va": "top", "parse_math": False}
+    title, subtitle = (line.encode("utf-8", "replace").decode() for line in (title, subtitle))
     for text in (
-        figure.text(left, top, title, fontsize=12, fontweight="bold", color=INK, **common),
+        figure.text(left, top, title, fontsize=12, fontweight="bold", color=INK, **text_options),
         figure.text(
-            left, top - 0.26 / height_in, subtitle, fontsize=8.5, color="#606060", **common
+            left, top - 0.26 / height_in, subtitle, fontsize=8.5, color="#606060", **text_options
         ),
     ):
         width_fraction = text.get_window_extent().width / (DPI * width_in)
@@ -136,18 +148,18 @@ def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure of a page.
+    """Image of a figure on a page of a report.
 
     Attributes
     ----------
     name : str
-        Name of its file, without the ending.
+        Name of the image file without its suffix.
     description : str
-        Alternative text, and caption.
+        Text that is used as caption and as alternative text.
     png : bytes
-        Content of its file.
+        Content of the PNG file.
     svg : bytes or None
-        The same as SVG, if there is one.
+        Content of the SVG file; None if there is none.
     """
 
     name: str
@@ -157,63 +169,70 @@ class Picture:
 
     @property
     def source(self) -> str:
-        """The figure itself, as a data URL.
+        """Image as a data URL, for an HTML page.
 
-        SVG, which can be searched and is sharp on paper, but of a figure with very many strokes,
-        such as many sessions' responses.
+        It is the SVG image, which can be searched and is sharp on paper. It is the PNG image if the
+        SVG image is more than twice as large, as with many sessions' responses.
         """
-        kind, content = "png", self.png
+        image_format, content = "png", self.png
         if self.svg is not None and len(self.svg) < 2 * len(self.png):
-            kind, content = "svg+xml", self.svg
-        return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
+            image_format, content = "svg+xml", self.svg
+        return f"data:image/{image_format};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def rendered(figure: Figure, kind: FigureFormat) -> bytes:
-    """Render a figure as PNG, SVG or PDF; within `styled`.
+def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
+    """Return a figure as the bytes of a PNG, SVG or PDF file; call it within `styled`.
 
     Parameters
     ----------
     figure : Figure
-    kind : {"png", "svg", "pdf"}
-        SVG has its text as text, and the same identifiers each time; PDF embeds TrueType fonts,
-        as journals ask for.
+        Figure to render.
+    file_format : {"png", "svg", "pdf"}
+        Format of the file. SVG contains text as text, and the same identifiers each time. PDF
+        embeds TrueType fonts, as journals require.
     """
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             if not axis.get_label_text():
-                # Else it is placed clear of the ticks, which are laid out twice more for it.
+                # Otherwise the empty label is placed clear of the ticks: two more layouts.
                 axis.set_label_coords(0, 0)
     buffer = io.BytesIO()
-    if kind == "png":
+    if file_format == "png":
         # Fast compression: a tenth more bytes for a quarter of the time.
-        figure.savefig(buffer, format=kind, dpi=DPI, pil_kwargs={"compress_level": _COMPRESSION})
+        figure.savefig(
+            buffer,
+            format=file_format,
+            dpi=DPI,
+            pil_kwargs={"compress_level": _PNG_COMPRESSION_LEVEL},
+        )
     else:
-        with rc_context(_VECTOR):
-            figure.savefig(buffer, format=kind, metadata=_NO_METADATA[kind])
+        with rc_context(_VECTOR_FORMAT_SETTINGS):
+            figure.savefig(buffer, format=file_format, metadata=_OMITTED_METADATA[file_format])
     return buffer.getvalue()
 
 
 def save(figure: Figure, path: Path) -> bytes:
-    """Write a figure in the format that the ending of its file names; within `styled`.
+    """Write a figure in the format of the file's suffix; call it within `styled`.
 
     Parameters
     ----------
     figure : Figure
+        Figure to write.
     path : Path
-        A new file.
+        New file, with the suffix of a figure format.
 
     Returns
     -------
     bytes
-        What was written.
+        Content of the file.
 
     Raises
     ------
     OutputError
-        If it cannot be written, or is there already.
+        If the file exists or cannot be written.
     """
-    (kind,) = (each for each in FIGURE_FORMATS if path.suffix == f".{each}")
-    content = rendered(figure, kind)
+    (file_format,) = (name for name in FIGURE_FORMATS if path.suffix == f".{name}")
+    content = render_figure(figure, file_format)
     write_new(path, content)
     return content
 
@@ -221,52 +240,60 @@ def save(figure: Figure, path: Path) -> bytes:
 def save_picture(
     figure: Figure, stem: Path, description: str, formats: Collection[FigureFormat]
 ) -> Picture:
-    """Write a figure in several formats, and return it for a page; within `styled`.
+    """Write a figure in several formats and return it for a page; call it within `styled`.
 
     Parameters
     ----------
     figure : Figure
+        Figure to write.
     stem : Path
-        New files without their endings.
+        Path of the new files without their suffixes.
     description : str
-        What is seen in it.
+        Caption of the picture.
     formats : collection of str
+        Formats of the files. PNG and SVG are rendered for the page in any case.
 
     Raises
     ------
     OutputError
-        If one cannot be written, or is there already.
+        If a file exists or cannot be written.
     """
-    wanted: set[FigureFormat] = {"png", "svg", *formats}
-    content = {kind: rendered(figure, kind) for kind in FIGURE_FORMATS if kind in wanted}
-    for kind in formats:
-        # A name may have its own dots.
-        write_new(stem.with_name(f"{stem.name}.{kind}"), content[kind])
+    file_formats: set[FigureFormat] = {"png", "svg", *formats}
+    content = {
+        file_format: render_figure(figure, file_format)
+        for file_format in FIGURE_FORMATS
+        if file_format in file_formats
+    }
+    for file_format in formats:
+        # The suffix is appended, because a name may contain dots.
+        write_new(stem.with_name(f"{stem.name}.{file_format}"), content[file_format])
     return Picture(stem.name, description, content["png"], content["svg"])
 
 
 def envelope(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
-    columns: int = COLUMNS,
+    columns: int = SCREEN_COLUMNS,
     *,
     logarithmic: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Decimate a line to the minimum and maximum in each of `columns` equal parts of its axis.
+    """Return a line decimated to its minimum and maximum in each of `columns` equal intervals of x.
 
     Parameters
     ----------
     x : ndarray, shape (n,)
-        Increasing; positive if `logarithmic`.
+        Increasing values; positive if `logarithmic`.
     y : ndarray, shape (n,)
+        Values of the line.
     columns : int
+        Number of intervals.
     logarithmic : bool
-        Whether the axis of x is.
+        Whether the intervals are equal in log x, for a logarithmic axis.
 
     Returns
     -------
     x, y : ndarray, shape (m,)
-        The line itself if it has no more than two points a column.
+        Decimated line; the line itself if it has at most two points per column.
     """
     if len(x) <= 2 * columns:
         return x, y
@@ -279,8 +306,11 @@ def envelope(
     return np.repeat(x[starts], 2), pairs.ravel()
 
 
-def spread(x: NDArray[np.float64], count: int) -> NDArray[np.intp]:
-    """Pick at most `count` points of a positive, increasing x, evenly over its logarithm."""
+def log_spaced_indices(x: NDArray[np.float64], count: int) -> NDArray[np.intp]:
+    """Return the indices of at most `count` values of x that are evenly spaced in log x.
+
+    x is positive and increasing.
+    """
     targets = np.geomspace(x[0], x[-1], count)
     return np.unique(np.clip(np.searchsorted(x, targets), 0, len(x) - 1))
 
@@ -293,7 +323,7 @@ def dots(
     size_pt: float,
     color: str,
 ) -> None:
-    """Draw points as one stroke with round caps, which SVG writes in a third of markers' time."""
+    """Draw points as one line with round caps, which SVG writes faster than markers."""
     corners = np.repeat(np.column_stack([x, y]), 2, axis=0)
     corners[1::2, 0] *= 1 + 1e-9  # Agg draws no caps where nothing lies between them
     codes = np.tile([Outline.MOVETO, Outline.LINETO], len(x))
@@ -305,7 +335,7 @@ def dots(
 
 
 def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, labels: bool = True) -> None:
-    """Logarithmic frequency axis over a band, with plain numbers at 1, 2 and 5."""
+    """Make the horizontal axis a logarithmic frequency axis, with labels at 1, 2 and 5."""
     axes.set_xscale("log")
     axes.set_xlim(band_hz)
     axes.xaxis.set_major_locator(
@@ -319,7 +349,10 @@ def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, labels: bool = T
 
 
 def response_axes(magnitude: Axes, phase: Axes, *, labels: bool = True) -> None:
-    """Label the axes of a torque over an angle; its phase lies between 0 and 180°, well inside."""
+    """Label the axes of a frequency response, and set the range of the phase.
+
+    The phase of torque over angle is from 0 to 180°, well inside the range.
+    """
     phase.set_ylim(-60, 240)
     phase.set_yticks((0, 90, 180))
     if labels:
@@ -334,12 +367,12 @@ def type_panels(
     band_hz: tuple[float, float],
     db_limits: tuple[float, float],
 ) -> Iterator[tuple[str, Axes, Axes]]:
-    """Make a panel of magnitude and phase for each model type, in the first cells of a grid."""
+    """Yield each model type with new axes for magnitude and phase, in the first cells of a grid."""
     for number, name in enumerate(types):
         row, column = divmod(number, cells.ncols)
-        cell = cells[row, column].subgridspec(2, 1, height_ratios=(2.3, 1.0), hspace=0.07)
-        magnitude, phase = figure.add_subplot(cell[0]), figure.add_subplot(cell[1])
-        symbols = ", ".join(QUANTITIES[each][0] for each in STRUCTURES[name].free)
+        subgrid = cells[row, column].subgridspec(2, 1, height_ratios=(2.3, 1.0), hspace=0.07)
+        magnitude, phase = figure.add_subplot(subgrid[0]), figure.add_subplot(subgrid[1])
+        symbols = ", ".join(QUANTITIES[parameter][0] for parameter in STRUCTURES[name].free)
         magnitude.set_title(f"({ascii_lowercase[number]}) Type {name}   {symbols}")
         magnitude.set_ylim(db_limits)
         response_axes(magnitude, phase, labels=column == 0)
@@ -353,20 +386,23 @@ def type_panels(
 def db_limits(
     measured: Sequence[NDArray[np.complex128]],
     models: Sequence[NDArray[np.complex128]],
-    room_db: float,
+    headroom_db: float,
 ) -> tuple[float, float]:
-    """Limits that hold measured responses and the models' peaks, not the depth of every zero."""
+    """Return magnitude limits in dB that contain the measured responses and the models' peaks.
+
+    The depth of narrow zeros is not included.
+    """
     measured_db = magnitude_db(np.concatenate(measured) + 1e-300)
     top_db = float(measured_db.max())
     peaks_db = max(float(magnitude_db(model).max()) for model in models)
     low_db = float(np.quantile(measured_db, 0.002)) - 4.0
-    return low_db, min(max(top_db, peaks_db), top_db + 15.0) + room_db
+    return low_db, min(max(top_db, peaks_db), top_db + 15.0) + headroom_db
 
 
 def legend(
     figure: Figure, handles: Sequence[Artist], names: Sequence[str] | None = None, *, columns: int
 ) -> Legend:
-    """Explain lines under the subtitle, by their labels or by names."""
+    """Add a legend under the subtitle of a figure and return it."""
     width_in, height_in = figure.get_size_inches()
     return figure.legend(
         handles=handles, labels=names, loc="upper left", ncols=columns, borderaxespad=0.0,
@@ -375,8 +411,8 @@ def legend(
 
 
 def limits(*values: NDArray[np.float64]) -> tuple[float, float]:
-    """Axis limits round all values with a margin on either side, never empty."""
+    """Return axis limits with a margin around all values. The limits always differ."""
     low = min(float(v.min()) for v in values)
     high = max(float(v.max()) for v in values)
-    pad = 0.06 * (high - low) or max(abs(high), 1e-12)
-    return low - pad, high + pad
+    margin = 0.06 * (high - low) or max(abs(high), 1e-12)
+    return low - margin, high + margin

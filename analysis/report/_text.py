@@ -1,4 +1,4 @@
-"""An analysis as text, for the terminal and for text files: verdict, tables, warnings."""
+"""Results of an analysis as text, for the terminal and for text files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.text import Text
 from analysis.identify.headline import EXACT_CONDITION, MISREAD
 from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
-from analysis.report.table import MARK, estimate, terminal_table
+from analysis.report.table import NOT_REPORTED_MARK, estimate_cells, terminal_table
 from analysis.suited import LEFT_OUT
 from rigd.printable import listed
 
@@ -26,213 +26,233 @@ if TYPE_CHECKING:
     from analysis.report.table import Table
     from analysis.results import RecordResult, WholeRecord
 
-_WIDTH: Final = 120
+_WIDTH_CHARACTERS: Final = 120
+"""Width of plain text in characters."""
 
 
-def as_text(shown: RenderableType) -> str:
-    """Return a renderable as plain text."""
-    console = Console(width=_WIDTH, color_system=None, force_terminal=False)
+def as_text(renderable: RenderableType) -> str:
+    """Return one of Rich's renderables as plain text."""
+    console = Console(width=_WIDTH_CHARACTERS, color_system=None, force_terminal=False)
     with console.capture() as capture:
-        console.print(shown)
+        console.print(renderable)
     return capture.get()
 
 
 def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
-    """Return what the terminal shows of one record.
+    """Return the terminal's text on one record: verdict, tables and warnings.
 
     Parameters
     ----------
     result : RecordResult
+        Results of one record.
     verbose : bool
-        Whether that is everything; otherwise the verdict, the modes and the parameters of damping
-        and beam, or without the whole record the Welch fits.
+        Whether all tables are included. Otherwise the text contains the verdict, the modes and the
+        parameters of damping and beam, or without a whole-record fit the Welch fits.
     """
-    whole, welch = result.whole, result.welch
-    shown: list[RenderableType] = []
-    if whole is not None:
-        shown.append(record_text(whole) if verbose else _main_results(whole))
-    if welch is not None and verbose:
-        shown.append(analysis_tables(result))
-    elif welch is not None:
-        if whole is None:
-            shown.append(Text(result.validity.sentence))
-            shown += spaced((fit_tables.welch_fits_table(welch),))
-        shown += _warnings(result.warnings)
+    whole_record, welch_analysis = result.whole, result.welch
+    parts: list[RenderableType] = []
+    if whole_record is not None:
+        parts.append(record_text(whole_record) if verbose else _main_results(whole_record))
+    if welch_analysis is not None and verbose:
+        parts.append(analysis_tables(result))
+    elif welch_analysis is not None:
+        if whole_record is None:
+            parts.append(Text(result.validity.sentence))
+            parts += with_empty_lines((fit_tables.welch_fits_table(welch_analysis),))
+        parts += _warning_lines(result.warnings)
     else:
         # The reason for missing Welch fits was reported before.
-        shown += _warnings(each for each in result.warnings if not each.startswith(LEFT_OUT))
-    return Group(*shown)
+        parts += _warning_lines(
+            warning for warning in result.warnings if not warning.startswith(LEFT_OUT)
+        )
+    return Group(*parts)
 
 
-_OF_RIG: Final = ("delay_s", "tool_inertia_kg_m2")
-"""Parameters that the verdict names where they are not as the file states them."""
+_RIG_PARAMETERS: Final = ("delay_s", "tool_inertia_kg_m2")
+"""Parameters of the rig, which the verdict names if they differ from the file's values."""
 
 
-def _main_results(whole: WholeRecord) -> RenderableType:
-    """Return the verdict, the modes, and the parameters under their condition."""
-    parameters = tables.parameters_table(whole)
-    names = tables.parameter_names(whole.headline)
-    rows = [row for name, row in zip(names, parameters.rows, strict=True) if name not in _OF_RIG]
-    # Room for one column of words.
-    spare = "meaning" if any(row["remark"] for row in rows) else "remark"
-    columns = tuple(each for each in parameters.columns if each.key != spare)
-    brief = replace(parameters, columns=columns, rows=tuple(rows))
-    modes = tables.modes_table(whole)
+def _main_results(whole_record: WholeRecord) -> RenderableType:
+    """Return the verdict, the modes and the parameters of damping and beam."""
+    parameters = tables.parameters_table(whole_record)
+    names = tables.parameter_names(whole_record.headline)
+    rows = [
+        row for name, row in zip(names, parameters.rows, strict=True) if name not in _RIG_PARAMETERS
+    ]
+    # The terminal has room for one column of text.
+    omitted_column = "meaning" if any(row["remark"] for row in rows) else "remark"
+    columns = tuple(column for column in parameters.columns if column.key != omitted_column)
+    short_table = replace(parameters, columns=columns, rows=tuple(rows))
+    modes = tables.modes_table(whole_record)
     return Group(
-        *map(Text, whole.verdict.sentences),
+        *map(Text, whole_record.verdict.sentences),
         "",
-        *spaced((_bare(modes), _bare(brief, caption=parameters.caption))),
+        *with_empty_lines(
+            (
+                _with_mark_notes_only(modes),
+                _with_mark_notes_only(short_table, caption=parameters.caption),
+            )
+        ),
     )
 
 
-def _bare(table: Table, caption: str = "") -> Table:
-    """Return a table with only those notes that explain marked numbers."""
-    notes = tuple(note for note in table.notes if note.startswith(MARK))
+def _with_mark_notes_only(table: Table, caption: str = "") -> Table:
+    """Return a table without notes, except those that explain marked numbers."""
+    notes = tuple(note for note in table.notes if note.startswith(NOT_REPORTED_MARK))
     return replace(table, caption=caption, notes=notes)
 
 
-def _warnings(sentences: Iterable[str]) -> list[Text]:
+def _warning_lines(sentences: Iterable[str]) -> list[Text]:
+    """Return warning sentences as yellow lines of text."""
     return [Text(f"Warning: {sentence}", style="yellow") for sentence in sentences]
 
 
 def tables_text(result: RecordResult) -> str:
-    """Return what a terminal would show of the Welch fits, without them of the whole record."""
+    """Return the tables of the Welch fits as plain text; without these, of the whole record."""
     if result.welch is not None:
         return as_text(analysis_tables(result))
     return "" if result.whole is None else as_text(record_text(result.whole))
 
 
 def analysis_tables(result: RecordResult) -> RenderableType:
-    """Return the Welch fits, the resonant peaks and the modes of one record, with its warnings.
+    """Return the tables of a record's Welch fits, resonance peaks and modes, with its warnings.
 
-    Orders that its whole record does not support are marked.
+    Orders that the whole record does not support are marked.
     """
-    welch = result.welch
-    assert welch is not None
-    modes = fit_tables.welch_modes_table(welch)
+    welch_analysis = result.welch
+    assert welch_analysis is not None
+    modes = fit_tables.welch_modes_table(welch_analysis)
     return Group(
         Text(f"{result.name}: Welch method (as in the paper)", style="italic"),
         Text(result.validity.sentence),
         "",
-        *spaced(
+        *with_empty_lines(
             (
-                fit_tables.welch_fits_table(welch, result.unsupported),
-                fit_tables.peaks_table(welch),
+                fit_tables.welch_fits_table(welch_analysis, result.unsupported),
+                fit_tables.peaks_table(welch_analysis),
                 *(() if modes is None else (modes,)),
             )
         ),
-        *_warnings(result.warnings),
+        *_warning_lines(result.warnings),
     )
 
 
 def summary_table(results: Sequence[RecordResult]) -> RenderableType:
-    """Return the Welch fits of several files in one table: those that were made."""
-    found = [each.welch for each in results if each.welch is not None]
-    table = fit_tables.summary_table(found)
-    notes = [f"{each.name}: {each.validity.sentence}" for each in results if each.welch is not None]
+    """Return the mean and standard deviation of the Welch fits of several files as a table."""
+    analyses = [result.welch for result in results if result.welch is not None]
+    table = fit_tables.summary_table(analyses)
+    notes = [
+        f"{result.name}: {result.validity.sentence}"
+        for result in results
+        if result.welch is not None
+    ]
     return terminal_table(replace(table, notes=(*table.notes, *notes)))
 
 
-def record_text(whole: WholeRecord) -> RenderableType:
-    """Return the verdict on one record, its parameters and its modes."""
-    verdict = whole.verdict
+def record_text(whole_record: WholeRecord) -> RenderableType:
+    """Return the verdict on one whole record, and its tables."""
+    verdict = whole_record.verdict
     sentences = [
-        *(Text(sentence, style="bold") for sentence in damping_sentences(whole.headline)),
+        *(Text(sentence, style="bold") for sentence in damping_sentences(whole_record.headline)),
         *map(Text, verdict.sentences),
-        *(Text(text, style="dim") for text in verdict.experiments),
+        *(Text(advice, style="dim") for advice in verdict.experiments),
     ]
     return Group(
-        Text(f"{whole.record.path.name}: verdict", style="italic"),
+        Text(f"{whole_record.record.path.name}: verdict", style="italic"),
         *(Padding(sentence, (0, 0, 0, 2)) for sentence in sentences),
         "",
-        record_tables(whole),
+        record_tables(whole_record),
     )
 
 
-def record_tables(whole: WholeRecord) -> RenderableType:
-    """Return the modes, the sizes of the damping and the parameters of one record."""
+def record_tables(whole_record: WholeRecord) -> RenderableType:
+    """Return the tables of one whole record: modes, loss factors and parameters."""
     return Group(
-        *spaced(
+        *with_empty_lines(
             (
                 *(
                     table
-                    for make in (
+                    for make_table in (
                         tables.modes_table,
                         tables.exact_modes_table,
-                        tables.sizes_table,
+                        tables.loss_factors_table,
                         tables.parameters_table,
                         tables.exact_geometry_table,
                     )
-                    if (table := make(whole)) is not None
+                    if (table := make_table(whole_record)) is not None
                 ),
-                *tables.amplitude_tables(whole),
+                *tables.amplitude_tables(whole_record),
             )
         )
     )
 
 
-def spaced(shown: Iterable[Table]) -> Iterator[RenderableType]:
-    """Put an empty line after each table."""
-    for table in shown:
+def with_empty_lines(tables_to_show: Iterable[Table]) -> Iterator[RenderableType]:
+    """Yield tables for the terminal, each followed by an empty line."""
+    for table in tables_to_show:
         yield terminal_table(table)
         yield ""
 
 
 # Damping in sentences
 
-_SMALL: Final = 1e-3
-"""Sizes below are shown in the power of ten that zeta has in the paper."""
+_LEAST_PLAIN_VALUE: Final = 1e-3
+"""Value below which a damping is written with the power of ten that zeta has in the paper."""
 
-_SYMBOLS: Final = {
+_DAMPING_SYMBOLS: Final = {
     "internal": ("ζ", "", "zeta", "alpha", "α"),
     "external": ("γ", " 1/m⁴", "gamma", "lambda", "λ"),
 }
+"""Coefficient, unit, parameter names and symbol of internal and external damping."""
 
 
 def damping_sentences(headline: Headline) -> tuple[str, ...]:
-    """Describe the damping of the modes, and the internal and external damping.
+    """Return sentences on the damping ratios, and on the internal and external damping.
 
-    Modes that the record does not show are omitted, and all if no number is the antenna's. Where
-    part of the record is unexplained the numbers are named as what they would be, without
-    intervals.
+    Modes that are not visible are omitted. There is no sentence if no number is a property of the
+    antenna. If part of the record is unexplained, the damping ratios are stated conditionally and
+    without intervals.
 
     Returns
     -------
     tuple of str
-        95 % intervals in brackets.
+        Sentences with 95 % intervals in brackets.
     """
-    found = []
+    sentences = []
     if any(mode.damping_ratio.flag == MISREAD for mode in headline.modes):
         return ()
-    shown = [_mode(mode) for mode in headline.modes if mode.shown]
+    visible_modes = [_mode_text(mode) for mode in headline.modes if mode.shown]
     if not headline.explained:
-        if not shown:
+        if not visible_modes:
             return ()
         return (
             "Part of the record is unexplained. If that causes no bias, the antenna's damping "
-            f"ratio would be {listed(shown)}.",
+            f"ratio would be {listed(visible_modes)}.",
         )
-    if shown:
-        found.append(
-            f"The antenna's damping ratio is {listed(shown)} (in brackets: 95 % intervals, "
+    if visible_modes:
+        sentences.append(
+            f"The antenna's damping ratio is {listed(visible_modes)} (in brackets: 95 % intervals, "
             "statistical only)."
         )
-    found.extend(
-        f"The {each.damping} damping {_size(each)}{_order(headline, each)}."
-        for each in headline.sizes
+    sentences.extend(
+        f"The {damping.damping} damping {_size_text(damping)}{_order_text(headline, damping)}."
+        for damping in headline.sizes
         # A coefficient for an assumed order is no property of the antenna.
-        if each.size.flag is None and (each.omega_rad_s is not None or not _flagged(headline, each))
+        if damping.size.flag is None
+        and (damping.omega_rad_s is not None or not _coefficient_is_flagged(headline, damping))
     )
-    return tuple(found)
+    return tuple(sentences)
 
 
-def _mode(mode: ReportedMode) -> str:
+def _mode_text(mode: ReportedMode) -> str:
+    """Return a mode's damping ratio and frequency as text."""
     ratio = mode.damping_ratio
-    return f"{_percent(ratio)} at {mode.frequency_hz.value:.4g} Hz"
+    return f"{_percent_text(ratio)} at {mode.frequency_hz.value:.4g} Hz"
 
 
-def _percent(ratio: ReportedValue) -> str:
-    value, low, high = estimate(
+def _percent_text(ratio: ReportedValue) -> str:
+    """Return a damping ratio in percent as text, with its interval unless it is flagged."""
+    value, low, high = estimate_cells(
         (ratio.value, *(ratio.interval_95 or (None, None))), ratio.std, 100.0
     )
     if ratio.flag is not None:
@@ -240,24 +260,28 @@ def _percent(ratio: ReportedValue) -> str:
     return f"{value.text} % ({low.text} to {high.text} %)"
 
 
-def _size(each: ReportedLossFactor) -> str:
-    coefficient, unit, *_names = _SYMBOLS[each.damping]
-    size = each.size
-    factor, tenth = (1e5, " · 10⁻⁵") if size.value < _SMALL else (1.0, "")
-    value, low, high = estimate((size.value, *(size.interval_95 or (None, None))), size.std, factor)
-    bounds = f"{value.text} ({low.text} to {high.text}){tenth}"
-    if each.omega_rad_s is None:
+def _size_text(damping: ReportedLossFactor) -> str:
+    """Return the loss factor or the coefficient of a damping as part of a sentence."""
+    coefficient, unit, *_names = _DAMPING_SYMBOLS[damping.damping]
+    size = damping.size
+    factor, power_of_ten = (1e5, " · 10⁻⁵") if size.value < _LEAST_PLAIN_VALUE else (1.0, "")
+    value, low, high = estimate_cells(
+        (size.value, *(size.interval_95 or (None, None))), size.std, factor
+    )
+    bounds = f"{value.text} ({low.text} to {high.text}){power_of_ten}"
+    if damping.omega_rad_s is None:
         return f"is {coefficient}\u00a0=\u00a0{bounds}{unit}"
-    return f"has a loss factor of {bounds} at {each.omega_rad_s / (2 * math.pi):.3g} Hz"
+    return f"has a loss factor of {bounds} at {damping.omega_rad_s / (2 * math.pi):.3g} Hz"
 
 
-def _flagged(headline: Headline, each: ReportedLossFactor) -> bool:
-    """Whether coefficient and order of a damping carry a flag."""
-    return headline.parameters[_SYMBOLS[each.damping][2]].flag is not None
+def _coefficient_is_flagged(headline: Headline, damping: ReportedLossFactor) -> bool:
+    """Return whether the coefficient of a damping carries a flag."""
+    return headline.parameters[_DAMPING_SYMBOLS[damping.damping][2]].flag is not None
 
 
-def _order(headline: Headline, each: ReportedLossFactor) -> str:
-    *_others, name, symbol = _SYMBOLS[each.damping]
+def _order_text(headline: Headline, damping: ReportedLossFactor) -> str:
+    """Return the order of a damping as the end of a sentence."""
+    *_others, name, symbol = _DAMPING_SYMBOLS[damping.damping]
     order = headline.parameters[name]
     if headline.tolerant is None and name not in headline.fit.structure.free:
         return f", of the fixed order {symbol}\u00a0=\u00a0{order.value:g}"
@@ -265,7 +289,7 @@ def _order(headline: Headline, each: ReportedLossFactor) -> str:
         return f"; its order {symbol} is not known"
     if headline.tolerant is not None:
         return ""  # the verdict has the slope of the loss, with its condition
-    value, low, high = estimate((order.value, *order.interval_95), order.std)
+    value, low, high = estimate_cells((order.value, *order.interval_95), order.std)
     condition = f", {EXACT_CONDITION}" if headline.modal is not None else ""
     return (
         f" and the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text}{condition})"

@@ -1,4 +1,4 @@
-"""Figures of touches: each one's evidence, and a map of all points as seen from above."""
+"""Figures of touches: the evidence of each touch, and a map of all contact points from above."""
 
 from __future__ import annotations
 
@@ -19,20 +19,22 @@ if TYPE_CHECKING:
     from analysis.touch import Touch, TouchedSession
     from rigd.touch import TouchEstimate
 
-_BEFORE_MS: Final = 25.0
-_AFTER_MS: Final = 100.0
-"""Time that is shown around a touch."""
-_LEAST_LOG: Final = 40.0
-"""Depth of the log-likelihood that is shown at least."""
-_LINEAR: Final = 5.0
-"""Innovations up to so many standard deviations are drawn to a linear scale."""
-_DETAIL: Final = 0.25
-"""Fraction of the antenna's length up to which the points have a detail of their own."""
-_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE)
+_SHOWN_BEFORE_MS: Final = 25.0
+"""Time that is shown before a touch, in milliseconds."""
+_SHOWN_AFTER_MS: Final = 100.0
+"""Time that is shown after a touch, in milliseconds."""
+_LEAST_LOG_LIKELIHOOD_RANGE: Final = 40.0
+"""Least range of the log-likelihood's axis."""
+_LINEAR_RANGE_STD: Final = 5.0
+"""Number of standard deviations up to which the axis of innovations is linear."""
+_MOST_DETAIL_FRACTION: Final = 0.25
+"""Largest extent of the contact points, relative to the antenna, for an enlarged map of them."""
+_SESSION_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE)
+"""Colours of the sessions in the map."""
 
 
 def touch_illustrations(sessions: Sequence[TouchedSession]) -> Iterator[Illustration]:
-    """Draw the map and the evidence of every touch; within `style.styled`."""
+    """Yield a map of all contact points and a figure of each touch; call it within `styled`."""
     if any(touch.point_m is not None for session in sessions for touch in session.touches):
         yield Illustration(
             "map",
@@ -58,68 +60,76 @@ def touch_illustrations(sessions: Sequence[TouchedSession]) -> Iterator[Illustra
 
 
 def touch_figure(touch: Touch, estimate: TouchEstimate) -> Figure:
-    """Draw likelihood, innovations and contact force of a touch.
+    """Draw the likelihood of the contact point, the innovations and the contact force of a touch.
 
     Parameters
     ----------
     touch : Touch
+        Detected touch.
     estimate : TouchEstimate
         Estimate of this touch.
     """
     rows = estimate.channels
     figure = style.new_figure(9.0, 4.6)
     grid = figure.add_gridspec(1, 2, left=0.075, right=0.985, top=0.94, bottom=0.1, wspace=0.2)
-    left = grid[0].subgridspec(2, 1, hspace=0.42)
-    right = grid[1].subgridspec(rows, 1, hspace=0.28)
-    _likelihood(figure.add_subplot(left[0]), estimate)
-    zero_s = touch.noticed_s if estimate.time_s is None else estimate.time_s.value
-    _force(figure.add_subplot(left[1]), estimate, zero_s)
+    left_grid = grid[0].subgridspec(2, 1, hspace=0.42)
+    right_grid = grid[1].subgridspec(rows, 1, hspace=0.28)
+    _draw_likelihood(figure.add_subplot(left_grid[0]), estimate)
+    touch_time_s = touch.noticed_s if estimate.time_s is None else estimate.time_s.value
+    _draw_force(figure.add_subplot(left_grid[1]), estimate, touch_time_s)
     for row, name in zip(range(rows), ("Torque", "Base shear"), strict=False):
-        axes = figure.add_subplot(right[row])
-        _innovations(axes, estimate, row, name, zero_s)
+        axes = figure.add_subplot(right_grid[row])
+        _draw_innovations(axes, estimate, row, name, touch_time_s)
         if row == rows - 1:
             axes.set_xlabel("Time from the touch (ms)", labelpad=1)
     return figure
 
 
-def _likelihood(axes: Axes, estimate: TouchEstimate) -> None:
-    relative = estimate.log_likelihood - estimate.log_likelihood.max()
-    axes.plot(estimate.positions_m, relative, color=style.BLUE)
+def _draw_likelihood(axes: Axes, estimate: TouchEstimate) -> None:
+    """Draw the relative log-likelihood of the contact point along the beam."""
+    relative_log_likelihood = estimate.log_likelihood - estimate.log_likelihood.max()
+    axes.plot(estimate.positions_m, relative_log_likelihood, color=style.BLUE)
     if estimate.x_m is not None:
         low, high = estimate.x_m.interval_95
-        axes.axvspan(low, high, color=style.SHADE, linewidth=0, zorder=0)
+        axes.axvspan(low, high, color=style.SHADE_COLOR, linewidth=0, zorder=0)
         axes.axvline(estimate.x_m.value, color=style.VERMILION, linewidth=0.9)
     axes.set_xlim(0.0, float(estimate.positions_m[-1]))
-    axes.set_ylim(-max(_LEAST_LOG, float(np.quantile(-relative, 0.75))), 2.0)
+    axes.set_ylim(
+        -max(_LEAST_LOG_LIKELIHOOD_RANGE, float(np.quantile(-relative_log_likelihood, 0.75))), 2.0
+    )
     axes.set_title("Point of contact")
     axes.set_ylabel("Relative log-likelihood")
     axes.set_xlabel("Distance from the axis (m)", labelpad=1)
 
 
-def _force(axes: Axes, estimate: TouchEstimate, zero_s: float) -> None:
-    times_ms = 1e3 * (estimate.force_times_s - zero_s)
+def _draw_force(axes: Axes, estimate: TouchEstimate, touch_time_s: float) -> None:
+    """Draw the contact force over time."""
+    times_ms = 1e3 * (estimate.force_times_s - touch_time_s)
     axes.plot(times_ms, estimate.force_history_n, color=style.VERMILION)
     if not estimate.force_history_n.size:
         axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", color=style.GREY)
-    axes.set_xlim(-_BEFORE_MS, _AFTER_MS)
+    axes.set_xlim(-_SHOWN_BEFORE_MS, _SHOWN_AFTER_MS)
     axes.set_ylim(bottom=0.0)
     axes.set_title("Contact force")
     axes.set_ylabel("Magnitude (N)")
     axes.set_xlabel("Time from the touch (ms)", labelpad=1)
 
 
-def _innovations(axes: Axes, estimate: TouchEstimate, row: int, name: str, zero_s: float) -> None:
-    times_ms = 1e3 * (estimate.innovation_times_s - zero_s)
-    axes.axhspan(-NORMAL_95, NORMAL_95, color=style.SHADE, linewidth=0, zorder=0)
+def _draw_innovations(
+    axes: Axes, estimate: TouchEstimate, row: int, name: str, touch_time_s: float
+) -> None:
+    """Draw the innovations of one channel over time, in standard deviations."""
+    times_ms = 1e3 * (estimate.innovation_times_s - touch_time_s)
+    axes.axhspan(-NORMAL_95, NORMAL_95, color=style.SHADE_COLOR, linewidth=0, zorder=0)
     axes.axvline(0.0, color=style.GREY, linewidth=0.8)
     axes.plot(
         times_ms, estimate.innovations[row], ".-", color=style.BLUE, linewidth=0.7, markersize=2.5
     )
-    axes.set_yscale("symlog", linthresh=_LINEAR)
-    reach = max(2 * _LINEAR, 1.2 * float(np.abs(estimate.innovations[row]).max()))
-    axes.set_ylim(-reach, reach)
+    axes.set_yscale("symlog", linthresh=_LINEAR_RANGE_STD)
+    axis_limit = max(2 * _LINEAR_RANGE_STD, 1.2 * float(np.abs(estimate.innovations[row]).max()))
+    axes.set_ylim(-axis_limit, axis_limit)
     axes.yaxis.set_major_formatter(lambda value, _position: f"{value:g}".replace("-", "−"))
-    axes.set_xlim(-_BEFORE_MS, _AFTER_MS)
+    axes.set_xlim(-_SHOWN_BEFORE_MS, _SHOWN_AFTER_MS)
     axes.set_title(f"{name}: innovations")
     axes.set_ylabel("Standard deviations")
 
@@ -133,47 +143,48 @@ def map_figure(sessions: Sequence[TouchedSession]) -> Figure:
     Parameters
     ----------
     sessions : sequence of TouchedSession
-        With one point or more.
+        Sessions with at least one contact point.
     """
     points = np.array(
         [t.point_m for session in sessions for t in session.touches if t.point_m is not None]
     )
     length_m = max(session.model.beam.length_m for session in sessions)
     spread_m = float(np.ptp(points, axis=0).max())
-    has_detail = spread_m < _DETAIL * length_m
+    has_detail = spread_m < _MOST_DETAIL_FRACTION * length_m
     figure = style.new_figure(9.0, 4.6)
     grid = figure.add_gridspec(
         1, 1 + has_detail, left=0.075, right=0.97, top=0.93, bottom=0.1, wspace=0.22
     )
-    whole = figure.add_subplot(grid[0])
-    _map(whole, sessions, numbered=not has_detail)
-    whole.plot(0.0, 0.0, "o", color=style.INK, markersize=7)
-    whole.set_aspect("equal", adjustable="datalim")
-    whole.set_title("Seen from above")
+    overview = figure.add_subplot(grid[0])
+    _draw_map(overview, sessions, with_numbers=not has_detail)
+    overview.plot(0.0, 0.0, "o", color=style.INK, markersize=7)
+    overview.set_aspect("equal", adjustable="datalim")
+    overview.set_title("Seen from above")
     if has_detail:
-        detail = figure.add_subplot(grid[1])
-        _map(detail, sessions, numbered=True)
+        detail_axes = figure.add_subplot(grid[1])
+        _draw_map(detail_axes, sessions, with_numbers=True)
         ends = np.concatenate(
             [t.ends_m for session in sessions for t in session.touches if t.ends_m is not None]
         )
         middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
-        half = 0.75 * max(float(np.ptp(ends, axis=0).max()), 0.005 * length_m)
-        detail.set_xlim(middle[0] - half, middle[0] + half)
-        detail.set_ylim(middle[1] - half, middle[1] + half)
-        detail.set_aspect("equal", adjustable="box")
-        detail.set_title("Detail: points and 95 % intervals")
-        whole.indicate_inset_zoom(detail, edgecolor=style.GREY)
+        half_width_m = 0.75 * max(float(np.ptp(ends, axis=0).max()), 0.005 * length_m)
+        detail_axes.set_xlim(middle[0] - half_width_m, middle[0] + half_width_m)
+        detail_axes.set_ylim(middle[1] - half_width_m, middle[1] + half_width_m)
+        detail_axes.set_aspect("equal", adjustable="box")
+        detail_axes.set_title("Detail: points and 95 % intervals")
+        overview.indicate_inset_zoom(detail_axes, edgecolor=style.GREY)
     for axes in figure.axes:
         axes.set_xlabel("x (m)", labelpad=1)
-    whole.set_ylabel("y (m)")
+    overview.set_ylabel("y (m)")
     if len(sessions) > 1:
-        whole.legend(loc="upper left", fontsize=7.5)
+        overview.legend(loc="upper left", fontsize=7.5)
     return figure
 
 
-def _map(axes: Axes, sessions: Sequence[TouchedSession], *, numbered: bool) -> None:
+def _draw_map(axes: Axes, sessions: Sequence[TouchedSession], *, with_numbers: bool) -> None:
+    """Draw the contact points of sessions with their intervals, and the bent antenna."""
     for number, session in enumerate(sessions):
-        color = _COLORS[number % len(_COLORS)]
+        color = _SESSION_COLORS[number % len(_SESSION_COLORS)]
         name: str | None = session.path.stem
         for touch in session.touches:
             if touch.antenna_m is not None:
@@ -181,13 +192,13 @@ def _map(axes: Axes, sessions: Sequence[TouchedSession], *, numbered: bool) -> N
             if touch.point_m is None or touch.ends_m is None:
                 continue
             axes.plot(*touch.ends_m.T, color=color, linewidth=2.4, alpha=0.5, zorder=2)
-            known = touch.estimate is not None and touch.estimate.kind != "unknown"
+            kind_is_known = touch.estimate is not None and touch.estimate.kind != "unknown"
             axes.plot(
                 *touch.point_m, "o", color=color, markersize=4, zorder=3, label=name,
-                markerfacecolor=color if known else "white",
+                markerfacecolor=color if kind_is_known else "white",
             )  # fmt: skip
             name = None
-            if numbered:
+            if with_numbers:
                 axes.annotate(
                     str(touch.number), tuple(touch.point_m), xytext=(5, 4),
                     textcoords="offset points", fontsize=7.5, color=color, clip_on=True,

@@ -1,4 +1,4 @@
-"""Whether the beam is uniform: modal constants measured against those of a uniform beam."""
+"""Test of the beam's uniformity: measured modal constants compared with a uniform beam's."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.identify import CONSTANTS
 from analysis.report import _style as style
-from analysis.report.table import WORDS, Cell, Column, Table, estimate, number
+from analysis.report.table import TEXT_FORMAT, Cell, Column, Table, estimate_cells, number_cell
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
@@ -21,25 +21,28 @@ if TYPE_CHECKING:
     from analysis.report.table import Entry
 
 UNIFORMITY: Final = "uniform_beam"
-"""Name of the figure."""
+"""File name of the figure of the test, without suffix."""
 
-_TITLES: Final = {
+_CONSTANT_TITLES: Final = {
     "ln_frequency": "Frequency",
     "ln_damping_ratio": "Damping ratio",
     "ln_residue": "Residue, magnitude",
     "residue_phase_rad": "Residue, phase",
 }
-"""Titles of the modal constants; all but the phase are compared by their logarithms."""
+"""Titles of the modal constants.
 
-_PER_CENT: Final = 100.0
+All but the phase are compared by their logarithms."""
+
+_PERCENT: Final = 100.0
+"""Factor from fractions to percent."""
 
 
 def _deviations(test: UniformBeamTest) -> NDArray[np.float64]:
-    """Measured less predicted constants, shape (n, 4)."""
-    away = (test.measured - test.predicted).reshape(-1, len(CONSTANTS))
+    """Return measured minus predicted constants, shape (modes, 4); phases within half a turn."""
+    deviations = (test.measured - test.predicted).reshape(-1, len(CONSTANTS))
     phase = CONSTANTS.index("residue_phase_rad")
-    away[:, phase] -= 2 * np.pi * np.round(away[:, phase] / (2 * np.pi))
-    return away
+    deviations[:, phase] -= 2 * np.pi * np.round(deviations[:, phase] / (2 * np.pi))
+    return deviations
 
 
 def uniformity_figure(test: UniformBeamTest) -> Figure:
@@ -48,41 +51,45 @@ def uniformity_figure(test: UniformBeamTest) -> Figure:
     Parameters
     ----------
     test : UniformBeamTest
-        With degrees of freedom.
+        Result of the test, with at least one degree of freedom.
     """
-    away, std = _deviations(test), test.std.reshape(-1, len(CONSTANTS))
+    deviations, std = _deviations(test), test.std.reshape(-1, len(CONSTANTS))
     figure = style.new_figure(9.0, 4.0)
     grid = figure.add_gridspec(
         2, len(CONSTANTS), left=0.075, right=0.985, top=0.87, bottom=0.115, hspace=0.28,
         wspace=0.34,
     )  # fmt: skip
     for column, name in enumerate(CONSTANTS):
-        in_std, in_per_cent = (figure.add_subplot(grid[row, column]) for row in range(2))
-        in_std.set_title(_TITLES[name], fontsize=8.5)
-        in_std.axhspan(
-            -NORMAL_95, NORMAL_95, color=style.SHADE, linewidth=0, zorder=0,
+        std_axes, percent_axes = (figure.add_subplot(grid[row, column]) for row in range(2))
+        std_axes.set_title(_CONSTANT_TITLES[name], fontsize=8.5)
+        std_axes.axhspan(
+            -NORMAL_95, NORMAL_95, color=style.SHADE_COLOR, linewidth=0, zorder=0,
             label="95 % of uniform beams",
         )  # fmt: skip
-        values = away[:, column] / std[:, column]
-        in_std.plot(test.modes, values, "o", color=style.BLUE, markersize=5.0)
-        _frame(in_std, test.modes, float(np.abs(values).max()), least=3.0)
-        half = NORMAL_95 * _PER_CENT * std[:, column]
-        percent = _PER_CENT * away[:, column]
-        in_per_cent.errorbar(
-            test.modes, percent, half, fmt="o", color=style.INK, markersize=4.0, capsize=3.0,
-            elinewidth=1.0, label="measured, 95 %",
+        values = deviations[:, column] / std[:, column]
+        std_axes.plot(test.modes, values, "o", color=style.BLUE, markersize=5.0)
+        _set_axes(std_axes, test.modes, float(np.abs(values).max()), least_limit=3.0)
+        half_width_percent = NORMAL_95 * _PERCENT * std[:, column]
+        percent = _PERCENT * deviations[:, column]
+        percent_axes.errorbar(
+            test.modes, percent, half_width_percent, fmt="o", color=style.INK, markersize=4.0,
+            capsize=3.0, elinewidth=1.0, label="measured, 95 %",
         )  # fmt: skip
-        _frame(in_per_cent, test.modes, float((np.abs(percent) + half).max()))
-        in_per_cent.set_xlabel("Mode", labelpad=1)
-        in_std.tick_params(labelbottom=False)
+        _set_axes(percent_axes, test.modes, float((np.abs(percent) + half_width_percent).max()))
+        percent_axes.set_xlabel("Mode", labelpad=1)
+        std_axes.tick_params(labelbottom=False)
         if column == 0:
-            in_std.set_ylabel("Deviation (std)")
-            in_per_cent.set_ylabel("Deviation (%)")
+            std_axes.set_ylabel("Deviation (std)")
+            percent_axes.set_ylabel("Deviation (%)")
     handles = [
-        each for axes in (in_std, in_per_cent) for each in axes.get_legend_handles_labels()[0]
+        handle_or_label
+        for axes in (std_axes, percent_axes)
+        for handle_or_label in axes.get_legend_handles_labels()[0]
     ]
     labels = [
-        each for axes in (in_std, in_per_cent) for each in axes.get_legend_handles_labels()[1]
+        handle_or_label
+        for axes in (std_axes, percent_axes)
+        for handle_or_label in axes.get_legend_handles_labels()[1]
     ]
     figure.align_ylabels()
     figure.legend(
@@ -92,10 +99,12 @@ def uniformity_figure(test: UniformBeamTest) -> Figure:
     return figure
 
 
-def _frame(axes: Axes, modes: tuple[int, ...], reach: float, *, least: float = 0.0) -> None:
-    """Set limits about zero and a tick at each mode."""
+def _set_axes(
+    axes: Axes, modes: tuple[int, ...], largest_value: float, *, least_limit: float = 0.0
+) -> None:
+    """Set symmetric limits about zero, and a tick at each mode."""
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7, zorder=1)
-    limit = max(1.2 * reach, least)
+    limit = max(1.2 * largest_value, least_limit)
     axes.set_ylim(-limit, limit)
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.set_xlim(modes[0] - 0.5, modes[-1] + 0.5)
@@ -103,7 +112,7 @@ def _frame(axes: Axes, modes: tuple[int, ...], reach: float, *, least: float = 0
 
 
 def uniformity_description(test: UniformBeamTest) -> str:
-    """Describe the figure and its result."""
+    """Return the description of the test's figure, with the result of the test."""
     return (
         "Modal constants measured, less those of the uniform beam that fits them best, by mode: "
         "above in standard deviations of the measured value (shaded: where 95 of 100 values of a "
@@ -114,22 +123,22 @@ def uniformity_description(test: UniformBeamTest) -> str:
 
 
 def uniformity_table(test: UniformBeamTest) -> Table:
-    """Measured and predicted modal constants with their deviations."""
+    """Return the table of measured and predicted modal constants with their deviations."""
     rows: list[tuple[Entry, ...]] = []
-    away = _deviations(test).ravel()
-    for index, (measured, std, predicted, off) in enumerate(
+    deviations = _deviations(test).ravel()
+    for index, (measured_value, std, predicted_value, deviation) in enumerate(
         zip(
-            test.measured.tolist(), test.std.tolist(), test.predicted.tolist(), away.tolist(),
+            test.measured.tolist(), test.std.tolist(), test.predicted.tolist(), deviations.tolist(),
             strict=True,
         )
     ):  # fmt: skip
         name = CONSTANTS[index % len(CONSTANTS)]
-        words = Cell(name, name.removesuffix("_rad").replace("_", " "))
-        shown = estimate((measured, std, predicted), std)
+        name_cell = Cell(name, name.removesuffix("_rad").replace("_", " "))
+        cells = estimate_cells((measured_value, std, predicted_value), std)
         rows.append(
             (
-                test.modes[index // len(CONSTANTS)], words, *shown,
-                number(off / std, "+.1f"), number(off, "+#.2g", _PER_CENT),
+                test.modes[index // len(CONSTANTS)], name_cell, *cells,
+                number_cell(deviation / std, "+.1f"), number_cell(deviation, "+#.2g", _PERCENT),
             )
         )  # fmt: skip
     return Table.of(
@@ -137,9 +146,9 @@ def uniformity_table(test: UniformBeamTest) -> Table:
         "Modal constants measured and of a uniform beam",
         (
             Column("Mode", "mode"),
-            Column("Constant", "constant", WORDS),
+            Column("Constant", "constant", TEXT_FORMAT),
             Column("Measured", "measured"),
-            Column("std", "std", spread=True),
+            Column("std", "std", std_of_previous=True),
             Column("Uniform beam", "uniform_beam"),
             Column("Deviation (std)", "deviation_std"),
             Column("Deviation (%)", "deviation"),

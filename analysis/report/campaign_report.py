@@ -1,4 +1,4 @@
-"""Report of a campaign: text, one page, and a folder with figures, tables and JSON."""
+"""Report of a campaign: text, an HTML page, and a folder with figures, tables and JSON."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from analysis.identify.headline import EXACT_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
 from analysis.report._document import document_text
-from analysis.report._paper_tables import paper_tables, welch_text
-from analysis.report._text import as_text, spaced
+from analysis.report._paper_tables import paper_tables, welch_method_text
+from analysis.report._text import as_text, with_empty_lines
 from analysis.report.folder import write_new
 from analysis.report.table import csv_text
 from analysis.results import DEFAULT_FORMATS
@@ -35,27 +35,30 @@ if TYPE_CHECKING:
 
 # Text
 
-_NO_VERDICT: Final = (
+_NO_VERDICT_SENTENCE: Final = (
     "No verdict on the whole records: two sessions are needed that determine a structure's damping."
 )
+"""Sentence that states why there is no verdict."""
 
 
 def campaign_sentences(campaign: CampaignResult) -> tuple[str, ...]:
-    """Return the verdict; without one, the statement on the specimen, and the reason.
+    """Return the verdict on a campaign and the validity of the linear model.
 
-    The second sentence, or the only one, is on the validity of the numbers.
+    Without a verdict the sentences state whether the sessions are of one specimen, and why there is
+    no verdict. The second sentence, or the only one, states the validity.
     """
     sentences = _verdict_sentences(campaign)
     return (*sentences[:1], campaign.validity.sentence, *sentences[1:])
 
 
 def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
+    """Return the verdict, or without one the statements on specimens and on the missing verdict."""
     if campaign.verdict is not None:
         return campaign.verdict.sentences
-    has_estimates = any(each.record_estimates for each in campaign.sessions)
+    has_estimates = any(session.record_estimates for session in campaign.sessions)
     return (
         *specimens(campaign.homogeneity),
-        *([_NO_VERDICT] if has_estimates else []),
+        *([_NO_VERDICT_SENTENCE] if has_estimates else []),
         *lost_trials(campaign.lost_trials, campaign.trials),
     )
 
@@ -63,29 +66,30 @@ def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
 def campaign_tables(
     campaign: CampaignResult, *, with_paper: bool = False, verbose: bool = True
 ) -> RenderableType:
-    """Return the verdict, its basis, and the paper's Tables 3 to 5.
+    """Return a campaign's verdict, its tables and its warnings, for the terminal.
 
     Parameters
     ----------
     campaign : CampaignResult
+        Results of all sessions.
     with_paper : bool
-        Whether the paper's numbers are included.
+        Whether the paper's own numbers are included.
     verbose : bool
-        Whether all tables are shown; otherwise the verdict, the pooled modes and parameters, and
-        with `with_paper` the tables of the paper.
+        Whether all tables are included. Otherwise only the verdict, the pooled modes and
+        parameters, and with `with_paper` the tables of the paper.
     """
     parts: list[RenderableType] = []
     sentences = campaign_sentences(campaign)
     if sentences:
-        first, *others = sentences
-        parts += [Text(first, style="bold"), *map(Text, others)]
+        first_sentence, *further_sentences = sentences
+        parts += [Text(first_sentence, style="bold"), *map(Text, further_sentences)]
         if campaign.verdict is not None and campaign.verdict.experiments:
             parts.append(Text("Further experiments:"))
             parts += [Text(f"  {advice}") for advice in campaign.verdict.experiments]
         parts.append("")
-    parts += spaced(shown_tables(campaign) if verbose else main_tables(campaign))
+    parts += with_empty_lines(shown_tables(campaign) if verbose else main_tables(campaign))
     if verbose or with_paper or campaign.headline is None:
-        parts += spaced(paper_tables(campaign, with_paper=with_paper))
+        parts += with_empty_lines(paper_tables(campaign, with_paper=with_paper))
     parts += [
         Text(f"Warning: {session.name}: {warning}", style="yellow")
         for session in campaign.sessions
@@ -95,14 +99,14 @@ def campaign_tables(
 
 
 def campaign_text(campaign: CampaignResult, *, with_paper: bool = False) -> str:
-    """Return the tables as plain text, with the files that were left out.
+    """Return a campaign's tables as plain text, with the files that were left out.
 
     Parameters
     ----------
     campaign : CampaignResult
-        The results.
+        Results of all sessions.
     with_paper : bool
-        Whether the paper's numbers are shown with them.
+        Whether the paper's own numbers are included.
     """
     left_out = (Text(f"Left out: {failure.message}") for failure in campaign.failures)
     return as_text(Group(campaign_tables(campaign, with_paper=with_paper), *left_out))
@@ -110,32 +114,35 @@ def campaign_text(campaign: CampaignResult, *, with_paper: bool = False) -> str:
 
 # Page
 
-_OF_RECORDS: Final = ("damping", "pooled_response", "pooled", "validation")
-"""Figures that go with the verdict; the others are the paper's."""
+_WHOLE_RECORD_FIGURES: Final = ("damping", "pooled_response", "pooled", "validation")
+"""Figures of the whole-record fits, which follow the verdict. All other figures are those of the
+paper."""
 
 
 def campaign_page(
     campaign: CampaignResult, pictures: Sequence[Picture], made_at: datetime, *, with_paper: bool
 ) -> str:
-    """Return a campaign's report.
+    """Return the HTML page with the results of a campaign.
 
     Parameters
     ----------
     campaign : CampaignResult
+        Results of all sessions.
     pictures : sequence of Picture
+        Figures of the campaign.
     made_at : datetime
-        Date of the report, with a time zone.
+        Date and time of the report, with a time zone.
     with_paper : bool
-        Whether the paper's numbers are included.
+        Whether the paper's own numbers are included.
 
     Returns
     -------
     str
-        An HTML document that refers to nothing outside it.
+        HTML document that refers to no other files.
     """
     from analysis.report._page import page, versions
 
-    paths = [each.path for each in campaign.sessions]
+    paths = [session.path for session in campaign.sessions]
     sentences = campaign_sentences(campaign)
     return page(
         "campaign.html",
@@ -144,21 +151,24 @@ def campaign_page(
         first=sentences[:1],
         sentences=sentences[1:],
         experiments=campaign.verdict.experiments if campaign.verdict else (),
-        warnings=_warnings(campaign),
-        pictures=[each for each in pictures if each.name in _OF_RECORDS],
+        warnings=_warning_texts(campaign),
+        pictures=[picture for picture in pictures if picture.name in _WHOLE_RECORD_FIGURES],
         tables=(*shown_tables(campaign), sessions_table(campaign)),
-        paper_pictures=[each for each in pictures if each.name not in _OF_RECORDS],
+        paper_pictures=[
+            picture for picture in pictures if picture.name not in _WHOLE_RECORD_FIGURES
+        ],
         paper_tables=paper_tables(campaign, with_paper=with_paper),
-        how=[*_how(campaign), versions(made_at)],
+        how=[*_collect_facts(campaign), versions(made_at)],
     )
 
 
-def _warnings(campaign: CampaignResult) -> list[str]:
+def _warning_texts(campaign: CampaignResult) -> list[str]:
+    """Return all warnings: files left out, lost trials, and the sessions' own warnings."""
     return [
-        *(f"Left out: {each.message}" for each in campaign.failures),
+        *(f"Left out: {failure.message}" for failure in campaign.failures),
         *(
-            f"Not predicted from the others: {each.path}: {each.reason}"
-            for each in campaign.lost_trials
+            f"Not predicted from the others: {trial.path}: {trial.reason}"
+            for trial in campaign.lost_trials
         ),
         *(
             f"{session.name}: {warning}"
@@ -168,8 +178,8 @@ def _warnings(campaign: CampaignResult) -> list[str]:
     ]
 
 
-def _how(campaign: CampaignResult) -> list[Facts]:
-    """Collect the facts on specimen and estimators."""
+def _collect_facts(campaign: CampaignResult) -> list[Facts]:
+    """Return the facts on specimen and estimators."""
     settings, (first_hz, last_hz) = campaign.settings, campaign.record_band_hz
     beam = campaign.sessions[0].beam
     parts = [
@@ -195,7 +205,7 @@ def _how(campaign: CampaignResult) -> list[Facts]:
                     "random effects: sessions with their own covariances, and a between-session "
                     "variance of each parameter (DerSimonian and Laird); Student's t",
                 ),
-                *_of_geometry(campaign),
+                *_geometry_facts(campaign),
                 (
                     "structure",
                     "the freest on the beam of the lowest Bayesian information criterion of all "
@@ -206,7 +216,7 @@ def _how(campaign: CampaignResult) -> list[Facts]:
         (
             "Welch method (as in the paper)",
             [
-                ("estimator", welch_text(campaign)),
+                ("estimator", welch_method_text(campaign)),
                 ("band", f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz"),
                 ("types", ", ".join(settings.types)),
                 ("weights", ", ".join(settings.weightings)),
@@ -220,8 +230,8 @@ def _how(campaign: CampaignResult) -> list[Facts]:
     return parts
 
 
-def _of_geometry(campaign: CampaignResult) -> list[tuple[str, str]]:
-    """Describe the model of modes and parameters if a tolerance of the geometry is stated."""
+def _geometry_facts(campaign: CampaignResult) -> list[tuple[str, str]]:
+    """Return the fact on the model of modes and parameters, if a geometry tolerance is stated."""
     if campaign.modal is None or not campaign.modal.leads:
         return []
     return [
@@ -245,31 +255,35 @@ def write_campaign(
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
     on_step: Callable[[str], None] = lambda _done: None,
 ) -> None:
-    """Write the page ``report.html``, ``figures/``, ``tables/*.csv``, text and JSON.
+    """Write the report of a campaign into a folder.
+
+    It consists of ``report.html``, ``figures/``, ``tables/*.csv``, ``tables.txt`` and
+    ``campaign.json``.
 
     Parameters
     ----------
     campaign : CampaignResult
+        Results of all sessions.
     folder : Path
-        An existing folder without these files.
+        Existing folder that contains none of these files.
     with_paper : bool
-        Whether the paper's numbers are included.
+        Whether the paper's own numbers are included.
     formats : sequence of str
         Formats of the figures.
     on_step : callable, optional
-        Called with a figure's name after each.
+        Function that is called after each figure with a short text.
 
     Raises
     ------
     OutputExistsError, OutputError
-        A file exists, or cannot be written.
+        If a file exists or cannot be written.
     """
     from analysis.report import _style as style
 
     pictures = []
-    for name, (draw, description) in _figures(campaign).items():
+    for name, (draw_figure, description) in _figures_with_data(campaign).items():
         with style.styled():
-            figure = draw()
+            figure = draw_figure()
             pictures.append(
                 style.save_picture(figure, folder / "figures" / name, description, formats)
             )
@@ -284,8 +298,8 @@ def write_campaign(
     write_new(folder / "report.html", html)
 
 
-def _figures(campaign: CampaignResult) -> dict[str, tuple[Callable[[], Figure], str]]:
-    """Return the figures for which there are data by name, with their descriptions."""
+def _figures_with_data(campaign: CampaignResult) -> dict[str, tuple[Callable[[], Figure], str]]:
+    """Return the functions that draw the campaign's figures and their descriptions, by name."""
     from analysis.report._campaign_figures import (
         best_figure,
         index_figure,
@@ -295,33 +309,33 @@ def _figures(campaign: CampaignResult) -> dict[str, tuple[Callable[[], Figure], 
     )
     from analysis.report._pooled_figures import damping_figure, response_figure
 
-    found: dict[str, tuple[Callable[[], Figure], str]] = {}
+    figures_by_name: dict[str, tuple[Callable[[], Figure], str]] = {}
     if campaign.headline is not None and campaign.modes:
-        found["damping"] = (
+        figures_by_name["damping"] = (
             partial(damping_figure, campaign),
             "Damping ratios of all sessions' modes against frequency, and the pooled ones with "
             "their 95 % intervals; below, each mode enlarged.",
         )
     if campaign.headline is not None:
-        found["pooled_response"] = (
+        figures_by_name["pooled_response"] = (
             partial(response_figure, campaign),
             "Frequency response of the pooled estimate over that of every session: magnitude, "
             "phase, and half-width of the 95 % band.",
         )
-        found["pooled"] = (
+        figures_by_name["pooled"] = (
             partial(pooled_figure, campaign),
             "Whole-record estimate of each session with its 95 % interval, and the pooled one.",
         )
     if campaign.validation:
-        found["validation"] = (
+        figures_by_name["validation"] = (
             partial(validation_figure, campaign),
             "Each session's torque predicted from the other sessions: error by model.",
         )
     if not campaign.nominal:
-        return found
-    return found | {
+        return figures_by_name
+    return figures_by_name | {
         "figure5_signals": (
-            partial(_signals, campaign),
+            partial(_draw_example_signals, campaign),
             "Reference, angle and torque of the first session (Figure 5 of the paper).",
         ),
         "figure6_nominal": (
@@ -340,7 +354,7 @@ def _figures(campaign: CampaignResult) -> dict[str, tuple[Callable[[], Figure], 
     }
 
 
-def _signals(campaign: CampaignResult) -> Figure:
+def _draw_example_signals(campaign: CampaignResult) -> Figure:
     """Draw the first session's signals as an example, as the paper does."""
     from analysis.paper import analyse
     from analysis.record import load_record

@@ -1,8 +1,8 @@
 """Folders of reports: each is complete or absent, and no other files are overwritten.
 
-Each folder lists its files with their SHA-256 (``SHA256SUMS``, as ``sha256sum -c`` checks it). A
-file that is in the list and unchanged was written by an analysis: nothing else is ever replaced or
-removed.
+Each folder contains a list of its files with their SHA-256 (``SHA256SUMS``, as ``sha256sum -c``
+checks it). A file that is in the list and unchanged was written by an analysis. No other file is
+ever replaced or removed.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from rigd.documents import DocumentError, read_json, read_text
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-_LONGEST_LIST: Final = 10_000_000
-"""Largest list in bytes: a hundred thousand files."""
-LIST: Final = "SHA256SUMS"
-"""Name of the list of a report's files."""
+_LARGEST_LIST_BYTES: Final = 10_000_000
+"""Largest size of a list of files that is read, in bytes: a hundred thousand files."""
+CHECKSUM_LIST_NAME: Final = "SHA256SUMS"
+"""Name of the file that lists a report's files with their checksums."""
 
-_KEYS_OF_RESULTS: Final = frozenset(("versions", "headlines", "fits"))
-"""Keys by which a JSON document is known to hold results of an analysis."""
+_RESULT_KEYS: Final = frozenset(("versions", "headlines", "fits"))
+"""Keys by which a JSON document is recognised as results of an analysis."""
 
 
 class OutputExistsError(ValueError):
-    """A file or folder to be written exists already."""
+    """Error: a file or folder that is to be written exists already."""
 
 
 class OutputError(Exception):
-    """Something could not be written."""
+    """Error: an output file or folder cannot be written."""
 
 
 # Names
@@ -42,90 +42,103 @@ class OutputError(Exception):
 def report_folders(
     files: Sequence[Path], report: Path | None, *, overwrite: bool = False
 ) -> list[Path]:
-    """Choose a folder for each file's report.
+    """Return the folder for each file's report, and raise if it must not be written.
 
     Parameters
     ----------
     files : sequence of Path
+        Session files that are analysed.
     report : Path, optional
-        Requested folder: that of the report of one file, or one that is to hold a folder per file,
-        named like the file. Default: ``NAME.report`` next to each file, or if that exists
-        ``NAME.report-2`` and so on.
+        Requested folder. With one file it is that file's report; with several files it contains one
+        folder per file, named like the file. Default: ``NAME.report`` next to each file, or if that
+        exists ``NAME.report-2`` and so on.
     overwrite : bool
-        Whether an earlier report is to be replaced.
+        Whether an earlier report is replaced.
 
     Raises
     ------
     OutputExistsError
-        If the folder exists, is not empty and does not hold an earlier report to be replaced.
+        If the folder exists, is not empty and contains no earlier report to replace.
     """
     if report is None:
         # A folder given for a file may have no name of its own ("." or "/").
-        requested = [file.parent / f"{file.stem}.report" for file in files]
+        requested_folders = [file.parent / f"{file.stem}.report" for file in files]
     elif overwrite or _is_free(report):
-        requested = [report] if len(files) == 1 else [report / file.stem for file in files]
+        requested_folders = [report] if len(files) == 1 else [report / file.stem for file in files]
     else:
         raise OutputExistsError(
             f"--report {report} exists and is not an empty folder; choose another name, or replace "
             "an earlier report with --overwrite. Nothing is overwritten without it."
         )
-    taken: set[Path] = set()
+    reserved_folders: set[Path] = set()
     if not overwrite:
-        return requested if requested == [report] else [_free(each, taken) for each in requested]
-    folders = [_free(each, taken, overwrite=True) for each in requested]
+        return (
+            requested_folders
+            if requested_folders == [report]
+            else [
+                _unused_folder(requested_folder, reserved_folders)
+                for requested_folder in requested_folders
+            ]
+        )
+    folders = [
+        _unused_folder(requested_folder, reserved_folders, overwrite=True)
+        for requested_folder in requested_folders
+    ]
     for folder in folders:
-        _check_earlier(folder)
+        _require_free_or_report(folder)
     return folders
 
 
-def check_new_file(path: Path, what: str, *, overwrite: bool = False) -> None:
-    """Raise OutputExistsError if a path exists, naming what it was to be.
+def check_new_file(path: Path, message_subject: str, *, overwrite: bool = False) -> None:
+    """Raise OutputExistsError if a path exists and must not be replaced.
 
     Parameters
     ----------
     path : Path
-        The new file.
-    what : str
-        Option that requests it.
+        File to be written.
+    message_subject : str
+        Beginning of the error message: the option that requests the file, or "The file".
     overwrite : bool
-        Whether it may be there already, holding results of an analysis in JSON.
+        Whether the file may exist if it contains results of an analysis in JSON.
     """
     if not os.path.lexists(path):
         return
     if not overwrite:
         raise OutputExistsError(
-            f"{what} {path} exists; choose another name or move it away, nothing is overwritten."
+            f"{message_subject} {path} exists; choose another name or move it away, nothing is "
+            "overwritten."
         )
-    if not _holds_results(path):
+    if not _contains_results(path):
         raise OutputExistsError(
-            f"{what} {path} exists and does not hold results of an analysis, which is all that "
-            "--overwrite replaces; choose another name or move it away."
+            f"{message_subject} {path} exists and does not hold results of an analysis, which is "
+            "all that --overwrite replaces; choose another name or move it away."
         )
 
 
 def _is_free(folder: Path) -> bool:
-    """Whether nothing is there, or an empty folder."""
+    """Return whether a path does not exist, or is an empty folder."""
     return not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir()))
 
 
-def _free(folder: Path, taken: set[Path], *, overwrite: bool = False) -> Path:
-    """Return the folder, or the first numbered name like it that is not in use."""
+def _unused_folder(folder: Path, reserved_folders: set[Path], *, overwrite: bool = False) -> Path:
+    """Return the folder, or the first numbered folder name like it that is not in use."""
     number, candidate = 1, folder
-    while candidate in taken or (os.path.lexists(candidate) and not overwrite):
+    while candidate in reserved_folders or (os.path.lexists(candidate) and not overwrite):
         number += 1
         candidate = folder.with_name(f"{folder.name}-{number}")
-    taken.add(candidate)
+    reserved_folders.add(candidate)
     return candidate
 
 
-def _holds_results(path: Path) -> bool:
+def _contains_results(path: Path) -> bool:
+    """Return whether a file contains the results of an analysis in JSON."""
     if path.is_symlink() or not path.is_file():
         return False
     try:
         content = read_json(path)
     except DocumentError:
         return False
-    return isinstance(content, dict) and content.keys() >= _KEYS_OF_RESULTS
+    return isinstance(content, dict) and content.keys() >= _RESULT_KEYS
 
 
 # Writing
@@ -133,69 +146,71 @@ def _holds_results(path: Path) -> bool:
 
 @contextmanager
 def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """Yield a temporary folder that is renamed on success, and removed otherwise.
+    """Provide a temporary folder that is renamed on success and removed on failure.
 
     Parameters
     ----------
     folder : Path
+        Final path of the folder.
     overwrite : bool
-        Whether an earlier report of that name is replaced: its own files go, all others stay.
+        Whether an earlier report in this folder is replaced: its own files are removed, all others
+        stay.
 
     Raises
     ------
     OutputExistsError
-        If a folder of that name has appeared meanwhile and is not empty, or a file of the earlier
-        report was changed.
+        If the folder was created meanwhile and is not empty, or if a file of the earlier report was
+        changed.
     OutputError
-        If it cannot be created.
+        If the folder cannot be created.
     """
-    part = folder.with_name(f".{folder.name}.part-{os.getpid()}")
+    temporary_folder = folder.with_name(f".{folder.name}.part-{os.getpid()}")
     try:
         try:
             folder.parent.mkdir(parents=True, exist_ok=True)
-            part.mkdir()
+            temporary_folder.mkdir()
         except OSError as error:
             raise OutputError(
                 f"The report {folder} cannot be written: {error.strerror or error}. "
                 "Choose a folder with --report."
             ) from error
-        yield part
-        sums = {
-            path.relative_to(part).as_posix(): {_sha256(path)}
-            for path in sorted(part.rglob("*"))
+        yield temporary_folder
+        checksums = {
+            path.relative_to(temporary_folder).as_posix(): {_sha256(path)}
+            for path in sorted(temporary_folder.rglob("*"))
             if path.is_file()
         }
         if overwrite and not _is_free(folder):
-            _replace(folder, part, sums)
+            _replace_report(folder, temporary_folder, checksums)
             return
-        (part / LIST).write_text(_listed(sums), encoding="utf-8")
+        (temporary_folder / CHECKSUM_LIST_NAME).write_text(_list_text(checksums), encoding="utf-8")
         try:
-            part.rename(folder)
+            temporary_folder.rename(folder)
         except OSError as error:
             raise OutputExistsError(
                 f"The report {folder} was created meanwhile ({error.strerror or error}); "
                 "nothing is overwritten, choose another name with --report."
             ) from error
     finally:
-        shutil.rmtree(part, ignore_errors=True)
+        shutil.rmtree(temporary_folder, ignore_errors=True)
 
 
 def write_new(path: Path, content: str | bytes, *, overwrite: bool = False) -> None:
-    """Write a new file, text in UTF-8, with the folders it needs.
+    """Write a new file, and create its folders. Text is encoded as UTF-8.
 
     Parameters
     ----------
     path : Path
-        The new file.
+        File to be written.
     content : str or bytes
-        Its content.
+        Content of the file.
     overwrite : bool
-        Whether it replaces earlier results of an analysis.
+        Whether the file replaces earlier results of an analysis.
 
     Raises
     ------
     OutputExistsError, OutputError
-        If it exists, or cannot be written.
+        If the file exists or cannot be written.
     """
     check_new_file(path, "The file", overwrite=overwrite)
     if isinstance(content, str):
@@ -204,7 +219,7 @@ def write_new(path: Path, content: str | bytes, *, overwrite: bool = False) -> N
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if os.path.lexists(path):
-            _write_over(path, content)
+            _replace_file(path, content)
         else:
             with path.open("xb") as stream:
                 stream.write(content)
@@ -212,33 +227,38 @@ def write_new(path: Path, content: str | bytes, *, overwrite: bool = False) -> N
         raise OutputError(f"{path} cannot be written: {error.strerror or error}.") from error
 
 
-def _write_over(path: Path, content: bytes) -> None:
-    """Replace a file atomically: a full disk leaves the old one."""
-    part = path.with_name(f".{path.name}.part-{os.getpid()}")
+def _replace_file(path: Path, content: bytes) -> None:
+    """Replace a file atomically, so that the old file remains if the disk is full."""
+    temporary_path = path.with_name(f".{path.name}.part-{os.getpid()}")
     try:
-        part.write_bytes(content)
-        part.replace(path)
+        temporary_path.write_bytes(content)
+        temporary_path.replace(path)
     finally:
-        part.unlink(missing_ok=True)
+        temporary_path.unlink(missing_ok=True)
 
 
 # Earlier reports
 
 
-def _check_earlier(folder: Path) -> None:
-    """Raise if a folder is neither free nor an earlier report."""
-    if not _is_free(folder) and not (folder.is_dir() and (folder / LIST).is_file()):
+def _require_free_or_report(folder: Path) -> None:
+    """Raise OutputExistsError if a folder is neither free nor an earlier report."""
+    if not _is_free(folder) and not (folder.is_dir() and (folder / CHECKSUM_LIST_NAME).is_file()):
         raise OutputExistsError(
             f"--overwrite replaces reports of an analysis, and {folder} is not one: it has no list "
-            f"of its files ({LIST}). Choose another folder with --report, or move it away."
+            f"of its files ({CHECKSUM_LIST_NAME}). Choose another folder with --report, or move "
+            "it away."
         )
 
 
-def _replace(folder: Path, part: Path, sums: Mapping[str, set[str]]) -> None:
-    """Move the files of a new report into the folder of an earlier one, whose own files go."""
-    earlier = _read_list(folder)
-    for name in sums:
-        if os.path.lexists(folder / name) and not _is_own(folder, name, earlier):
+def _replace_report(
+    folder: Path, temporary_folder: Path, checksums: Mapping[str, set[str]]
+) -> None:
+    """Move a new report's files into an earlier report's folder, and remove the earlier files."""
+    earlier_checksums = _read_list(folder)
+    for name in checksums:
+        if os.path.lexists(folder / name) and not _is_unchanged_report_file(
+            folder, name, earlier_checksums
+        ):
             raise OutputExistsError(
                 f"The report {folder} is unchanged: {name} in it was modified, or not written by "
                 "an analysis, and --overwrite does not replace such files; move it away, or choose "
@@ -246,50 +266,60 @@ def _replace(folder: Path, part: Path, sums: Mapping[str, set[str]]) -> None:
             )
     try:
         # If this is interrupted, the list still contains all files.
-        both = {
-            name: earlier.get(name, set()) | sums.get(name, set()) for name in {*earlier, *sums}
+        all_checksums = {
+            name: earlier_checksums.get(name, set()) | checksums.get(name, set())
+            for name in {*earlier_checksums, *checksums}
         }
-        _write_over(folder / LIST, _listed(both).encode())
-        for name in sums:
+        _replace_file(folder / CHECKSUM_LIST_NAME, _list_text(all_checksums).encode())
+        for name in checksums:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (part / name).replace(folder / name)
-        for name in earlier.keys() - sums.keys():
-            if _is_own(folder, name, earlier):
+            (temporary_folder / name).replace(folder / name)
+        for name in earlier_checksums.keys() - checksums.keys():
+            if _is_unchanged_report_file(folder, name, earlier_checksums):
                 (folder / name).unlink()
                 with suppress(OSError):  # folders that are not empty stay
                     (folder / name).parent.rmdir()
-        _write_over(folder / LIST, _listed(sums).encode())
+        _replace_file(folder / CHECKSUM_LIST_NAME, _list_text(checksums).encode())
     except OSError as error:
         raise OutputError(
             f"The report {folder} cannot be replaced: {error.strerror or error}."
         ) from error
 
 
-def _is_own(folder: Path, name: str, earlier: Mapping[str, set[str]]) -> bool:
-    """Whether a file inside the folder is one of its list, and unchanged."""
+def _is_unchanged_report_file(
+    folder: Path, name: str, listed_checksums: Mapping[str, set[str]]
+) -> bool:
+    """Return whether a file of a report's folder is in the folder's list and unchanged."""
     path = folder / name
-    inside = path.resolve().is_relative_to(folder.resolve()) and not path.is_symlink()
-    return inside and path.is_file() and _sha256(path) in earlier.get(name, ())
+    is_inside = path.resolve().is_relative_to(folder.resolve()) and not path.is_symlink()
+    return is_inside and path.is_file() and _sha256(path) in listed_checksums.get(name, ())
 
 
 def _read_list(folder: Path) -> dict[str, set[str]]:
-    """Read SHA-256 by name; of a file that was just being replaced there are two."""
-    found: dict[str, set[str]] = {}
+    """Return the listed SHA-256 checksums of a report's files, by name.
+
+    A file that was being replaced at an interruption has two checksums.
+    """
+    checksums: dict[str, set[str]] = {}
     try:
-        for line in read_text(folder / LIST, _LONGEST_LIST).splitlines():
+        for line in read_text(folder / CHECKSUM_LIST_NAME, _LARGEST_LIST_BYTES).splitlines():
             checksum, _, name = line.partition("  ")
-            found.setdefault(name, set()).add(checksum)
+            checksums.setdefault(name, set()).add(checksum)
     except DocumentError as error:
-        raise OutputError(f"{folder / LIST} {error}.") from error
-    return found
+        raise OutputError(f"{folder / CHECKSUM_LIST_NAME} {error}.") from error
+    return checksums
 
 
-def _listed(sums: Mapping[str, set[str]]) -> str:
+def _list_text(checksums: Mapping[str, set[str]]) -> str:
+    """Return the text of a report's list of files and checksums."""
     return "".join(
-        f"{checksum}  {name}\n" for name in sorted(sums) for checksum in sorted(sums[name])
+        f"{checksum}  {name}\n"
+        for name in sorted(checksums)
+        for checksum in sorted(checksums[name])
     )
 
 
 def _sha256(path: Path) -> str:
+    """Return the SHA-256 checksum of a file, in hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

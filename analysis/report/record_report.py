@@ -1,4 +1,4 @@
-"""Report of a record: one page, and a folder with figures, tables, text and JSON."""
+"""Report of one record: an HTML page, and a folder with figures, tables, text and JSON."""
 
 from __future__ import annotations
 
@@ -34,76 +34,78 @@ def record_page(
     result: RecordResult,
     pictures: Sequence[Picture],
     modes: Table,
-    of_record: Sequence[Table],
+    record_tables: Sequence[Table],
     made_at: datetime,
     paper_pictures: Sequence[Picture] = (),
     paper_tables: Sequence[Table] = (),
 ) -> str:
-    """Return a report.
+    """Return the HTML page with the results of one record.
 
     Parameters
     ----------
     result : RecordResult
-        With whole-record fits.
+        Results of the record, with whole-record fits.
     pictures : sequence of Picture
-        The figures; the table of the modes follows the first one.
+        Figures of the whole-record fits. The table of modes follows the first figure.
     modes : Table
-    of_record : sequence of Table
+        Table of the modes.
+    record_tables : sequence of Table
         Tables of the whole-record fits.
     made_at : datetime
-        When, with a time zone.
+        Date and time of the report, with a time zone.
     paper_pictures : sequence of Picture, optional
+        Figures of the Welch fits.
     paper_tables : sequence of Table, optional
-        Figures and tables of the Welch fits; without tables their section is left out.
+        Tables of the Welch fits. Without tables, the section of the Welch fits is omitted.
 
     Returns
     -------
     str
-        An HTML document that refers to nothing outside it.
+        HTML document that refers to no other files.
     """
     from analysis.report._page import page, versions
 
-    whole = result.whole
-    assert whole is not None
-    figures = [each for each in pictures if each.name != UNIFORMITY]
-    test = whole.headline.uniform_beam
+    whole_record = result.whole
+    assert whole_record is not None
+    figures = [picture for picture in pictures if picture.name != UNIFORMITY]
+    test = whole_record.headline.uniform_beam
     return page(
         "record.html",
         title=result.name,
-        session=_session(result.record),
+        session=_session_lines(result.record),
         note=result.record.metadata.get("note"),
-        first=damping_sentences(whole.headline),
-        sentences=whole.verdict.sentences,
-        experiments=whole.verdict.experiments,
+        first=damping_sentences(whole_record.headline),
+        sentences=whole_record.verdict.sentences,
+        experiments=whole_record.verdict.experiments,
         warnings=result.warnings,
         pictures=figures,
         uniformity=None
         if test is None
         else {
             "sentence": test.summary.sentence,
-            "pictures": [each for each in pictures if each.name == UNIFORMITY],
-            "tables": uniformity_tables(whole),
+            "pictures": [picture for picture in pictures if picture.name == UNIFORMITY],
+            "tables": uniformity_tables(whole_record),
         },
-        equations=[mathml(each) for each in equations(whole)],
-        definitions=definitions(whole),
-        types=types_table(whole),
+        equations=[mathml(picture_or_formula) for picture_or_formula in equations(whole_record)],
+        definitions=definitions(whole_record),
+        types=types_table(whole_record),
         modes=modes,
-        tables=of_record,
+        tables=record_tables,
         paper_pictures=paper_pictures,
         paper_tables=paper_tables,
-        how=[*_how(result, whole), versions(made_at)],
+        how=[*_collect_facts(result, whole_record), versions(made_at)],
     )
 
 
-def _session(record: Record) -> list[str]:
-    """Return specimen, operator and outcome of the session, as the file states them."""
+def _session_lines(record: Record) -> list[str]:
+    """Return start, outcome, specimen and operator of the session, as the file states them."""
     metadata = record.metadata
     lines = [f"{key}: {metadata[key]}" for key in ("specimen", "operator") if metadata.get(key)]
-    return [*_start(metadata), f"outcome {record.outcome}", *lines]
+    return [*_start_lines(metadata), f"outcome {record.outcome}", *lines]
 
 
-def _start(metadata: Mapping[str, str]) -> list[str]:
-    """Return the start time of the session, if the file states it."""
+def _start_lines(metadata: Mapping[str, str]) -> list[str]:
+    """Return the start time of the session as a list of one text; empty if the file states none."""
     try:
         seconds = int(metadata["start_utc_ns"]) / 1e9
         start = datetime.fromtimestamp(seconds, UTC)
@@ -112,31 +114,40 @@ def _start(metadata: Mapping[str, str]) -> list[str]:
     return [f"recorded {start:%Y-%m-%d %H:%M:%S} UTC"]
 
 
-_SHOWN_ALREADY = frozenset(
+_METADATA_SHOWN_ELSEWHERE = frozenset(
     (
         "rate_hz", "beam_length_m", "beam_density_kg_per_m", "beam_bending_stiffness_n_m2",
         "tool_inertia_kg_m2", "angle_delay_s", "torque_delay_s",
     )
 )  # fmt: skip
+"""Keys of metadata that the page shows in another section."""
 
 
-def _how(result: RecordResult, whole: WholeRecord) -> list[Facts]:
-    """Collect the facts on file, record, session and settings."""
-    record, welch = result.record, result.welch
+def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[Facts]:
+    """Return the facts on file, record, session and settings."""
+    record, welch_analysis = result.record, result.welch
     return [
         ("File", _file_facts(record.path)),
         ("Record", _record_facts(record)),
         (
             "Session, as the file states it",
-            [(key, value) for key, value in record.metadata.items() if key not in _SHOWN_ALREADY],
+            [
+                (key, value)
+                for key, value in record.metadata.items()
+                if key not in _METADATA_SHOWN_ELSEWHERE
+            ],
         ),
-        ("Whole-record fits", _record_fit_facts(whole)),
-        *([] if welch is None else [("Welch method (as in the paper)", _welch_facts(welch))]),
+        ("Whole-record fits", _record_fit_facts(whole_record)),
+        *(
+            []
+            if welch_analysis is None
+            else [("Welch method (as in the paper)", _welch_facts(welch_analysis))]
+        ),
     ]
 
 
 def sha256(path: Path) -> str | None:
-    """Checksum of a file, None if it is not there any more."""
+    """Return the SHA-256 checksum of a file in hexadecimal; None if the file cannot be read."""
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -145,6 +156,7 @@ def sha256(path: Path) -> str | None:
 
 
 def _file_facts(path: Path) -> list[tuple[str, str]]:
+    """Return path, size and checksum of a file, as facts."""
     checksum = sha256(path)
     facts = [("path", str(path))]
     if checksum is not None:
@@ -153,6 +165,7 @@ def _file_facts(path: Path) -> list[tuple[str, str]]:
 
 
 def _record_facts(record: Record) -> list[tuple[str, str]]:
+    """Return outcome, samples, beam, latencies and gaps of a record, as facts."""
     beam, gaps = record.beam, record.gaps
     samples = len(record.time_s)
     flags = ", ".join(f"{count} × {meaning}" for meaning, count in record.flags.items())
@@ -175,11 +188,12 @@ def _record_facts(record: Record) -> list[tuple[str, str]]:
     ]
 
 
-def _record_fit_facts(whole: WholeRecord) -> list[tuple[str, str]]:
-    first_hz, last_hz = whole.band_hz
+def _record_fit_facts(whole_record: WholeRecord) -> list[tuple[str, str]]:
+    """Return estimator, band, types and fixed parameters of the whole-record fits, as facts."""
+    first_hz, last_hz = whole_record.band_hz
     lines = [
         f"{line.frequency_hz:.5g} Hz, {1e3 * line.amplitude_nm:.3g} mN·m"
-        for line in whole.analysis.lines
+        for line in whole_record.analysis.lines
     ]
     return [
         (
@@ -188,9 +202,9 @@ def _record_fit_facts(whole: WholeRecord) -> list[tuple[str, str]]:
             "for the measured angle minus the measured torque, whitened by the noise model; "
             "maximum likelihood for noise in the torque",
         ),
-        ("band", f"{first_hz:g} to {last_hz:g} Hz, {whole.analysis.frequency_hz.size} bins"),
-        ("types", ", ".join(whole.fits)),
-        ("fixed at the file's values", ", ".join(whole.fixed) or "none"),
+        ("band", f"{first_hz:g} to {last_hz:g} Hz, {whole_record.analysis.frequency_hz.size} bins"),
+        ("types", ", ".join(whole_record.fits)),
+        ("fixed at the file's values", ", ".join(whole_record.fixed) or "none"),
         ("narrow-band disturbances removed", "; ".join(lines) or "none found"),
         (
             "intervals and bands",
@@ -200,7 +214,8 @@ def _record_fit_facts(whole: WholeRecord) -> list[tuple[str, str]]:
 
 
 def _welch_facts(analysis: WelchAnalysis) -> list[tuple[str, str]]:
-    settings, used, response = analysis.settings, analysis.segmentation, analysis.response
+    """Return estimator, band, types and segments of the Welch fits, as facts."""
+    settings, segmentation, response = analysis.settings, analysis.segmentation, analysis.response
     first_hz, last_hz = settings.band_hz
     facts = [
         ("estimator", ESTIMATOR_WORDS[settings.estimator]),
@@ -214,8 +229,8 @@ def _welch_facts(analysis: WelchAnalysis) -> list[tuple[str, str]]:
         facts.append(
             (
                 "segments",
-                f"{response.segments} of {used.segment_length} samples (Hamming), overlap "
-                f"{used.overlap}, nfft {used.nfft}",
+                f"{response.segments} of {segmentation.segment_length} samples (Hamming), overlap "
+                f"{segmentation.overlap}, nfft {segmentation.nfft}",
             )
         )
     return facts
@@ -227,75 +242,89 @@ _WELCH_DESCRIPTION: Final = (
     "Frequency response by Welch's method, as in the paper, with the fits of each type and "
     "weighting, and the coherence."
 )
+"""Caption of the Welch fits' figures."""
 
 
-_FOR_PAPERS: Final = ("modes", "parameters")
-"""Tables that are there for LaTeX, too."""
+_LATEX_TABLES: Final = ("modes", "parameters")
+"""Tables that are also written as LaTeX."""
 
 
 def _write_page(
     result: RecordResult,
-    whole: WholeRecord,
+    whole_record: WholeRecord,
     folder: Path,
     on_step: Callable[[str], None],
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
     paper_pictures: Sequence[Picture] = (),
 ) -> None:
-    """Write ``report.html``, ``figures/`` and ``tables/``."""
+    """Write ``report.html`` and the files in ``figures/`` and ``tables/``."""
     from analysis.report import _style as style
     from analysis.report._record_figures import illustrations
 
     pictures = []
     with style.styled():
-        for shown in illustrations(whole):
-            stem = folder / "figures" / shown.name
-            pictures.append(style.save_picture(shown.figure, stem, shown.description, formats))
-            on_step(f"figure {shown.name}")
-    modes, of_record, of_paper = report_tables(result)
-    for each in (modes, *uniformity_tables(whole), *of_record, *of_paper):
-        table = with_validity(each, result.validity)
+        for illustration in illustrations(whole_record):
+            stem = folder / "figures" / illustration.name
+            pictures.append(
+                style.save_picture(illustration.figure, stem, illustration.description, formats)
+            )
+            on_step(f"figure {illustration.name}")
+    modes, record_tables, paper_tables = report_tables(result)
+    for report_table in (modes, *uniformity_tables(whole_record), *record_tables, *paper_tables):
+        table = with_validity(report_table, result.validity)
         write_new(folder / "tables" / f"{table.name}.csv", csv_text(table))
-        if table.name in _FOR_PAPERS:
+        if table.name in _LATEX_TABLES:
             write_new(folder / "tables" / f"{table.name}.tex", latex_table(table))
-    write_new(folder / "tables" / "model.tex", latex(equations(whole)))
+    write_new(folder / "tables" / "model.tex", latex(equations(whole_record)))
     made_at = datetime.now().astimezone()
-    text = record_page(result, pictures, modes, of_record, made_at, paper_pictures, of_paper)
+    text = record_page(
+        result, pictures, modes, record_tables, made_at, paper_pictures, paper_tables
+    )
     write_new(folder / "report.html", text)
 
 
-def uniformity_tables(whole: WholeRecord) -> tuple[Table, ...]:
-    """Make the tables on the uniformity of the beam."""
-    test = whole.headline.uniform_beam
+def uniformity_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
+    """Return the tables of the test of the beam's uniformity; nothing without the test."""
+    test = whole_record.headline.uniform_beam
     if test is None or test.p_value is None:
         return ()
-    modes = tables.exact_modes_table(whole)
+    modes = tables.exact_modes_table(whole_record)
     return (uniformity_table(test), *(() if modes is None else (modes,)))
 
 
 def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
-    """Make the table of modes, those of the whole-record fits, and those of the Welch method."""
-    whole, welch = result.whole, result.welch
-    assert whole is not None
-    conditions = tables.exact_geometry_table(whole), tables.condition_table(whole)
-    of_record = (
-        tables.sizes_table(whole),
-        tables.parameters_table(whole),
-        *(each for each in conditions if each is not None),
-        tables.correlations_table(whole),
-        *tables.amplitude_tables(whole),
-        fit_tables.structures_table(whole),
+    """Return the table of modes, those of whole-record fits, and those of the Welch method."""
+    whole_record, welch_analysis = result.whole, result.welch
+    assert whole_record is not None
+    conditions = (
+        tables.exact_geometry_table(whole_record),
+        tables.simpler_structure_table(whole_record),
     )
-    of_paper = (
+    record_tables = (
+        tables.loss_factors_table(whole_record),
+        tables.parameters_table(whole_record),
+        *(table for table in conditions if table is not None),
+        tables.correlations_table(whole_record),
+        *tables.amplitude_tables(whole_record),
+        fit_tables.structures_table(whole_record),
+    )
+    paper_tables = (
         ()
-        if welch is None
-        else (fit_tables.welch_fits_table(welch, whole.unsupported), fit_tables.peaks_table(welch))
+        if welch_analysis is None
+        else (
+            fit_tables.welch_fits_table(welch_analysis, whole_record.unsupported),
+            fit_tables.peaks_table(welch_analysis),
+        )
     )
-    return tables.modes_table(whole), of_record, of_paper
+    return tables.modes_table(whole_record), record_tables, paper_tables
 
 
-_FIGURES: Final = ("welch_signals", "welch_frf", "welch_torque")
-_FIGURES_WITH_RECORD: Final = ("welch_frf",)
-"""Figures of the Welch fits if the whole-record fit has its own of signals and torque."""
+_WELCH_FIGURES: Final = ("welch_signals", "welch_frf", "welch_torque")
+"""Names of the Welch fits' figures."""
+_WELCH_FIGURES_WITH_RECORD: Final = ("welch_frf",)
+"""Names of the Welch fits' figures in a report with whole-record fits.
+
+The whole-record fits have their own figures of signals and torque."""
 
 
 def write_report(
@@ -304,39 +333,41 @@ def write_report(
     on_step: Callable[[str], None] = lambda _done: None,
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
 ) -> None:
-    """Write ``figures/``, ``tables.txt``, ``analysis.json`` and, of a whole record, a page.
+    """Write the report of a record into a folder.
 
-    The page ``report.html`` comes with ``tables/``. Every file's name is in lower case with
-    underscores: ``figures/NAME.png``, ``.svg``, ``.pdf``; ``tables/NAME.csv``, ``.tex``.
+    It consists of ``figures/``, ``tables.txt``, ``analysis.json`` and, with whole-record fits, the
+    page ``report.html`` and ``tables/``. All file names are in lower case with underscores:
+    ``figures/NAME.png``, ``.svg``, ``.pdf``; ``tables/NAME.csv``, ``.tex``.
 
     Parameters
     ----------
     result : RecordResult
+        Results of the record.
     folder : Path
-        An existing folder without these files.
+        Existing folder that contains none of these files.
     on_step : callable, optional
-        Called with a few words after each figure.
+        Function that is called after each figure with a short text.
     formats : sequence of str
         Formats of the figures.
 
     Raises
     ------
     OutputExistsError, OutputError
-        If a file exists, or cannot be written.
+        If a file exists or cannot be written.
     """
-    whole = result.whole
+    whole_record = result.whole
     pictures: list[Picture] = []
     if result.welch is not None:
-        names = figures_of_paper(paper=True, whole_record=whole is not None)
-        pictures = _draw(result.welch, names, folder / "figures", on_step, formats)
+        names = figures_of_paper(paper=True, whole_record=whole_record is not None)
+        pictures = _write_welch_figures(result.welch, names, folder / "figures", on_step, formats)
     write_new(folder / "tables.txt", tables_text(result))
-    if whole is not None:
-        _write_page(result, whole, folder, on_step, formats, pictures)
+    if whole_record is not None:
+        _write_page(result, whole_record, folder, on_step, formats, pictures)
     write_new(folder / "analysis.json", document_text(document([result])))
 
 
 def figures_of_paper(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
-    """Name the figures of the Welch fits that a report has.
+    """Return the names of the Welch fits' figures in a report.
 
     Parameters
     ----------
@@ -347,25 +378,28 @@ def figures_of_paper(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
     """
     if not paper:
         return ()
-    return _FIGURES_WITH_RECORD if whole_record else _FIGURES
+    return _WELCH_FIGURES_WITH_RECORD if whole_record else _WELCH_FIGURES
 
 
-def _draw(
+def _write_welch_figures(
     analysis: WelchAnalysis,
     names: Sequence[str],
     folder: Path,
     on_step: Callable[[str], None],
     formats: Sequence[FigureFormat],
 ) -> list[Picture]:
+    """Draw and write figures of the Welch fits, and return them for the page."""
     from analysis.report import _style as style
     from analysis.report._frf_figure import frf_figure
     from analysis.report._signal_figures import paper_signals_figure, torque_figure
 
-    drawn = dict(zip(_FIGURES, (paper_signals_figure, frf_figure, torque_figure), strict=True))
+    drawing_functions = dict(
+        zip(_WELCH_FIGURES, (paper_signals_figure, frf_figure, torque_figure), strict=True)
+    )
     pictures = []
     for name in names:
         with style.styled():
-            figure = drawn[name](analysis)
+            figure = drawing_functions[name](analysis)
             pictures.append(style.save_picture(figure, folder / name, _WELCH_DESCRIPTION, formats))
         on_step(f"figure {name}")
     return pictures

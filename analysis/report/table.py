@@ -1,6 +1,6 @@
-"""A table, described once, and its output on the terminal, in LaTeX, CSV and JSON.
+"""Table that is defined once and rendered for the terminal, LaTeX, CSV, JSON and pages.
 
-For a page the template's macro `table` makes it, from the same cells.
+The HTML of a page is made by the template's macro `table`, from the same cells.
 """
 
 from __future__ import annotations
@@ -24,27 +24,30 @@ if TYPE_CHECKING:
     from analysis.models import Structure
     from rigd.session import Validity
 
-ABSENT: Final = "–"
-WORDS: Final = ""
-"""Format of a column that holds no numbers."""
+ABSENT_TEXT: Final = "–"
+"""Text that a cell without a value shows."""
+TEXT_FORMAT: Final = ""
+"""Number format of a column that contains texts instead of numbers."""
 
 Value = str | float | bool | None
+"""Value of a cell as programs read it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A cell with a text of its own.
+    """Cell of a table whose displayed text differs from the standard format of its value.
 
     Attributes
     ----------
     value : str, float, bool or None
-        Value for programs: in SI units and in full; None if it is not known.
+        Value for programs, in SI units with all digits; None if it is unknown.
     text : str
         Text for people, in the unit that the table states.
     strong : bool
-        Whether it is emphasised.
+        Whether the text is emphasised.
     doubtful : bool
-        Whether it is not reported: shown in grey, as the data do not support it.
+        Whether the value is not a reported result: it is shown in grey, because the data do not
+        support it.
     """
 
     value: Value
@@ -54,76 +57,82 @@ class Cell:
 
     @property
     def is_number(self) -> bool:
-        """Whether the value is a number."""
+        """Whether the cell's value is a number."""
         return isinstance(self.value, int | float) and not isinstance(self.value, bool)
 
 
 Entry = Cell | Value
+"""Cell of a table, or a value that is shown in its column's standard format."""
 Row = Mapping[str, Entry]
-"""Entries by their columns' keys."""
+"""Entries of a table's row by the keys of their columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column that people see.
+    """Column of a table: heading, key and number format.
 
     Attributes
     ----------
     heading : str
-        Without one the column is in the files only.
+        Heading for people. A column with an empty heading is written to files only.
     key : str
-        Its name, with the SI unit, for programs: header in CSV, key in JSON.
-    form : str
-        Format of its numbers; `WORDS` of a column of words.
+        Name for programs, with the SI unit: header in CSV, key in JSON.
+    number_format : str
+        Format of the column's numbers; `TEXT_FORMAT` if the column contains texts.
     factor : float
-        By which a number in SI units is multiplied to be shown.
-    spread : bool
-        Whether it is the standard deviation of the column before it; on the terminal, which is
-        narrow, it follows a ±.
+        Factor from SI units to the displayed unit.
+    std_of_previous : bool
+        Whether the column contains the standard deviations of the column before it. The terminal,
+        which is narrow, shows them after a ± in the same column.
     """
 
     heading: str
     key: str
-    form: str = ".4g"
+    number_format: str = ".4g"
     factor: float = 1.0
-    spread: bool = False
+    std_of_previous: bool = False
 
     @property
     def numeric(self) -> bool:
-        """Whether it holds numbers."""
-        return self.form != WORDS
+        """Whether the column contains numbers."""
+        return self.number_format != TEXT_FORMAT
 
     def shown(self, entry: Entry) -> Cell:
-        """Return the cell that people see of an entry."""
+        """Return the cell that people see for an entry of this column."""
         if isinstance(entry, Cell):
             return entry
         if isinstance(entry, bool):
             return Cell(entry, "yes" if entry else "no")
         if isinstance(entry, str):
             return Cell(entry, entry)
-        return count(entry) if isinstance(entry, int) else number(entry, self.form, self.factor)
+        return (
+            count_cell(entry)
+            if isinstance(entry, int)
+            else number_cell(entry, self.number_format, self.factor)
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table of a report.
+    """Table of a report: columns, rows and notes.
 
     Attributes
     ----------
     name : str
-        Name of its CSV file, without the ending, and of the list of its rows in JSON.
+        Name of the CSV file without suffix, and key of the list of rows in JSON.
     caption : str
+        Title of the table.
     columns : tuple of Column
-        Those that people see, in their order; the first one names the rows.
+        Columns for people, in their order. The first one identifies the row.
     rows : tuple of mapping of str to Entry
-        By the columns' keys. Further entries of a row are for programs only. A row may lack
+        Entries by the keys of their columns. Further entries are for programs only. A row may lack
         entries.
     notes : tuple of str
-        Sentences under it.
+        Sentences below the table.
     selected : int or None
-        Row that is marked.
+        Index of the row that is shown in bold.
     grouped : bool
-        Whether rows with the same first cell belong together, and are ruled off on the terminal.
+        Whether a line is drawn on the terminal between rows whose first cells differ.
     """
 
     name: str
@@ -146,32 +155,32 @@ class Table:
         selected: int | None = None,
         grouped: bool = False,
     ) -> Table:
-        """Make a table whose rows have their entries in the order of the columns.
+        """Return a table whose rows contain their entries in the order of the columns.
 
         Parameters
         ----------
         name : str
-            Name of its file, without suffix.
+            Name of the CSV file without suffix.
         caption : str
             Title.
         columns : sequence of Column
             The columns.
         rows : iterable of sequence
-            Entries of each row.
+            Entries of each row, in the order of the columns.
         notes : sequence of str, optional
-            Sentences below it.
+            Sentences below the table.
         selected : int, optional
-            Number of the row that is marked.
+            Index of the row that is shown in bold.
         grouped : bool
-            Whether rows with the same first entry are ruled off from the others.
+            Whether a line is drawn between rows whose first entries differ.
         """
         keys = [column.key for column in columns]
-        by_key = tuple(dict(zip(keys, row, strict=True)) for row in rows)
-        return cls(name, caption, tuple(columns), by_key, tuple(notes), selected, grouped)
+        keyed_rows = tuple(dict(zip(keys, row, strict=True)) for row in rows)
+        return cls(name, caption, tuple(columns), keyed_rows, tuple(notes), selected, grouped)
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Names of all columns, as the rows have them."""
+        """Keys of all entries of a table, in their order: the header of its CSV file."""
         return tuple(
             dict.fromkeys(key for row in self.rows for key in row)
             or (column.key for column in self.columns)
@@ -179,17 +188,17 @@ class Table:
 
     @property
     def shown_columns(self) -> tuple[Column, ...]:
-        """The columns that have a heading, but those without an entry in any row."""
-        filled = {key for row in self.rows for key, entry in row.items() if entry != ""}
+        """Columns of a table that have a heading and an entry in at least one row."""
+        keys_with_entries = {key for row in self.rows for key, entry in row.items() if entry != ""}
         return tuple(
             column
             for column in self.columns
-            if column.heading and (column.key in filled or not self.rows)
+            if column.heading and (column.key in keys_with_entries or not self.rows)
         )
 
     @property
     def shown_rows(self) -> tuple[tuple[Cell, ...], ...]:
-        """Cells of these columns."""
+        """Cells of a table's displayed columns, row by row."""
         columns = self.shown_columns
         return tuple(
             tuple(column.shown(row.get(column.key, "")) for column in columns) for row in self.rows
@@ -197,9 +206,9 @@ class Table:
 
 
 def with_validity(table: Table, validity: Validity) -> Table:
-    """Add to a table the validity of the linear model for its numbers.
+    """Return a table with the validity of the linear model, as a note and in each row.
 
-    People read it under the table; programs have it in each row.
+    People read the note below the table. Programs read the values in each row.
 
     Parameters
     ----------
@@ -208,16 +217,16 @@ def with_validity(table: Table, validity: Validity) -> Table:
     validity : Validity
         Validity of the linear model.
     """
-    stated = {
+    validity_entries = {
         "predicted_peak_tip_slope_rad": validity.predicted_peak_tip_slope_rad,
         "linear_model_error": validity.linear_model_error,
     }
-    rows = tuple({**row, **stated} for row in table.rows)
+    rows = tuple({**row, **validity_entries} for row in table.rows)
     return replace(table, rows=rows, notes=(*table.notes, validity.sentence))
 
 
 def csv_text(table: Table) -> str:
-    """Write a table as CSV: keys as header, numbers in SI units and full precision.
+    """Return a table as CSV, with keys as header and numbers in SI units with all digits.
 
     Unknown values are empty fields.
     """
@@ -229,67 +238,76 @@ def csv_text(table: Table) -> str:
 
 
 def json_rows(table: Table) -> list[dict[str, Value]]:
-    """Return the rows as plain values by their keys; None for what is not known or not finite."""
-    return [{key: _plain(entry) for key, entry in row.items()} for row in table.rows]
+    """Return a table's rows as plain values by their keys; None if unknown or not finite."""
+    return [{key: _program_value(entry) for key, entry in row.items()} for row in table.rows]
 
 
-def _plain(entry: Entry) -> Value:
+def _program_value(entry: Entry) -> Value:
+    """Return an entry's value as programs read it; None if it is not finite."""
     value = entry.value if isinstance(entry, Cell) else entry
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def terminal_table(table: Table) -> rich.table.Table:
-    """Make a table for the terminal, at least as wide as its title."""
+    """Return a table for the terminal, at least as wide as its title."""
     from rich import box
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    shown = RichTable(
+    rich_table = RichTable(
         title=Text(table.caption, style="bold"), title_justify="left",
         caption=Text("\n".join(table.notes)) if table.notes else None, caption_justify="left",
         min_width=len(table.caption),
         box=box.SIMPLE_HEAD, padding=(0, 1), header_style="bold", show_edge=False, pad_edge=False,
     )  # fmt: skip
-    spreads = [column.spread for column in table.shown_columns]
+    std_columns = [column.std_of_previous for column in table.shown_columns]
     for column in table.shown_columns:
-        if not column.spread:
-            shown.add_column(Text(column.heading), justify="right" if column.numeric else "left")
+        if not column.std_of_previous:
+            rich_table.add_column(
+                Text(column.heading), justify="right" if column.numeric else "left"
+            )
     rows = table.shown_rows
     for index, row in enumerate(rows):
         cells: list[Text] = []
-        for cell, spread in zip(row, spreads, strict=True):
-            if not spread:
+        for cell, is_std in zip(row, std_columns, strict=True):
+            if not is_std:
                 cells.append(Text(cell.text, style="dim italic" if cell.doubtful else ""))
             elif cell.value:
                 # No space follows the ±, so that a narrow terminal breaks the line before it.
                 cells[-1].append(f" ±{cell.text}")
-        ends = table.grouped and row[0].text != rows[min(index + 1, len(rows) - 1)][0].text
-        shown.add_row(*cells, end_section=ends, style="bold" if index == table.selected else "")
-    return shown
+        ends_group = table.grouped and row[0].text != rows[min(index + 1, len(rows) - 1)][0].text
+        rich_table.add_row(
+            *cells, end_section=ends_group, style="bold" if index == table.selected else ""
+        )
+    return rich_table
 
 
-_LETTERS: Final = {
+_LATEX_SYMBOLS: Final = {
     "α": "alpha", "β": "beta", "γ": "gamma", "δ": "delta", "Δ": "Delta", "ε": "varepsilon",
     "ζ": "zeta", "κ": "kappa", "λ": "lambda", "µ": "mu", "ξ": "xi", "π": "pi", "ρ": "rho",
     "τ": "tau", "ω": "omega", "·": "cdot", "±": "pm", "∝": "propto", "‖": "Vert",
     "ŷ": "hat{y}",
 }  # fmt: skip
-_ESCAPED: Final = {
+"""LaTeX commands of the letters and symbols of formulas."""
+_LATEX_ESCAPES: Final = {
     **{each: f"\\{each}" for each in "&%#_{}$"},
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "†": r"\dag{}", "‡": r"\ddag{}",
     "–": "--",
 }  # fmt: skip
-_RAISED: Final = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+"""LaTeX's escapes of special characters."""
+_SUPERSCRIPT_DIGITS: Final = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+"""Translation table from superscript characters to digits and the minus sign."""
 _LATEX_TOKENS: Final = re.compile(
     r"(?P<digits>\d+(?:\.\d+)?)e(?P<power>[+-]?\d+)|\^(?P<up>[^\W⁰¹²³⁴⁵⁶⁷⁸⁹]+)"
-    rf"|(?P<raised>[⁰¹²³⁴⁵⁶⁷⁸⁹⁻]+)|(?P<letter>[{''.join(_LETTERS)}])(?P<index>\d*)"
+    rf"|(?P<raised>[⁰¹²³⁴⁵⁶⁷⁸⁹⁻]+)|(?P<letter>[{''.join(_LATEX_SYMBOLS)}])(?P<index>\d*)"
     r"|(?P<minus>−)|(?P<stiffness>\bEI\b)|(?P<other>.)",
     re.DOTALL,
 )
+"""Pattern of a text's parts with their own LaTeX: powers, superscripts, Greek letters, others."""
 
 
 def latex_text(text: str) -> str:
-    r"""Write a cell's text for LaTeX: letters of formulas as mathematics, the rest escaped.
+    r"""Return a cell's text as LaTeX: Greek letters and powers as mathematics, the rest escaped.
 
     Examples
     --------
@@ -297,32 +315,36 @@ def latex_text(text: str) -> str:
     >>> print(latex_text("1e-5 s^α"), latex_text("ρ/EI"), latex_text("−7.2 %"))
     $10^{-5}$ s$^{\alpha}$ $\rho$/$EI$ $-$7.2 \%
     """
-    found = "".join(map(_latex_token, _LATEX_TOKENS.finditer(text)))
-    return found.replace("$$", "")
+    latex = "".join(map(_latex_token, _LATEX_TOKENS.finditer(text)))
+    return latex.replace("$$", "")
 
 
 def _latex_token(token: re.Match[str]) -> str:
-    part = token.groupdict()
-    if part["power"]:
-        digits = "" if part["digits"] == "1" else rf"{part['digits']} \cdot "
-        return f"${digits}10^{{{int(part['power'])}}}$"
-    if part["up"]:
-        up = "".join(f"\\{_LETTERS[each]} " if each in _LETTERS else each for each in part["up"])
-        return f"$^{{{up.rstrip()}}}$"
-    if part["raised"]:
-        return f"$^{{{part['raised'].translate(_RAISED)}}}$"
-    if part["letter"]:
-        index = f"_{{{part['index']}}}" if part["index"] else ""
-        return rf"$\{_LETTERS[part['letter']]}{index}$"
-    if part["minus"] or part["stiffness"]:
-        return "$-$" if part["minus"] else "$EI$"
-    return _ESCAPED.get(part["other"], part["other"])
+    """Return the LaTeX of one match of `_LATEX_TOKENS`."""
+    groups = token.groupdict()
+    if groups["power"]:
+        digits = "" if groups["digits"] == "1" else rf"{groups['digits']} \cdot "
+        return f"${digits}10^{{{int(groups['power'])}}}$"
+    if groups["up"]:
+        exponent = "".join(
+            f"\\{_LATEX_SYMBOLS[character]} " if character in _LATEX_SYMBOLS else character
+            for character in groups["up"]
+        )
+        return f"$^{{{exponent.rstrip()}}}$"
+    if groups["raised"]:
+        return f"$^{{{groups['raised'].translate(_SUPERSCRIPT_DIGITS)}}}$"
+    if groups["letter"]:
+        index = f"_{{{groups['index']}}}" if groups["index"] else ""
+        return rf"$\{_LATEX_SYMBOLS[groups['letter']]}{index}$"
+    if groups["minus"] or groups["stiffness"]:
+        return "$-$" if groups["minus"] else "$EI$"
+    return _LATEX_ESCAPES.get(groups["other"], groups["other"])
 
 
 def latex_table(table: Table) -> str:
-    r"""Write a table as LaTeX's ``table``, with the rules of the package booktabs.
+    r"""Return a table as LaTeX's ``table``, with the rules of the package booktabs.
 
-    Notes stand under it.
+    The notes follow below the table.
     """
     columns = table.shown_columns
     alignment = "".join("r" if column.numeric else "l" for column in columns)
@@ -347,92 +369,101 @@ def latex_table(table: Table) -> str:
     return "\n".join(lines) + "\n"
 
 
-def number(value: float | None, form: str = ".4g", factor: float = 1.0) -> Cell:
-    """Return a cell that shows a number; a dash if it is not known or not finite.
+def number_cell(value: float | None, number_format: str = ".4g", factor: float = 1.0) -> Cell:
+    """Return a cell that shows a number; a dash if the number is unknown or not finite.
 
     Parameters
     ----------
     value : float or None
         The number, in SI units.
-    form : str
-        Format, as of `format`.
+    number_format : str
+        Format of the number, as for the function `format`.
     factor : float
-        Factor of the number shown.
+        Factor from SI units to the displayed unit.
     """
     if value is None or not math.isfinite(value):
-        return Cell(None, ABSENT)
-    return Cell(float(value), f"{factor * value:{form}}".replace("-", "−"))
+        return Cell(None, ABSENT_TEXT)
+    return Cell(float(value), f"{factor * value:{number_format}}".replace("-", "−"))
 
 
-def count(value: int) -> Cell:
-    """Show a whole number."""
+def count_cell(value: int) -> Cell:
+    """Return a cell that shows a whole number."""
     return Cell(value, str(value))
 
 
-def estimate(
+def estimate_cells(
     values: Sequence[float | None], std: float | None, factor: float = 1.0
 ) -> tuple[Cell, ...]:
-    """Return cells that show numbers to the second digit of their standard deviation.
+    """Return cells that show numbers rounded to the second digit of their standard deviation.
 
     Parameters
     ----------
     values : sequence of float or None
         The numbers, in SI units.
     std : float or None
-        Standard deviation of all of them.
+        Common standard deviation of all numbers, in SI units.
     factor : float
-        Factor of the numbers shown.
+        Factor from SI units to the displayed unit.
     """
     return tuple(
-        number(value, factor=factor)
+        number_cell(value, factor=factor)
         if value is None or not math.isfinite(value)
         else Cell(value, to_uncertainty((value,), std or 0.0, factor)[0].replace("-", "−"))
         for value in values
     )
 
 
-MARK: Final = "†"
+NOT_REPORTED_MARK: Final = "†"
+"""Mark after a number that is not a reported result."""
 
-_SYMBOLS: Final = {"alpha": "α", "lambda": "λ"}
+_ORDER_SYMBOLS: Final = {"alpha": "α", "lambda": "λ"}
+"""Symbols of the fractional orders by parameter name."""
 
 
-def unreported(structure: Structure, withheld: Collection[str]) -> frozenset[str]:
-    """Return the parameters of a fit that are not properties of the antenna.
+def unreported_parameters(
+    structure: Structure, unsupported_orders: Collection[str]
+) -> frozenset[str]:
+    """Return the names of a fit's parameters that are not properties of the antenna.
 
     Parameters
     ----------
     structure : Structure
         Structure of the fit.
-    withheld : collection of str
-        Orders that the data do not support, "alpha" or "lambda".
+    unsupported_orders : collection of str
+        Fractional orders that the data do not support: "alpha" or "lambda".
 
     Returns
     -------
     frozenset of str
-        Each of these orders that the structure has, and its coefficient: that holds for this
-        order only, as its very unit shows.
+        Each of these orders that the structure has, and the coefficient that belongs to it. A
+        coefficient is valid for one order only, as its unit shows.
     """
     return frozenset(
-        name for order in withheld for name in (order, COEFFICIENT_OF[order]) if structure.has(name)
+        name
+        for order in unsupported_orders
+        for name in (order, COEFFICIENT_OF[order])
+        if structure.has(name)
     )
 
 
-def marked(cell: Cell) -> Cell:
-    """Mark a number that is not reported; a dash needs no mark."""
-    return greyed(cell if cell.value is None else replace(cell, text=cell.text + MARK))
+def mark_cell(cell: Cell) -> Cell:
+    """Return a cell in grey with the mark of numbers that are not reported; dashes get no mark."""
+    return grey_cell(
+        cell if cell.value is None else replace(cell, text=cell.text + NOT_REPORTED_MARK)
+    )
 
 
-def greyed(cell: Cell) -> Cell:
-    """Return a cell in grey, such as those that belong to a marked number."""
+def grey_cell(cell: Cell) -> Cell:
+    """Return a cell in grey, such as a number that belongs to a marked number."""
     return replace(cell, doubtful=cell.value is not None)
 
 
-def footnotes(withheld: Collection[str]) -> tuple[str, ...]:
-    """Return the meaning of the mark, if it occurs."""
-    if not withheld:
+def footnotes(unsupported_orders: Collection[str]) -> tuple[str, ...]:
+    """Return the note that explains the mark, if an order is not reported; else nothing."""
+    if not unsupported_orders:
         return ()
-    orders = " or ".join(_SYMBOLS[order] for order in sorted(withheld))
+    orders = " or ".join(_ORDER_SYMBOLS[order] for order in sorted(unsupported_orders))
     return (
-        f"{MARK} not reported: the data support no order {orders}. The number belongs to its "
-        "curve, not to the antenna.",
+        f"{NOT_REPORTED_MARK} not reported: the data support no order {orders}. The number belongs "
+        "to its curve, not to the antenna.",
     )

@@ -1,4 +1,4 @@
-"""Report of touches: table, document and lines, and a folder with page and figures."""
+"""Report of touches: table, JSON document and text lines, and a folder with page and figures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.report._document import document_text, versions
 from analysis.report.folder import write_new
-from analysis.report.table import WORDS, Cell, Column, Entry, Table, csv_text, number
+from analysis.report.table import TEXT_FORMAT, Cell, Column, Entry, Table, csv_text, number_cell
 from analysis.results import DEFAULT_FORMATS, finite
 from rigd.units import decimals, with_half_width
 
@@ -19,54 +19,60 @@ if TYPE_CHECKING:
     from analysis.touch import Touch, TouchedSession
     from rigd.touch import Estimated
 
-_LOPSIDED = 0.25
-"""Distance of a value from the middle of its interval, relative to the interval, above which the
-ends are shown instead."""
-_KINDS = {
+_MOST_INTERVAL_ASYMMETRY = 0.25
+"""Asymmetry of an interval above which its ends are shown instead of value and half-width.
+
+It is the distance of the value from the middle, relative to the interval's length."""
+_KIND_DESCRIPTIONS = {
     "rigid": "obstacle at rest",
     "yielding": "obstacle that gives way",
     "moving": "moving obstacle",
     "knock": "knock",
     "unknown": "cannot tell",
 }
+"""Descriptions of the kinds of contact, by key."""
 
 
 def touches_table(sessions: Sequence[TouchedSession]) -> Table:
-    """Put the touches of all sessions into a table.
+    """Return the table of the touches of all sessions.
 
     Parameters
     ----------
     sessions : sequence of TouchedSession
+        Sessions with their touches.
     """
-    several = len(sessions) > 1
+    has_several_sessions = len(sessions) > 1
     columns = (
-        Column("Session" if several else "", "session", WORDS),
+        Column("Session" if has_several_sessions else "", "session", TEXT_FORMAT),
         Column("Touch", "number"),
         Column("Time (s)", "time_s"),
         Column("From the axis (m)", "x_m"),
         Column("Angle (rad)", "angle_rad", ".4f"),
         Column("Peak force (N)", "force_n"),
         Column("Stiffness (N/m)", "stiffness_n_per_m"),
-        Column("Kind", "kind", WORDS),
+        Column("Kind", "kind", TEXT_FORMAT),
     )
-    rows = [_row(session, touch) for session in sessions for touch in session.touches]
+    rows = [_touch_row(session, touch) for session in sessions for touch in session.touches]
     return Table(
         "touches",
         "Touches",
         columns,
         tuple(rows),
         ("± or to: 95 % interval; the angle is that of the motor at the touch.",) if rows else (),
-        grouped=several,
+        grouped=has_several_sessions,
     )
 
 
-def _row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
+def _touch_row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
+    """Return the table row of a touch: time, position, angle, peak force, stiffness and kind."""
     estimate = touch.estimate
     row: dict[str, Entry] = {
         "session": session.path.stem,
         "number": touch.number,
         "angle_rad": touch.angle_rad,
-        "kind": "not estimated" if estimate is None else _KINDS.get(estimate.kind, estimate.kind),
+        "kind": "not estimated"
+        if estimate is None
+        else _KIND_DESCRIPTIONS.get(estimate.kind, estimate.kind),
     }
     estimates: dict[str, tuple[Estimated | None, float]] = {}
     if estimate is not None:
@@ -77,43 +83,46 @@ def _row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
             "stiffness_n_per_m": (estimate.stiffness_n_per_m, 0.0),
         }
     for key in ("time_s", "x_m", "force_n", "stiffness_n_per_m"):
-        found, start = estimates.get(key, (None, 0.0))
-        row[key] = _cell(found, start)
-        row[f"{key}_std"] = None if found is None else found.std
+        quantity, offset = estimates.get(key, (None, 0.0))
+        row[key] = _estimate_cell(quantity, offset)
+        row[f"{key}_std"] = None if quantity is None else quantity.std
     return row
 
 
-def _cell(found: Estimated | None, start: float) -> Cell:
-    if found is None:
-        return number(None)
-    value = found.value + start
-    low, high = (each + start for each in found.interval_95)
-    if abs(value - (low + high) / 2) > _LOPSIDED * (high - low):
+def _estimate_cell(quantity: Estimated | None, offset: float) -> Cell:
+    """Return the cell of an estimate with its 95 % interval; a dash without an estimate."""
+    if quantity is None:
+        return number_cell(None)
+    value = quantity.value + offset
+    low, high = (limit + offset for limit in quantity.interval_95)
+    if abs(value - (low + high) / 2) > _MOST_INTERVAL_ASYMMETRY * (high - low):
         digits = decimals((high - low) / 2)
         return Cell(value, f"{low:.{digits}f} to {high:.{digits}f}".replace("-", "−"))
     return Cell(value, with_half_width(value, (low, high)).replace("-", "−"))
 
 
 def session_lines(session: TouchedSession) -> list[str]:
-    """Return the lines on a session's touches, and on the model.
+    """Return text lines on a session: number of touches, source of the model, and warnings.
 
     Parameters
     ----------
     session : TouchedSession
+        Session with its touches.
     """
     count = len(session.touches)
-    what = "no touch" if count == 0 else "1 touch" if count == 1 else f"{count} touches"
+    touch_count_text = "no touch" if count == 0 else "1 touch" if count == 1 else f"{count} touches"
     by = "during the session" if session.found == "loop" else "in the record"
-    detected = f", detected {by}" if count else ""
+    detection_text = f", detected {by}" if count else ""
     validity = f" {session.validity.sentence}" if count else ""
     return [
-        f"{session.path.name}: {what}{detected}. Model: {model_words(session)}.{validity}",
+        f"{session.path.name}: {touch_count_text}{detection_text}. "
+        f"Model: {model_words(session)}.{validity}",
         *(f"Warning: {sentence}" for sentence in session.warnings),
     ]
 
 
 def model_words(session: TouchedSession) -> str:
-    """Describe the source of the beam model."""
+    """Return the source of the beam model as text."""
     source = session.model.source
     return "the nominal beam of the attached profile" if source == "profile" else source
 
@@ -121,11 +130,12 @@ def model_words(session: TouchedSession) -> str:
 def touches_document(
     sessions: Sequence[TouchedSession], errors: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Collect the touches of all sessions.
+    """Return the touches of all sessions as one JSON document.
 
     Parameters
     ----------
     sessions : sequence of TouchedSession
+        Sessions with their touches.
     errors : mapping of str to str
         Message for each file that could not be analysed.
 
@@ -161,21 +171,23 @@ def write_touch_report(
     errors: Mapping[str, str],
     folder: Path,
 ) -> None:
-    """Write ``report.html``, ``figures/``, ``tables/touches.csv`` and ``touches.json``.
+    """Write the report of touches into a folder.
+
+    It consists of ``report.html``, ``figures/``, ``tables/touches.csv`` and ``touches.json``.
 
     Parameters
     ----------
     sessions : sequence of TouchedSession
-        One or more.
+        At least one session.
     errors : mapping of str to str
         Message for each file that could not be analysed.
     folder : Path
-        An existing folder without these files.
+        Existing folder that contains none of these files.
 
     Raises
     ------
     OutputExistsError, OutputError
-        If a file exists, or cannot be written.
+        If a file exists or cannot be written.
     """
     from analysis.report import _page as pages
     from analysis.report import _style as style
@@ -183,9 +195,11 @@ def write_touch_report(
 
     pictures = []
     with style.styled():
-        for shown in touch_illustrations(sessions):
-            stem = folder / "figures" / shown.name
-            picture = style.save_picture(shown.figure, stem, shown.description, DEFAULT_FORMATS)
+        for illustration in touch_illustrations(sessions):
+            stem = folder / "figures" / illustration.name
+            picture = style.save_picture(
+                illustration.figure, stem, illustration.description, DEFAULT_FORMATS
+            )
             pictures.append(picture)
     table = touches_table(sessions)
     write_new(folder / "tables" / "touches.csv", csv_text(table))
@@ -198,33 +212,37 @@ def write_touch_report(
         sentences=[line for session in sessions for line in session_lines(session)[:1]],
         experiments=(),
         warnings=[
-            *(f"{each.path.name}: {sentence}" for each in sessions for sentence in each.warnings),
+            *(
+                f"{session.path.name}: {sentence}"
+                for session in sessions
+                for sentence in session.warnings
+            ),
             *(f"Left out: {message}" for message in errors.values()),
         ],
         pictures=pictures,
         tables=(table,) if table.rows else (),
         paper_pictures=(),
         paper_tables=(),
-        how=[*_how(sessions), pages.versions(datetime.now().astimezone())],
+        how=[*_collect_facts(sessions), pages.versions(datetime.now().astimezone())],
     )
     write_new(folder / "report.html", text)
 
 
-def _how(sessions: Sequence[TouchedSession]) -> list[Facts]:
-    """Collect the facts on sessions, model and estimator."""
+def _collect_facts(sessions: Sequence[TouchedSession]) -> list[Facts]:
+    """Return the facts on sessions, model and estimator."""
     return [
         (
             "Sessions",
             [
                 (
-                    str(each.path),
-                    f"{each.rate_hz:g} Hz, "
-                    + ("torque and base shear" if each.has_shear else "torque alone"),
+                    str(session.path),
+                    f"{session.rate_hz:g} Hz, "
+                    + ("torque and base shear" if session.has_shear else "torque alone"),
                 )
-                for each in sessions
+                for session in sessions
             ],
         ),
-        ("Model", sorted({(model_words(each), _beam(each)) for each in sessions})),
+        ("Model", sorted({(model_words(session), _beam_text(session)) for session in sessions})),
         (
             "Estimate",
             [
@@ -245,7 +263,8 @@ def _how(sessions: Sequence[TouchedSession]) -> list[Facts]:
     ]
 
 
-def _beam(session: TouchedSession) -> str:
+def _beam_text(session: TouchedSession) -> str:
+    """Return length, density and bending stiffness of a session's beam model as text."""
     beam = session.model.beam
     return (
         f"length {beam.length_m:g} m, density {beam.density_kg_per_m:.5g} kg/m, bending stiffness "

@@ -1,8 +1,9 @@
 """Library of session files: the sessions of a folder with their metadata and modes.
 
-The package offers the filtered list of the sessions of a folder (`list_sessions`) and, in its
-public module `trend`, the course of a specimen's modes over time. The index `library.sqlite` in the
-folder avoids reading unchanged files; it may be removed at any time.
+The package offers a filtered list of the sessions in a folder (`list_sessions`) and, in its public
+module `trend`, the changes of a specimen's modes over its sessions. Thanks to the index file
+`library.sqlite` in the folder, unchanged session files are not read again. The index may be removed
+at any time.
 """
 
 import lazy_loader as lazy

@@ -1,9 +1,9 @@
 """Index of a folder of sessions: an SQLite file in the folder with one row per session.
 
-The index is a cache. Each row has the stamp of its source files, and is rebuilt when the stamp
-differs. An index that cannot be read or written is ignored. Several programs may use it at the same
-time: each writes in one transaction, and the stamps reveal rows that another program overwrote or
-removed.
+The index is a cache. Each row contains the size and time of its source files as a stamp, and is
+rebuilt when the stamp differs. An index that cannot be read or written is ignored. Several programs
+may use it at the same time: each writes in one transaction, and the stamps reveal rows that another
+program overwrote or removed.
 """
 
 import contextlib
@@ -23,18 +23,21 @@ from rigd.session import Validity
 INDEX_NAME: Final = "library.sqlite"
 """File name of the index."""
 
-_APPLICATION: Final = 0x72696764  # "rigd"
-_VERSION: Final = 3
-"""Version of the table and of the content of a row; older indexes are rebuilt."""
-_HEADER: Final = b"SQLite format 3\0"
-_APPLICATION_OFFSET: Final = slice(68, 72)
-_PATIENCE_S: Final = 2.0
-"""Longest wait for another writing program."""
+_APPLICATION_ID: Final = 0x72696764  # "rigd"
+"""SQLite's application ID, by which the index is recognised: "rigd" in ASCII."""
+_INDEX_VERSION: Final = 3
+"""Version of the table and of the rows' content. Indexes of older versions are rebuilt."""
+_SQLITE_FIRST_BYTES: Final = b"SQLite format 3\0"
+"""First bytes of every SQLite file."""
+_APPLICATION_ID_POSITION: Final = slice(68, 72)
+"""Position of the application ID in an SQLite file."""
+_MOST_LOCK_WAIT_S: Final = 2.0
+"""Longest wait in seconds for another program that is writing the index."""
 
-_DAMAGED: Final = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-"""Error codes of an invalid index."""
+_DAMAGE_ERROR_CODES: Final = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+"""SQLite's error codes for a damaged index."""
 
-_TYPES: Final = {
+_SQL_TYPES: Final = {
     "id": "TEXT",
     "start_utc": "TEXT",
     "start_utc_ns": "INTEGER",
@@ -58,99 +61,111 @@ _TYPES: Final = {
     "meta": "TEXT",
     "problem": "TEXT",
 }
-"""Columns in addition to ``file`` and ``stamp``. Modes, validity and meta are JSON; times are UTC
-in ISO 8601."""
-_KINDS: Final = {"TEXT": str, "INTEGER": int | None, "REAL": float | None}
-_READ: Final = tuple(name for name in _TYPES if name != "start_utc")
+"""SQL types of the columns, without ``file`` and ``stamp``.
 
-Stamped = tuple[str, SessionRow]
-"""A row and the stamp of its source files."""
+Modes, validity and meta are JSON. Times are UTC in ISO 8601."""
+_PYTHON_TYPES: Final = {"TEXT": str, "INTEGER": int | None, "REAL": float | None}
+"""Python types of the values that are read from a column of each SQL type."""
+_COLUMNS_TO_READ: Final = tuple(name for name in _SQL_TYPES if name != "start_utc")
+"""Columns that are read from the index: all but the start time as text, which is for other
+programs."""
+
+StampedRow = tuple[str, SessionRow]
+"""Size and time of a row's source files as a stamp, and the row."""
 
 
 class Index:
-    """Index of one folder.
+    """Index of the sessions in one folder.
 
     Parameters
     ----------
     folder
-        Folder of the sessions; the index may be there or not, and need not be writable.
+        Folder of the sessions. It may be without an index, or not writable.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._path = folder / INDEX_NAME
 
-    def read(self) -> dict[str, Stamped]:
-        """Return the rows by file name; empty without a valid index."""
-        if not self._is_ours():
+    def read(self) -> dict[str, StampedRow]:
+        """Return the index's rows with their stamps, by file name; empty without a valid index."""
+        if not self._is_own_index():
             return {}
-        rows: dict[str, Stamped] = {}
+        rows: dict[str, StampedRow] = {}
         try:
-            with self._connected("ro") as database:
-                if database.execute("PRAGMA user_version").fetchone() != (_VERSION,):
+            with self._connection("ro") as database:
+                if database.execute("PRAGMA user_version").fetchone() != (_INDEX_VERSION,):
                     return {}
-                columns = ", ".join(("file", "stamp", *_READ))
+                columns = ", ".join(("file", "stamp", *_COLUMNS_TO_READ))
                 for file, stamp, *values in database.execute(f"SELECT {columns} FROM sessions"):
                     with contextlib.suppress(ValueError, TypeError):  # the row is rebuilt
-                        rows[file] = stamp, self._row(file, dict(zip(_READ, values, strict=True)))
+                        rows[file] = (
+                            stamp,
+                            self._row_from_values(
+                                file, dict(zip(_COLUMNS_TO_READ, values, strict=True))
+                            ),
+                        )
         except sqlite3.Error:  # locked for long, or damaged
             return {}
         return rows
 
-    def write(self, rows: Mapping[str, Stamped], gone: Collection[str]) -> None:
-        """Store rows by file name and remove those of missing files, if possible.
+    def write(self, rows: Mapping[str, StampedRow], missing_files: Collection[str]) -> None:
+        """Store new rows in the index and remove rows of missing files, if the index is writable.
 
         Parameters
         ----------
         rows
-            New rows, and those that have changed.
-        gone
-            Names of files that are not there any more.
+            New and changed rows by file name.
+        missing_files
+            Names of files that no longer exist.
         """
-        if self._path.exists() and not self._is_ours():
+        if self._path.exists() and not self._is_own_index():
             return  # the file is not an index of this program
         try:
-            self._store(rows, gone)
+            self._store(rows, missing_files)
         except sqlite3.Error as error:
-            if error.sqlite_errorcode & 0xFF not in _DAMAGED:
+            if error.sqlite_errorcode & 0xFF not in _DAMAGE_ERROR_CODES:
                 return  # a folder that cannot be written to, a full disk, a lock held for long
-            with contextlib.suppress(OSError, sqlite3.Error):  # the files have everything
+            with contextlib.suppress(OSError, sqlite3.Error):  # the session files contain all data
                 self._path.unlink()
-                self._store(rows, gone)
+                self._store(rows, missing_files)
 
-    def _store(self, rows: Mapping[str, Stamped], gone: Collection[str]) -> None:
-        with self._connected("rwc") as database:
+    def _store(self, rows: Mapping[str, StampedRow], missing_files: Collection[str]) -> None:
+        """Store and remove rows in one transaction, and create the table if necessary."""
+        with self._connection("rwc") as database:
             database.execute("BEGIN IMMEDIATE")
-            if database.execute("PRAGMA user_version").fetchone() != (_VERSION,):
-                columns = ", ".join(f"{name} {kind}" for name, kind in _TYPES.items())
+            if database.execute("PRAGMA user_version").fetchone() != (_INDEX_VERSION,):
+                columns = ", ".join(f"{name} {kind}" for name, kind in _SQL_TYPES.items())
                 database.execute("DROP TABLE IF EXISTS sessions")
                 database.execute(
                     f"CREATE TABLE sessions (file TEXT PRIMARY KEY, {columns}, stamp TEXT)"
                 )
-                database.execute(f"PRAGMA application_id = {_APPLICATION}")
-                database.execute(f"PRAGMA user_version = {_VERSION}")
+                database.execute(f"PRAGMA application_id = {_APPLICATION_ID}")
+                database.execute(f"PRAGMA user_version = {_INDEX_VERSION}")
             database.executemany(
-                "DELETE FROM sessions WHERE file = ?", [(file,) for file in gone if _storable(file)]
+                "DELETE FROM sessions WHERE file = ?",
+                [(file,) for file in missing_files if _is_storable_name(file)],
             )
-            names = ("file", "stamp", *_TYPES)
-            marks = ", ".join("?" * len(names))
+            names = ("file", "stamp", *_SQL_TYPES)
+            placeholders = ", ".join("?" * len(names))
             database.executemany(
-                f"INSERT OR REPLACE INTO sessions ({', '.join(names)}) VALUES ({marks})",
+                f"INSERT OR REPLACE INTO sessions ({', '.join(names)}) VALUES ({placeholders})",
                 [
-                    (file, stamp, *_values(row))
+                    (file, stamp, *_column_values(row))
                     for file, (stamp, row) in rows.items()
-                    if _storable(file)
+                    if _is_storable_name(file)
                 ],
             )
             database.execute("COMMIT")
 
     @contextmanager
-    def _connected(self, mode: str) -> Iterator[sqlite3.Connection]:
+    def _connection(self, mode: str) -> Iterator[sqlite3.Connection]:
+        """Provide a connection to the index, without implicit transactions."""
         # Explicit transactions: the implicit ones would commit before a table is created.
         database = sqlite3.connect(
             f"{self._path.absolute().as_uri()}?mode={mode}",
             uri=True,
-            timeout=_PATIENCE_S,
+            timeout=_MOST_LOCK_WAIT_S,
             isolation_level=None,
         )
         try:
@@ -158,50 +173,58 @@ class Index:
         finally:
             database.close()
 
-    def _is_ours(self) -> bool:
+    def _is_own_index(self) -> bool:
         """Return whether the file is an index of this program, or empty."""
         try:
             with self._path.open("rb") as file:
-                head = file.read(_APPLICATION_OFFSET.stop)
+                first_bytes = file.read(_APPLICATION_ID_POSITION.stop)
         except OSError:
             return False
-        mark = _APPLICATION.to_bytes(4, "big")
-        return not head or (head.startswith(_HEADER) and head[_APPLICATION_OFFSET] == mark)
+        application_id = _APPLICATION_ID.to_bytes(4, "big")
+        return not first_bytes or (
+            first_bytes.startswith(_SQLITE_FIRST_BYTES)
+            and first_bytes[_APPLICATION_ID_POSITION] == application_id
+        )
 
-    def _row(self, file: str, values: dict[str, object]) -> SessionRow:
-        """Return the row of the columns; raise ValueError or TypeError if they are invalid."""
+    def _row_from_values(self, file: str, values: dict[str, object]) -> SessionRow:
+        """Return the session row with the given column values.
+
+        It raises ValueError or TypeError if a value is invalid.
+        """
         report = values["report"]
         for name, value in values.items():
-            if name != "report" and not isinstance(value, _KINDS[_TYPES[name]]):
+            if name != "report" and not isinstance(value, _PYTHON_TYPES[_SQL_TYPES[name]]):
                 raise TypeError(name)
         values["modes"] = usable_modes(json.loads(str(values["modes"])))
-        stated = json.loads(str(values["validity"]))
-        values["validity"] = None if stated is None else Validity.of_document(stated).as_json()
+        validity = json.loads(str(values["validity"]))
+        values["validity"] = None if validity is None else Validity.of_document(validity).as_json()
         values["meta"] = dict(json.loads(str(values["meta"])))
         values["report"] = None if report is None else self._folder / str(report)
         return SessionRow(path=self._folder / file, **values)  # type: ignore[arg-type]
 
 
-def _values(row: SessionRow) -> list[object]:
-    values: dict[str, object] = {each.name: getattr(row, each.name) for each in fields(row)}
-    values["start_utc"] = None if row.start_utc_ns is None else _iso(row.start_utc_ns)
+def _column_values(row: SessionRow) -> list[object]:
+    """Return a row's values in the order of the index's columns."""
+    values: dict[str, object] = {field.name: getattr(row, field.name) for field in fields(row)}
+    values["start_utc"] = None if row.start_utc_ns is None else _iso_time(row.start_utc_ns)
     values["modes"] = json.dumps(row.modes)
     values["validity"] = json.dumps(row.validity)
     values["meta"] = json.dumps(row.meta)
     values["report"] = row.report and os.fspath(row.report.relative_to(row.path.parent))
-    return [values[name] for name in _TYPES]
+    return [values[name] for name in _SQL_TYPES]
 
 
-def _iso(utc_ns: int) -> str | None:
+def _iso_time(utc_ns: int) -> str | None:
+    """Return a time in ns since 1970 as UTC in ISO 8601; None if it is beyond the calendar."""
     try:
-        moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
+        time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
     except OverflowError:
         return None
-    return moment.isoformat(timespec="milliseconds")
+    return time.isoformat(timespec="milliseconds")
 
 
-def _storable(file: str) -> bool:
-    """Return whether a name is valid text; other files are read each time."""
+def _is_storable_name(file: str) -> bool:
+    """Return whether a file name is valid text. Files with other names are read each time."""
     try:
         file.encode()
     except UnicodeEncodeError:

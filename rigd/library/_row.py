@@ -1,4 +1,4 @@
-"""One session of the library: data from its file, its quick look and its report."""
+"""Row of one session in the library: data from its session file, quick look and report."""
 
 import json
 import re
@@ -13,178 +13,202 @@ from rigd.runtime import read_plain_file
 from rigd.session import Validity
 from rigd.session.quick_look import modes_of, read_quick_look
 
-SUFFIX: Final = ".mcap"
-TORN_SUFFIX: Final = ".mcap.part"
+SESSION_SUFFIX: Final = ".mcap"
+"""File name suffix of a session file."""
+INCOMPLETE_SUFFIX: Final = ".mcap.part"
+"""File name suffix of a session file that is being recorded or is incomplete."""
 REPORT_FOLDER: Final = re.compile(r"(.+)\.report(?:-(\d+))?")
-"""Name of a report folder: session and number of the report."""
+"""Pattern of the name of a report folder: session, and number of the report."""
 REPORT_PAGE: Final = "report.html"
-NUMBERS: Final = "analysis.json"
+"""Name of the HTML page in a report folder."""
+RESULTS_FILE: Final = "analysis.json"
+"""Name of the file with the results in JSON in a report folder."""
 
 _MOST_JSON_BYTES: Final = 8 << 20
-_MOST_CHARACTERS: Final = 1000
-_MOST_META: Final = 100
-_MOST_DIGITS: Final = 18
+"""Largest size of a JSON file that is read."""
+_MOST_TEXT_CHARACTERS: Final = 1000
+"""Number of characters to which texts are cut."""
+_MOST_META_ENTRIES: Final = 100
+"""Largest number of metadata entries of users in a row."""
+_MOST_COUNT_DIGITS: Final = 18
+"""Number of digits that every count of up to 64 bits may have."""
 
 Mode = dict[str, Any]
+"""Mode of a session as in JSON documents."""
 Document = dict[str, Any]
+"""JSON object."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionRow:
-    """A session file of a folder, with the data of its session.
+    """Session of a folder with the data from its files.
 
-    Unknown values are empty texts or None. Texts are printable and truncated to 1000 characters.
+    Unknown values are empty texts or None. Texts are printable and cut to 1000 characters.
     """
 
     id: str
-    """Name of the file without ``.mcap`` or, for an incomplete file, ``.mcap.part``."""
+    """Name of the session file without ``.mcap`` or, if it is incomplete, without ``.mcap.part``.
+    """
     path: Path
-    """The file."""
+    """Path of the session file."""
     size_bytes: int
-    """Its size."""
+    """Size of the session file in bytes."""
     start_utc_ns: int | None = None
-    """Wall clock at tick 0, ns since the Unix epoch."""
+    """Time of tick 0 by the computer's clock, in ns since 1970 (UTC)."""
     profile: str = ""
     """Name of the rig's profile."""
     specimen: str = ""
     """Name of the specimen."""
     operator: str = ""
-    """Operator."""
+    """Name of the operator."""
     excitation: str = ""
-    """Kind of the excitation."""
+    """Name of the excitation, such as ``chirp``."""
     note: str = ""
-    """Note."""
+    """Note of the operator."""
     outcome: str = "unknown"
     """``complete``, ``stopped`` or ``fault``; ``unknown`` if the file does not state it;
     ``recording`` or ``incomplete`` for a file without an end; ``unreadable``."""
     reason: str = ""
-    """Why the session ended early, or failed."""
+    """Reason why the session ended early or failed."""
     duration_s: float | None = None
-    """Length of the record."""
+    """Duration of the record in seconds."""
     scheduled: int | None = None
-    """Ticks that were due."""
+    """Number of ticks that were scheduled."""
     recorded: int | None = None
-    """Samples in the file."""
+    """Number of samples in the file."""
     missed: int | None = None
-    """Ticks that the loop skipped."""
+    """Number of ticks that the loop skipped."""
     late: int | None = None
-    """Ticks that woke late."""
+    """Number of ticks with a late wake-up."""
     lost: int | None = None
-    """Samples that were taken but not recorded."""
+    """Number of samples that were measured but not recorded."""
     modes: tuple[Mode, ...] = ()
-    """Modes of the last report, or else of the quick look: objects ``frequency_hz`` and
-    ``damping_ratio`` and ``participation`` (or None), each with ``value``, ``std``, ``interval_95``
-    and ``flag``, and ``source``."""
+    """Modes of the last report or, without a report, of the quick look.
+
+    A mode is an object with ``frequency_hz``, ``damping_ratio`` and ``participation`` (or None),
+    each with ``value``, ``std``, ``interval_95`` and ``flag``, and with ``source``."""
     validity: Document | None = None
     """Validity of the linear model for the modes, as `rigd.session.Validity.as_json`; None without
     modes."""
     report: Path | None = None
-    """HTML page of the last report."""
+    """Path of the HTML page of the last report; None without a report."""
     meta: dict[str, float | str] = field(default_factory=dict)
     """Metadata that users added, by name."""
     problem: str = ""
-    """Problem of the file and its remedy; else empty."""
+    """Problem of the file and its remedy; empty if there is none."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row for JSON."""
-        document = {each.name: getattr(self, each.name) for each in fields(self)}
+        """Return the row as a dictionary for JSON."""
+        document = {field.name: getattr(self, field.name) for field in fields(self)}
         report = None if self.report is None else str(self.report)
         return document | {"path": str(self.path), "report": report, "modes": list(self.modes)}
 
 
 def read_row(path: Path, quick_look: Path | None, report: Path | None) -> tuple[SessionRow, bool]:
-    """Return the row of a session; unreadable parts are reported in the row.
+    """Return the row of a session. Files that cannot be read are reported in the row.
 
     Parameters
     ----------
     path
-        Session file.
+        Path of the session file.
     quick_look
-        File of its quick look, if there is one.
+        File with the session's quick look; None if there is none.
     report
-        Folder of its last report, if there is one.
+        Folder of the session's last report; None if there is none.
 
     Returns
     -------
     SessionRow
-        The row.
+        Row of the session.
     bool
-        Whether the row is valid until the files change; False after a system error.
+        Whether the row is valid until a file changes; False after a system error.
 
     Raises
     ------
     FileNotFoundError
-        If the file no longer exists.
+        If the session file no longer exists.
     """
     from rigd.session import SessionAccessError, SessionError, read_summary
     from rigd.session.user_metadata import added_metadata
 
     size = path.stat().st_size
-    name = path.name.removesuffix(TORN_SUFFIX).removesuffix(SUFFIX)
-    results: dict[str, Any] = _modes(quick_look, report)
+    name = path.name.removesuffix(INCOMPLETE_SUFFIX).removesuffix(SESSION_SUFFIX)
+    results_of_analysis: dict[str, Any] = _modes_of_results(quick_look, report)
     if report is not None and (report / REPORT_PAGE).is_file():
-        results["report"] = report / REPORT_PAGE
+        results_of_analysis["report"] = report / REPORT_PAGE
     try:
         summary = read_summary(path)
     except SessionError as error:
         path.stat()  # raises if the file no longer exists
         row = SessionRow(
-            name, path, size, outcome="unreadable", problem=printable(str(error)), **results
+            name,
+            path,
+            size,
+            outcome="unreadable",
+            problem=printable(str(error)),
+            **results_of_analysis,
         )
         return row, not isinstance(error, SessionAccessError)
     metadata, outcome = summary.metadata, summary.outcome or {}
-    ended = _text(outcome, "outcome") or "unknown"
+    outcome_text = _text_of_key(outcome, "outcome") or "unknown"
     if summary.recording:
-        ended = "recording"
+        outcome_text = "recording"
     elif summary.problem:
-        ended = "incomplete"
-    scheduled = _count(outcome, "scheduled")
-    ticks = summary.samples if scheduled is None else scheduled
-    rate_hz = _number(metadata, "rate_hz") or 0.0
-    added = list(added_metadata(metadata).items())[:_MOST_META]
+        outcome_text = "incomplete"
+    scheduled_ticks = _count_of_key(outcome, "scheduled")
+    tick_count = summary.samples if scheduled_ticks is None else scheduled_ticks
+    rate_hz = _number_of_key(metadata, "rate_hz") or 0.0
+    user_metadata = list(added_metadata(metadata).items())[:_MOST_META_ENTRIES]
     row = SessionRow(
         id=name,
         path=path,
         size_bytes=size,
-        start_utc_ns=_count(metadata, "start_utc_ns"),
-        profile=_text(metadata, "profile"),
-        specimen=_text(metadata, "specimen"),
-        operator=_text(metadata, "operator"),
-        excitation=_text(metadata, "excitation"),
-        note=_text(metadata, "note"),
-        outcome=ended,
-        reason=_text(outcome, "reason"),
-        duration_s=_finite(ticks / rate_hz) if ticks is not None and rate_hz > 0 else None,
-        scheduled=scheduled,
+        start_utc_ns=_count_of_key(metadata, "start_utc_ns"),
+        profile=_text_of_key(metadata, "profile"),
+        specimen=_text_of_key(metadata, "specimen"),
+        operator=_text_of_key(metadata, "operator"),
+        excitation=_text_of_key(metadata, "excitation"),
+        note=_text_of_key(metadata, "note"),
+        outcome=outcome_text,
+        reason=_text_of_key(outcome, "reason"),
+        duration_s=_finite_or_none(tick_count / rate_hz)
+        if tick_count is not None and rate_hz > 0
+        else None,
+        scheduled=scheduled_ticks,
         recorded=summary.samples,
-        missed=_count(outcome, "missed"),
-        late=_count(outcome, "late"),
-        lost=_count(outcome, "lost"),
+        missed=_count_of_key(outcome, "missed"),
+        late=_count_of_key(outcome, "late"),
+        lost=_count_of_key(outcome, "lost"),
         meta={
-            _cut(name): _cut(value) if isinstance(value, str) else value for name, value in added
+            _cut_text(name): _cut_text(value) if isinstance(value, str) else value
+            for name, value in user_metadata
         },
         problem=summary.problem,
-        **results,
+        **results_of_analysis,
     )
     return row, True
 
 
-def _cut(text: str) -> str:
-    return printable(text, _MOST_CHARACTERS)
+def _cut_text(text: str) -> str:
+    """Return a printable text of at most 1000 characters."""
+    return printable(text, _MOST_TEXT_CHARACTERS)
 
 
-def _text(values: Mapping[str, str], key: str) -> str:
-    return _cut(values.get(key, "").strip())
+def _text_of_key(values: Mapping[str, str], key: str) -> str:
+    """Return the text of a key, cut to 1000 characters; empty if there is none."""
+    return _cut_text(values.get(key, "").strip())
 
 
-def _count(values: Mapping[str, str], key: str) -> int | None:
+def _count_of_key(values: Mapping[str, str], key: str) -> int | None:
+    """Return the non-negative integer that a key states; None if there is none below 2**63."""
     text = values.get(key, "")
     # More digits are not a count and exceed 64 bits.
-    countable = text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS + 1
-    return int(text) if countable and int(text) < 2**63 else None
+    is_count = text.isascii() and text.isdigit() and len(text) <= _MOST_COUNT_DIGITS + 1
+    return int(text) if is_count and int(text) < 2**63 else None
 
 
-def _number(values: Mapping[str, str], key: str) -> float | None:
+def _number_of_key(values: Mapping[str, str], key: str) -> float | None:
+    """Return the number that a key states; None if it is not a finite number."""
     try:
         number = float(values.get(key, "")[:400])
     except ValueError:
@@ -195,37 +219,44 @@ def _number(values: Mapping[str, str], key: str) -> float | None:
 # Modes
 
 
-def _modes(quick_look: Path | None, report: Path | None) -> Document:
-    """Return modes and validity of the report, or else of the quick look; nothing without them."""
+def _modes_of_results(quick_look: Path | None, report: Path | None) -> Document:
+    """Return modes and validity from the report, else from the quick look, else nothing."""
     if report is not None:
-        for headline in _list(_document(report / NUMBERS), "headlines"):
-            if modes := usable_modes(_list(headline, "modes")):
+        for headline in _list_in_document(_read_json(report / RESULTS_FILE), "headlines"):
+            if modes := usable_modes(_list_in_document(headline, "modes")):
                 return _with_validity(modes, headline)
-    found = None if quick_look is None else read_quick_look(quick_look)
-    return {} if found is None else _with_validity(usable_modes(found["modes"]), found)
+    quick_look_document = None if quick_look is None else read_quick_look(quick_look)
+    return (
+        {}
+        if quick_look_document is None
+        else _with_validity(usable_modes(quick_look_document["modes"]), quick_look_document)
+    )
 
 
-def _with_validity(modes: tuple[Mode, ...], found: object) -> Document:
+def _with_validity(modes: tuple[Mode, ...], document: object) -> Document:
+    """Return modes with the validity that a document states; empty without modes."""
     if not modes:
         return {}
-    stated = found.get("validity") if isinstance(found, dict) else None
-    return {"modes": modes, "validity": Validity.of_document(stated).as_json()}
+    validity_document = document.get("validity") if isinstance(document, dict) else None
+    return {"modes": modes, "validity": Validity.of_document(validity_document).as_json()}
 
 
-def _document(path: Path) -> object:
+def _read_json(path: Path) -> object:
+    """Return the content of a JSON file; None if it cannot be read."""
     try:
         return json.loads(read_plain_file(path, _MOST_JSON_BYTES))
     except (OSError, ValueError, RecursionError):  # the session is listed without this result
         return None
 
 
-def _list(document: object, key: str) -> list[object]:
-    found = document.get(key) if isinstance(document, dict) else None
-    return found if isinstance(found, list) else []
+def _list_in_document(document: object, key: str) -> list[object]:
+    """Return the list that a key of a document has; empty if there is none."""
+    value = document.get(key) if isinstance(document, dict) else None
+    return value if isinstance(value, list) else []
 
 
 def usable_modes(modes: object) -> tuple[Mode, ...]:
-    """Return the observed modes of a list whose numbers are finite."""
+    """Return the modes of a list that are visible in the record and have finite numbers."""
     return tuple(
         {name: mode[name] for name in ("frequency_hz", "damping_ratio", "participation", "source")}
         for mode in modes_of(modes)
@@ -233,5 +264,6 @@ def usable_modes(modes: object) -> tuple[Mode, ...]:
     )
 
 
-def _finite(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
+    """Return a number, or None if it is not finite."""
     return value if isfinite(value) else None

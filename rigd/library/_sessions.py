@@ -1,4 +1,4 @@
-"""Sessions of a folder: search, comparison with the index, reading of new files, and filters."""
+"""List of the sessions in a folder: search, comparison with the index, reading and filters."""
 
 import os
 from collections.abc import Callable
@@ -7,24 +7,26 @@ from pathlib import Path
 from typing import Final
 
 from rigd.errors import UserError
-from rigd.library._index import Index, Stamped
+from rigd.library._index import Index, StampedRow
 from rigd.library._row import (
-    NUMBERS,
+    INCOMPLETE_SUFFIX,
     REPORT_FOLDER,
     REPORT_PAGE,
-    SUFFIX,
-    TORN_SUFFIX,
+    RESULTS_FILE,
+    SESSION_SUFFIX,
     SessionRow,
     read_row,
 )
 from rigd.session.quick_look import QUICK_LOOK_SUFFIX
 
 _NS_PER_S: Final = 1_000_000_000
+"""Number of nanoseconds in a second."""
 _DATE_CHARACTERS: Final = len("2026-11-20")
+"""Number of characters of a date without a time of day."""
 
 
 class LibraryError(UserError, ValueError):
-    """Sessions cannot be listed; the message names the folder or filter, and the remedy."""
+    """Error: sessions cannot be listed. The message names the folder or filter, and the remedy."""
 
 
 def list_sessions(
@@ -39,30 +41,32 @@ def list_sessions(
     text: str | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> list[SessionRow]:
-    """List the sessions of a folder, the newest first.
+    """Return the sessions in a folder, the newest first.
 
-    New or changed files, by size and time, are read, and the index of the folder is updated if it
-    is writable. Incomplete and third-party files are listed with the reason. Subfolders are not
-    searched.
+    Files that are new or changed, by size and time, are read, and the index of the folder is
+    updated if it is writable. Incomplete and third-party files are listed with the reason.
+    Subfolders are not searched.
 
     Parameters
     ----------
     folder
-        Folder of the session files.
+        Folder with the session files.
     specimen, operator, excitation, outcome
-        Required values, case-insensitive; None for any.
+        Required values, compared without case; None permits any value.
     since, until
-        First and last permitted start time, in ISO 8601, local unless an offset is given. A date
-        alone as `until` includes its day.
+        First and last permitted start time in ISO 8601, local unless an offset is given. A date
+        without a time as `until` includes the whole day.
     text
-        Text that any of specimen, operator, excitation, note, reason, metadata or name must
-        contain, case-insensitive.
+        Text that must occur in specimen, operator, excitation, note, reason, metadata or name,
+        compared without case.
     on_progress
-        Called from time to time with the fraction of new files that have been read.
+        Function that is called from time to time with the fraction of new files that have been
+        read.
 
     Returns
     -------
     list of SessionRow
+        Rows of the sessions that pass all filters.
 
     Raises
     ------
@@ -76,59 +80,68 @@ def list_sessions(
     >>> row.id, row.outcome, row.duration_s
     ('session', 'complete', 21.5)
     """
-    begins, ends = _moment_ns(since, "since"), _moment_ns(until, "until")
-    exactly = {
+    first_ns, last_ns = _time_ns(since, "since"), _time_ns(until, "until")
+    requested_values = {
         "specimen": specimen,
         "operator": operator,
         "excitation": excitation,
         "outcome": outcome,
     }
-    wanted = {name: value.strip().casefold() for name, value in exactly.items() if value}
+    required_values = {
+        name: value.strip().casefold() for name, value in requested_values.items() if value
+    }
 
     def fits(row: SessionRow) -> bool:
-        if any(getattr(row, name).casefold() != value for name, value in wanted.items()):
+        if any(getattr(row, name).casefold() != value for name, value in required_values.items()):
             return False
-        if begins is not None and (row.start_utc_ns is None or row.start_utc_ns < begins):
+        if first_ns is not None and (row.start_utc_ns is None or row.start_utc_ns < first_ns):
             return False
-        if ends is not None and (row.start_utc_ns is None or row.start_utc_ns > ends):
+        if last_ns is not None and (row.start_utc_ns is None or row.start_utc_ns > last_ns):
             return False
-        return not text or text.casefold() in _searched(row)
+        return not text or text.casefold() in _searchable_text(row)
 
-    rows = [row for row in _rows(Path(folder), on_progress) if fits(row)]
+    rows = [row for row in _read_rows(Path(folder), on_progress) if fits(row)]
     return sorted(rows, key=lambda row: (row.start_utc_ns or 0, row.id), reverse=True)
 
 
-def _searched(row: SessionRow) -> str:
+def _searchable_text(row: SessionRow) -> str:
+    """Return all texts of a row in which `list_sessions` searches, in case-folded form."""
     texts = (row.id, row.specimen, row.operator, row.excitation, row.note, row.reason)
-    added = (f"{name}={value}" for name, value in row.meta.items())
-    return "\n".join((*texts, *added)).casefold()
+    user_metadata = (f"{name}={value}" for name, value in row.meta.items())
+    return "\n".join((*texts, *user_metadata)).casefold()
 
 
-def _moment_ns(given: str | datetime | None, name: str) -> int | None:
-    """Return a time in ns since the epoch; for a date alone, the start or end of its day."""
-    if given is None or given == "":
+def _time_ns(given_time: str | datetime | None, name: str) -> int | None:
+    """Return a time in ns since 1970; for a date without time, the start or end of its day."""
+    if given_time is None or given_time == "":
         return None
     try:
-        moment = given if isinstance(given, datetime) else datetime.fromisoformat(given.strip())
-        if name == "until" and not isinstance(given, datetime) and _is_date(given):
+        moment = (
+            given_time
+            if isinstance(given_time, datetime)
+            else datetime.fromisoformat(given_time.strip())
+        )
+        if name == "until" and not isinstance(given_time, datetime) and _is_date_only(given_time):
             moment = datetime.combine(moment, time()) + timedelta(days=1, microseconds=-1)
         # Without an offset it is local time.
         return int(moment.timestamp()) * _NS_PER_S + moment.microsecond * 1000
     except (ValueError, OverflowError, OSError):
         raise LibraryError(
-            f"{name} = {str(given)[:40]!r} is not a date; write 2026-11-20 or 2026-11-20T14:30."
+            f"{name} = {str(given_time)[:40]!r} is not a date; write 2026-11-20 or "
+            "2026-11-20T14:30."
         ) from None
 
 
-def _is_date(given: str) -> bool:
-    return len(given.strip()) <= _DATE_CHARACTERS
+def _is_date_only(text: str) -> bool:
+    """Return whether a text is a date without a time of day, by its length."""
+    return len(text.strip()) <= _DATE_CHARACTERS
 
 
 # Files
 
 
-class _Found:
-    """Session file of a folder, with its quick look and report."""
+class _SessionFiles:
+    """Session file in a folder, with its quick look and its last report."""
 
     def __init__(self, entry: os.DirEntry[str]) -> None:
         self.path = Path(entry.path)
@@ -136,65 +149,64 @@ class _Found:
         self.quick_look: Path | None = None
         self.report: Path | None = None
 
-    def with_results(self, quick_look: Path | None, report: Path | None) -> None:
-        """Add quick look and report, and append their stamps to the stamp of the file."""
+    def add_results(self, quick_look: Path | None, report: Path | None) -> None:
+        """Add quick look and report, and append their stamps to the stamp of the session file."""
         self.quick_look, self.report = quick_look, report
         if quick_look is not None:
             self.stamp += f" look {_stamp_of(quick_look)}"
         if report is not None:
             self.stamp += (
-                f" {report.name} {_stamp_of(report / NUMBERS)} {_stamp_of(report / REPORT_PAGE)}"
+                f" {report.name} {_stamp_of(report / RESULTS_FILE)}"
+                f" {_stamp_of(report / REPORT_PAGE)}"
             )
 
 
-def _rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[SessionRow]:
-    found = _scan(folder)
+def _read_rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[SessionRow]:
+    """Return the rows of a folder's sessions from the index or from the files; update the index."""
+    session_files = _find_session_files(folder)
     index = Index(folder)
-    known = index.read()
+    indexed_rows = index.read()
     rows: list[SessionRow] = []
-    fresh: dict[str, Stamped] = {}
-    unread = []
-    for name, file in found.items():
-        stamp, row = known.get(name, ("", None))
+    new_rows: dict[str, StampedRow] = {}
+    files_to_read = []
+    for name, file in session_files.items():
+        stamp, row = indexed_rows.get(name, ("", None))
         # The stamp does not show whether an incomplete file is being recorded.
-        if row is not None and stamp == file.stamp and not name.endswith(TORN_SUFFIX):
+        if row is not None and stamp == file.stamp and not name.endswith(INCOMPLETE_SUFFIX):
             rows.append(row)
         else:
-            unread.append(name)
-    for number, name in enumerate(unread, start=1):
-        file = found[name]
+            files_to_read.append(name)
+    for number, name in enumerate(files_to_read, start=1):
+        file = session_files[name]
         try:
-            row, holds = read_row(file.path, file.quick_look, file.report)
+            row, is_storable = read_row(file.path, file.quick_look, file.report)
         except OSError:  # the file was removed or received its final name
             continue
         rows.append(row)
-        if holds and not name.endswith(TORN_SUFFIX):
-            fresh[name] = file.stamp, row
+        if is_storable and not name.endswith(INCOMPLETE_SUFFIX):
+            new_rows[name] = file.stamp, row
         if on_progress is not None:
-            on_progress(number / len(unread))
-    gone = known.keys() - found.keys()
-    if fresh or gone:
-        index.write(fresh, gone)
+            on_progress(number / len(files_to_read))
+    missing_files = indexed_rows.keys() - session_files.keys()
+    if new_rows or missing_files:
+        index.write(new_rows, missing_files)
     return rows
 
 
-def _scan(folder: Path) -> dict[str, _Found]:
-    """Return the session files of a folder by name, with quick look and last report.
+def _find_session_files(folder: Path) -> dict[str, _SessionFiles]:
+    """Return the session files of a folder by name, with their quick looks and last reports.
 
-    Raises
-    ------
-    LibraryError
-        If it is not a folder, or cannot be read.
+    It raises LibraryError if the path is not a folder or the folder cannot be read.
     """
-    found: dict[str, _Found] = {}
+    session_files: dict[str, _SessionFiles] = {}
     quick_looks: dict[str, Path] = {}
     reports: dict[str, tuple[int, Path]] = {}
     try:
         with os.scandir(folder) as entries:
             for entry in entries:
                 name = entry.name
-                if name.endswith((SUFFIX, TORN_SUFFIX)):
-                    found[name] = _Found(entry)
+                if name.endswith((SESSION_SUFFIX, INCOMPLETE_SUFFIX)):
+                    session_files[name] = _SessionFiles(entry)
                 elif name.endswith(QUICK_LOOK_SUFFIX):
                     quick_looks[name.removesuffix(QUICK_LOOK_SUFFIX)] = Path(entry.path)
                 elif match := REPORT_FOLDER.fullmatch(name):
@@ -206,15 +218,15 @@ def _scan(folder: Path) -> dict[str, _Found]:
             f"{folder}: the folder cannot be listed ({error.strerror}); give a folder of session "
             "files."
         ) from None
-    for name, file in found.items():
-        if name.endswith(SUFFIX):
-            stem = name.removesuffix(SUFFIX)
-            file.with_results(quick_looks.get(stem), reports.get(stem, (0, None))[1])
-    return found
+    for name, file in session_files.items():
+        if name.endswith(SESSION_SUFFIX):
+            session_name = name.removesuffix(SESSION_SUFFIX)
+            file.add_results(quick_looks.get(session_name), reports.get(session_name, (0, None))[1])
+    return session_files
 
 
 def _stamp_of(path: str | os.PathLike[str]) -> str:
-    """Return size and time of a file; empty if they are not known."""
+    """Return size and modification time of a file as text; empty if they cannot be read."""
     try:
         status = Path(path).stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""Modes of a specimen over time: their course through its sessions and significant changes."""
+"""Changes of a specimen's modes over its sessions, with a test of their significance."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -7,52 +7,55 @@ from typing import Any, Final
 
 from rigd.library._row import SessionRow
 
-_SAME_MODE: Final = log(1.25)
-"""Largest frequency ratio of the same mode in two sessions; modes of a beam are further apart."""
+_MOST_LOG_FREQUENCY_RATIO: Final = log(1.25)
+"""Largest logarithm of the frequency ratio of the same mode in two sessions.
 
-_SIGNIFICANT: Final = 3.0 / 1.96
-"""Half-widths of a 95 % interval in three standard deviations."""
+Modes of a beam are further apart."""
+
+_SIGNIFICANCE_HALF_WIDTHS: Final = 3.0 / 1.96
+"""Ratio of three standard deviations to the half-width of a 95 % interval."""
 
 Quantity = Mapping[str, Any]
-"""Number of a mode: ``value``, ``std``, ``interval_95``, ``flag``."""
+"""Frequency or damping ratio of a mode: ``value``, ``std``, ``interval_95``, ``flag``."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModeChange:
-    """Difference of a quantity between two sessions."""
+    """Change of a mode's frequency or damping ratio between two sessions."""
 
     difference: float
-    """Later less earlier, in the unit of the quantity."""
+    """Value in the later session minus value in the earlier one, in the unit of the quantity."""
     significant: bool | None
-    """Whether the difference exceeds three standard deviations; None if this is not known: an
-    interval is missing, or a quantity is flagged."""
+    """Whether the difference exceeds three standard deviations.
+
+    None if this is unknown, because an interval is missing or a value is flagged."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrendPoint:
-    """A mode in one session."""
+    """Frequency and damping ratio of a mode in one session, and their changes."""
 
     row: SessionRow
-    """The session."""
+    """Session in the library."""
     frequency_hz: Quantity
-    """Natural frequency."""
+    """Natural frequency of the mode."""
     damping_ratio: Quantity
-    """Damping ratio."""
+    """Damping ratio of the mode."""
     frequency_change: ModeChange | None
-    """Change since the mode's first session; None for that session."""
+    """Change of the frequency since the mode's first session; None for that session."""
     damping_change: ModeChange | None
-    """Change of the damping ratio, likewise."""
+    """Change of the damping ratio since the mode's first session; None for that session."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModeTrend:
-    """A mode through the sessions of a specimen."""
+    """Frequency and damping ratio of a mode over the sessions of a specimen."""
 
     points: tuple[TrendPoint, ...]
-    """The mode in its sessions, the oldest first."""
+    """Values of the mode in each session, the oldest session first."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the trend for JSON."""
+        """Return the trend as a dictionary for JSON."""
         return {
             "points": [
                 {
@@ -62,8 +65,8 @@ class ModeTrend:
                     "frequency_hz": point.frequency_hz,
                     "damping_ratio": point.damping_ratio,
                     "validity": point.row.validity,
-                    "frequency_change": _document(point.frequency_change),
-                    "damping_change": _document(point.damping_change),
+                    "frequency_change": _change_json(point.frequency_change),
+                    "damping_change": _change_json(point.damping_change),
                 }
                 for point in self.points
             ]
@@ -71,12 +74,12 @@ class ModeTrend:
 
 
 def change_between(before: Quantity, after: Quantity) -> ModeChange:
-    """Return the change of a quantity between two sessions.
+    """Return the change of a frequency or damping ratio between two sessions.
 
     Parameters
     ----------
     before, after
-        The quantity in the earlier and in the later session.
+        Quantity in the earlier and in the later session.
 
     Returns
     -------
@@ -97,43 +100,48 @@ def change_between(before: Quantity, after: Quantity) -> ModeChange:
     True
     """
     difference = after["value"] - before["value"]
-    if any(each.get("interval_95") is None or each.get("flag") for each in (before, after)):
+    if any(
+        quantity.get("interval_95") is None or quantity.get("flag") for quantity in (before, after)
+    ):
         return ModeChange(difference, None)
-    low, high = (before, after) if difference >= 0 else (after, before)
-    allowed = hypot(low["interval_95"][1] - low["value"], high["value"] - high["interval_95"][0])
-    return ModeChange(difference, abs(difference) > _SIGNIFICANT * allowed > 0.0)
+    lower, higher = (before, after) if difference >= 0 else (after, before)
+    half_width_95 = hypot(
+        lower["interval_95"][1] - lower["value"], higher["value"] - higher["interval_95"][0]
+    )
+    return ModeChange(difference, abs(difference) > _SIGNIFICANCE_HALF_WIDTHS * half_width_95 > 0.0)
 
 
 def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
-    """Return the trends of the modes of one specimen through its sessions.
+    """Return the trends of the modes of one specimen over its sessions.
 
     Parameters
     ----------
     rows
-        Sessions of the specimen in any order; those without modes are ignored.
+        Sessions of the specimen in any order. Sessions without modes are ignored.
 
     Returns
     -------
     list of ModeTrend
         Trends in the order of frequency. Modes of two sessions are the same if their frequencies
-        are the nearest, within a factor of 1.25. Changes are relative to the mode's first session.
+        are nearest to each other, within a factor of 1.25. Changes are relative to the mode's first
+        session.
     """
     trends: list[list[TrendPoint]] = []
     for row in sorted(rows, key=lambda row: (row.start_utc_ns or 0, row.id)):
-        taken: set[int] = set()
+        assigned: set[int] = set()
         for mode in row.modes:
             frequency, damping = mode["frequency_hz"], mode["damping_ratio"]
             distances = {
                 number: abs(log(frequency["value"] / points[-1].frequency_hz["value"]))
                 for number, points in enumerate(trends)
-                if number not in taken
+                if number not in assigned
             }
-            nearest = min(distances, key=distances.__getitem__, default=None)
-            if nearest is None or distances[nearest] > _SAME_MODE:
-                nearest = len(trends)
+            nearest_trend = min(distances, key=distances.__getitem__, default=None)
+            if nearest_trend is None or distances[nearest_trend] > _MOST_LOG_FREQUENCY_RATIO:
+                nearest_trend = len(trends)
                 trends.append([])
-            taken.add(nearest)
-            points = trends[nearest]
+            assigned.add(nearest_trend)
+            points = trends[nearest_trend]
             changes: tuple[ModeChange | None, ModeChange | None] = (None, None)
             if points:
                 first = points[0]
@@ -146,7 +154,8 @@ def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
     return [ModeTrend(tuple(points)) for points in trends]
 
 
-def _document(change: ModeChange | None) -> dict[str, Any] | None:
+def _change_json(change: ModeChange | None) -> dict[str, Any] | None:
+    """Return a change as a dictionary for JSON; None if there is none."""
     if change is None:
         return None
     return {"difference": change.difference, "significant": change.significant}

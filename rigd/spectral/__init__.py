@@ -1,9 +1,10 @@
 """Frequency responses estimated from sampled records.
 
-Offers Welch's estimate (`welch_response`: H1, H2, Hv), the instrumental-variable estimate within a
-control loop (`instrumental_response`: Hiv), the transform of a whole record (`fft_response`),
-Welch's estimate of a record that still grows (`RunningResponse`) and a running spectrogram
-(`RunningSpectrogram`). It works on arrays and depends on neither sessions nor the beam.
+The package offers Welch's estimate (`welch_response`: H1, H2, Hv), the instrumental-variable
+estimate within a control loop (`instrumental_response`: Hiv), the ratio of the transforms of whole
+records (`fft_response`), Welch's estimate of a record that is still growing (`RunningResponse`) and
+a running spectrogram (`RunningSpectrogram`). It works on arrays and depends on neither sessions nor
+the beam.
 """
 
 import lazy_loader as lazy

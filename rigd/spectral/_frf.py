@@ -31,28 +31,30 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Estimator = Literal["h1", "h2", "hv", "iv", "fft"]
+"""Names of the estimators of a frequency response."""
 
 
 class SpectralError(ValueError):
-    """The record or a setting does not allow the estimation of a frequency response."""
+    """Error: the record or a setting does not allow the estimation of a frequency response."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrequencyResponse:
-    """Estimated ratio of output to input, bin by bin.
+    """Estimated frequency response: ratio of output to input in each frequency bin.
 
     Attributes
     ----------
     frequency_hz : ndarray of float, shape (n,)
-        Increasing.
+        Frequencies of the bins, increasing.
     response : ndarray of complex, shape (n,)
-        Output over input, in the unit of the one per unit of the other. An output that lags the
-        input has a negative phase. NaN in a bin where the input has no power at all.
+        Output over input, in the unit of the output per unit of the input. An output that lags the
+        input has a negative phase. NaN in a bin in which the input has no power.
     coherence : ndarray of float, shape (n,), or None
-        Ordinary coherence, 0 to 1; None with fewer than two segments, where it has no meaning.
+        Ordinary coherence, 0 to 1; None with fewer than two segments, for which it has no meaning.
     segments : int
         Number of averaged segments.
     estimator : {"h1", "h2", "hv", "iv", "fft"}
+        Estimator of the response.
     """
 
     frequency_hz: NDArray[np.float64]
@@ -62,12 +64,12 @@ class FrequencyResponse:
     estimator: Estimator
 
     def band(self, first_hz: float, last_hz: float) -> "FrequencyResponse":
-        """Return the bins from `first_hz` to `last_hz`, both included.
+        """Return the response in the bins from `first_hz` to `last_hz`, both included.
 
         Parameters
         ----------
         first_hz, last_hz : float
-            Ends of the band.
+            Lowest and highest frequency.
 
         Raises
         ------
@@ -75,10 +77,10 @@ class FrequencyResponse:
             If no bin lies in the band.
         """
         # Rounding errors of the caller must not lose the bin at either end.
-        slack = 1e-9 * max(abs(first_hz), abs(last_hz))
-        first = int(np.searchsorted(self.frequency_hz, first_hz - slack, side="left"))
-        end = int(np.searchsorted(self.frequency_hz, last_hz + slack, side="right"))
-        if first >= end:
+        tolerance_hz = 1e-9 * max(abs(first_hz), abs(last_hz))
+        first_bin = int(np.searchsorted(self.frequency_hz, first_hz - tolerance_hz, side="left"))
+        end_bin = int(np.searchsorted(self.frequency_hz, last_hz + tolerance_hz, side="right"))
+        if first_bin >= end_bin:
             raise SpectralError(
                 f"The band {first_hz:g} to {last_hz:g} Hz holds no bin of a frequency response "
                 f"that runs from {self.frequency_hz[0]:g} to {self.frequency_hz[-1]:g} Hz; "
@@ -86,18 +88,18 @@ class FrequencyResponse:
             )
         return replace(
             self,
-            frequency_hz=self.frequency_hz[first:end],
-            response=self.response[first:end],
-            coherence=None if self.coherence is None else self.coherence[first:end],
+            frequency_hz=self.frequency_hz[first_bin:end_bin],
+            response=self.response[first_bin:end_bin],
+            coherence=None if self.coherence is None else self.coherence[first_bin:end_bin],
         )
 
     def without_delays(self, *, input_delay_s: float, output_delay_s: float) -> "FrequencyResponse":
-        """Return the response between the quantities themselves, given the age of their samples.
+        """Return the response corrected for the delays of the input and output channels.
 
         Parameters
         ----------
         input_delay_s, output_delay_s : float
-            Age of a sample at its time stamp, in s; positive: the value is older.
+            Age of a sample at its time stamp, in s. Positive: the value is older than the stamp.
 
         Notes
         -----
@@ -105,19 +107,21 @@ class FrequencyResponse:
         ``exp(j omega (output_delay - input_delay))``.
         """
         advance_s = output_delay_s - input_delay_s
-        shift = np.exp(2j * np.pi * advance_s * self.frequency_hz)
-        return replace(self, response=self.response * shift)
+        phase_shift = np.exp(2j * np.pi * advance_s * self.frequency_hz)
+        return replace(self, response=self.response * phase_shift)
 
 
 def checked_records(
     input_: ArrayLike, output: ArrayLike, rate_hz: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return both records as float arrays of one dimension, equal length and finite values.
+    """Return input and output as float arrays after a check; raise if they are not valid.
+
+    They must have one dimension, equal length and finite values, and the input must not be zero.
 
     Raises
     ------
     SpectralError
-        With the wrong record and the problem.
+        If the rate or a record is invalid. The message names the record and the problem.
     """
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise SpectralError(f"The sampling rate must be a positive number of Hz, not {rate_hz!r}.")
@@ -130,9 +134,9 @@ def checked_records(
         )
     for name, record in (("input", x), ("output", y)):
         if not np.isfinite(record).all():
-            count = int(np.count_nonzero(~np.isfinite(record)))
+            invalid_count = int(np.count_nonzero(~np.isfinite(record)))
             raise SpectralError(
-                f"{count} of {record.size} samples of the {name} are NaN or infinite; "
+                f"{invalid_count} of {record.size} samples of the {name} are NaN or infinite; "
                 "fill or cut them before estimating a frequency response."
             )
     if not x.any():
@@ -146,36 +150,42 @@ def checked_records(
 # Segments of a record
 
 PAPER_RATE_HZ: Final = 1000.0
+"""Sampling rate of the reference paper's records, in hertz."""
 PAPER_SEGMENT_LENGTH: Final = 17266
+"""Number of samples in a segment of the reference paper's Welch estimate."""
 PAPER_OVERLAP: Final = 2590
+"""Number of samples in the overlap of the reference paper's segments."""
 PAPER_NFFT: Final = 160_000
+"""Number of samples of the reference paper's zero-padded transforms."""
 PAPER_SEGMENTS: Final = 8
+"""Number of segments in the reference paper's records."""
 PAPER_OVERLAP_FRACTION: Final = 0.15
+"""Overlap of the reference paper's segments, as a fraction of a segment."""
 
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
-    """Lengths of Welch's segments, their overlap and their transform, all in samples."""
+    """Length and overlap of the segments of Welch's method, and length of their transform."""
 
     segment_length: int = PAPER_SEGMENT_LENGTH
-    """Samples of one segment."""
+    """Number of samples in a segment."""
     overlap: int = PAPER_OVERLAP
-    """Samples that neighbours have in common."""
+    """Number of samples that adjacent segments have in common."""
     nfft: int = PAPER_NFFT
-    """Length of the transform, at least that of a segment."""
+    """Number of samples of the zero-padded transform, at least those of a segment."""
 
 
 def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
-    """Return segments for a record of known length.
+    """Return the default segmentation for a record of known length.
 
-    They have the paper's duration and transform. A record too short for one of those is divided
-    like the paper's, into eight with 15 % of overlap; one too short even for that is a single
-    segment.
+    Segments have the duration and transform of the reference paper's. If the record is shorter than
+    one such segment, it is divided like the paper's record into eight segments with 15 % overlap.
+    If it is too short for that, it is a single segment.
 
     Parameters
     ----------
     samples
-        Length of the record.
+        Number of samples in the record.
     rate_hz
         Sampling rate.
     """
@@ -190,14 +200,14 @@ def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
 
 
 def segment_count(samples: int, segment_length: int, overlap: int) -> int:
-    """Return the number of whole segments in a record; a remainder at its end is unused.
+    """Return the number of whole segments in a record. The samples after them are not used.
 
     Parameters
     ----------
     samples
-        Length of the record.
+        Number of samples in the record.
     segment_length, overlap
-        In samples.
+        Number of samples in a segment, and in the overlap of adjacent segments.
 
     Examples
     --------
@@ -209,16 +219,17 @@ def segment_count(samples: int, segment_length: int, overlap: int) -> int:
 
 
 def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tuple[int, int]:
-    """Return the longest segments that fit a record `segments` times, and their overlap.
+    """Return the largest segment length and overlap for a given number of segments.
 
-    The overlap is rounded to the nearest sample. Rounding it down, as is usual, makes eight
-    segments of 15 % overlap miss a record of 120 000 samples by five: seven are then averaged
-    without a message, the record ends at 105.3 s and the third resonance of a 120 s chirp is lost.
+    The overlap is rounded to the nearest sample. If it is rounded down, as is usual, eight segments
+    with 15 % overlap exceed a record of 120 000 samples by five samples. Seven segments are then
+    averaged without a message, the estimate ends at 105.3 s, and the third resonance of a 120 s
+    chirp is lost.
 
     Parameters
     ----------
     samples
-        Length of the record.
+        Number of samples in the record.
     segments
         Number of segments.
     overlap_fraction
@@ -227,7 +238,8 @@ def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tup
     Returns
     -------
     (segment_length, overlap) : tuple of int
-        ``segment_lengths(120_000, 8, 0.15) == (17266, 2590)``, the paper's.
+        Numbers of samples. ``segment_lengths(120_000, 8, 0.15) == (17266, 2590)`` are those of the
+        reference paper.
 
     Raises
     ------
@@ -246,15 +258,15 @@ def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tup
             f"segment), not {segments} segments with an overlap of {overlap_fraction:g}."
         )
 
-    def end_of_last(length: int) -> int:
+    def end_of_last_segment(length: int) -> int:
         return length + (segments - 1) * (length - round(overlap_fraction * length))
 
     # The end grows with the length except for rounding, so start above and decrease.
     length = int(samples / (1 + (segments - 1) * (1 - overlap_fraction))) + segments + 1
-    while length > 1 and end_of_last(length) > samples:
+    while length > 1 and end_of_last_segment(length) > samples:
         length -= 1
     overlap = round(overlap_fraction * length)
-    if length < 2 or overlap >= length or end_of_last(length) > samples:
+    if length < 2 or overlap >= length or end_of_last_segment(length) > samples:
         raise SpectralError(
             f"A record of {samples} samples is too short for {segments} segments "
             f"with an overlap of {overlap_fraction:.0%}; ask for fewer segments."
@@ -263,12 +275,12 @@ def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tup
 
 
 def check_segmentation(segment_length: int, overlap: int, nfft: int) -> None:
-    """Raise if the lengths are inconsistent.
+    """Raise SpectralError if the lengths of a segmentation are inconsistent.
 
     Raises
     ------
     SpectralError
-        With the wrong length and the reason.
+        The message names the wrong length and the reason.
     """
     if segment_length < 2 or not 0 <= overlap < segment_length:
         raise SpectralError(
@@ -287,19 +299,19 @@ def check_segmentation(segment_length: int, overlap: int, nfft: int) -> None:
 
 @dataclass(slots=True)
 class CrossSpectra:
-    """Sums over segments, bin by bin.
+    """Auto- and cross-spectra of input and output in each bin, summed over segments.
 
-    Common factors of the densities (rate, power of the window, number of segments) cancel in every
-    ratio and are left out.
+    Common factors of the spectral densities (rate, power of the window, number of segments) cancel
+    in every ratio and are omitted.
 
     Attributes
     ----------
     sxx, syy : ndarray of float, shape (n,)
-        Sums of squared magnitudes of input and output.
+        Summed squared magnitudes of the input's and the output's transform.
     sxy : ndarray of complex, shape (n,)
-        Sum of the conjugate of the input times the output.
+        Sum of the conjugate of the input's transform times the output's transform.
     segments : int
-        Number of added segments.
+        Number of segments in the sums.
     """
 
     sxx: NDArray[np.float64]
@@ -308,16 +320,16 @@ class CrossSpectra:
     segments: int = 0
 
     @classmethod
-    def of_nothing(cls, bins: int) -> "CrossSpectra":
-        """Return sums of no segments."""
+    def of_zero_segments(cls, bins: int) -> "CrossSpectra":
+        """Return spectra that are zero in each bin, to which segments can be added."""
         return cls(np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.complex128))
 
     def copy(self) -> "CrossSpectra":
-        """Return an independent copy of the sums."""
+        """Return an independent copy of the summed spectra."""
         return CrossSpectra(self.sxx.copy(), self.syy.copy(), self.sxy.copy(), self.segments)
 
     def add(self, fx: NDArray[np.complex128], fy: NDArray[np.complex128]) -> None:
-        """Add a segment by the transforms (n,) of its input and its output."""
+        """Add a segment, given the transforms (n,) of its input and its output."""
         self.sxx += power(fx)
         self.syy += power(fy)
         self.sxy += fx.conj() * fy
@@ -326,7 +338,10 @@ class CrossSpectra:
     def response(
         self, frequency_hz: NDArray[np.float64], estimator: Literal["h1", "h2", "hv"]
     ) -> FrequencyResponse:
-        """Return the response on the bins `frequency_hz` (n,); NaN where the input has no power."""
+        """Return the frequency response on the bins `frequency_hz` (n,).
+
+        It is NaN in bins in which the input has no power.
+        """
         return FrequencyResponse(
             frequency_hz=frequency_hz,
             response=self._ratio(estimator),
@@ -336,7 +351,7 @@ class CrossSpectra:
         )
 
     def _ratio(self, estimator: Literal["h1", "h2", "hv"]) -> NDArray[np.complex128]:
-        """Return output over input."""
+        """Return the estimated ratio of output to input in each bin."""
         with np.errstate(divide="ignore", invalid="ignore"):
             if estimator == "h1":
                 return self.sxy / self.sxx
@@ -346,14 +361,19 @@ class CrossSpectra:
             return self.sxy / np.abs(self.sxy) * np.sqrt(self.syy / self.sxx)
 
     def _coherence(self) -> NDArray[np.float64]:
-        """Return the ordinary coherence, 0 where either record has no power."""
-        both = self.sxx * self.syy
-        coherence = np.divide(power(self.sxy), both, out=np.zeros_like(both), where=both > 0)
+        """Return the ordinary coherence in each bin; 0 where input or output has no power."""
+        power_product = self.sxx * self.syy
+        coherence = np.divide(
+            power(self.sxy),
+            power_product,
+            out=np.zeros_like(power_product),
+            where=power_product > 0,
+        )
         return np.minimum(coherence, 1.0)  # Cauchy-Schwarz, up to rounding
 
 
 def power(transform: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return the squared magnitude."""
+    """Return the squared magnitudes of a transform."""
     return transform.real**2 + transform.imag**2
 
 
@@ -367,29 +387,33 @@ def welch_response(
     nfft: int = PAPER_NFFT,
     estimator: Literal["h1", "h2", "hv"] = "h1",
 ) -> FrequencyResponse:
-    """Return the frequency response from averaged cross- and auto-spectra of windowed segments.
+    """Return the frequency response from averaged spectra of windowed segments (Welch's method).
 
-    The window is Hamming's, symmetric as MATLAB's is. No trend is removed from the segments.
+    The window is the symmetric Hamming window, as in MATLAB. No trend is removed from the segments.
 
     Parameters
     ----------
     input_, output : array_like, shape (n,)
+        Records of input and output.
     rate_hz : float
         Sampling rate.
     segment_length, overlap : int
-        In samples. The defaults are the paper's: eight segments of a record of 120 000.
+        Numbers of samples. The defaults are the reference paper's: eight segments of a record of
+        120 000 samples.
     nfft : int
-        Length of the transform in samples, at least `segment_length`: segments are padded with
-        zeros, which puts bins closer together without resolving more.
+        Number of samples of the transform, at least `segment_length`. Segments are padded with
+        zeros, which puts the bins closer together without a higher resolution.
     estimator : {"h1", "h2", "hv"}
-        H1 = Sxy/Sxx is biased low by noise on the input, H2 = Syy/Syx high by noise on the
-        output. Hv, their geometric mean, has the phase of both and lies between them; unlike
-        the one from total least squares it does not depend on the units of the two records.
+        H1 = Sxy/Sxx is biased low by noise in the input. H2 = Syy/Syx is biased high by noise in
+        the output. Hv is their geometric mean. It has the phase of both and a magnitude between
+        them. Unlike the total least squares estimate it does not depend on the units of the two
+        records.
 
     Returns
     -------
     FrequencyResponse
-        ``nfft // 2 + 1`` bins from 0 to half the rate.
+        Response in ``nfft
+        2 + 1`` bins from 0 to half the sampling rate.
 
     Raises
     ------
@@ -416,7 +440,7 @@ def welch_response(
     check_segmentation(segment_length, overlap, nfft)
     if estimator not in ("h1", "h2", "hv"):
         raise SpectralError(f"There is no estimator {estimator!r}; choose one of h1, h2, hv.")
-    taper = np.hamming(segment_length)
+    window = np.hamming(segment_length)
     count = segment_count(x.size, segment_length, overlap)
     if count == 0:
         raise SpectralError(
@@ -425,14 +449,14 @@ def welch_response(
             "record for longer or ask for shorter segments."
         )
     bins = nfft // 2 + 1
-    sums = CrossSpectra.of_nothing(bins)
+    sums = CrossSpectra.of_zero_segments(bins)
     # Allocated once, because allocating this much memory again is slow.
     fx, fy = np.empty((2, bins), dtype=np.complex128)
     # One segment at a time stays in the cache, unlike a whole batch.
     for k in range(count):
         segment = slice(start := k * (segment_length - overlap), start + segment_length)
-        np.fft.rfft(x[segment] * taper, nfft, out=fx)
-        np.fft.rfft(y[segment] * taper, nfft, out=fy)
+        np.fft.rfft(x[segment] * window, nfft, out=fx)
+        np.fft.rfft(y[segment] * window, nfft, out=fy)
         sums.add(fx, fy)
     return sums.response(np.arange(bins) * rate_hz / nfft, estimator)
 
@@ -440,27 +464,31 @@ def welch_response(
 def fft_response(
     input_: ArrayLike, output: ArrayLike, rate_hz: float, nfft: int | None = None
 ) -> FrequencyResponse:
-    """Return the ratio of the Fourier transforms of output and input, without window or averaging.
+    """Return the ratio of the transforms of whole records, without window and averaging.
 
-    There is no leakage if the system is at rest before the first sample and again before the last;
-    then the estimate has no bias. It has no averaging against noise either.
+    If the system is at rest at the beginning and at the end of the record, there is no leakage, and
+    the estimate has no bias. Noise is not averaged out.
 
     Parameters
     ----------
     input_, output : array_like, shape (n,)
+        Records of input and output.
     rate_hz : float
+        Sampling rate.
     nfft : int, optional
-        Length of the transform, at least n; the record is padded with zeros. Default n.
+        Number of samples of the transform, at least n. The records are padded with zeros. Default
+        n.
 
     Returns
     -------
     FrequencyResponse
-        ``nfft // 2 + 1`` bins, without coherence: one record has none.
+        Response in ``nfft
+        2 + 1`` bins, without coherence, which needs several segments.
 
     Raises
     ------
     SpectralError
-        If a record holds values that are not finite, the input is zero, or `nfft` is too short.
+        If a record contains values that are not finite, the input is zero, or `nfft` is too short.
 
     References
     ----------
@@ -504,25 +532,28 @@ def instrumental_response(
     overlap: int = PAPER_OVERLAP,
     nfft: int = PAPER_NFFT,
 ) -> FrequencyResponse:
-    """Return the frequency response ``Hiv = Sry / Srx`` from input to output.
+    """Return the response ``Hiv = Sry / Srx`` from input to output of a control loop.
+
+    The loop's reference is the instrument, with which noise in the input is averaged out.
 
     Parameters
     ----------
     reference : array_like, shape (n,)
-        Reference of the loop, in any unit and with any delay: both cancel.
+        Reference of the control loop, in any unit and with any delay: both cancel.
     input_, output : array_like, shape (n,)
+        Records of input and output.
     rate_hz, segment_length, overlap, nfft
         See `rigd.spectral.welch_response`.
 
     Returns
     -------
     FrequencyResponse
-        The coherence is that of reference and output.
+        Response with the coherence of reference and output.
 
     Raises
     ------
     SpectralError
-        As `rigd.spectral.welch_response`, and if the reference is 0 throughout.
+        As `rigd.spectral.welch_response`, and if the reference is zero throughout.
 
     References
     ----------
@@ -546,18 +577,18 @@ def instrumental_response(
         raise SpectralError(
             "The reference is zero throughout, so nothing followed it; choose another estimator."
         )
-    of_input, of_output = (
+    reference_to_input, reference_to_output = (
         welch_response(
             reference, values, rate_hz, segment_length=segment_length, overlap=overlap, nfft=nfft
         )
         for values in (input_, output)
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        response = of_output.response / of_input.response
+        response = reference_to_output.response / reference_to_input.response
     return FrequencyResponse(
-        frequency_hz=of_output.frequency_hz,
+        frequency_hz=reference_to_output.frequency_hz,
         response=response,
-        coherence=of_output.coherence,
-        segments=of_output.segments,
+        coherence=reference_to_output.coherence,
+        segments=reference_to_output.segments,
         estimator="iv",
     )

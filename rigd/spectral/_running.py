@@ -29,24 +29,28 @@ from rigd.spectral._frf import (
 )
 
 Real = NDArray[np.float64]
+"""Array of real numbers."""
 
-LEAST_FRACTION: Final = 0.25
-"""Least fraction of a segment for an estimate: shorter ones have too little resolution."""
+LEAST_SEGMENT_FRACTION: Final = 0.25
+"""Least fraction of a segment from which a response is estimated.
+
+Shorter segments have too little resolution."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunningEstimate:
-    """Estimate of a response so far.
+    """Frequency response estimated from the samples so far.
 
     Attributes
     ----------
     response : FrequencyResponse
-        Response; its coherence is None until there are two whole segments.
+        Estimated response. Its coherence is None until there are two whole segments.
     excited : ndarray of bool, shape (n,)
-        Bins of the response that the reference has excited; elsewhere it shows noise and leakage.
+        Whether the reference has excited each bin of the response. Other bins contain noise and
+        leakage.
 
     final : bool
-        Whether the record is complete; then this is the estimate of `welch_response`.
+        Whether the record is complete. The estimate is then equal to that of `welch_response`.
     """
 
     response: FrequencyResponse
@@ -55,22 +59,23 @@ class RunningEstimate:
 
 
 class RunningResponse:
-    """H1 estimate of a growing record; at its end equal to `welch_response`, except for rounding.
+    """H1 estimate of the frequency response of a growing record.
 
-    Whole segments are averaged as in Welch's method, each with a Hamming window. Until the end the
-    newest samples, at most a segment of them, count as one more segment with its own window length:
-    the response then includes the newest part of the record.
+    Whole segments are averaged as in Welch's method, each with a Hamming window. Until the record
+    ends, its newest samples, at most a segment of them, count as an additional segment with a
+    window of their length, so that the response includes the newest part of the record. At the end
+    of the record the estimate is equal to that of `welch_response`, except for rounding.
 
     Parameters
     ----------
     rate_hz : float
         Sampling rate.
     samples : int
-        Length of the whole record.
+        Number of samples in the complete record.
     last_hz : float
         Highest frequency of the response.
     segmentation : Segmentation, optional
-        By default from `segmentation_of` for that length.
+        Lengths of the segments. Default: those of `segmentation_of` for the complete record.
 
     Raises
     ------
@@ -86,53 +91,54 @@ class RunningResponse:
         last_hz: float,
         segmentation: Segmentation | None = None,
     ) -> None:
-        chosen = segmentation or segmentation_of(samples, rate_hz)
-        self._length, self._nfft = chosen.segment_length, chosen.nfft
-        check_segmentation(self._length, chosen.overlap, self._nfft)
+        lengths = segmentation or segmentation_of(samples, rate_hz)
+        self._length, self._nfft = lengths.segment_length, lengths.nfft
+        check_segmentation(self._length, lengths.overlap, self._nfft)
         bins = bins_up_to(last_hz, self._nfft, rate_hz)
         self._frequency_hz = np.arange(bins) * rate_hz / self._nfft
         self._transform = LowBins(self._length, self._nfft, bins)
         self._segments = Segments(
             3,
             self._length,
-            self._length - chosen.overlap,
+            self._length - lengths.overlap,
             longest_gap=round(LONGEST_GAP_S * rate_hz),
             end=samples,
         )
-        self._sums = CrossSpectra.of_nothing(bins)
+        self._sums = CrossSpectra.of_zero_segments(bins)
         self._reference_power = np.zeros(bins)
         self._summed_up_to = 0
 
     def feed(
         self, ticks: ArrayLike, reference: ArrayLike, input_: ArrayLike, output: ArrayLike
     ) -> None:
-        """Add samples; the result does not depend on their number per call.
+        """Add samples. The estimate does not depend on how the samples are divided into calls.
 
         Parameters
         ----------
         ticks : array_like of int, shape (n,)
-            Increasing, 0 at the record's first sample. Gaps of up to `LONGEST_GAP_S` are
-            interpolated, segments with a longer one left out. Samples from before and after the
-            record are allowed too: they close gaps at its ends, and one from after it marks it as
-            complete.
+            Increasing numbers of the samples, 0 at the record's first sample. Gaps of up to
+            `LONGEST_GAP_S` are interpolated; segments with a longer gap are omitted. Samples from
+            before and after the record are allowed. They close gaps at its ends, and a sample from
+            after the record marks the record as complete.
         reference, input_, output : array_like, shape (n,)
-            A tick with a value that is not finite counts as missing. No trend is removed: the input
-            should be relative to its value at rest, since an offset leaks into the lowest bins.
+            Values of each tick. A tick with a value that is not finite counts as missing. No trend
+            is removed. The input should be relative to its value at rest, since an offset leaks
+            into the lowest bins.
         """
         for first, segment in self._segments.feed(ticks, np.stack((reference, input_, output))):
             self._add(segment, self._sums, self._reference_power)
             self._summed_up_to = first + self._length
 
     def estimate(self) -> RunningEstimate | None:
-        """Return the estimate from the samples so far; None while these are too few."""
-        final = self._segments.over
+        """Return the response estimated so far; None while there are too few samples."""
+        is_final = self._segments.over
         sums, reference_power = self._sums, self._reference_power
-        newest = self._segments.newest(self._length)
-        shortest = self._length
-        if self._is_to_be_added(newest.shape[1], final):
+        newest_samples = self._segments.newest(self._length)
+        shortest_segment = self._length
+        if self._newest_count_as_segment(newest_samples.shape[1], is_final):
             sums, reference_power = sums.copy(), reference_power.copy()
-            self._add(newest, sums, reference_power)
-            shortest = newest.shape[1]
+            self._add(newest_samples, sums, reference_power)
+            shortest_segment = newest_samples.shape[1]
         if sums.segments == 0:
             return None
         response = sums.response(self._frequency_hz, "h1")
@@ -141,15 +147,15 @@ class RunningResponse:
             response = replace(response, coherence=None)
         return RunningEstimate(
             response=response,
-            excited=excited_bins(reference_power, -(-self._nfft // shortest)),
-            final=final,
+            excited=excited_bins(reference_power, -(-self._nfft // shortest_segment)),
+            final=is_final,
         )
 
-    def _is_to_be_added(self, newest: int, final: bool) -> bool:
-        """Return whether the newest samples count in addition to the whole segments."""
-        if self._segments.end == self._summed_up_to or (final and self._sums.segments):
+    def _newest_count_as_segment(self, newest_count: int, is_final: bool) -> bool:
+        """Return whether the newest samples count as a segment in addition to the whole ones."""
+        if self._segments.end == self._summed_up_to or (is_final and self._sums.segments):
             return False
-        return newest >= LEAST_FRACTION * self._length
+        return newest_count >= LEAST_SEGMENT_FRACTION * self._length
 
     def _add(
         self,
@@ -161,40 +167,40 @@ class RunningResponse:
         window = np.hamming(segment.shape[1])
         reference, input_, output = segment
         # The mean angle excites nothing, but its power would exceed that of the motion.
-        moving = reference - np.average(reference, weights=window)
-        reference_power += power(self._transform(moving * window))
+        reference_motion = reference - np.average(reference, weights=window)
+        reference_power += power(self._transform(reference_motion * window))
         sums.add(self._transform(input_ * window), self._transform(output * window))
 
 
 # Segments of a growing record
 
 LONGEST_GAP_S: Final = 0.1
-"""Longest gap that is interpolated linearly; a segment with a longer one is left out."""
+"""Longest gap in seconds that is interpolated linearly. Segments with a longer gap are omitted."""
 
 
 class Segments:
-    """Segments of equal length from blocks of any length.
+    """Splitter of samples that arrive in blocks of any length into segments of equal length.
 
-    Segment k begins at tick ``k * hop``.
+    Segment k begins at tick ``k * hop``. Short gaps between samples are interpolated.
 
     Parameters
     ----------
     channels : int
-        Values per tick.
+        Number of values per tick.
     length, hop : int
-        Length of a segment, and distance from its start to the next one's, in ticks.
+        Number of ticks in a segment, and from its start to the start of the next one.
     longest_gap : int
-        Longest run of missing ticks that is interpolated.
+        Largest number of successive missing ticks that are interpolated.
     end : int, optional
-        Tick before which the record ends. Samples outside the record, before tick 0 or from here
-        on, only close a gap at its edge.
+        First tick after the record. Samples outside the record, before tick 0 or from this tick on,
+        are only used to close gaps at the ends of the record.
 
     Attributes
     ----------
     end : int
         Tick after the newest sample of the record.
     over : bool
-        Whether a sample has arrived that is the record's last or later.
+        Whether the record's last sample or a later one has arrived.
     """
 
     def __init__(
@@ -204,182 +210,190 @@ class Segments:
         self.over = False
         self._length, self._hop = length, hop
         self._limit = end
-        self._gaps = _GapFilling(longest_gap)
+        self._gaps = _GapFiller(longest_gap)
         # The newest samples are the columns from `_used - available` to `_used`; when the array is
         # full, those that may still be needed move to the front.
-        self._room = np.empty((channels, 3 * length))
+        self._buffer = np.empty((channels, 3 * length))
         self._used = 0
         self._available = 0
         self._next = 0
 
     def feed(self, ticks: ArrayLike, values: ArrayLike) -> Iterator[tuple[int, Real]]:
-        """Add samples and yield the segments that they complete, one by one.
+        """Add samples and yield each segment that they complete.
 
-        Use a segment before the next one, which overwrites it, and consume the whole iteration,
-        which adds the samples.
+        A segment must be used before the next one is requested, which overwrites it. The iteration
+        must be consumed completely, because it adds the samples.
 
         Parameters
         ----------
         ticks : array_like of int, shape (n,)
-            Increasing, also from call to call.
+            Increasing numbers of the samples, also from call to call.
         values : array_like, shape (channels, n)
-            A tick with a value that is not finite counts as missing.
+            Values of each tick. A tick with a value that is not finite counts as missing.
 
         Yields
         ------
         first : int
             First tick of the segment.
         segment : ndarray of float, shape (channels, length)
-            A view.
+            Values of the segment, as a view of the internal array.
         """
-        for first, block in self._gaps.fill(ticks, values):
-            start, stop = max(first, 0), first + block.shape[1]
+        for first_tick, block in self._gaps.fill(ticks, values):
+            start, end_tick = max(first_tick, 0), first_tick + block.shape[1]
             if self._limit is not None:
-                self.over = stop >= self._limit
-                stop = min(stop, self._limit)
-            if start < stop:
-                yield from self._take(start, block[:, start - first : stop - first])
+                self.over = end_tick >= self._limit
+                end_tick = min(end_tick, self._limit)
+            if start < end_tick:
+                yield from self._add_block(
+                    start, block[:, start - first_tick : end_tick - first_tick]
+                )
 
     def newest(self, most: int) -> Real:
-        """Return the newest samples (channels, n) without a gap, at most so many; a view."""
-        return self._room[:, self._used - min(most, self._available) : self._used]
+        """Return at most `most` of the newest samples without a gap, (channels, n), as a view."""
+        return self._buffer[:, self._used - min(most, self._available) : self._used]
 
-    def _take(self, first: int, block: Real) -> Iterator[tuple[int, Real]]:
-        """Add a block without gaps."""
+    def _add_block(self, first: int, block: Real) -> Iterator[tuple[int, Real]]:
+        """Add a block without gaps and yield each segment that it completes."""
         if first != self.end:
             self.end = first
             self._available = 0
             self._next = -(-first // self._hop) * self._hop
-        taken = 0
-        while taken < block.shape[1]:
-            due = self._next + self._length
-            part = block[:, taken : taken + min(due - self.end, self._length)]
-            taken += part.shape[1]
-            self._append(part)
-            if self.end == due:
+        added_count = 0
+        while added_count < block.shape[1]:
+            segment_end = self._next + self._length
+            samples = block[
+                :, added_count : added_count + min(segment_end - self.end, self._length)
+            ]
+            added_count += samples.shape[1]
+            self._append(samples)
+            if self.end == segment_end:
                 yield self._next, self.newest(self._length)
                 self._next += self._hop
 
-    def _append(self, part: Real) -> None:
-        """Add samples to the newest, at most a segment of them."""
-        count = part.shape[1]
-        if self._used + count > self._room.shape[1]:
-            newest = self.newest(self._length)
-            self._room[:, : newest.shape[1]] = newest
-            self._used = newest.shape[1]
-        self._room[:, self._used : self._used + count] = part
+    def _append(self, samples: Real) -> None:
+        """Append samples to the internal array, which stores at least the newest segment."""
+        count = samples.shape[1]
+        if self._used + count > self._buffer.shape[1]:
+            newest_samples = self.newest(self._length)
+            self._buffer[:, : newest_samples.shape[1]] = newest_samples
+            self._used = newest_samples.shape[1]
+        self._buffer[:, self._used : self._used + count] = samples
         self._used += count
         self._available = min(self._available + count, self._length)
         self.end += count
 
 
-class _GapFilling:
-    """Interpolates short gaps, and shows long ones as a jump of the tick."""
+class _GapFiller:
+    """Filler of gaps in blocks of samples: short gaps are interpolated, long gaps split a block."""
 
     def __init__(self, longest_gap: int) -> None:
         self._longest = longest_gap
         self._last: tuple[NDArray[np.int64], Real] | None = None
 
     def fill(self, ticks: ArrayLike, values: ArrayLike) -> Iterator[tuple[int, Real]]:
-        """Yield blocks without gaps: their first tick, and the values (channels, n)."""
+        """Yield blocks without gaps: their first tick and their values (channels, n)."""
         known_ticks = np.asarray(ticks, dtype=np.int64)
-        known = np.asarray(values, dtype=np.float64)
-        is_known = np.isfinite(known).all(axis=0)
+        known_values = np.asarray(values, dtype=np.float64)
+        is_known = np.isfinite(known_values).all(axis=0)
         if not is_known.all():
-            known_ticks, known = known_ticks[is_known], known[:, is_known]
+            known_ticks, known_values = known_ticks[is_known], known_values[:, is_known]
         if known_ticks.size == 0:
             return
-        last = self._last
-        if last is None and 0 < known_ticks[0] <= self._longest:
+        last_sample = self._last
+        if last_sample is None and 0 < known_ticks[0] <= self._longest:
             # There is nothing from which to interpolate: the first values are held.
             known_ticks = np.concatenate(([0], known_ticks))
-            known = np.concatenate((known[:, :1], known), axis=1)
-        elif last is not None:
-            known_ticks = np.concatenate((last[0], known_ticks))
-            known = np.concatenate((last[1], known), axis=1)
-        self._last = known_ticks[-1:].copy(), known[:, -1:].copy()
-        breaks = 1 + np.flatnonzero(np.diff(known_ticks) > self._longest + 1)
-        for start, stop in pairwise([0, *breaks, known_ticks.size]):
-            first, block = _interpolated(known_ticks[start:stop], known[:, start:stop])
-            if start == 0 and last is not None:  # yielded with the previous block
+            known_values = np.concatenate((known_values[:, :1], known_values), axis=1)
+        elif last_sample is not None:
+            known_ticks = np.concatenate((last_sample[0], known_ticks))
+            known_values = np.concatenate((last_sample[1], known_values), axis=1)
+        self._last = known_ticks[-1:].copy(), known_values[:, -1:].copy()
+        block_starts = 1 + np.flatnonzero(np.diff(known_ticks) > self._longest + 1)
+        for start, stop in pairwise([0, *block_starts, known_ticks.size]):
+            first, block = _interpolate_to_ticks(
+                known_ticks[start:stop], known_values[:, start:stop]
+            )
+            if start == 0 and last_sample is not None:  # yielded with the previous block
                 first, block = first + 1, block[:, 1:]
             if block.shape[1]:
                 yield first, block
 
 
-def _interpolated(ticks: NDArray[np.int64], values: Real) -> tuple[int, Real]:
-    """Return the first tick, and interpolated values on every tick up to the last."""
+def _interpolate_to_ticks(ticks: NDArray[np.int64], values: Real) -> tuple[int, Real]:
+    """Return the first tick and the values of every tick up to the last one, interpolated."""
     first, last = int(ticks[0]), int(ticks[-1])
     if last - first + 1 == ticks.size:
         return first, values
-    every = np.arange(first, last + 1)
-    return first, np.stack([np.interp(every, ticks, channel) for channel in values])
+    all_ticks = np.arange(first, last + 1)
+    return first, np.stack([np.interp(all_ticks, ticks, channel) for channel in values])
 
 
 # Excited bins
 
-LEAST_POWER: Final = 2e-3
-"""Least power of an excited bin, relative to the largest.
+LEAST_RELATIVE_POWER: Final = 2e-3
+"""Least power of the reference in an excited bin, relative to the largest power.
 
-Above the leakage of a Hamming window (−43 dB in its side lobes, and its pedestal of 0.08 where the
-record ends in mid-chirp), below the power of a chirp where two of the paper's segments join
-(−15 dB).
-"""
+It is above the leakage of a Hamming window (−43 dB in its side lobes, and its pedestal of 0.08
+where the record ends in mid-chirp). It is below the power of a chirp where two of the reference
+paper's segments join (−15 dB)."""
 
 
 def excited_bins(power: NDArray[np.float64], resolution_bins: int) -> NDArray[np.bool_]:
-    """Return the bins with power of the reference itself, not leaked from their neighbours.
+    """Return in which bins the reference has power that has not leaked from other bins.
 
     Parameters
     ----------
     power : ndarray of float, shape (n,)
-        Power of the reference, on bins from frequency 0 on.
+        Power of the reference in the bins from frequency 0 on.
     resolution_bins : int
-        Bins per inverse length of the shortest window of the power. A dip no wider than twice that
-        is a ripple of the window and counts as excited; at either end of a band so many bins are
-        excluded because of leakage.
+        Number of bins per inverse length of the shortest window. A dip that is at most twice as
+        wide is a ripple of the window, and counts as excited. At either end of a band, this number
+        of bins is excluded because of leakage.
 
     Returns
     -------
     ndarray of bool, shape (n,)
     """
-    largest = power.max(initial=0.0)
-    if not largest > 0.0:
+    largest_power = power.max(initial=0.0)
+    if not largest_power > 0.0:
         return np.zeros(power.shape, dtype=np.bool_)
-    closed = _any_near(power > LEAST_POWER * largest, resolution_bins)
-    return ~_any_near(~closed, 2 * resolution_bins)
+    without_dips = _is_near_marked(power > LEAST_RELATIVE_POWER * largest_power, resolution_bins)
+    return ~_is_near_marked(~without_dips, 2 * resolution_bins)
 
 
-def _any_near(marked: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Return whether any bin within the reach is marked, with constant continuation at the ends."""
-    counts = np.cumsum(np.pad(marked, (reach + 1, reach), mode="edge"))
-    near: NDArray[np.bool_] = counts[2 * reach + 1 :] > counts[: -2 * reach - 1]
-    return near
+def _is_near_marked(is_marked: NDArray[np.bool_], distance: int) -> NDArray[np.bool_]:
+    """Return whether each bin is within `distance` bins of a marked one.
+
+    Beyond the ends, the marks of the end bins continue.
+    """
+    counts = np.cumsum(np.pad(is_marked, (distance + 1, distance), mode="edge"))
+    is_near: NDArray[np.bool_] = counts[2 * distance + 1 :] > counts[: -2 * distance - 1]
+    return is_near
 
 
 # Lowest bins of a transform
 
 
 def bins_up_to(last_hz: float, nfft: int, rate_hz: float) -> int:
-    """Return the number of bins of a transform from 0 to a frequency, included."""
+    """Return the number of bins of a transform from 0 to `last_hz`, both included."""
     # Rounding errors of the caller must not lose the last bin.
     return 1 + min(nfft // 2, int(last_hz * nfft / rate_hz * (1 + 1e-9)))
 
 
 class LowBins:
-    """Transform that equals ``np.fft.rfft(x, nfft)[:bins]`` to rounding.
+    """Fourier transform in the lowest bins: ``np.fft.rfft(x, nfft)[:bins]`` except for rounding.
 
-    With ``2 n k = n² + k² − (k − n)²`` the sum over n becomes a convolution with a chirp, computed
-    by two short transforms. For 17 266 samples padded to 160 000 the bins up to 60 Hz take a
-    quarter of the time of all bins. With so little padding that it would take longer, all bins are
-    computed.
+    With ``2 n k = n² + k² − (k − n)²`` the sum over n becomes a convolution with a chirp, which two
+    short transforms compute. For 17 266 samples padded to 160 000 the bins up to 60 Hz take a
+    quarter of the time of all bins. With so little padding that this would take longer, all bins
+    are computed.
 
     Parameters
     ----------
     length : int
-        Largest number of samples.
+        Largest number of samples to transform.
     nfft : int
-        Length of the padded transform, at least `length`.
+        Number of samples of the padded transform, at least `length`.
     bins : int
         Number of bins, from frequency 0 on; at most ``nfft // 2 + 1``.
     """
@@ -387,7 +401,7 @@ class LowBins:
     def __init__(self, length: int, nfft: int, bins: int) -> None:
         self._bins, self._nfft = bins, nfft
         size = _fast_length(length + bins - 1)
-        # A real transform takes half the time of a complex one, of which there would be two.
+        # A real transform takes half the time of a complex one, and two of these would be needed.
         self._all = np.empty(nfft // 2 + 1, dtype=np.complex128) if nfft < 4 * size else None
         if self._all is not None:
             return
@@ -403,7 +417,7 @@ class LowBins:
         self._transform = np.empty(size, dtype=np.complex128)
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Transform the samples (n,) into a new array (bins,)."""
+        """Return the lowest bins (bins,) of the transform of samples (n,), as a new array."""
         if self._all is not None:
             return np.fft.rfft(x, self._nfft, out=self._all)[: self._bins].copy()
         self._work[x.size :] = 0.0
@@ -416,13 +430,13 @@ class LowBins:
 
 
 def _fast_length(least: int) -> int:
-    """Return the smallest length of at least `least` without a prime factor above 5."""
-    best = 1 << (least - 1).bit_length()
-    fives = 1
-    while fives < best:
-        odd = fives
-        while odd < best:
-            best = min(best, odd << (-(-least // odd) - 1).bit_length())
-            odd *= 3
-        fives *= 5
-    return best
+    """Return the smallest transform length of at least `least` without a prime factor above 5."""
+    best_length = 1 << (least - 1).bit_length()
+    power_of_five = 1
+    while power_of_five < best_length:
+        odd_factor = power_of_five
+        while odd_factor < best_length:
+            best_length = min(best_length, odd_factor << (-(-least // odd_factor) - 1).bit_length())
+            odd_factor *= 3
+        power_of_five *= 5
+    return best_length

@@ -1,4 +1,4 @@
-"""Spectrogram of a signal that arrives in blocks: amplitude over frequency and time."""
+"""Spectrogram of a signal that arrives in blocks: level over frequency and time."""
 
 from typing import Final
 
@@ -7,19 +7,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigd.spectral._running import LONGEST_GAP_S, Segments, bins_up_to
 
-LEAST_DB: Final = -200.0
-"""Level of silence."""
+LEAST_LEVEL_DB: Final = -200.0
+"""Level of silence, in dB: lower levels are raised to it."""
 
-_PADDING: Final = 4
-"""Length of the transforms over that of the window: the level of a sine between two bins is then
-low by at most 0.1 dB."""
+_TRANSFORM_TO_WINDOW_LENGTH: Final = 4
+"""Ratio of the transform's length to the window's.
+
+With this ratio the level of a sine between two bins is low by at most 0.1 dB."""
 
 
 class RunningSpectrogram:
-    """Columns of levels, one every step, under a Hann window.
+    """Spectrogram of a signal that arrives in blocks, with a column of levels in every step.
 
-    A sine of amplitude A has the level 20 log10 A at its frequency, in dB re 1 of the signal's
-    unit; a constant A has it at frequency 0.
+    The window is Hann's. A sine of amplitude A has the level 20 log10 A at its frequency, in dB re
+    1 of the signal's unit. A constant A has this level at frequency 0.
 
     Parameters
     ----------
@@ -28,12 +29,12 @@ class RunningSpectrogram:
     window_s, step_s : float
         Length of the window, and time between two columns.
     last_hz : float
-        Highest frequency shown.
+        Highest frequency of the columns.
 
     Attributes
     ----------
     frequency_hz : ndarray of float, shape (m,)
-        Frequencies from 0 on.
+        Frequencies of a column's levels, from 0 on.
     """
 
     def __init__(
@@ -46,11 +47,11 @@ class RunningSpectrogram:
     ) -> None:
         length = max(4, round(window_s * rate_hz))
         self._rate_hz = rate_hz
-        self._nfft = _PADDING * length
+        self._nfft = _TRANSFORM_TO_WINDOW_LENGTH * length
         bins = bins_up_to(last_hz, self._nfft, rate_hz)
         self.frequency_hz = np.arange(bins) * rate_hz / self._nfft
         window = np.hanning(length)
-        # One-sided: the half of an amplitude at the negative frequency is added.
+        # One-sided spectrum: half of each amplitude is at the negative frequency.
         self._window = window * (2.0 / window.sum())
         self._segments = Segments(
             1,
@@ -65,27 +66,28 @@ class RunningSpectrogram:
         Parameters
         ----------
         ticks : array_like of int, shape (n,)
-            Increasing, from 0 on. Gaps of up to `LONGEST_GAP_S` are interpolated; a longer one
-            leaves out the columns whose window it touches.
+            Increasing numbers of the samples, from 0 on. Gaps of up to `LONGEST_GAP_S` are
+            interpolated. Columns whose window contains a longer gap are omitted.
         values : array_like, shape (n,)
-            One that is not finite counts as missing.
+            Samples of the signal. A value that is not finite counts as missing.
 
         Returns
         -------
         list of (time_s, level_db)
-            The time of the window's middle since tick 0, and the levels (m,), none below
-            `LEAST_DB`.
+            Time of the middle of the column's window since tick 0, and levels (m,) of at least
+            `LEAST_LEVEL_DB`.
         """
         return [
-            ((first + (segment.shape[1] - 1) / 2) / self._rate_hz, self._level_db(segment[0]))
+            ((first + (segment.shape[1] - 1) / 2) / self._rate_hz, self._levels_db(segment[0]))
             for first, segment in self._segments.feed(ticks, np.asarray(values)[np.newaxis])
         ]
 
-    def _level_db(self, segment: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _levels_db(self, segment: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the levels (m,) of a segment in dB."""
         amplitude = np.abs(
             np.fft.rfft(segment * self._window, self._nfft)[: self.frequency_hz.size]
         )
         amplitude[0] /= 2.0  # a constant has no negative frequency
-        least = 10.0 ** (LEAST_DB / 20.0)
-        level_db: NDArray[np.float64] = 20.0 * np.log10(np.maximum(amplitude, least))
+        least_amplitude = 10.0 ** (LEAST_LEVEL_DB / 20.0)
+        level_db: NDArray[np.float64] = 20.0 * np.log10(np.maximum(amplitude, least_amplitude))
         return level_db

@@ -1,9 +1,9 @@
 """Builders for tests of your own devices, excitations and analyses.
 
-Offers a profile with other values than a shipped one (`write_profile`), records of a beam whose
-parameters are known (`chirp_signals`, `beam_torque`, `write_session`, with the paper's `PAPER_BEAM`
-and `PAPER_DAMPING`), and what every drive with its sensor has to do (`DEVICE_CHECKS`). No test
-framework is needed, and none is imported.
+The package offers a profile with other values than a shipped one (`write_profile`), records of a
+beam whose parameters are known (`chirp_signals`, `beam_torque`, `write_session`, with the reference
+paper's `PAPER_BEAM` and `PAPER_DAMPING`), and checks of the behaviour that every drive and sensor
+must have (`DEVICE_CHECKS`). No test framework is needed, and none is imported.
 """
 
 import lazy_loader as lazy

@@ -1,4 +1,4 @@
-"""Records of a beam whose parameters are known, as arrays and as session files."""
+"""Records of a beam with known parameters, as arrays and as session files."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -12,29 +12,30 @@ from rigd.session import SessionWriter
 from rigd.session.layout import encode_samples
 
 PAPER_BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
-"""The paper's antenna (Table 1)."""
+"""Antenna of the reference paper (Table 1)."""
 PAPER_DAMPING = Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
-"""The paper's best model: type VI with frequency-dependent weights (Table 3)."""
+"""Best model of the reference paper: type VI with frequency-dependent weights (Table 3)."""
 
-_POLE_RAD_S = 80.0
-"""Both poles of the motor loop."""
+_MOTOR_LOOP_POLE_RAD_S = 80.0
+"""Both poles of the simulated motor control loop, in rad/s."""
 _START_UTC_NS = 1_700_000_000_000_000_000
+"""Start time of the written sessions, in ns since 1970."""
 
 
 @dataclass(frozen=True)
 class Signals:
-    """Signals of a session, one value per tick, and the segments they fall into.
+    """Signals of a session, with one value per tick, and the segments of the session.
 
     Attributes
     ----------
     reference_rad, angle_rad, torque_nm : array (n,)
-        Reference, motor angle, and coupling torque on the motor's shaft.
+        Reference angle, motor angle, and coupling torque on the motor's shaft.
     segments : dict of str to (int, int)
-        First tick and end of ``rest``, ``sweep`` and ``ring_down``.
+        First tick and end (exclusive) of ``rest``, ``sweep`` and ``ring_down``.
     rate_hz : float
         Sampling rate.
     metadata : dict of str to str
-        What a file is to state of the excitation.
+        Metadata on the excitation for the session file.
     """
 
     reference_rad: NDArray[np.float64]
@@ -45,7 +46,7 @@ class Signals:
     metadata: dict[str, str] = field(default_factory=dict)
 
     def part(self, selected: slice | NDArray[np.generic]) -> "Signals":
-        """Return some of the samples, by numpy's indexing; segments and rate stay as they are."""
+        """Return selected samples, by NumPy's indexing; segments and rate are unchanged."""
         return replace(
             self,
             reference_rad=self.reference_rad[selected],
@@ -63,24 +64,25 @@ def beam_torque(
     tool_inertia_kg_m2: float = 0.0,
     delay_s: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Compute the coupling torque that the exact model answers to a motion of the motor.
+    """Return the coupling torque that the exact model gives for a motion of the motor.
 
     Parameters
     ----------
     angle_rad : array (n,)
         Angle of the motor, at rest before the first sample.
     rate_hz : float
+        Sampling rate.
     beam, damping
-        Parameters of the beam; those of the paper by default.
+        Parameters of the beam. Default: those of the reference paper.
     tool_inertia_kg_m2 : float
-        Inertia between sensor and beam.
+        Inertia between the sensor and the beam.
     delay_s : float
         Delay of the torque channel.
 
     Returns
     -------
     array (n,)
-        Torque in N·m.
+        Coupling torque in N·m.
 
     Notes
     -----
@@ -100,7 +102,7 @@ def beam_torque(
     >>> torque_nm.shape
     (4000,)
     """
-    return _answered(
+    return _causal_response(
         np.asarray(angle_rad, dtype=float),
         rate_hz,
         lambda s: (transfer(s, beam, damping) + tool_inertia_kg_m2 * s**2) * np.exp(-s * delay_s),
@@ -125,26 +127,27 @@ def chirp_signals(
     quantum_rad: float = 7e-5,
     seed: int = 1,
 ) -> Signals:
-    """Make the signals of a chirp: through a motor loop of 80 rad/s, and the exact beam.
+    """Return the signals of a chirp through a simulated motor loop and the exact beam.
 
     Parameters
     ----------
     rest_s, sweep_s, ring_down_s : float
-        Lengths of the segments.
+        Durations of the segments.
     rate_hz : float
         Sampling rate.
     amplitude_rad, start_hz, stop_hz : float
-        Amplitude and frequencies of the reference; those of the paper by default.
+        Amplitude and first and last frequency of the reference. Default: those of the reference
+        paper.
     beam, damping, tool_inertia_kg_m2
-        See :func:`beam_torque`.
+        As for :func:`beam_torque`.
     angle_delay_s, torque_delay_s : float
-        Delay of either channel.
+        Delay of the angle's and of the torque's channel.
     noise_nm : float
-        Standard deviation of the torque's white noise.
+        Standard deviation of the white noise in the torque.
     quantum_rad : float
-        Step of the encoder; 0 for none.
+        Resolution of the encoder; 0 for an ideal encoder.
     seed : int
-        Seed of the noise.
+        Seed of the random noise.
 
     Returns
     -------
@@ -157,31 +160,33 @@ def chirp_signals(
     >>> len(signals.torque_nm), signals.segments["sweep"]
     (13000, (1000, 11000))
     """
-    rest, sweep, ring_down = (round(each * rate_hz) for each in (rest_s, sweep_s, ring_down_s))
-    t = np.arange(sweep) / rate_hz
+    rest_samples, sweep_samples, ring_down_samples = (
+        round(duration_s * rate_hz) for duration_s in (rest_s, sweep_s, ring_down_s)
+    )
+    t = np.arange(sweep_samples) / rate_hz
     phase = 2 * np.pi * (start_hz * t + (stop_hz - start_hz) * t**2 / (2 * sweep_s))
-    reference = np.zeros(rest + sweep + ring_down)
-    reference[rest : rest + sweep] = amplitude_rad * np.sin(phase)
+    reference = np.zeros(rest_samples + sweep_samples + ring_down_samples)
+    reference[rest_samples : rest_samples + sweep_samples] = amplitude_rad * np.sin(phase)
 
     def motor(s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        return 1 / (1 + s / _POLE_RAD_S) ** 2
+        return 1 / (1 + s / _MOTOR_LOOP_POLE_RAD_S) ** 2
 
     def torque_of(s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        answer = transfer(s, beam, damping) + tool_inertia_kg_m2 * s**2
-        return np.asarray(answer * motor(s) * np.exp(-s * torque_delay_s))
+        beam_response = transfer(s, beam, damping) + tool_inertia_kg_m2 * s**2
+        return np.asarray(beam_response * motor(s) * np.exp(-s * torque_delay_s))
 
-    angle = _answered(reference, rate_hz, lambda s: motor(s) * np.exp(-s * angle_delay_s))
+    angle = _causal_response(reference, rate_hz, lambda s: motor(s) * np.exp(-s * angle_delay_s))
     if quantum_rad:
         angle = quantum_rad * np.round(angle / quantum_rad)
     noise = noise_nm * np.random.default_rng(seed).standard_normal(reference.size)
     segments = {
-        "rest": (0, rest),
-        "sweep": (rest, rest + sweep),
-        "ring_down": (rest + sweep, reference.size),
+        "rest": (0, rest_samples),
+        "sweep": (rest_samples, rest_samples + sweep_samples),
+        "ring_down": (rest_samples + sweep_samples, reference.size),
     }
-    torque = _answered(reference, rate_hz, torque_of) + noise
-    stated = {"excitation": "chirp", "start_hz": repr(start_hz), "stop_hz": repr(stop_hz)}
-    return Signals(reference, angle, torque, segments, rate_hz, stated)
+    torque = _causal_response(reference, rate_hz, torque_of) + noise
+    metadata = {"excitation": "chirp", "start_hz": repr(start_hz), "stop_hz": repr(stop_hz)}
+    return Signals(reference, angle, torque, segments, rate_hz, metadata)
 
 
 def write_session(
@@ -196,33 +201,34 @@ def write_session(
     status: ArrayLike = 0,
     outcome: str = "complete",
 ) -> Path:
-    """Write signals as a session file, of the format that rigd records.
+    """Write signals as a session file in rigd's format, and return its path.
 
     Parameters
     ----------
     path : Path
-        File to write; one that exists is not overwritten.
+        New file. An existing file is not overwritten.
     signals : Signals
+        Signals to write.
     beam : Beam
-        Beam that the file states.
+        Beam whose parameters the file states.
     metadata : mapping of str to str, optional
-        Further metadata, or other values of them.
+        Additional metadata, or replaced values of the default metadata.
     segments : mapping, optional
-        Used instead of those of the signals.
+        Segments to state instead of those of the signals.
     ticks, t_ns, status : array (n,), optional
-        Ticks, times in ns, and status bits; by default no tick is missing, and nothing is amiss.
+        Ticks, times in ns, and status bits. Default: no tick is missing, and no status bit is set.
     outcome : str
-        How the session ended.
+        Outcome that the file states.
 
     Returns
     -------
     Path
-        The file.
+        Path of the file.
 
     Raises
     ------
     rigd.session.SessionExistsError
-        If there is a file of that name.
+        If a file of that name exists.
 
     Examples
     --------
@@ -245,7 +251,7 @@ def write_session(
         "coupling_torque_nm": signals.torque_nm,
         "status": status,
     }
-    stated = {
+    default_metadata = {
         "rate_hz": repr(signals.rate_hz),
         "beam_length_m": repr(beam.length_m),
         "beam_density_kg_per_m": repr(beam.density_kg_per_m),
@@ -254,7 +260,7 @@ def write_session(
     writer = SessionWriter(path)
     writer.begin(
         _START_UTC_NS,
-        stated | signals.metadata | dict(metadata or {}),
+        default_metadata | signals.metadata | dict(metadata or {}),
         dict(signals.segments if segments is None else segments),
         {},
     )
@@ -262,16 +268,19 @@ def write_session(
     return writer.close({"outcome": outcome})
 
 
-def _answered(
+def _causal_response(
     values: NDArray[np.float64],
     rate_hz: float,
     transfer_of_s: Callable[[NDArray[np.complex128]], NDArray[np.complex128]],
 ) -> NDArray[np.float64]:
-    """Causal response (n,), by a transform on ``s = sigma + j omega`` of the record and zeros."""
+    """Return the causal response (n,) of a transfer function to values that begin at rest.
+
+    The transform is evaluated on ``s = sigma + j omega``, for the values followed by zeros.
+    """
     n = len(values)
-    padded = 1 << (4 * n).bit_length()
+    padded_length = 1 << (4 * n).bit_length()
     sigma = rate_hz / n
     decay = np.exp(-sigma * np.arange(n) / rate_hz)
-    s = np.asarray(sigma + 2j * np.pi * np.fft.rfftfreq(padded, 1 / rate_hz), np.complex128)
-    spectrum = np.multiply(np.fft.rfft(values * decay, padded), transfer_of_s(s))
-    return np.asarray(np.fft.irfft(spectrum, padded)[:n] / decay)
+    s = np.asarray(sigma + 2j * np.pi * np.fft.rfftfreq(padded_length, 1 / rate_hz), np.complex128)
+    spectrum = np.multiply(np.fft.rfft(values * decay, padded_length), transfer_of_s(s))
+    return np.asarray(np.fft.irfft(spectrum, padded_length)[:n] / decay)

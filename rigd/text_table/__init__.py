@@ -1,8 +1,8 @@
-"""Tables in text files of other programs: detection of the layout, numbers, and errors.
+"""Tables in text files of other programs: detection of the layout, reading of columns, errors.
 
 `read_table` detects separator, decimal sign, titles, row of units and first line of numbers, reads
 some columns, and reports every invalid line with its number. `decode_text` decodes a text with or
-without a byte order mark. The public module `titles` finds units and times in the titles of
+without a byte order mark. The public module `titles` recognises units and times in the titles of
 columns. The package depends on no other package.
 """
 

@@ -1,4 +1,4 @@
-"""Cells of a table: numbers with a decimal point or comma, dates, rows of units."""
+"""Cells of a table: recognition of numbers with either decimal sign, dates and units."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -7,31 +7,45 @@ from typing import Final
 from rigd.text_table.titles import is_unit
 
 POINT: Final = "."
+"""Decimal point."""
 COMMA: Final = ","
+"""Decimal comma."""
 
-_UNSIGNED: Final = r"(?:\d+{mark}?\d*|{mark}\d+)(?:[eE][-+]?\d+)?"
-_NOT_FINITE: Final = r"nan|inf|infinity"
-_NUMBERS: Final = {
+_UNSIGNED_PATTERN: Final = r"(?:\d+{mark}?\d*|{mark}\d+)(?:[eE][-+]?\d+)?"
+"""Pattern of a finite number without sign, in which {mark} is replaced by the decimal sign."""
+_NOT_FINITE_PATTERN: Final = r"nan|inf|infinity"
+"""Pattern of NaN and infinity."""
+_NUMBER_PATTERNS: Final = {
     mark: re.compile(
-        rf"[-+]?(?:{_UNSIGNED.replace('{mark}', re.escape(mark))}|{_NOT_FINITE})",
+        rf"[-+]?(?:{_UNSIGNED_PATTERN.replace('{mark}', re.escape(mark))}|{_NOT_FINITE_PATTERN})",
         re.ASCII | re.IGNORECASE,
     )
     for mark in (POINT, COMMA)
 }
-_GROUPED: Final = {
+"""Patterns of numbers, by decimal sign."""
+_GROUPED_PATTERNS: Final = {
     mark: re.compile(rf"[-+]?[1-9]\d{{0,2}}{re.escape(mark)}\d{{3}}") for mark in (POINT, COMMA)
 }
-_UP_TO_THREE_DIGITS: Final = re.compile(r"[-+]?\d{1,3}")
-_DATE: Final = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}([ T_].*)?|(.*\d)?\d:\d\d(:\d.*)?")
-_DECIMALS: Final = re.compile(r"\d+(?:[eE][-+]?\d+)?")
-_LEADING_ZERO: Final = re.compile(r"0\d+.*")
-_WHOLE: Final = re.compile(r"[-+]?\d+")
-_COMMENT: Final = re.compile(r"\s*[#%]\s*")
+"""Patterns of numbers with exactly three digits after the decimal sign, by decimal sign."""
+_SHORT_INTEGER_PATTERN: Final = re.compile(r"[-+]?\d{1,3}")
+"""Pattern of an integer of at most three digits."""
+_DATE_PATTERN: Final = re.compile(
+    r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}([ T_].*)?|(.*\d)?\d:\d\d(:\d.*)?"
+)
+"""Pattern of a date or a time of day."""
+_DECIMALS_PATTERN: Final = re.compile(r"\d+(?:[eE][-+]?\d+)?")
+"""Pattern of the digits after a decimal sign."""
+_LEADING_ZERO_PATTERN: Final = re.compile(r"0\d+.*")
+"""Pattern of digits that begin with a zero."""
+_INTEGER_PATTERN: Final = re.compile(r"[-+]?\d+")
+"""Pattern of an integer."""
+_COMMENT_PATTERN: Final = re.compile(r"\s*[#%]\s*")
+"""Pattern of a comment mark at the start of a line."""
 
 
-def is_number(cell: str, mark: str) -> bool:
-    """Return whether a cell is a number with that decimal sign, NaN or infinity."""
-    return _NUMBERS[mark].fullmatch(cell.strip()) is not None
+def is_number(cell: str, decimal_sign: str) -> bool:
+    """Return whether a cell is NaN, infinity or a number with a given decimal sign."""
+    return _NUMBER_PATTERNS[decimal_sign].fullmatch(cell.strip()) is not None
 
 
 def is_any_number(cell: str) -> bool:
@@ -39,8 +53,8 @@ def is_any_number(cell: str) -> bool:
     return is_number(cell, POINT) or is_number(cell, COMMA)
 
 
-def number_of(cell: str, mark: str) -> float:
-    """Return the number of a cell; NaN for an empty cell.
+def number_of(cell: str, decimal_sign: str) -> float:
+    """Return the number in a cell; NaN for an empty cell.
 
     Raises
     ------
@@ -50,17 +64,18 @@ def number_of(cell: str, mark: str) -> float:
     text = cell.strip()
     if not text:
         return float("nan")
-    if not is_number(text, mark):
+    if not is_number(text, decimal_sign):
         raise ValueError(text)
     return float(text.replace(COMMA, POINT))
 
 
-def quick_reader(mark: str) -> Callable[[str], float]:
-    """Return the fastest converter of a cell to a number; it raises ValueError if in doubt."""
-    return float if mark == POINT else _with_comma
+def fast_number_converter(decimal_sign: str) -> Callable[[str], float]:
+    """Return a fast function from a cell to its number; it raises ValueError if in doubt."""
+    return float if decimal_sign == POINT else _number_with_comma
 
 
-def _with_comma(cell: str) -> float:
+def _number_with_comma(cell: str) -> float:
+    """Return the number in a cell with a decimal comma, or raise ValueError."""
     if POINT in cell:
         raise ValueError(cell)
     return float(cell.replace(COMMA, POINT))
@@ -68,66 +83,71 @@ def _with_comma(cell: str) -> float:
 
 def is_date(cell: str) -> bool:
     """Return whether a cell resembles a date or a time of day."""
-    return _DATE.fullmatch(cell.strip()) is not None
+    return _DATE_PATTERN.fullmatch(cell.strip()) is not None
 
 
-class ThousandsWatch:
-    """Check of one column whose decimal signs could be thousands separators.
+class ThousandsCheck:
+    """Check of one column for decimal signs that could be thousands separators.
 
-    Every cell with the sign has exactly three digits after it and no leading zero. Such a column is
-    ambiguous if other cells, below 1000, have no sign.
+    The signs are ambiguous if each has exactly three digits after it, no number has a leading zero,
+    and other cells contain numbers below 1000 without the sign.
     """
 
-    def __init__(self, mark: str) -> None:
-        self._mark = mark
+    def __init__(self, decimal_sign: str) -> None:
+        self._decimal_sign = decimal_sign
         self.grouped_line = 0
         self.plain = False
 
-    def settles(self, cell: str, line: int) -> bool:
-        """Add a cell; return whether it shows that the sign is a decimal sign."""
+    def proves_decimal_sign(self, cell: str, line: int) -> bool:
+        """Add a cell and return whether it proves that the sign is a decimal sign."""
         text = cell.strip()
-        if self._mark not in text:
-            self.plain = self.plain or _UP_TO_THREE_DIGITS.fullmatch(text) is not None
+        if self._decimal_sign not in text:
+            self.plain = self.plain or _SHORT_INTEGER_PATTERN.fullmatch(text) is not None
             return False
-        if not _GROUPED[self._mark].fullmatch(text):
+        if not _GROUPED_PATTERNS[self._decimal_sign].fullmatch(text):
             return True
         self.grouped_line = self.grouped_line or line
         return False
 
 
 def are_split_decimals(rows: Sequence[Sequence[str]]) -> bool:
-    """Return whether cells between commas are halves of numbers with decimal commas (0,025).
+    """Return whether commas in decimal numbers (0,025) were taken as separators of cells.
 
     Every line then has an even number of cells without a decimal sign. The second cell of each pair
-    has no sign, and somewhere a leading zero, which no integer has.
+    is an unsigned integer. At least one of these has a leading zero, which no integer has.
     """
-    zeros = False
+    has_leading_zero = False
     for row in rows:
-        second = [cell.strip() for cell in row[1::2]]
-        if not row or len(row) % 2 or not all(map(_DECIMALS.fullmatch, second)):
+        decimal_cells = [cell.strip() for cell in row[1::2]]
+        if not row or len(row) % 2 or not all(map(_DECIMALS_PATTERN.fullmatch, decimal_cells)):
             return False
-        if not all(_WHOLE.fullmatch(cell.strip()) for cell in row[::2]):
+        if not all(_INTEGER_PATTERN.fullmatch(cell.strip()) for cell in row[::2]):
             return False
-        zeros = zeros or any(_LEADING_ZERO.fullmatch(cell) for cell in second)
-    return zeros
+        has_leading_zero = has_leading_zero or any(
+            _LEADING_ZERO_PATTERN.fullmatch(cell) for cell in decimal_cells
+        )
+    return has_leading_zero
 
 
 # Titles and units
 
 
 def without_comment_mark(cell: str) -> str:
-    """Return a title without the comment mark of numpy or MATLAB at the start of the line."""
-    return _COMMENT.sub("", cell, count=1) if _COMMENT.match(cell) else cell
+    """Return a title without a comment mark (# or %) at the start of the line."""
+    return _COMMENT_PATTERN.sub("", cell, count=1) if _COMMENT_PATTERN.match(cell) else cell
 
 
 def is_comment(row: Sequence[str]) -> bool:
-    """Return whether a line is a comment, or a rule such as dashes below the titles."""
+    """Return whether a line is a comment or a horizontal rule, such as dashes below the titles."""
     text = "".join(row).strip()
-    return _COMMENT.match(text) is not None or set(text) <= set("-=_+|*: ")
+    return _COMMENT_PATTERN.match(text) is not None or set(text) <= set("-=_+|*: ")
 
 
 def is_row_of_units(row: Sequence[str], columns: Sequence[int]) -> bool:
-    """Return whether a line below the titles has units: at least one known unit and no number."""
+    """Return whether a line below the titles is a row of units.
+
+    It is if it contains no number, and a known unit in at least one of the columns.
+    """
     cells = [cell.strip() for cell in row]
     if any(is_any_number(cell) for cell in cells if cell and cell != "1"):
         return False

@@ -1,41 +1,45 @@
-"""Encoding of a text file: by its byte order mark, else UTF-8, else Windows-1252."""
+"""Encoding of a text file: from its byte order mark, else UTF-8, else Windows-1252."""
 
 import codecs
 from typing import Final
 
-_MARKS: Final = (
+_BYTE_ORDER_MARKS: Final = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),  # first, because the mark of UTF-16 is its prefix
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-_LONGEST_MARK: Final = 4
+"""Byte order marks and the encodings that they state."""
+_MOST_MARK_BYTES: Final = 4
+"""Number of bytes in the longest byte order mark."""
 
 
-def encodings(head: bytes) -> tuple[str, ...]:
-    """Return the possible encodings from the first bytes of a file, the most probable first.
+def encodings(first_bytes: bytes) -> tuple[str, ...]:
+    """Return the possible encodings of a file from its first bytes, the most probable first.
 
     Most programs without UTF-8 write Windows-1252. Numbers have the same bytes in both encodings;
     only titles and units can differ.
     """
-    marked = _marked(head)
-    if marked is not None:
-        return (marked,)
-    if len(head) > 1 and not head[1] and head[0]:
+    encoding = _encoding_of_mark(first_bytes)
+    if encoding is not None:
+        return (encoding,)
+    if len(first_bytes) > 1 and not first_bytes[1] and first_bytes[0]:
         return ("utf-16-le",)
-    if len(head) > 1 and not head[0] and head[1]:
+    if len(first_bytes) > 1 and not first_bytes[0] and first_bytes[1]:
         return ("utf-16-be",)
     return ("utf-8", "cp1252")
 
 
 def decode_text(data: bytes) -> str:
-    r"""Decode text in UTF-8, or in UTF-16 or UTF-32 with a byte order mark; omit the mark.
+    r"""Return text that is encoded in UTF-8, or in UTF-16 or UTF-32 with a byte order mark.
+
+    The byte order mark is omitted.
 
     Parameters
     ----------
     data : bytes
-        Contents of a file.
+        Content of a file.
 
     Raises
     ------
@@ -48,9 +52,9 @@ def decode_text(data: bytes) -> str:
     >>> decode_text(b"\xef\xbb\xbfname = 1")
     'name = 1'
     """
-    return data.decode(_marked(data[:_LONGEST_MARK]) or "utf-8")
+    return data.decode(_encoding_of_mark(data[:_MOST_MARK_BYTES]) or "utf-8")
 
 
-def _marked(head: bytes) -> str | None:
-    """Return the encoding of a byte order mark, None without a mark."""
-    return next((name for mark, name in _MARKS if head.startswith(mark)), None)
+def _encoding_of_mark(first_bytes: bytes) -> str | None:
+    """Return the encoding that a byte order mark states; None without a mark."""
+    return next((name for mark, name in _BYTE_ORDER_MARKS if first_bytes.startswith(mark)), None)

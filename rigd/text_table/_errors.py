@@ -1,23 +1,25 @@
-"""Errors of tables."""
+"""Errors for text files that are not the requested table."""
 
 from collections.abc import Sequence
 from typing import Final
 
 from rigd.printable import printable
 
-_TITLES_SHOWN: Final = 12
-_CELL_SHOWN: Final = 40
+_MOST_TITLES_SHOWN: Final = 12
+"""Largest number of titles in a message."""
+_MOST_CELL_CHARACTERS_SHOWN: Final = 40
+"""Largest number of characters of a cell in a message."""
 
 
 class TableError(Exception):
-    """A text file is not a table of numbers; the message names the line and the remedy.
+    """Error: a text file is not a table of numbers. The message names the line and the remedy.
 
     Parameters
     ----------
     message : str
-        Sentence without the file's name.
+        Sentence without the name of the file, in which ``{cell}`` is replaced by the invalid text.
     cell : str
-        Invalid text of the file, "" if none.
+        Invalid text in the file; empty if there is none.
     """
 
     def __init__(self, message: str, cell: str = "") -> None:
@@ -26,34 +28,40 @@ class TableError(Exception):
         self.cell = cell
 
     def __str__(self) -> str:
-        """Return the message with the invalid text of the file."""
-        shown = f" ('{printable(self.cell, _CELL_SHOWN)}')" if self.cell else ""
-        return self.message.replace("{cell}", shown)
+        """Return the message with the invalid text from the file."""
+        cell_text = f" ('{printable(self.cell, _MOST_CELL_CHARACTERS_SHOWN)}')" if self.cell else ""
+        return self.message.replace("{cell}", cell_text)
 
     def unquoted(self) -> str:
-        """Return the message without any text of the file."""
+        """Return the message without any text from the file."""
         return self.message.replace("{cell}", "")
 
 
 class MissingColumnError(TableError):
-    """The table has no column with that title.
+    """Error: the table has no column with a requested title.
 
     Parameters
     ----------
     name : str
-        Missing title.
+        Requested title that is missing.
     titles : sequence of str
-        Probable titles of the file.
+        Titles in the most probable line of titles.
     line : int
-        Line of the titles, 0 if there are none.
+        Number of this line; 0 if there is none.
     """
 
     def __init__(self, name: str, titles: Sequence[str], line: int) -> None:
-        listed = ", ".join(repr(printable(each, 60)) for each in titles[:_TITLES_SHOWN])
-        more = f" and {len(titles) - _TITLES_SHOWN} more" if len(titles) > _TITLES_SHOWN else ""
-        where = f" (line {line})" if line else ""
+        listed_titles = ", ".join(
+            repr(printable(title, 60)) for title in titles[:_MOST_TITLES_SHOWN]
+        )
+        more_titles = (
+            f" and {len(titles) - _MOST_TITLES_SHOWN} more"
+            if len(titles) > _MOST_TITLES_SHOWN
+            else ""
+        )
+        line_text = f" (line {line})" if line else ""
         super().__init__(
-            f"has no channel '{name}'; it has {listed}{more}{where}."
+            f"has no channel '{name}'; it has {listed_titles}{more_titles}{line_text}."
             if titles
             else f"has no channel '{name}', and no other either."
         )

@@ -20,30 +20,41 @@ from rigd.text_table._head_rates import stated_rate_hz
 from rigd.text_table._stamps import is_stamp
 from rigd.text_table.titles import bare_unit, is_unit
 
-HEAD_LINES: Final = 500
-"""Largest line number of the first line of numbers."""
+MOST_HEAD_LINES: Final = 500
+"""Number of lines at the beginning of a file in which the first line of numbers must be."""
 
-BLANKS: Final = " "
+BLANK_SEPARATOR: Final = " "
+"""Separator that means any number of blanks."""
 _SEPARATORS: Final = ("\t", ";", ",", "|")
-_NAMES: Final = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "bars", BLANKS: "blanks"}
-_EXCEL: Final = "sep="
-_BETWEEN: Final = 6
+"""Characters that may separate cells, without blanks."""
+_SEPARATOR_NAMES: Final = {
+    "\t": "tabs",
+    ";": "semicolons",
+    ",": "commas",
+    "|": "bars",
+    BLANK_SEPARATOR: "blanks",
+}
+"""Names of the separators in messages."""
+_EXCEL_SEPARATOR_LINE: Final = "sep="
+"""Beginning of the line with which Excel states the separator."""
+_MOST_LINES_BELOW_TITLES: Final = 6
 """Largest number of lines between the titles and the first line of numbers."""
 _NUMBERING_LINES: Final = 5
+"""Number of rows below a row 1, 2, 3, … that are examined to find out if it numbers the columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class TextRow:
-    """A row of cells: one line of the file, or several with line breaks in a quoted cell.
+    """Row of cells: one line of a file, or several lines with a line break inside quotes.
 
     Attributes
     ----------
     line : int
-        Number of its first line, from 1.
+        Number of the row's first line, from 1.
     cells : list of str
-        Cells without surrounding blanks.
+        Texts of the cells without surrounding blanks.
     index : int
-        Number of rows before it, including empty ones.
+        Number of rows before this one, including empty rows.
     """
 
     line: int
@@ -53,32 +64,32 @@ class TextRow:
 
 @dataclass(frozen=True, slots=True)
 class TableLayout:
-    """Layout of a table in a text.
+    """Layout of a table in a text file: separator, titles, units and first row of numbers.
 
     Attributes
     ----------
     separator : str
-        Character between cells; a blank means any number of blanks.
+        Character between cells. A blank means any number of blanks.
     titles : tuple of str
-        Title of each column, empty without titles.
+        Title of each column; empty if the table has no titles.
     titles_line : int
-        Line of the titles, 0 without titles.
+        Number of the line with the titles; 0 if the table has no titles.
     units : tuple of str
-        Units of the row below the titles, "" for an empty cell.
+        Units in the row below the titles; "" for an empty cell. Empty if there is no such row.
     width : int
-        Number of cells of each line.
-    optional : int
-        Number of optional columns at the end: the comment of LabVIEW's text files.
-    skip : int
+        Number of cells in each row.
+    optional_columns : int
+        Number of columns at the end that a row may lack, such as the comment in LabVIEW's files.
+    rows_before_numbers : int
         Number of rows before the first row of numbers.
     columns : tuple of int
-        Indices of the requested columns, in their order.
-    first : tuple of str
+        Indices of the requested columns, in the order of the request.
+    first_cells : tuple of str
         Cells of the first row of numbers.
     labview : LabviewHead or None
-        Head of a LabVIEW measurement file.
+        Head of the file if it is a LabVIEW measurement file.
     rate_hz : float or None
-        Sampling rate in another head.
+        Sampling rate stated in the head of another file; None if there is none.
     """
 
     separator: str
@@ -86,50 +97,55 @@ class TableLayout:
     titles_line: int
     units: tuple[str, ...]
     width: int
-    optional: int
-    skip: int
+    optional_columns: int
+    rows_before_numbers: int
     columns: tuple[int, ...]
-    first: tuple[str, ...]
+    first_cells: tuple[str, ...]
     labview: "_labview.LabviewHead | None" = None
     rate_hz: float | None = None
 
 
 def stated_separator(first_line: str) -> str | None:
-    """Return the separator of Excel's line ``sep=;``, None for another line."""
+    """Return the separator that Excel's line ``sep=;`` states; None for any other line."""
     text = first_line.rstrip("\r\n").strip('"')
-    is_statement = text[: len(_EXCEL)].lower() == _EXCEL and len(text) == len(_EXCEL) + 1
+    is_statement = (
+        text[: len(_EXCEL_SEPARATOR_LINE)].lower() == _EXCEL_SEPARATOR_LINE
+        and len(text) == len(_EXCEL_SEPARATOR_LINE) + 1
+    )
     return text[-1] if is_statement else None
 
 
-def rows_of(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number of the first line and the cells of each row."""
-    if separator == BLANKS:
+def rows_of_cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a text: number of the row's first line, and its cells."""
+    if separator == BLANK_SEPARATOR:
         for number, line in enumerate(lines, 1):
             yield number, line.split()
         return
-    reader = csv.reader(lines, delimiter=separator)
-    before = 0
-    for row in reader:
-        yield before + 1, row
-        before = reader.line_num
+    csv_reader = csv.reader(lines, delimiter=separator)
+    lines_before = 0
+    for row in csv_reader:
+        yield lines_before + 1, row
+        lines_before = csv_reader.line_num
 
 
-def fitted(row: Sequence[str], width: int) -> list[str]:
-    """Return a row without the empty cells after the last column."""
+def without_trailing_empty_cells(row: Sequence[str], column_count: int) -> list[str]:
+    """Return a row without the empty cells that follow the last column."""
     cells = list(row)
-    while len(cells) > width and not cells[-1].strip():
+    while len(cells) > column_count and not cells[-1].strip():
         cells.pop()
     return cells
 
 
-def wrong_width(line: int, cells: int, layout_width: int, titles_line: int, separator: str) -> str:
-    """Return the message for a line with too many or too few cells."""
-    table = (
-        f"line {titles_line} has {_counted(layout_width, 'title')}"
+def wrong_width_message(
+    line: int, cells: int, layout_width: int, titles_line: int, separator: str
+) -> str:
+    """Return the error message for a row with too many or too few cells."""
+    expected_width = (
+        f"line {titles_line} has {_count_with_noun(layout_width, 'title')}"
         if titles_line
         else f"the lines above have {layout_width}"
     )
-    between = _NAMES.get(separator, repr(separator))
+    separator_name = _SEPARATOR_NAMES.get(separator, repr(separator))
     if cells > layout_width:
         cause = (
             "decimal commas in a file that separates by commas, an index without a title and a "
@@ -142,269 +158,317 @@ def wrong_width(line: int, cells: int, layout_width: int, titles_line: int, sepa
         cause = "a value is missing, a quotation does not end, or the line is not part of the table"
         remedy = "repair or remove the line; an unknown value is an empty cell"
     return (
-        f"line {line} has {_counted(cells, 'cell')} between {between}, and {table}: {cause}; "
-        f"{remedy}."
+        f"line {line} has {_count_with_noun(cells, 'cell')} between {separator_name}, and "
+        f"{expected_width}: {cause}; {remedy}."
     )
 
 
-def _counted(count: int, noun: str) -> str:
+def _count_with_noun(count: int, noun: str) -> str:
+    """Return a number with a noun in singular or plural."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
-    """Find the table in the first lines of a file.
+    """Return the layout of the table in a file, from the first lines of the file.
 
     Parameters
     ----------
     lines : sequence of str
-        At most `HEAD_LINES`, with their ends.
+        First lines with their line ends, at most `MOST_HEAD_LINES`.
     names : sequence of str
-        Titles of the requested columns, or ``#3`` for the third.
+        Titles of the requested columns, or numbers such as ``#3`` for the third column.
 
     Raises
     ------
     TableError
-        If there is no such table.
+        If the file contains no table with these columns.
     """
     if not any(line.strip() for line in lines):
         raise TableError("is empty; export the record again.")
-    stated = stated_separator(lines[0])
-    if stated:
+    separator_in_file = stated_separator(lines[0])
+    if separator_in_file:
         lines = ["\n", *lines[1:]]
-    labview = _labview.head_of(lines)
-    if labview is not None:
-        stated = labview.separator
-    present = [mark for mark in _SEPARATORS if any(mark in line for line in lines)]
-    candidates = [stated] if stated else [*present, BLANKS]
-    failures: list[_UnlikelyError] = []
-    found: TableLayout | None = None
+    labview_head = _labview.head_of(lines)
+    if labview_head is not None:
+        separator_in_file = labview_head.separator
+    present_separators = [
+        character for character in _SEPARATORS if any(character in line for line in lines)
+    ]
+    candidates = (
+        [separator_in_file] if separator_in_file else [*present_separators, BLANK_SEPARATOR]
+    )
+    failures: list[_NotThisTableError] = []
+    best_layout: TableLayout | None = None
     for separator in candidates:
         try:
             rows = [
                 TextRow(line, [cell.strip() for cell in cells], index)
-                for index, (line, cells) in enumerate(rows_of(lines, separator))
+                for index, (line, cells) in enumerate(rows_of_cells(lines, separator))
             ]
         except csv.Error as error:
-            failures.append(_UnlikelyError(_NO_ROWS, TableError(f"is no table ({error}).")))
+            failures.append(
+                _NotThisTableError(_RANK_NO_ROWS, TableError(f"is no table ({error})."))
+            )
             continue
-        written = [row for row in rows if any(row.cells)]
-        if labview is not None:
-            written = [row for row in written if row.line > labview.last_line]
+        nonempty_rows = [row for row in rows if any(row.cells)]
+        if labview_head is not None:
+            nonempty_rows = [row for row in nonempty_rows if row.line > labview_head.last_line]
         try:
-            layout = _layout(written, separator, names, labview)
-        except _UnlikelyError as unlikely:
+            layout = _layout_with_separator(nonempty_rows, separator, names, labview_head)
+        except _NotThisTableError as unlikely:
             unlikely.separator = separator
             failures.append(unlikely)
             continue
         if separator == ",":
-            _check_split_decimals(rows[layout.skip :], layout)
-        if found is None or layout.skip < found.skip:
-            found = layout
-    worst = max(failures, key=lambda failure: failure.rank, default=None)
+            _check_split_decimals(rows[layout.rows_before_numbers :], layout)
+        if best_layout is None or layout.rows_before_numbers < best_layout.rows_before_numbers:
+            best_layout = layout
+    nearest_failure = max(failures, key=lambda failure: failure.rank, default=None)
     # A table that starts late does not count if earlier lines nearly form a table.
-    early = any(
-        each.rank == _TITLES and found and each.index < found.skip and each.separator != BLANKS
-        for each in failures
+    has_earlier_titles = any(
+        failed_layout.rank == _RANK_ALL_TITLES
+        and best_layout
+        and failed_layout.index < best_layout.rows_before_numbers
+        and failed_layout.separator != BLANK_SEPARATOR
+        for failed_layout in failures
     )
-    if found is None or early:
-        assert worst is not None
-        raise worst.error
-    if labview is None:
-        return replace(found, rate_hz=stated_rate_hz(lines[: found.skip]))
-    return found
+    if best_layout is None or has_earlier_titles:
+        assert nearest_failure is not None
+        raise nearest_failure.error
+    if labview_head is None:
+        return replace(
+            best_layout, rate_hz=stated_rate_hz(lines[: best_layout.rows_before_numbers])
+        )
+    return best_layout
 
 
-class _UnlikelyError(Exception):
-    """Separator with which the text is not the requested table; `rank`: how near it is."""
+class _NotThisTableError(Exception):
+    """Error: with a certain separator, the text is not the requested table.
 
-    def __init__(self, rank: int, error: TableError, index: int = HEAD_LINES) -> None:
+    `rank` states how much of the table was found, and `error` is the error for the user.
+    """
+
+    def __init__(self, rank: int, error: TableError, row_index: int = MOST_HEAD_LINES) -> None:
         super().__init__()
         self.rank = rank
         self.error = error
-        self.index = index
+        self.index = row_index
         self.separator = ""
 
 
-_NO_ROWS, _NO_TITLES, _SOME_TITLES, _TITLES = range(4)
-"""Ranks of failures: the message of the highest rank is shown."""
+_RANK_NO_ROWS, _RANK_NO_TITLES, _RANK_SOME_TITLES, _RANK_ALL_TITLES = range(4)
+"""Ranks of failures. The error of the failure with the highest rank is reported."""
 
 
-def _layout(
+def _layout_with_separator(
     rows: Sequence[TextRow],
     separator: str,
     names: Sequence[str],
-    labview: "_labview.LabviewHead | None",
+    labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout:
-    numbers = [_number(name) for name in names]
-    titled = [name for name, number in zip(names, numbers, strict=True) if number is None]
+    """Return the layout of the table for a given separator, or raise the most specific error."""
+    column_numbers = [_column_number(name) for name in names]
+    requested_titles = [
+        name for name, number in zip(names, column_numbers, strict=True) if number is None
+    ]
     if not rows:
-        raise _UnlikelyError(_NO_ROWS, TableError("has no lines below its head."))
-    failure: _UnlikelyError | None = None
+        raise _NotThisTableError(_RANK_NO_ROWS, TableError("has no lines below its head."))
+    failure: _NotThisTableError | None = None
     for index, row in enumerate(rows):
-        if titled and not _has_titles(row, titled):
+        if requested_titles and not _has_titles(row, requested_titles):
             continue
         try:
-            if titled:
-                return _below_titles(rows, index, separator, names, labview)
-            found = _with_numbers(rows, index, separator, [n or 0 for n in numbers], labview)
-            if found is not None:
-                return found
-        except _UnlikelyError as unlikely:
-            if unlikely.index == HEAD_LINES:
+            if requested_titles:
+                return _layout_below_titles(rows, index, separator, names, labview_head)
+            layout = _layout_from_numbers(
+                rows, index, separator, [n or 0 for n in column_numbers], labview_head
+            )
+            if layout is not None:
+                return layout
+        except _NotThisTableError as unlikely:
+            if unlikely.index == MOST_HEAD_LINES:
                 unlikely.index = row.index
-            if not titled:
+            if not requested_titles:
                 raise
             failure = failure or unlikely
     if failure is not None:
         raise failure
-    if titled:
-        raise _missing(rows, titled)
-    raise _UnlikelyError(
-        _NO_TITLES if max(len(row.cells) for row in rows) >= max(n or 0 for n in numbers) else 0,
-        _no_numbers(rows, names),
+    if requested_titles:
+        raise _missing_title_error(rows, requested_titles)
+    raise _NotThisTableError(
+        _RANK_NO_TITLES
+        if max(len(row.cells) for row in rows) >= max(n or 0 for n in column_numbers)
+        else 0,
+        _no_numbers_error(rows, names),
     )
 
 
-def _number(name: str) -> int | None:
-    """Return 3 for ``#3``, None for a title."""
+def _column_number(name: str) -> int | None:
+    """Return the number in a name such as ``#3``; None for a title."""
     digits = name.removeprefix("#")
     return int(digits) if name != digits and digits.isdecimal() and int(digits) > 0 else None
 
 
 def _plain_titles(row: TextRow) -> list[str]:
-    """Return the titles of a row without comment mark and without empty titles at the end."""
-    cells = fitted(row.cells, 0)
+    """Return a row's titles without a comment mark and without empty titles at the end."""
+    cells = without_trailing_empty_cells(row.cells, 0)
     if cells and cells[0] in ("#", "%"):  # with blanks as separator the mark is a separate cell
         return cells[1:]
     return [without_comment_mark(cell) if not index else cell for index, cell in enumerate(cells)]
 
 
 def _has_titles(row: TextRow, names: Iterable[str]) -> bool:
+    """Return whether a row contains all of the requested titles."""
     return all(name in row.cells or name in _plain_titles(row) for name in names)
 
 
-def _below_titles(
+def _layout_below_titles(
     rows: Sequence[TextRow],
     index: int,
     separator: str,
     names: Sequence[str],
-    labview: "_labview.LabviewHead | None",
+    labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout:
-    """Return the layout of the table whose titles are in one row."""
-    head = rows[index]
-    raw, plain = fitted(head.cells, 0), _plain_titles(head)
-    titles = raw if all(name in raw for name in names if _number(name) is None) else plain
-    if len(plain) < len(raw):  # a single mark may be that of a comment or the title of an index
-        below = _next(rows, head)
-        titles = raw if below is None or len(below.cells) == len(raw) else plain
+    """Return the layout of the table below a row of titles."""
+    titles_row = rows[index]
+    raw_titles, plain_titles = (
+        without_trailing_empty_cells(titles_row.cells, 0),
+        _plain_titles(titles_row),
+    )
+    titles = (
+        raw_titles
+        if all(name in raw_titles for name in names if _column_number(name) is None)
+        else plain_titles
+    )
+    # "#" or "%" alone may mark a comment or be the title of an index.
+    if len(plain_titles) < len(raw_titles):
+        next_row = _next_row(rows, titles_row)
+        titles = (
+            raw_titles
+            if next_row is None or len(next_row.cells) == len(raw_titles)
+            else plain_titles
+        )
     width = len(titles)
     columns = []
     for name in names:
         if titles.count(name) > 1:
-            raise _UnlikelyError(
-                _TITLES,
+            raise _NotThisTableError(
+                _RANK_ALL_TITLES,
                 TableError(
-                    f"{titles.count(name)} columns are named '{name}' (line {head.line}); give the "
-                    f"number, such as #{titles.index(name) + 1} for the first of them."
+                    f"{titles.count(name)} columns are named '{name}' (line {titles_row.line}); "
+                    f"give the number, such as #{titles.index(name) + 1} for the first of them."
                 ),
             )
-        number = _number(name)
+        number = _column_number(name)
         if name in titles:
             columns.append(titles.index(name))
         elif number is not None and number <= width:
             columns.append(number - 1)
         else:
-            raise _UnlikelyError(_TITLES, MissingColumnError(name, titles, head.line))
-    optional = int(labview is not None and titles[-1] == _labview.COMMENT)
+            raise _NotThisTableError(
+                _RANK_ALL_TITLES, MissingColumnError(name, titles, titles_row.line)
+            )
+    optional_columns = int(labview_head is not None and titles[-1] == _labview.COMMENT_TITLE)
     units: Sequence[str] = ()
-    above = rows[index - 1].cells if index else []
-    if len(fitted(above, width)) == width and all(is_unit(cell) for cell in above if cell):
-        units = above
-    for row in rows[index + 1 : index + 2 + _BETWEEN]:
-        cells = fitted(row.cells, width)
-        fits = width - optional <= len(cells) <= width
-        if fits and _is_data(cells, columns, _next(rows, row)):
-            _check_single(row.line, cells)
+    cells_above = rows[index - 1].cells if index else []
+    if len(without_trailing_empty_cells(cells_above, width)) == width and all(
+        is_unit(cell) for cell in cells_above if cell
+    ):
+        units = cells_above
+    for row in rows[index + 1 : index + 2 + _MOST_LINES_BELOW_TITLES]:
+        cells = without_trailing_empty_cells(row.cells, width)
+        has_table_width = width - optional_columns <= len(cells) <= width
+        if has_table_width and _is_data(cells, columns, _next_row(rows, row)):
+            _check_single_column(row.line, cells)
             return TableLayout(
                 separator=separator,
                 titles=tuple(titles),
-                titles_line=head.line,
+                titles_line=titles_row.line,
                 units=tuple(bare_unit(cell) for cell in units),
                 width=width,
-                optional=optional,
-                skip=row.index,
+                optional_columns=optional_columns,
+                rows_before_numbers=row.index,
                 columns=tuple(columns),
-                first=tuple(cells),
-                labview=labview,
+                first_cells=tuple(cells),
+                labview=labview_head,
             )
         if len(cells) <= width and not units and is_row_of_units(cells, columns):
             units = cells + [""] * (width - len(cells))
             continue
         if is_comment(cells):
             continue
-        error = _not_data(row, cells, columns, names, head, width, separator)
-        raise _UnlikelyError(_TITLES, error, row.index)
-    raise _UnlikelyError(
-        _TITLES,
-        TableError(f"has 0 samples: no line of numbers below the titles in line {head.line}."),
+        error = _error_for_unexpected_row(row, cells, columns, names, titles_row, width, separator)
+        raise _NotThisTableError(_RANK_ALL_TITLES, error, row.index)
+    raise _NotThisTableError(
+        _RANK_ALL_TITLES,
+        TableError(
+            f"has 0 samples: no line of numbers below the titles in line {titles_row.line}."
+        ),
     )
 
 
-def _check_single(line: int, cells: Sequence[str]) -> None:
+def _check_single_column(line: int, cells: Sequence[str]) -> None:
+    """Raise if a row with a single cell contains a comma, which may be a decimal comma."""
     if len(cells) == 1 and "," in cells[0]:
-        raise _UnlikelyError(_TITLES, TableError(comma_in_single(line)))
+        raise _NotThisTableError(_RANK_ALL_TITLES, TableError(comma_in_single_message(line)))
 
 
-def comma_in_single(line: int) -> str:
-    """Return the message for a single column with decimal commas."""
+def comma_in_single_message(line: int) -> str:
+    """Return the error message for a table of one column with decimal commas."""
     return (
         f"line {line} has a comma, which separates two cells, and the table has one column; save "
         "the file with decimal points."
     )
 
 
-def _next(rows: Sequence[TextRow], row: TextRow) -> TextRow | None:
-    return next((each for each in rows if each.index > row.index), None)
+def _next_row(rows: Sequence[TextRow], row: TextRow) -> TextRow | None:
+    """Return the row after a given one; None if it is the last."""
+    return next((other for other in rows if other.index > row.index), None)
 
 
-def _is_data(cells: Sequence[str], columns: Sequence[int], below: TextRow | None) -> bool:
-    """Return whether a row has numbers in the requested columns and no text unlike the next row."""
+def _is_data(cells: Sequence[str], columns: Sequence[int], next_row: TextRow | None) -> bool:
+    """Return whether a row is one of numbers.
+
+    It must have numbers in the requested columns, and no text where the next row has a number.
+    """
     if max(columns) >= len(cells):
         return False
-    own = [cells[column] for column in columns if cells[column]]
-    if not all(is_any_number(cell) or is_stamp(cell) for cell in own):
+    requested_cells = [cells[column] for column in columns if cells[column]]
+    if not all(is_any_number(cell) or is_stamp(cell) for cell in requested_cells):
         return False
     if not any(map(is_any_number, cells)):
         return False
-    return below is None or not any(
-        cell and not is_any_number(cell) and is_any_number(other)
-        for cell, other in zip(cells, below.cells, strict=False)
+    return next_row is None or not any(
+        cell and not is_any_number(cell) and is_any_number(cell_below)
+        for cell, cell_below in zip(cells, next_row.cells, strict=False)
     )
 
 
-def _not_data(
+def _error_for_unexpected_row(
     row: TextRow,
     cells: Sequence[str],
     columns: Sequence[int],
     names: Sequence[str],
-    head: TextRow,
+    titles_row: TextRow,
     width: int,
     separator: str,
 ) -> TableError:
-    """Return the error for a first row below the titles without numbers."""
+    """Return the error for a row below the titles that is neither numbers nor units."""
     if len(cells) != width:
-        return TableError(wrong_width(row.line, len(cells), width, head.line, separator))
+        return TableError(
+            wrong_width_message(row.line, len(cells), width, titles_row.line, separator)
+        )
     for name, column in zip(names, columns, strict=True):
         if cells[column] and not is_any_number(cells[column]) and not is_stamp(cells[column]):
-            return not_a_number(row.line, name, cells[column])
+            return not_a_number_error(row.line, name, cells[column])
     return TableError(
         f"line {row.line} has texts where the line below has numbers, and is no row of units; "
         "remove it."
     )
 
 
-def not_a_number(line: int, name: str, cell: str) -> TableError:
-    """Return the error for a cell that is not a number."""
+def not_a_number_error(line: int, name: str, cell: str) -> TableError:
+    """Return the error for a cell that should be a number."""
     if is_date(cell):
         return TableError(
             f"line {line}: '{name}' is a date or a time of day{{cell}} that is not understood; "
@@ -419,56 +483,72 @@ def not_a_number(line: int, name: str, cell: str) -> TableError:
     )
 
 
-def _with_numbers(
+def _layout_from_numbers(
     rows: Sequence[TextRow],
     index: int,
     separator: str,
     numbers: Sequence[int],
-    labview: "_labview.LabviewHead | None",
+    labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout | None:
-    """Return the layout if this row is the first row of numbers, for columns given by number."""
-    row, above = rows[index], list(takewhile(lambda each: each.index < rows[index].index, rows))
+    """Return the layout if a row is the first one with numbers; None if it is not.
+
+    The requested columns are given by their numbers.
+    """
+    row, rows_above = (
+        rows[index],
+        list(takewhile(lambda other_row: other_row.index < rows[index].index, rows)),
+    )
     columns = [number - 1 for number in numbers]
     if is_comment(row.cells):
         return None
-    if not _is_data(row.cells, columns, _next(rows, row)) or _numbers_the_columns(rows, index):
-        partly = [c for c in columns if c < len(row.cells) and row.cells[c]]
-        known = [c for c in partly if is_any_number(row.cells[c])]
-        following = _next(rows, row)
+    if not _is_data(row.cells, columns, _next_row(rows, row)) or _is_row_of_column_numbers(
+        rows, index
+    ):
+        filled_columns = [c for c in columns if c < len(row.cells) and row.cells[c]]
+        number_columns = [c for c in filled_columns if is_any_number(row.cells[c])]
+        row_below = _next_row(rows, row)
         if (
-            known
-            and len(known) < len(partly)
-            and following is not None
-            and len(following.cells) == len(row.cells)
-            and not _numbers_the_columns(rows, index)
+            number_columns
+            and len(number_columns) < len(filled_columns)
+            and row_below is not None
+            and len(row_below.cells) == len(row.cells)
+            and not _is_row_of_column_numbers(rows, index)
         ):
-            column = next(c for c in partly if c not in known)
-            raise _UnlikelyError(
-                _TITLES, not_a_number(row.line, f"#{column + 1}", row.cells[column])
+            column = next(c for c in filled_columns if c not in number_columns)
+            raise _NotThisTableError(
+                _RANK_ALL_TITLES, not_a_number_error(row.line, f"#{column + 1}", row.cells[column])
             )
         return None
     units: Sequence[str] = ()
-    last = [fitted(each.cells, 0) for each in above[-2:]]
-    if len(last) == 2 and len(last[0]) == len(last[1]) and is_row_of_units(last[1], columns):
-        units = above.pop().cells
+    last_rows_above = [
+        without_trailing_empty_cells(other_row.cells, 0) for other_row in rows_above[-2:]
+    ]
+    if (
+        len(last_rows_above) == 2
+        and len(last_rows_above[0]) == len(last_rows_above[1])
+        and is_row_of_units(last_rows_above[1], columns)
+    ):
+        units = rows_above.pop().cells
     titles: Sequence[str] = ()
     titles_line = 0
-    optional = 0
-    if above and (len(_plain_titles(above[-1])) > 1 or len(row.cells) == 1):
-        titles, titles_line = _plain_titles(above[-1]), above[-1].line
-        optional = int(labview is not None and titles[-1:] == [_labview.COMMENT])
+    optional_columns = 0
+    if rows_above and (len(_plain_titles(rows_above[-1])) > 1 or len(row.cells) == 1):
+        titles, titles_line = _plain_titles(rows_above[-1]), rows_above[-1].line
+        optional_columns = int(labview_head is not None and titles[-1:] == [_labview.COMMENT_TITLE])
     if titles and not units and all(is_unit(title) for title in titles if title):
         units = titles
-    cells = fitted(row.cells, len(titles)) if titles else row.cells
-    if titles and not len(titles) - optional <= len(cells) <= len(titles):
-        if separator != BLANKS or len(cells) > len(titles):
-            raise _UnlikelyError(
-                _TITLES,
-                TableError(wrong_width(row.line, len(cells), len(titles), titles_line, separator)),
+    cells = without_trailing_empty_cells(row.cells, len(titles)) if titles else row.cells
+    if titles and not len(titles) - optional_columns <= len(cells) <= len(titles):
+        if separator != BLANK_SEPARATOR or len(cells) > len(titles):
+            raise _NotThisTableError(
+                _RANK_ALL_TITLES,
+                TableError(
+                    wrong_width_message(row.line, len(cells), len(titles), titles_line, separator)
+                ),
             )
         titles, titles_line = (), 0  # titles of several words cannot be separated
     width = len(titles) if titles else len(cells)
-    _check_single(row.line, cells)
+    _check_single_column(row.line, cells)
     return TableLayout(
         separator=separator,
         titles=tuple(titles),
@@ -477,41 +557,46 @@ def _with_numbers(
         if units
         else (),
         width=width,
-        optional=optional,
-        skip=row.index,
+        optional_columns=optional_columns,
+        rows_before_numbers=row.index,
         columns=tuple(columns),
-        first=tuple(cells),
-        labview=labview,
+        first_cells=tuple(cells),
+        labview=labview_head,
     )
 
 
-def _numbers_the_columns(rows: Sequence[TextRow], index: int) -> bool:
-    """Return whether the first row numbers the columns: no row below has only integers."""
+def _is_row_of_column_numbers(rows: Sequence[TextRow], index: int) -> bool:
+    """Return whether the first row contains the numbers of the columns instead of data.
+
+    This is the case if it counts from 0 or 1, and no row below contains only integers.
+    """
     cells = [cell for cell in rows[index].cells if cell]
     if index or len(cells) < 2:
         return False
-    counted = any(cells == [str(first + n) for n in range(len(cells))] for first in (0, 1))
-    below = rows[1 : 1 + _NUMBERING_LINES]
+    counts_upwards = any(cells == [str(first + n) for n in range(len(cells))] for first in (0, 1))
+    rows_below = rows[1 : 1 + _NUMBERING_LINES]
     return (
-        counted
-        and bool(below)
+        counts_upwards
+        and bool(rows_below)
         and not any(
-            all(cell.lstrip("+-").isdecimal() for cell in row.cells if cell) for row in below
+            all(cell.lstrip("+-").isdecimal() for cell in row.cells if cell) for row in rows_below
         )
     )
 
 
-def _missing(rows: Sequence[TextRow], names: Sequence[str]) -> _UnlikelyError:
-    """Return the error for a missing title, with the most probable line of titles."""
+def _missing_title_error(rows: Sequence[TextRow], names: Sequence[str]) -> _NotThisTableError:
+    """Return the error for a missing title, with the titles of the most probable row."""
 
-    def found(row: TextRow) -> int:
+    def count_found_names(row: TextRow) -> int:
         return sum(name in row.cells or name in _plain_titles(row) for name in names)
 
-    best = max(rows, key=found)
-    if found(best):
-        titles = _plain_titles(best)
-        name = next(each for each in names if each not in titles and each not in best.cells)
-        return _UnlikelyError(_SOME_TITLES, MissingColumnError(name, titles, best.line))
+    best_row = max(rows, key=count_found_names)
+    if count_found_names(best_row):
+        titles = _plain_titles(best_row)
+        name = next(title for title in names if title not in titles and title not in best_row.cells)
+        return _NotThisTableError(
+            _RANK_SOME_TITLES, MissingColumnError(name, titles, best_row.line)
+        )
     index = next(
         (
             index
@@ -521,30 +606,30 @@ def _missing(rows: Sequence[TextRow], names: Sequence[str]) -> _UnlikelyError:
         None,
     )
     if index is None:
-        return _UnlikelyError(
-            _NO_ROWS, MissingColumnError(names[0], _plain_titles(rows[0]), rows[0].line)
+        return _NotThisTableError(
+            _RANK_NO_ROWS, MissingColumnError(names[0], _plain_titles(rows[0]), rows[0].line)
         )
     width = len(rows[index].cells)
-    above = [row for row in rows[:index] if len(_plain_titles(row)) == width]
-    if above:
-        best = (
-            above[-2]
-            if len(above) > 1 and is_row_of_units(above[-1].cells, range(width))
-            else above[-1]
+    rows_above = [row for row in rows[:index] if len(_plain_titles(row)) == width]
+    if rows_above:
+        best_row = (
+            rows_above[-2]
+            if len(rows_above) > 1 and is_row_of_units(rows_above[-1].cells, range(width))
+            else rows_above[-1]
         )
-        titles, line = _plain_titles(best), best.line
+        titles, line = _plain_titles(best_row), best_row.line
     else:
         titles, line = [f"#{number}" for number in range(1, width + 1)], 0
-    return _UnlikelyError(
-        _NO_TITLES if width > 1 else _NO_ROWS, MissingColumnError(names[0], titles, line)
+    return _NotThisTableError(
+        _RANK_NO_TITLES if width > 1 else _RANK_NO_ROWS, MissingColumnError(names[0], titles, line)
     )
 
 
-def _no_numbers(rows: Sequence[TextRow], names: Sequence[str]) -> TableError:
-    """Return the error for a table without numbers in the requested columns."""
+def _no_numbers_error(rows: Sequence[TextRow], names: Sequence[str]) -> TableError:
+    """Return the error for a table that has no row with numbers in the requested columns."""
     width = max(len(row.cells) for row in rows)
     for name in names:
-        if (_number(name) or 0) > width:
+        if (_column_number(name) or 0) > width:
             return MissingColumnError(name, [f"#{n}" for n in range(1, width + 1)], 0)
     return TableError(
         f"has 0 samples: none of its first {len(rows)} lines has numbers in all of the columns "
@@ -553,8 +638,11 @@ def _no_numbers(rows: Sequence[TextRow], names: Sequence[str]) -> TableError:
 
 
 def _check_split_decimals(rows: Sequence[TextRow], layout: TableLayout) -> None:
-    written = [fitted(row.cells, layout.width) for row in rows if any(row.cells)]
-    if are_split_decimals(written):
+    """Raise TableError if commas in decimal numbers were taken as separators of cells."""
+    nonempty_rows = [
+        without_trailing_empty_cells(row.cells, layout.width) for row in rows if any(row.cells)
+    ]
+    if are_split_decimals(nonempty_rows):
         raise TableError(
             f"line {rows[0].line}: every second cell between commas looks like the decimals of the "
             "one before it; save the file with decimal points, or with semicolons or tabs between "

@@ -1,4 +1,4 @@
-"""Reader of the columns of a table, with checks of the cells and the decimal sign."""
+"""Reader of requested columns of a table, with checks of every cell and of the decimal sign."""
 
 import csv
 from array import array
@@ -16,52 +16,57 @@ import numpy.typing as npt
 from rigd.text_table._cells import (
     COMMA,
     POINT,
-    ThousandsWatch,
+    ThousandsCheck,
+    fast_number_converter,
     is_any_number,
     is_number,
     number_of,
-    quick_reader,
 )
 from rigd.text_table._encoding import encodings
 from rigd.text_table._errors import TableError
 from rigd.text_table._layout import (
-    HEAD_LINES,
+    MOST_HEAD_LINES,
     TableLayout,
-    comma_in_single,
+    comma_in_single_message,
     find_layout,
-    fitted,
-    not_a_number,
-    rows_of,
+    not_a_number_error,
+    rows_of_cells,
     stated_separator,
-    wrong_width,
+    without_trailing_empty_cells,
+    wrong_width_message,
 )
 from rigd.text_table._stamps import StampReader, is_stamp
 from rigd.text_table.titles import is_title_of_times, stated_unit_of, time_unit_s
 
-MAX_LINE: Final = 65_536
-"""Longest line, characters, enough for hundreds of columns; longer lines are not split."""
+MOST_LINE_CHARACTERS: Final = 65_536
+"""Largest number of characters in a line; a longer line is an error.
 
-_HEAD_BYTES: Final = 4
-_HEAD_CHARACTERS: Final = 1_000_000
-_X_DIMENSIONS: Final = ("", "time", "zeit")
+It is enough for hundreds of columns."""
+
+_ENCODING_BYTES: Final = 4
+"""Number of bytes from which the encoding is detected."""
+_MOST_HEAD_CHARACTERS: Final = 1_000_000
+"""Number of characters after which no further lines are read to detect the layout."""
+_TIME_DIMENSIONS: Final = ("", "time", "zeit")
+"""Values of the key X_Dimension for samples over time, in LabVIEW's files."""
 
 
 @dataclass(frozen=True, slots=True)
 class TableColumn:
-    """One column of numbers.
+    """Column of numbers from a text file.
 
     Attributes
     ----------
     values : ndarray of float, shape (n,)
-        NaN for an empty cell.
+        Numbers of the column; NaN for an empty cell.
     title : str
-        "" if the table has no titles.
+        Title of the column; empty if the table has no titles.
     unit : str
-        Unit in the file, "" if none.
+        Unit of the column in the file; empty if there is none.
     rate_hz : float or None
-        Sampling rate in the head of the file, None if there is none.
+        Sampling rate stated in the head of the file; None if there is none.
     start_ns : int or None
-        Time of the first sample in the head of the file, ns; None if there is none.
+        Time of the first sample stated in the head of the file, in ns; None if there is none.
     """
 
     values: npt.NDArray[np.float64]
@@ -73,16 +78,16 @@ class TableColumn:
 
 @dataclass(frozen=True, slots=True)
 class TableTimes:
-    """A column of times in addition to the requested columns.
+    """Column of times that was read in addition to the requested columns.
 
     Attributes
     ----------
     title : str
-        Title of the column, or ``#1``.
+        Title of the column, or its number such as ``#1``.
     values : ndarray of float, shape (n,)
         Times in the unit of the file.
     unit_s : float or None
-        Unit in seconds, None if the file does not state it.
+        Unit of the times in seconds; None if the file does not state it.
     """
 
     title: str
@@ -92,20 +97,20 @@ class TableTimes:
 
 @dataclass(frozen=True, slots=True)
 class TextTable:
-    """Requested columns of a text file.
+    """Requested columns of a table in a text file.
 
     Attributes
     ----------
     columns : mapping of str to TableColumn
-        Columns by requested name; all of the same length.
+        Columns by requested name, all with the same number of rows.
     lines : ndarray of uint32, shape (n,)
-        Line number of each row in the file, from 1.
+        Number of each row's line in the file, from 1.
     width : int
-        Number of columns of the table.
+        Number of columns in the table.
     times : TableTimes or None
-        A column of times in addition to the requested ones, if any.
+        Column of times in addition to the requested columns; None if there is none.
     remark : str
-        Remark on the file for the user, "" if none.
+        Remark on the file for the user; empty if there is none.
     """
 
     columns: Mapping[str, TableColumn]
@@ -116,21 +121,21 @@ class TextTable:
 
 
 def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> TextTable:
-    r"""Read some columns of a text file.
+    r"""Read some columns of a table of numbers in a text file.
 
     The separator is a tab, a semicolon, a comma, a bar or blanks. The decimal sign is a point or a
-    comma, the same in the whole file. The titles are the first line with all names and as many
-    cells as the lines of numbers below it. A line of units may follow. Every line of numbers has
-    the same number of cells, except for empty ones after the last column.
+    comma, the same in the whole file. The titles are the first line that contains all names and has
+    as many cells as the lines of numbers below it. A line of units may follow. Every line of
+    numbers has the same number of cells, except for empty cells after the last column.
 
     Parameters
     ----------
     stream : file, open for reading bytes
         The file must be seekable; it is not closed.
     names : sequence of str
-        Titles, or ``#3`` for the third column.
+        Titles of the requested columns, or numbers such as ``#3`` for the third column.
     most_rows : int
-        Number of rows after which reading ends; one more row is returned if there are more.
+        Number of rows after which reading ends. If the file has more rows, one more is returned.
 
     Returns
     -------
@@ -139,7 +144,7 @@ def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> Tex
     Raises
     ------
     TableError
-        If a line does not fit the table; the message has its number and the remedy.
+        If a line does not fit the table. The message states the line's number and the remedy.
 
     Examples
     --------
@@ -150,9 +155,9 @@ def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> Tex
     ([0.5, 0.7], 'rad')
     """
     stream.seek(0)
-    head = stream.read(_HEAD_BYTES)
+    first_bytes = stream.read(_ENCODING_BYTES)
     error: UnicodeError | None = None
-    for encoding in encodings(head):
+    for encoding in encodings(first_bytes):
         try:
             return _read(stream, encoding, names, most_rows)
         except UnicodeError as found:
@@ -163,122 +168,136 @@ def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> Tex
 
 
 def _read(stream: BinaryIO, encoding: str, names: Sequence[str], most_rows: int) -> TextTable:
-    with _lines(stream, encoding) as lines:
-        layout = find_layout(_head(lines), names)
-    first = [layout.first[column] for column in layout.columns]
-    mark = COMMA if any(COMMA in cell and not is_stamp(cell) for cell in first) else POINT
+    """Read columns of a text with a given encoding."""
+    with _open_lines(stream, encoding) as lines:
+        layout = find_layout(_first_lines(lines), names)
+    first_cells = [layout.first_cells[column] for column in layout.columns]
+    decimal_sign = (
+        COMMA if any(COMMA in cell and not is_stamp(cell) for cell in first_cells) else POINT
+    )
     try:
-        return _columns(stream, encoding, layout, names, most_rows, mark)
+        return _read_columns(stream, encoding, layout, names, most_rows, decimal_sign)
     except _DecimalCommaError:
         # Read again from the start: a point in earlier lines may not be a decimal point.
-        return _columns(stream, encoding, layout, names, most_rows, COMMA)
+        return _read_columns(stream, encoding, layout, names, most_rows, COMMA)
 
 
-def _head(lines: Iterator[str]) -> list[str]:
-    """Return the first lines, for the detection of the layout."""
-    head: list[str] = []
+def _first_lines(lines: Iterator[str]) -> list[str]:
+    """Return the first lines of a file, from which the layout is detected."""
+    first_lines: list[str] = []
     characters = 0
-    for line in islice(lines, HEAD_LINES):
-        head.append(line)
+    for line in islice(lines, MOST_HEAD_LINES):
+        first_lines.append(line)
         characters += len(line)
-        if characters > _HEAD_CHARACTERS:
+        if characters > _MOST_HEAD_CHARACTERS:
             break
-    return head
+    return first_lines
 
 
 class _DecimalCommaError(Exception):
-    """A decimal comma was found while reading with decimal points."""
+    """Error: a decimal comma was found while numbers were read with decimal points."""
 
 
 @contextmanager
-def _lines(stream: BinaryIO, encoding: str) -> Iterator[Iterator[str]]:
-    """Yield the lines of a text; Excel's statement of the separator becomes an empty line."""
+def _open_lines(stream: BinaryIO, encoding: str) -> Iterator[Iterator[str]]:
+    """Provide the lines of a text file, decoded, as a context manager."""
     stream.seek(0)
     text = TextIOWrapper(stream, encoding, newline="")
     try:
-        yield _bounded(text)
+        yield _lines_of_bounded_length(text)
     finally:
         text.detach()
 
 
-def _bounded(text: TextIOWrapper) -> Iterator[str]:
+def _lines_of_bounded_length(text: TextIOWrapper) -> Iterator[str]:
+    """Yield the lines of a text, and raise TableError for a line that is too long."""
     number = 0
-    while line := text.readline(MAX_LINE + 1):
+    while line := text.readline(MOST_LINE_CHARACTERS + 1):
         number += 1
-        if len(line) > MAX_LINE:
+        if len(line) > MOST_LINE_CHARACTERS:
             raise TableError(
-                f"line {number}: a line of more than {MAX_LINE} characters; a table has one line "
-                "per sample and few channels. Export the session's channels alone."
+                f"line {number}: a line of more than {MOST_LINE_CHARACTERS} characters; a table "
+                "has one line per sample and few channels. Export the session's channels alone."
             )
         yield line
 
 
 @dataclass(slots=True)
 class _NumberRows:
-    """Reader of rows of numbers, each checked against the layout."""
+    """Reader of rows of numbers that checks each row against the layout of the table."""
 
     layout: TableLayout
     names: Sequence[str]
-    mark: str
-    wanted: Sequence[int]
-    """Requested columns."""
+    decimal_sign: str
+    """Decimal sign of the numbers."""
+    columns_to_read: Sequence[int]
+    """Indices of the columns to read, which are the requested ones and a column of times."""
     stamps: Mapping[int, StampReader] = field(default_factory=dict)
-    """Columns of `wanted` with times of day."""
-    checked: Sequence[int] = ()
-    """Columns with a number in the first row, requested or not."""
-    watches: dict[int, ThousandsWatch] = field(default_factory=dict)
-    settled: bool = False
-    """Whether a cell has shown that the mark is the decimal sign."""
+    """Readers of the columns to read that contain times of day."""
+    checked_columns: Sequence[int] = ()
+    """Indices of the columns with a number in the first row, whether requested or not."""
+    thousands_checks: dict[int, ThousandsCheck] = field(default_factory=dict)
+    """Checks for thousands separators in the columns to read."""
+    sign_is_certain: bool = False
+    """Whether a cell has shown that the expected sign is the decimal sign."""
     blank_line: int = 0
+    """Number of the first empty line between lines of numbers; 0 without one."""
     blank_count: int = 0
+    """Number of interruptions of the numbers by empty lines."""
 
     def __post_init__(self) -> None:
-        first = self.layout.first
-        numeric = (c for c, cell in enumerate(first) if is_any_number(cell))
-        self.stamps = {c: StampReader() for c in self.wanted if is_stamp(first[c])}
-        self.checked = sorted({*self.wanted, *numeric} - {*self.stamps})
-        self.watches = {c: ThousandsWatch(self.mark) for c in self.checked if c in self.wanted}
+        first_cells = self.layout.first_cells
+        number_columns = (c for c, cell in enumerate(first_cells) if is_any_number(cell))
+        self.stamps = {c: StampReader() for c in self.columns_to_read if is_stamp(first_cells[c])}
+        self.checked_columns = sorted({*self.columns_to_read, *number_columns} - {*self.stamps})
+        self.thousands_checks = {
+            c: ThousandsCheck(self.decimal_sign)
+            for c in self.checked_columns
+            if c in self.columns_to_read
+        }
 
     def title(self, column: int) -> str:
-        """Return the name of a requested column for messages."""
+        """Return the name of a requested column for messages; its number if it has no name."""
         if column in self.layout.columns:
             return self.names[self.layout.columns.index(column)]
         return f"#{column + 1}"
 
     def fit(self, row: Sequence[str], line: int) -> list[str]:
-        """Return a row with the number of cells of the table, or raise."""
+        """Return a row with the table's number of cells, or raise TableError."""
         width = self.layout.width
-        cells = fitted(row, width)
-        if width - self.layout.optional <= len(cells) < width:
+        cells = without_trailing_empty_cells(row, width)
+        if width - self.layout.optional_columns <= len(cells) < width:
             cells += [""] * (width - len(cells))
         if len(cells) != width:
             raise TableError(
-                wrong_width(line, len(cells), width, self.layout.titles_line, self.layout.separator)
+                wrong_width_message(
+                    line, len(cells), width, self.layout.titles_line, self.layout.separator
+                )
             )
         return cells
 
     def numbers(self, row: Sequence[str], line: int) -> list[float]:
-        """Return the numbers of the checked cells of a row; raise for an invalid cell."""
-        found = []
-        for column in self.checked:
+        """Return the numbers in the checked cells of a row, or raise if a cell is not a number."""
+        values = []
+        for column in self.checked_columns:
             cell = row[column].strip()
-            if column not in self.wanted:
+            if column not in self.columns_to_read:
                 if cell and not is_any_number(cell):
                     raise TableError(
                         f"line {line}: column {column + 1} is not a number{{cell}}, unlike in the "
                         "lines above; remove the line if it is not a sample.",
                         cell,
                     )
-                found.append(float("nan"))
+                values.append(float("nan"))
                 continue
             try:
-                found.append(number_of(cell, self.mark))
+                values.append(number_of(cell, self.decimal_sign))
             except ValueError:
-                raise self._odd(cell, column, line) from None
-        return found
+                raise self._invalid_number_error(cell, column, line) from None
+        return values
 
     def stamp(self, row: Sequence[str], column: int, line: int) -> float:
-        """Return a time of day in seconds after the first one."""
+        """Return the time stamp in a cell, in seconds since the column's first time stamp."""
         try:
             return self.stamps[column](row[column])
         except ValueError:
@@ -289,12 +308,13 @@ class _NumberRows:
                 "day and month is not clear; write the date as 2026-11-25.",
                 cell,
             )
-        raise not_a_number(line, self.title(column), cell)
+        raise not_a_number_error(line, self.title(column), cell)
 
-    def _odd(self, cell: str, column: int, line: int) -> Exception:
-        if self.mark == POINT and is_number(cell, COMMA):
+    def _invalid_number_error(self, cell: str, column: int, line: int) -> Exception:
+        """Return the error for a cell that is not a number with the expected decimal sign."""
+        if self.decimal_sign == POINT and is_number(cell, COMMA):
             if self.layout.width == 1:
-                return TableError(comma_in_single(line))
+                return TableError(comma_in_single_message(line))
             return _DecimalCommaError()
         if is_number(cell, POINT):
             return TableError(
@@ -303,55 +323,60 @@ class _NumberRows:
                 "separators between thousands.",
                 cell,
             )
-        return not_a_number(line, self.title(column), cell)
+        return not_a_number_error(line, self.title(column), cell)
 
-    def watch(self, row: Sequence[str], line: int) -> None:
-        """Check a row for thousands separators."""
-        for column in tuple(self.watches):
-            if self.watches[column].settles(row[column], line):
-                del self.watches[column]
-                self.settled = True
+    def check_row_for_thousands(self, row: Sequence[str], line: int) -> None:
+        """Update the checks for thousands separators with a row."""
+        for column in tuple(self.thousands_checks):
+            if self.thousands_checks[column].proves_decimal_sign(row[column], line):
+                del self.thousands_checks[column]
+                self.sign_is_certain = True
 
     def check_thousands(self) -> None:
-        """Raise for columns whose decimal signs could be thousands separators."""
-        for column, watch in self.watches.items():
-            doubtful = watch.plain or (self.mark == COMMA and not self.settled)
-            if watch.grouped_line and doubtful:
-                sign = "commas" if self.mark == COMMA else "points"
+        """Raise TableError if a column's decimal signs may be thousands separators."""
+        for column, thousands_check in self.thousands_checks.items():
+            is_ambiguous = thousands_check.plain or (
+                self.decimal_sign == COMMA and not self.sign_is_certain
+            )
+            if thousands_check.grouped_line and is_ambiguous:
+                sign_noun = "commas" if self.decimal_sign == COMMA else "points"
                 raise TableError(
-                    f"line {watch.grouped_line}: the {sign} in '{self.title(column)}' may be "
-                    "decimal signs or separators between thousands, as each has three digits "
-                    "behind it; save the file with decimal points and without separators between "
-                    "thousands."
+                    f"line {thousands_check.grouped_line}: the {sign_noun} in "
+                    f"'{self.title(column)}' may be decimal signs or separators between thousands, "
+                    "as each has three digits behind it; save the file with decimal points and "
+                    "without separators between thousands."
                 )
 
 
-def _columns(
+def _read_columns(
     stream: BinaryIO,
     encoding: str,
     layout: TableLayout,
     names: Sequence[str],
     most_rows: int,
-    mark: str,
+    decimal_sign: str,
 ) -> TextTable:
-    times = _times_column(layout)
-    wanted = sorted({*layout.columns, *(() if times is None else (times,))})
-    rows = _NumberRows(layout, names, mark, wanted)
-    values = {column: array("d") for column in wanted}
-    appends = [
-        (values[column].append, rows.checked.index(column))
-        for column in wanted
+    """Read the requested columns and the column of times, with a given decimal sign."""
+    times_column = _times_column(layout)
+    columns_to_read = sorted({*layout.columns, *(() if times_column is None else (times_column,))})
+    rows = _NumberRows(layout, names, decimal_sign, columns_to_read)
+    values = {column: array("d") for column in columns_to_read}
+    number_appends = [
+        (values[column].append, rows.checked_columns.index(column))
+        for column in columns_to_read
         if column not in rows.stamps
     ]
-    stamps = [(values[column].append, column) for column in rows.stamps]
-    pick, quick = itemgetter(*rows.checked), quick_reader(mark)
-    single = len(rows.checked) == 1
-    numbers_of_lines = array("I")
-    empty: list[int] = []
+    stamp_appends = [(values[column].append, column) for column in rows.stamps]
+    pick_cells, convert = itemgetter(*rows.checked_columns), fast_number_converter(decimal_sign)
+    has_single_column = len(rows.checked_columns) == 1
+    line_numbers = array("I")
+    empty_lines: list[int] = []
     blank_line = 0
-    with _lines(stream, encoding) as lines:
+    with _open_lines(stream, encoding) as lines:
         for line, row in islice(
-            rows_of(_without_statement(lines), layout.separator), layout.skip, None
+            rows_of_cells(_skip_excel_separator_line(lines), layout.separator),
+            layout.rows_before_numbers,
+            None,
         ):
             if len(row) != layout.width:
                 if not any(cell.strip() for cell in row) and len(row) < 2:
@@ -359,12 +384,16 @@ def _columns(
                     continue
                 row = rows.fit(row, line)  # noqa: PLW2901 - the row as the table has it
             try:
-                numbers = [quick(pick(row))] if single else list(map(quick, pick(row)))
-                if any("_" in row[column] for column in rows.checked):
+                numbers = (
+                    [convert(pick_cells(row))]
+                    if has_single_column
+                    else list(map(convert, pick_cells(row)))
+                )
+                if any("_" in row[column] for column in rows.checked_columns):
                     numbers = rows.numbers(row, line)  # Python would read 1_000
             except ValueError:
                 if not any(cell.strip() for cell in row):
-                    empty.append(line)
+                    empty_lines.append(line)
                     continue
                 numbers = rows.numbers(row, line)
             if blank_line:
@@ -376,32 +405,38 @@ def _columns(
                 rows.blank_line = rows.blank_line or blank_line
                 rows.blank_count += 1
                 blank_line = 0
-            if rows.watches:
-                rows.watch(row, line)
-            if empty:
-                for column in wanted:
-                    values[column].extend(len(empty) * [float("nan")])
-                numbers_of_lines.extend(empty)
-                empty = []
-            for append, index in appends:
+            if rows.thousands_checks:
+                rows.check_row_for_thousands(row, line)
+            if empty_lines:
+                for column in columns_to_read:
+                    values[column].extend(len(empty_lines) * [float("nan")])
+                line_numbers.extend(empty_lines)
+                empty_lines = []
+            for append, index in number_appends:
                 append(numbers[index])
-            for append, column in stamps:
+            for append, column in stamp_appends:
                 append(rows.stamp(row, column, line))
-            numbers_of_lines.append(line)
-            if len(numbers_of_lines) > most_rows:
+            line_numbers.append(line)
+            if len(line_numbers) > most_rows:
                 break
     rows.check_thousands()
-    return _table(layout, names, values, np.frombuffer(numbers_of_lines, np.uint32), times, rows)
+    return _text_table(
+        layout, names, values, np.frombuffer(line_numbers, np.uint32), times_column, rows
+    )
 
 
-def _without_statement(lines: Iterator[str]) -> Iterator[str]:
-    """Replace Excel's statement of the separator by an empty line to preserve line numbers."""
-    first = next(lines, "")
-    yield "\n" if stated_separator(first) else first
+def _skip_excel_separator_line(lines: Iterator[str]) -> Iterator[str]:
+    """Yield the lines, with an empty line instead of Excel's separator line (``sep=;``).
+
+    The empty line preserves the numbers of the following lines.
+    """
+    first_line = next(lines, "")
+    yield "\n" if stated_separator(first_line) else first_line
     yield from lines
 
 
-def _remark(rows: _NumberRows) -> str:
+def _blank_lines_remark(rows: _NumberRows) -> str:
+    """Return the remark on empty lines between the numbers; empty if there are none."""
     if not rows.blank_count:
         return ""
     return (
@@ -411,8 +446,8 @@ def _remark(rows: _NumberRows) -> str:
 
 
 def _times_column(layout: TableLayout) -> int | None:
-    """Return the index of a column of times that is not requested, or None."""
-    for column, cell in enumerate(layout.first):
+    """Return the index of a column of times that is not requested; None if there is none."""
+    for column, cell in enumerate(layout.first_cells):
         if column in layout.columns or not (is_any_number(cell) or is_stamp(cell)):
             continue
         if is_stamp(cell):
@@ -426,15 +461,16 @@ def _times_column(layout: TableLayout) -> int | None:
 
 
 def _time_unit_s(layout: TableLayout, column: int) -> float | None:
-    unit = time_unit_s(_unit(layout, column))
+    """Return the length of a time column's unit in seconds; None if the file states no unit."""
+    unit = time_unit_s(_unit_in_file(layout, column))
     if unit is None and layout.titles and is_title_of_times(layout.titles[column]):
         unit = time_unit_s(layout.titles[column].rpartition("_")[2])
     return unit
 
 
-def _unit(layout: TableLayout, column: int) -> str:
-    """Return the unit of a column in the file; seconds for times of day."""
-    if is_stamp(layout.first[column]):
+def _unit_in_file(layout: TableLayout, column: int) -> str:
+    """Return the unit of a column that the file states; "s" for times of day."""
+    if is_stamp(layout.first_cells[column]):
         return "s"
     in_row = layout.units[column] if layout.units else ""
     in_head = layout.labview.text("Y_Unit_Label", column) if layout.labview else ""
@@ -442,20 +478,21 @@ def _unit(layout: TableLayout, column: int) -> str:
     return in_row or in_head or in_title
 
 
-def _table(
+def _text_table(
     layout: TableLayout,
     names: Sequence[str],
     values: Mapping[int, "array[float]"],
     lines: npt.NDArray[np.uint32],
-    times: int | None,
+    times_column: int | None,
     rows: _NumberRows,
 ) -> TextTable:
+    """Return the table from the values that were read."""
     columns = {}
     for name, column in zip(names, layout.columns, strict=True):
         period_s = start_ns = None
         if layout.labview is not None:
             dimension = layout.labview.text("X_Dimension", column)
-            if dimension.lower() not in _X_DIMENSIONS:
+            if dimension.lower() not in _TIME_DIMENSIONS:
                 raise TableError(
                     f"'{name}' is not a function of time by the X_Dimension of the head{{cell}}; "
                     "give measured samples.",
@@ -466,12 +503,15 @@ def _table(
         columns[name] = TableColumn(
             values=np.frombuffer(values[column]),
             title=layout.titles[column] if layout.titles else "",
-            unit=_unit(layout, column),
+            unit=_unit_in_file(layout, column),
             rate_hz=1 / period_s if period_s and period_s > 0 else layout.rate_hz,
             start_ns=start_ns,
         )
-    found = None
-    if times is not None and np.isfinite(stamps := np.frombuffer(values[times])).any():
-        title = layout.titles[times] if layout.titles else f"#{times + 1}"
-        found = TableTimes(title, stamps, _time_unit_s(layout, times))
-    return TextTable(columns, lines, layout.width, found, _remark(rows))
+    table_times = None
+    if (
+        times_column is not None
+        and np.isfinite(time_values := np.frombuffer(values[times_column])).any()
+    ):
+        title = layout.titles[times_column] if layout.titles else f"#{times_column + 1}"
+        table_times = TableTimes(title, time_values, _time_unit_s(layout, times_column))
+    return TextTable(columns, lines, layout.width, table_times, _blank_lines_remark(rows))

@@ -1,31 +1,33 @@
-"""Time stamps of a table: date and time of day, as seconds after the first of them."""
+"""Time stamps in a table: date and time of day, as seconds since the first one."""
 
 import re
 from datetime import date
 from typing import Final
 
-_STAMP: Final = re.compile(
+_STAMP_PATTERN: Final = re.compile(
     r"(?:(?P<date>\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4})[ T_]+)?"
     r"(?P<hour>\d{1,2}):(?P<minute>[0-5]\d):(?P<second>[0-5]\d)(?:[.,:](?P<fraction>\d{1,12}))?"
     r"(?:\s*(?P<half>[AaPp])[.]?[Mm][.]?)?\s*(?:Z|[-+]\d\d:?\d\d)?",
     re.ASCII,
 )
-_DAY_S: Final = 86_400
+"""Pattern of a time stamp: optional date, hours, minutes and seconds."""
+_SECONDS_PER_DAY: Final = 86_400
+"""Number of seconds in a day."""
 
 
 def is_stamp(cell: str) -> bool:
     """Return whether a cell is a time with hours, minutes and seconds, with or without a date."""
-    return _STAMP.fullmatch(cell.strip()) is not None
+    return _STAMP_PATTERN.fullmatch(cell.strip()) is not None
 
 
 class StampReader:
-    """Reader of the time stamps of one column, in seconds after the first one."""
+    """Reader of the time stamps in one column, in seconds since the column's first one."""
 
     def __init__(self) -> None:
         self._first: re.Match[str] | None = None
 
     def __call__(self, cell: str) -> float:
-        """Return the seconds from the first stamp to this one; NaN for an empty cell.
+        """Return the seconds from the column's first stamp to this one; NaN for an empty cell.
 
         Raises
         ------
@@ -35,18 +37,23 @@ class StampReader:
         text = cell.strip()
         if not text:
             return float("nan")
-        stamp = _STAMP.fullmatch(text)
+        stamp = _STAMP_PATTERN.fullmatch(text)
         if stamp is None:
             raise ValueError(text)
-        first = self._first = self._first or stamp
+        first_stamp = self._first = self._first or stamp
         days = 0
-        if stamp["date"] != first["date"]:
-            days = _ordinal(stamp["date"]) - _ordinal(first["date"])
-        seconds = days * _DAY_S + _of_day_s(stamp) - _of_day_s(first)
-        return (seconds * 10**9 + _nanoseconds(stamp) - _nanoseconds(first)) / 1e9
+        if stamp["date"] != first_stamp["date"]:
+            days = _day_number(stamp["date"]) - _day_number(first_stamp["date"])
+        seconds = (
+            days * _SECONDS_PER_DAY
+            + _seconds_since_midnight(stamp)
+            - _seconds_since_midnight(first_stamp)
+        )
+        return (seconds * 10**9 + _nanoseconds(stamp) - _nanoseconds(first_stamp)) / 1e9
 
 
-def _of_day_s(stamp: re.Match[str]) -> int:
+def _seconds_since_midnight(stamp: re.Match[str]) -> int:
+    """Return the whole seconds of a time stamp since midnight."""
     hour = int(stamp["hour"])
     if stamp["half"]:
         hour = hour % 12 + 12 * (stamp["half"] in "Pp")
@@ -54,14 +61,15 @@ def _of_day_s(stamp: re.Match[str]) -> int:
 
 
 def _nanoseconds(stamp: re.Match[str]) -> int:
+    """Return the fraction of a time stamp's second in nanoseconds."""
     return int(f"{stamp['fraction'] or '':0<9}"[:9])
 
 
-def _ordinal(day: str | None) -> int:
-    """Return the ordinal of an unambiguous date: year first, or day first with points."""
-    parts = re.split(r"[-/.]", day or "")
-    if len(parts) == 3 and len(parts[0]) == 4:
-        return date(int(parts[0]), int(parts[1]), int(parts[2])).toordinal()
-    if len(parts) == 3 and len(parts[2]) == 4 and "." in (day or ""):
-        return date(int(parts[2]), int(parts[1]), int(parts[0])).toordinal()
+def _day_number(day: str | None) -> int:
+    """Return the day number of an unambiguous date: year first, or day first with points."""
+    date_parts = re.split(r"[-/.]", day or "")
+    if len(date_parts) == 3 and len(date_parts[0]) == 4:
+        return date(int(date_parts[0]), int(date_parts[1]), int(date_parts[2])).toordinal()
+    if len(date_parts) == 3 and len(date_parts[2]) == 4 and "." in (day or ""):
+        return date(int(date_parts[2]), int(date_parts[1]), int(date_parts[0])).toordinal()
     raise ValueError(day)

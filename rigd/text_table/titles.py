@@ -1,18 +1,22 @@
-"""Titles of columns: their units, and the recognition of columns of times."""
+"""Titles of columns: recognition of units in them, and of columns of times."""
 
 import re
 from typing import Final
 
-_IN_BRACKETS: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
-_PRODUCT: Final = re.compile(r"[\s.·⋅*-]")
-_AFTER_SLASH: Final = re.compile(r"(?:[/,]|\bin\b)\s*([^\s/,]+)\s*$")
+_BRACKETS_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
+"""Pattern of brackets with their content at the end of a title."""
+_PRODUCT_SIGN_PATTERN: Final = re.compile(r"[\s.·⋅*-]")
+"""Pattern of product signs and blanks in a unit."""
+_AFTER_SLASH_PATTERN: Final = re.compile(r"(?:[/,]|\bin\b)\s*([^\s/,]+)\s*$")
+"""Pattern of the last word of a title after a slash, a comma or the word "in"."""
 
-_TIME_TITLE: Final = re.compile(
+_TIME_TITLE_PATTERN: Final = re.compile(
     r"(?:t|time|times|zeit|temps|tiempo|tempo|x_value|timestamps?|"
     r"(?:rel\w*|abs\w*|elapsed|sample|sampling|measurement)[ _]time)"
     r"(?=$|[\s\[(/,:_])",
     re.IGNORECASE,
 )
+"""Pattern of the beginning of a column of times' title, in several languages."""
 
 TIME_UNITS_S: Final = {
     "s": 1.0,
@@ -35,7 +39,7 @@ TIME_UNITS_S: Final = {
     "minutes": 60.0,
     "h": 3600.0,
 }
-"""Spellings of units of time, in seconds."""
+"""Units of time by their spelling, in seconds."""
 
 _OTHER_UNITS: Final = (
     "rad", "mrad", "urad", "deg", "degree", "degrees", "radian", "radians", "arcmin", "arcsec",
@@ -45,17 +49,17 @@ _OTHER_UNITS: Final = (
     "m/s", "m/s²", "m/s^2", "m/s2", "rad/s", "rad/s²", "rad/s^2", "deg/s", "°/s", "°c", "degc",
     "k", "pa", "bar", "pu", "w",
 )  # fmt: skip
-"""Other units, in lower case and without product signs."""
+"""Spellings of units that are not units of time, in lower case and without product signs."""
 
 
 def stated_unit_of(title: str) -> str:
-    """Return the unit in a title such as ``Angle [deg]`` or ``t/ms``, "" if there is none.
+    """Return the unit in a title such as ``Angle [deg]`` or ``t/ms``; "" if there is none.
 
     Parameters
     ----------
     title : str
         Title of a column. Any text in square brackets is a unit. In parentheses, or after a slash,
-        a comma or the word "in", only known units count.
+        a comma or the word "in", only known units are recognised.
 
     Examples
     --------
@@ -63,15 +67,15 @@ def stated_unit_of(title: str) -> str:
     >>> stated_unit_of("Angle [deg]"), stated_unit_of("t/ms"), stated_unit_of("Rig/Angle")
     ('deg', 'ms', '')
     """
-    found = _IN_BRACKETS.search(title) or _AFTER_SLASH.search(title)
-    if found is None:
+    match = _BRACKETS_PATTERN.search(title) or _AFTER_SLASH_PATTERN.search(title)
+    if match is None:
         return ""
-    is_stated = is_unit(found[1]) or found[0].startswith("[")
-    return found[1].strip() if is_stated else ""
+    is_stated = is_unit(match[1]) or match[0].startswith("[")
+    return match[1].strip() if is_stated else ""
 
 
 def is_unit(cell: str) -> bool:
-    """Return whether a cell is a known unit, with or without brackets."""
+    """Return whether a cell contains a known unit, with or without brackets."""
     return _plain_unit(cell) in TIME_UNITS_S or _plain_unit(cell) in _OTHER_UNITS
 
 
@@ -82,14 +86,17 @@ def bare_unit(cell: str) -> str:
 
 
 def _plain_unit(cell: str) -> str:
-    return _PRODUCT.sub("", bare_unit(cell).lower().replace("µ", "u").replace("μ", "u"))
+    """Return a unit in lower case, without brackets and product signs."""
+    return _PRODUCT_SIGN_PATTERN.sub(
+        "", bare_unit(cell).lower().replace("µ", "u").replace("μ", "u")
+    )
 
 
 def is_title_of_times(title: str) -> bool:
     """Return whether a title is that of a column of times."""
-    return _TIME_TITLE.match(title.strip()) is not None
+    return _TIME_TITLE_PATTERN.match(title.strip()) is not None
 
 
 def time_unit_s(unit: str) -> float | None:
-    """Return a unit of time in seconds, None if it is unknown."""
+    """Return the length of a unit of time in seconds; None if the unit is unknown."""
     return TIME_UNITS_S.get(_plain_unit(unit))

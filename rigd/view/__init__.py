@@ -1,6 +1,6 @@
 """Display of a session in Rerun: its layout, and the drawing of samples, events and health.
 
-The public interface is the scene of a session (`Scene`), which turns records into drawings,
+The package offers the scene of a session (`Scene`), which turns records into functions that draw,
 recorded sessions and Rerun files (`draw_session`, `new_rrd_file`), and charts over frequency
 (`Chart`). Rerun takes half a second to import, so only the functions that need it import it.
 Viewers, servers and processes are in `rigd.live`.

@@ -1,7 +1,7 @@
 """Fits of the record: modes over time with their shrinking intervals, and a table of the last fit.
 
-During a session a fit comes every second, or with every segment of a search for a precision. A
-recorded file has only the last fit, which is shown as a table.
+During a session a new fit arrives every second, or with every segment of a search for a target
+precision. A recorded file contains only the last fit, which is shown as a table.
 """
 
 from collections.abc import Mapping
@@ -22,26 +22,35 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 Fit = Mapping[str, Any]
-"""Fit as in JSON documents (docs/online_fit.md)."""
+"""Fit of a session's record as in JSON documents (docs/online_fit.md)."""
 
 TABLE: Final = "/fit_table"
-_ENTITY: Final = "/fits"
+"""Entity path in Rerun of the table with the last fit."""
+_PLOTS_ENTITY: Final = "/fits"
+"""Entity path in Rerun of the plots of fitted modes over time."""
 _MOST_FINDINGS: Final = 8
+"""Largest number of findings that the table of a fit lists."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Quantity:
+    """Quantity of a mode that is plotted over time: its names, unit and scale."""
+
     name: str
-    """Name as in the targets of a search."""
+    """Name of the quantity in the target precisions of a search."""
     key: str
-    """Key in a mode of a fit."""
+    """Key of the quantity in the JSON document of a mode."""
     suffix: str
-    """Suffix of the component's name."""
+    """Suffix of the plot's component name in Rerun, which ends in the unit."""
     title: str
+    """Title of the plot, without the mode."""
     unit: str
+    """Unit of the plotted values."""
     factor: float
+    """Factor from the unit of the JSON document to the plotted unit."""
 
     def field(self, mode: int) -> str:
+        """Return the name of the field with this quantity of a mode in the record of a fit."""
         return f"{self.name}_{mode}"
 
 
@@ -49,12 +58,13 @@ _QUANTITIES: Final = (
     _Quantity("damping", "damping_ratio", "percent", "Damping ratio", "%", 100.0),
     _Quantity("frequency", "frequency_hz", "hz", "Frequency", "Hz", 1.0),
 )
-_TARGET_LOW, _TARGET_HIGH, _LOW, _HIGH, _VALUE = range(5)
-"""Columns of a field of a fit's record; unknown values are NaN."""
+"""Quantities that are plotted for each mode: damping ratio and frequency."""
+_TARGET_LOW_INDEX, _TARGET_HIGH_INDEX, _LOW_INDEX, _HIGH_INDEX, _VALUE_INDEX = range(5)
+"""Indices of the five values in each field of a fit's record; unknown values are NaN."""
 
 
 def fit_source(modes: int, *, with_targets: bool) -> Source:
-    """Return the plots of the first modes, for each the damping ratio and then the frequency.
+    """Return the plots of damping ratio and frequency over time, for each of the first modes.
 
     Parameters
     ----------
@@ -68,45 +78,46 @@ def fit_source(modes: int, *, with_targets: bool) -> Source:
         for n in range(1, modes + 1)
         for quantity in _QUANTITIES
     )
-    return Source(_ENTITY, tuple(plots))
+    return Source(_PLOTS_ENTITY, tuple(plots))
 
 
 def _plot(quantity: _Quantity, mode: int, *, with_targets: bool) -> Plot:
+    """Return the plot of a mode's frequency or damping ratio, with its 95 % interval over time."""
     field, unit = quantity.field(mode), quantity.unit
 
     def values(records: npt.NDArray[Any], column: int) -> Values:
-        found: Values = records[field][:, column]
-        return found
+        column_values: Values = records[field][:, column]
+        return column_values
 
     # Curves with the same name have one entry in the legend.
     target, interval = f"asked for, 95 % ({unit})", f"95 % interval ({unit})"
     target_ends = (
-        PlotCurve(target, GREY, partial(values, column=_TARGET_LOW)),
-        PlotCurve(target, GREY, partial(values, column=_TARGET_HIGH)),
+        PlotCurve(target, GREY, partial(values, column=_TARGET_LOW_INDEX)),
+        PlotCurve(target, GREY, partial(values, column=_TARGET_HIGH_INDEX)),
     )
     return Plot(
         f"{quantity.name}_{mode}_{quantity.suffix}",
         f"{quantity.title} of mode {mode} ({unit})",
         (
             *(target_ends if with_targets else ()),
-            PlotCurve(interval, ORANGE, partial(values, column=_LOW)),
-            PlotCurve(interval, ORANGE, partial(values, column=_HIGH)),
-            PlotCurve(f"estimate ({unit})", SKY_BLUE, partial(values, column=_VALUE), 2.5),
+            PlotCurve(interval, ORANGE, partial(values, column=_LOW_INDEX)),
+            PlotCurve(interval, ORANGE, partial(values, column=_HIGH_INDEX)),
+            PlotCurve(f"estimate ({unit})", SKY_BLUE, partial(values, column=_VALUE_INDEX), 2.5),
         ),
     )
 
 
 def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
-    """Return the record of a fit for the plots of `fit_source`, shape (1,), with ``t_ns``.
+    """Return a fit as one record (1,) with time and modes, for the plots of `fit_source`.
 
-    Modes that the record does not show and doubtful values are NaN.
+    Doubtful values and modes that are not visible in the samples are NaN.
 
     Parameters
     ----------
     fit
-        Fit; None: there is none yet.
+        Fit as in JSON documents; None if there is no fit yet.
     modes
-        Number of modes in the plots.
+        Number of modes in the plots; further modes of the fit are omitted.
     """
     fields = [(q.field(n), "<f8", (5,)) for n in range(1, modes + 1) for q in _QUANTITIES]
     record = np.zeros(1, [("t_ns", "<i8"), *fields])
@@ -115,24 +126,29 @@ def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
     if fit is None:
         return record
     record["t_ns"] = round(1e9 * fit["duration_s"])
-    stds = {(each["quantity"], each["mode"]): each["asked_std"] for each in _targets(fit)}
+    target_stds = {
+        (target["quantity"], target["mode"]): target["asked_std"] for target in _targets(fit)
+    }
     for mode in fit.get("modes", ()):
         for quantity in _QUANTITIES if mode["mode"] <= modes else ():
-            found = mode[quantity.key]
-            ends = found["interval_95"]
-            if not mode.get("shown", True) or found["flag"] or ends is None:
+            estimate = mode[quantity.key]
+            interval = estimate["interval_95"]
+            if not mode.get("shown", True) or estimate["flag"] or interval is None:
                 continue
-            value, (low, high) = found["value"], ends
-            target_std = stds.get((quantity.name, mode["mode"]))
-            half = np.nan
-            if target_std is not None and found["std"]:
-                half = target_std * (high - low) / (2.0 * found["std"])
-            shown = np.array([value - half, value + half, low, high, value])
-            record[quantity.field(mode["mode"])] = quantity.factor * shown
+            value, (low, high) = estimate["value"], interval
+            target_std = target_stds.get((quantity.name, mode["mode"]))
+            target_half_width = np.nan
+            if target_std is not None and estimate["std"]:
+                target_half_width = target_std * (high - low) / (2.0 * estimate["std"])
+            field_values = np.array(
+                [value - target_half_width, value + target_half_width, low, high, value]
+            )
+            record[quantity.field(mode["mode"])] = quantity.factor * field_values
     return record
 
 
 def _targets(fit: Fit) -> list[Mapping[str, Any]]:
+    """Return the target precisions of a fit's search; an empty list without a search."""
     return list((fit.get("search") or {}).get("targets") or ())
 
 
@@ -140,101 +156,113 @@ def _targets(fit: Fit) -> list[Mapping[str, Any]]:
 
 
 def fit_table(fit: Fit | None) -> str:
-    """Return a fit as Markdown: target precisions and those reached, modes, parameters.
+    """Return a Markdown table of a fit: target and reached precisions, modes and parameters.
 
     Parameters
     ----------
     fit
-        Fit; None: there is none yet.
+        Fit as in JSON documents; None if there is no fit yet.
     """
     if fit is None:
         return "No fit yet."
     search = fit.get("search") or {}
-    parts = []
+    paragraphs = []
     if search.get("reason"):
-        parts.append(f"**{plain(search['reason'])}**")
+        paragraphs.append(f"**{plain(search['reason'])}**")
     targets = _targets(fit)
     if targets:
-        rows = [_target_row(each) for each in targets]
-        parts.append(_markdown("asked for", "value", "std", "asked std", rows=rows))
+        rows = [_target_row(parameter_item) for parameter_item in targets]
+        paragraphs.append(_markdown_table("asked for", "value", "std", "asked std", rows=rows))
     if not search.get("reason") and search.get("left_s") is not None:
-        parts.append(f"About **{search['left_s']:.0f} s** more.")
+        paragraphs.append(f"About **{search['left_s']:.0f} s** more.")
     if not search.get("reason") and search.get("piece"):
-        parts.append(f"Excited now: {plain(str(search['piece']))}")
+        paragraphs.append(f"Excited now: {plain(str(search['piece']))}")
     if fit.get("problem"):
-        parts.append(f"**After {fit['duration_s']:.1f} s:** {plain(fit['problem'])}")
+        paragraphs.append(f"**After {fit['duration_s']:.1f} s:** {plain(fit['problem'])}")
     else:
-        parts.append(f"**Fit of the first {fit['duration_s']:.1f} s** (± 95 %, statistical only)")
+        paragraphs.append(
+            f"**Fit of the first {fit['duration_s']:.1f} s** (± 95 %, statistical only)"
+        )
     modes = [_mode_row(mode) for mode in fit.get("modes", ()) if mode.get("shown", True)]
     if modes:
-        parts.append(_markdown("mode", "frequency (Hz)", "damping ratio (%)", rows=modes))
-    unseen = unseen_modes(fit.get("modes", ()))
-    if unseen:
-        parts.append(f"Not visible so far: {unseen}.")
+        paragraphs.append(
+            _markdown_table("mode", "frequency (Hz)", "damping ratio (%)", rows=modes)
+        )
+    modes_not_visible = unseen_modes(fit.get("modes", ()))
+    if modes_not_visible:
+        paragraphs.append(f"Not visible so far: {modes_not_visible}.")
     if modes:
         validity = Validity.of_document(fit.get("validity"))
-        parts.append(validity.sentence)
+        paragraphs.append(validity.sentence)
         if validity.uniform_beam is not None:
-            parts.append(validity.uniform_beam.sentence)
-    rows = [_parameter_row(*each) for each in fit.get("parameters", {}).items()]
+            paragraphs.append(validity.uniform_beam.sentence)
+    rows = [_parameter_row(*parameter_item) for parameter_item in fit.get("parameters", {}).items()]
     if rows:
-        parts.append(_markdown("parameter", "value", rows=[row for row in rows if row]))
-    parts += [plain(sentence) for sentence in fit.get("findings", ())[:_MOST_FINDINGS]]
-    return "\n\n".join(parts)
+        paragraphs.append(_markdown_table("parameter", "value", rows=[row for row in rows if row]))
+    paragraphs += [plain(sentence) for sentence in fit.get("findings", ())[:_MOST_FINDINGS]]
+    return "\n\n".join(paragraphs)
 
 
-def _markdown(*heads: str, rows: list[tuple[str, ...]]) -> str:
-    lines = (heads, ("---",) * len(heads), *rows)
+def _markdown_table(*headings: str, rows: list[tuple[str, ...]]) -> str:
+    """Return a Markdown table with the given column heads and rows."""
+    lines = (headings, ("---",) * len(headings), *rows)
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def _target_row(target: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the table row of a target precision: name, value, reached and target deviation."""
     value, std, target_std = target["value"], target["std"], target["asked_std"]
     if value is None:
         return plain(target["name"]), "–", "–", "–"
     if std is None:
         return plain(target["name"]), f"{value:.4g}", "doubtful", with_percentage(target_std, value)
-    reached = " ✓" if std <= target_std else ""
+    check_mark = " ✓" if std <= target_std else ""
     return (
         plain(target["name"]),
         f"{value:.4g}",
-        f"**{with_percentage(std, value)}**{reached}",
+        f"**{with_percentage(std, value)}**{check_mark}",
         with_percentage(target_std, value),
     )
 
 
 def _mode_row(mode: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the table row of a mode: its number, frequency and damping ratio with intervals."""
     hz, damping = mode["frequency_hz"], mode["damping_ratio"]
     return (
         str(mode["mode"]),
-        with_half_width(hz["value"], hz["interval_95"]) + _doubt(hz),
-        with_half_width(damping["value"], damping["interval_95"], 100.0) + _doubt(damping),
+        with_half_width(hz["value"], hz["interval_95"]) + _doubt_suffix(hz),
+        with_half_width(damping["value"], damping["interval_95"], 100.0) + _doubt_suffix(damping),
     )
 
 
-def _parameter_row(name: str, found: Mapping[str, Any]) -> tuple[str, ...]:
-    value, ends = found["value"], found["interval_95"]
+def _parameter_row(name: str, estimate: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the table row of a fitted parameter: its name, and its value with interval."""
+    value, interval = estimate["value"], estimate["interval_95"]
     if value is None:
         return ()
     # Small numbers, such as zeta, have a power of ten, the same for value and interval.
-    size = abs(value) if ends is None else max(abs(value), (ends[1] - ends[0]) / 2.0)
-    power = 0 if size == 0 or size >= 1e-2 else int(np.floor(np.log10(size)))
-    text = with_half_width(value, ends, 10.0**-power)
+    magnitude = (
+        abs(value) if interval is None else max(abs(value), (interval[1] - interval[0]) / 2.0)
+    )
+    power = 0 if magnitude == 0 or magnitude >= 1e-2 else int(np.floor(np.log10(magnitude)))
+    text = with_half_width(value, interval, 10.0**-power)
     if power:
-        text = f"({text})·10{str(power).translate(_RAISED)}"
-    words = name.removesuffix(suffix_of(name)).replace("_", " ")
-    return words, f"{text} {unit_of(name)}".rstrip() + _doubt(found)
+        text = f"({text})·10{str(power).translate(_SUPERSCRIPTS)}"
+    label = name.removesuffix(suffix_of(name)).replace("_", " ")
+    return label, f"{text} {unit_of(name)}".rstrip() + _doubt_suffix(estimate)
 
 
-_RAISED: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+"""Translation table from digits and the minus sign to their superscript characters."""
 
 
-def _doubt(found: Mapping[str, Any]) -> str:
-    return f" (doubtful: {plain(found['flag'])})" if found.get("flag") else ""
+def _doubt_suffix(estimate: Mapping[str, Any]) -> str:
+    """Return why an estimate is doubtful, in brackets; an empty text if it is not."""
+    return f" (doubtful: {plain(estimate['flag'])})" if estimate.get("flag") else ""
 
 
 def send_table(stream: "RecordingStream", fit: Fit | None) -> None:
-    """Show the table of a fit from the end of its samples on, or a note that there is none."""
+    """Send the table of a fit to Rerun, at the time of the fit's last sample."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=0.0 if fit is None else fit["duration_s"])

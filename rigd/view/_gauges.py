@@ -1,4 +1,4 @@
-"""Gauges: signals of a session as fractions of their limits."""
+"""Gauges: largest values of a session's signals as fractions of their limits."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,9 +11,10 @@ import numpy.typing as npt
 from rigd.session.layout import WRENCH_FIELDS, Status
 
 Records = npt.NDArray[Any]
+"""Structured array of samples, shape (n,)."""
 
-NEAR: Final = 0.8
-"""Fraction of a limit above which a gauge is near it, as for the interlocks' warnings."""
+WARNING_FRACTION: Final = 0.8
+"""Fraction of a limit above which a gauge turns orange, as for the interlocks' warnings."""
 
 
 UNITS: Final = {
@@ -23,21 +24,22 @@ UNITS: Final = {
     "torque_command": "N·m",
     "i2t": "N·m",
 } | {field.partition("_")[0]: "N" if field.endswith("_n") else "N·m" for field in WRENCH_FIELDS}
-"""Units of the gauges, by name."""
+"""Units of the gauges, by the name of the signal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """A signal with its limit.
+    """Largest magnitude of a signal, with the limit of the signal.
 
     Attributes
     ----------
     value
-        Largest magnitude; None if unknown.
+        Largest magnitude of the signal; None if unknown.
     limit
-        Magnitude at which the session ends or the torque is clipped; None without a limit.
+        Magnitude at which the session ends or the torque is clipped; None if the signal has no
+        limit.
     unit
-        Unit of both.
+        Unit of the value and of the limit.
     """
 
     value: float | None
@@ -46,23 +48,23 @@ class Gauge:
 
     @property
     def fraction(self) -> float | None:
-        """Value as a fraction of the limit; None if either is unknown."""
+        """Magnitude of the signal as a fraction of its limit; None if either is unknown."""
         return None if self.value is None or self.limit is None else self.value / self.limit
 
 
 class Gauges:
-    """Peaks of the samples with their limits, block by block.
+    """Calculator of the largest magnitudes of each signal, for successive blocks of samples.
 
-    The rms torque (i²t) assumes a cold motor at the first sample.
+    The rms torque (i²t) is computed as if the motor were cold at the first sample.
 
     Parameters
     ----------
     rate_hz
         Scheduled ticks per second.
     limits
-        Limits by the names of ``UNITS``; an absent or infinite one is no limit.
+        Limits by the names of ``UNITS``. A signal with an absent or infinite limit has no limit.
     thermal_time_constant_s
-        Time constant of the rms torque.
+        Time constant of the filter that averages the squared torque.
     """
 
     def __init__(
@@ -75,30 +77,30 @@ class Gauges:
         self._last: tuple[int, float] | None = None  # tick and angle of the last fresh reading
 
     def take(self, samples: Records) -> dict[str, Gauge]:
-        """Return the peaks of a block by the names of ``UNITS``.
+        """Return the largest magnitudes in a block of samples, by the names of ``UNITS``.
 
         Parameters
         ----------
         samples
-            (n,) of ``SAMPLE_DTYPE``, in order; there may be gaps.
+            Samples (n,) of ``SAMPLE_DTYPE``, in order. There may be gaps.
         """
         torque_nm = samples["torque_command_nm"]
-        peaks = {
+        largest_magnitudes = {
             "angle": _peak(samples["angle_rad"]),
-            "velocity": _peak(self._speeds_rad_s(samples)),
+            "velocity": _peak(self._speeds_from_fresh_angles(samples)),
             "tracking_error": _peak(samples["angle_reference_rad"] - samples["angle_rad"]),
             "torque_command": _peak(torque_nm),
-            "i2t": self._rms_nm(torque_nm),
+            "i2t": self._update_rms_torque(torque_nm),
         } | {field.partition("_")[0]: _peak(samples[field]) for field in WRENCH_FIELDS}
-        return self.with_limits(peaks)
+        return self.with_limits(largest_magnitudes)
 
     def with_limits(self, values: Mapping[str, float | None]) -> dict[str, Gauge]:
-        """Return values with their limits, by the names of ``UNITS``.
+        """Return gauges with the given magnitudes and this session's limits, by signal name.
 
         Parameters
         ----------
         values
-            Magnitudes by name; an absent one is unknown.
+            Magnitudes by signal name. A signal that is absent has an unknown magnitude.
         """
         return {
             name: Gauge(values.get(name), self._limits.get(name), unit)
@@ -106,24 +108,27 @@ class Gauges:
         }
 
     def cool(self, duration_s: float) -> float:
-        """Return the rms torque (i²t) after the motor has cooled without torque.
+        """Return the rms torque (i²t) in N·m after the motor was without torque for some time.
 
         Parameters
         ----------
         duration_s
-            Time without samples.
+            Time during which the motor had no torque.
         """
         self._heat_nm2 *= exp(-duration_s / self._time_constant_s)
         return sqrt(self._heat_nm2)
 
     def forget_angle(self) -> None:
-        """Forget the last angle, because the next sample is of another record."""
+        """Forget the last angle, so that no speed is computed across two records."""
         self._last = None
 
-    def _speeds_rad_s(self, samples: Records) -> npt.NDArray[np.float64]:
-        """Return the speeds between fresh angles: a stale one would double the next speed."""
-        fresh = samples[(samples["status"] & Status.ANGLE_STALE) == 0]
-        ticks, angles_rad = fresh["tick"].astype(np.int64), fresh["angle_rad"]
+    def _speeds_from_fresh_angles(self, samples: Records) -> npt.NDArray[np.float64]:
+        """Return the speeds in rad/s between fresh readings of the angle, shape (n,).
+
+        A repeated (stale) reading is omitted, because the speed after it would be doubled.
+        """
+        fresh_samples = samples[(samples["status"] & Status.ANGLE_STALE) == 0]
+        ticks, angles_rad = fresh_samples["tick"].astype(np.int64), fresh_samples["angle_rad"]
         if self._last is not None:
             ticks = np.append(self._last[0], ticks)
             angles_rad = np.append(self._last[1], angles_rad)
@@ -132,14 +137,16 @@ class Gauges:
         speeds: npt.NDArray[np.float64] = np.diff(angles_rad) / np.diff(ticks) * self._rate_hz
         return speeds
 
-    def _rms_nm(self, torque_nm: npt.NDArray[np.float64]) -> float:
-        known = torque_nm[np.isfinite(torque_nm)]
-        ticks = self._rate_hz * self._time_constant_s
-        self._heat_nm2 *= exp(-torque_nm.size / ticks)
-        self._heat_nm2 += float(known @ known) / ticks
+    def _update_rms_torque(self, torque_nm: npt.NDArray[np.float64]) -> float:
+        """Update the rms torque (i²t) with commanded torques and return it in N·m."""
+        known_nm = torque_nm[np.isfinite(torque_nm)]
+        time_constant_ticks = self._rate_hz * self._time_constant_s
+        self._heat_nm2 *= exp(-torque_nm.size / time_constant_ticks)
+        self._heat_nm2 += float(known_nm @ known_nm) / time_constant_ticks
         return sqrt(self._heat_nm2)
 
 
 def _peak(values: npt.NDArray[np.float64]) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.abs(known).max()) if known.size else None
+    """Return the largest magnitude of the finite values; None if there are none."""
+    finite_values = values[np.isfinite(values)]
+    return float(np.abs(finite_values).max()) if finite_values.size else None

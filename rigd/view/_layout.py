@@ -22,14 +22,14 @@ from rigd.view import _antenna as antenna
 from rigd.view import banner, plots
 from rigd.view._fits import TABLE as FIT_TABLE
 from rigd.view._fits import fit_source
-from rigd.view._session_info import EVENTS, RECENT_EVENTS, SUMMARY
+from rigd.view._session_info import EVENTS_ENTITY, RECENT_EVENTS_ENTITY, SUMMARY_ENTITY
 from rigd.view.frequency_charts import (
-    COHERENCE,
-    MAGNITUDE,
-    OVERVIEW_MAGNITUDE,
-    PHASE,
+    COHERENCE_ENTITY,
+    MAGNITUDE_ENTITY,
+    OVERVIEW_MAGNITUDE_ENTITY,
+    PHASE_ENTITY,
     SIZES,
-    SPECTROGRAM,
+    SPECTROGRAM_ENTITY,
 )
 from rigd.view.frequency_charts import SIZE as SPECTROGRAM_SIZE
 from rigd.view.plots import TIMELINE, Plot, Source, Values, send_columns
@@ -43,28 +43,32 @@ if TYPE_CHECKING:
 
 
 WINDOW_S = 10.0
-"""Time shown up to the cursor; the viewer's load grows with it, not with the session."""
+"""Time range before the cursor that most plots show, in seconds.
+
+The viewer's load grows with this range, not with the length of the session."""
 
 CLOSE_UP_S = 2.0
-"""Time shown in the tab Signals, short enough to resolve the oscillations."""
+"""Time range that the plots of the tab Signals show: short enough to resolve the oscillations."""
 
 HISTORY_S = 60.0
-"""Time shown of values that come only a few times per second."""
+"""Time range before the cursor that plots of slow values show: a few values arrive per second."""
 
 WHOLE_S = 86_400.0
-"""Window for the whole session, for values that come at most once per second."""
+"""Time range of plots that show the whole session: longer than any session.
+
+Their values arrive at most once per second."""
 
 
 @dataclass(frozen=True, slots=True)
 class TimeView:
-    """A plot over time in one of the tabs.
+    """Position and size of a plot over time in a tab of the window.
 
     Attributes
     ----------
     source, plot
-        Source and plot to show.
+        Source of the plotted values, and the plot to show.
     window_s
-        Time shown up to the cursor.
+        Time range before the cursor that the plot shows.
     height
         Height inside the axes, in points, in a window of 1280 × 800.
     """
@@ -76,21 +80,24 @@ class TimeView:
 
     @property
     def ticks(self) -> str:
-        """Component name of the invisible points that extend the axis."""
+        """Component name in Rerun of the invisible points that extend the plot's vertical axis."""
         return f"{self.plot.component}_ticks_{self.window_s:g}_s"
 
 
-_OVERVIEW_HEIGHT: Final = 228.0
-_THREE_ROWS: Final = 189.0
-_FOUR_ROWS: Final = 131.0
-"""Heights of the plots of a tab."""
+_OVERVIEW_PLOT_HEIGHT: Final = 228.0
+"""Height of each plot in the tab Overview, in points."""
+_THREE_ROW_PLOT_HEIGHT: Final = 189.0
+"""Height of each plot in a tab with three rows of plots, in points."""
+_FOUR_ROW_PLOT_HEIGHT: Final = 131.0
+"""Height of each plot in a tab with four rows of plots, in points."""
 
-OVERVIEW: Final = tuple(
-    TimeView(plots.SIGNALS, plot, WINDOW_S, _OVERVIEW_HEIGHT)
+OVERVIEW_PLOTS: Final = tuple(
+    TimeView(plots.SIGNALS, plot, WINDOW_S, _OVERVIEW_PLOT_HEIGHT)
     for plot in (plots.ANGLE, plots.COUPLING_TORQUE)
 )
+"""Plots of the tab Overview."""
 SIGNALS: Final = tuple(
-    TimeView(plots.SIGNALS, plot, CLOSE_UP_S, _THREE_ROWS)
+    TimeView(plots.SIGNALS, plot, CLOSE_UP_S, _THREE_ROW_PLOT_HEIGHT)
     for plot in (
         plots.ANGLE,
         plots.TRACKING_ERROR,
@@ -100,24 +107,33 @@ SIGNALS: Final = tuple(
         plots.TORQUES,
     )
 )
+"""Plots of the tab Signals."""
 HEALTH: Final = (
-    TimeView(plots.SIGNALS, plots.LOOP, WINDOW_S, _FOUR_ROWS),
-    TimeView(plots.READINGS, plots.AGES, WINDOW_S, _FOUR_ROWS),
-    *(TimeView(plots.HEALTH, plot, HISTORY_S, _FOUR_ROWS) for plot in plots.HEALTH.plots),
+    TimeView(plots.SIGNALS, plots.LOOP, WINDOW_S, _FOUR_ROW_PLOT_HEIGHT),
+    TimeView(plots.READINGS, plots.AGES, WINDOW_S, _FOUR_ROW_PLOT_HEIGHT),
+    *(
+        TimeView(plots.HEALTH, plot, HISTORY_S, _FOUR_ROW_PLOT_HEIGHT)
+        for plot in plots.HEALTH.plots
+    ),
 )
-_TWO_COLUMNS: Final = 4
-"""Least number of plots of the tab Health for two columns."""
-TIME_VIEWS: Final = (*OVERVIEW, *SIGNALS, *HEALTH)
+"""Plots of the tab Health."""
+_LEAST_PLOTS_FOR_TWO_COLUMNS: Final = 4
+"""Least number of plots in the tab Health for which they are arranged in two columns."""
+TIME_VIEWS: Final = (*OVERVIEW_PLOTS, *SIGNALS, *HEALTH)
+"""All plots over time of the window, without those of the tab Fit."""
 
-TABS = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
-FIT_TAB = "Fit"
-"""Second tab, for sessions whose record is fitted."""
-_FIT_TAB_HEIGHT: Final = 640.0
-_FIT_PLOT_MARGIN: Final = 50.0
+TAB_TITLES = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
+"""Titles of the tabs that every session has, in the window's order."""
+FIT_TAB_TITLE = "Fit"
+"""Title of the tab that follows the first one if the session's record is fitted."""
+_FIT_TAB_HEIGHT_PT: Final = 640.0
+"""Total height of the plots in the tab Fit, in points."""
+_FIT_PLOT_MARGIN_PT: Final = 50.0
+"""Height that each plot of the tab Fit needs outside its axes, in points."""
 
 
 def fit_views(source: Source) -> tuple[TimeView, ...]:
-    """Return the plots of the tab Fit.
+    """Return the plots of the tab Fit, with heights for their number.
 
     Parameters
     ----------
@@ -125,7 +141,7 @@ def fit_views(source: Source) -> tuple[TimeView, ...]:
         Source of the plots, two for each mode.
     """
     rows = max(1, len(source.plots) // 2)
-    height = _FIT_TAB_HEIGHT / rows - _FIT_PLOT_MARGIN
+    height = _FIT_TAB_HEIGHT_PT / rows - _FIT_PLOT_MARGIN_PT
     return tuple(TimeView(source, plot, WHOLE_S, height) for plot in source.plots)
 
 
@@ -135,14 +151,15 @@ def blueprint(
     fit_modes: int | None = None,
     fit_targets: bool = False,
 ) -> "rrb.Blueprint":
-    """Return the layout, which follows the newest sample and shows the first tab.
+    """Return the layout of the live window, which follows the newest sample.
 
     Parameters
     ----------
     absent
-        Components of plots to omit, because they have no values.
+        Component names of plots to omit, because the session has no values for them.
     fit_modes
-        As `Subject.fit_modes`.
+        Number of modes whose fits are plotted over time. 0: only a table of the last fit. None: no
+        tab Fit.
     fit_targets
         Whether the session may have target precisions.
     """
@@ -156,10 +173,10 @@ def blueprint(
         _health(absent),
         _events(),
     ]
-    names = list(TABS)
+    names = list(TAB_TITLES)
     if fit_modes is not None:
         contents.insert(1, _fit(fit_modes, with_targets=fit_targets))
-        names.insert(1, FIT_TAB)
+        names.insert(1, FIT_TAB_TITLE)
     for tab, name in zip(contents, names, strict=True):
         tab.name = name
     return rrb.Blueprint(
@@ -171,18 +188,19 @@ def blueprint(
 
 
 def _overview() -> "rrb.Container":
+    """Return the contents of the tab Overview: state, gauges, antenna, plots and response."""
     import rerun.blueprint as rrb
 
-    state, values = banner.views()
+    state_view, gauges_view = banner.views()
     return rrb.Vertical(
-        rrb.Horizontal(state, values, column_shares=[6, 7]),
+        rrb.Horizontal(state_view, gauges_view, column_shares=[6, 7]),
         rrb.Horizontal(
-            rrb.Vertical(*map(_plot, OVERVIEW)),
+            rrb.Vertical(*map(_plot, OVERVIEW_PLOTS)),
             rrb.Vertical(
                 chart_view(
                     "Frequency response: magnitude of torque over angle",
-                    OVERVIEW_MAGNITUDE,
-                    SIZES[OVERVIEW_MAGNITUDE],
+                    OVERVIEW_MAGNITUDE_ENTITY,
+                    SIZES[OVERVIEW_MAGNITUDE_ENTITY],
                 ),
                 rrb.Horizontal(antenna.view(), _recent_events()),
                 row_shares=[6, 5],
@@ -194,39 +212,47 @@ def _overview() -> "rrb.Container":
 
 
 def _signals() -> "rrb.Container":
+    """Return the contents of the tab Signals: plots of the samples over a short time."""
     import rerun.blueprint as rrb
 
     return rrb.Grid(*map(_plot, SIGNALS), grid_columns=2)
 
 
 def _frequency_response() -> "rrb.Container":
+    """Return the contents of the tab with magnitude, phase and coherence."""
     return chart_page(
-        chart_view("Magnitude of torque over angle", MAGNITUDE, SIZES[MAGNITUDE]),
-        chart_view("Phase of torque over angle", PHASE, SIZES[PHASE]),
-        chart_view("Coherence of angle and torque", COHERENCE, SIZES[COHERENCE]),
+        chart_view("Magnitude of torque over angle", MAGNITUDE_ENTITY, SIZES[MAGNITUDE_ENTITY]),
+        chart_view("Phase of torque over angle", PHASE_ENTITY, SIZES[PHASE_ENTITY]),
+        chart_view("Coherence of angle and torque", COHERENCE_ENTITY, SIZES[COHERENCE_ENTITY]),
     )
 
 
 def _spectrogram() -> "rrb.Container":
+    """Return the contents of the tab with the spectrogram."""
     import rerun.blueprint as rrb
 
     return rrb.Vertical(
-        chart_view("Spectrogram of the coupling torque", SPECTROGRAM, SPECTROGRAM_SIZE)
+        chart_view("Spectrogram of the coupling torque", SPECTROGRAM_ENTITY, SPECTROGRAM_SIZE)
     )
 
 
 def _health(absent: Collection[str]) -> "rrb.Container":
+    """Return the contents of the tab Health: plots of loop, bus and recorder, and a summary."""
     import rerun.blueprint as rrb
 
-    shown = [view for view in HEALTH if view.plot.component not in absent]
+    shown_views = [view for view in HEALTH if view.plot.component not in absent]
     return rrb.Horizontal(
-        rrb.Grid(*map(_plot, shown), grid_columns=1 if len(shown) < _TWO_COLUMNS else 2),
+        rrb.Grid(
+            *map(_plot, shown_views),
+            grid_columns=1 if len(shown_views) < _LEAST_PLOTS_FOR_TWO_COLUMNS else 2,
+        ),
         _summary(),
         column_shares=[7, 2],
     )
 
 
 def _fit(modes: int, *, with_targets: bool) -> "rrb.Container":
+    """Return the contents of the tab Fit: modes over time, and the table of the last fit."""
     import rerun.blueprint as rrb
 
     table = rrb.TextDocumentView(name="Fit of the record", origin=FIT_TABLE)
@@ -242,12 +268,14 @@ def _fit(modes: int, *, with_targets: bool) -> "rrb.Container":
 
 
 def _events() -> "rrb.Container":
+    """Return the contents of the tab Events: the log of the session."""
     import rerun.blueprint as rrb
 
     return rrb.Vertical(_log())
 
 
 def _plot(view: TimeView) -> "rrb.TimeSeriesView":
+    """Return Rerun's view of a plot over time, with the style of each curve."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -259,15 +287,16 @@ def _plot(view: TimeView) -> "rrb.TimeSeriesView":
         # The default averages the values of a pixel, which understates peaks.
         aggregation_policy="MinMax",
     )
-    # Invisible, but within the axis. Curves with the same name have one entry in the legend.
+    # The points are invisible, but extend the axis. Curves with the same name have one entry in the
+    # legend.
     ticks = rr.SeriesPoints(
         names=[plot.curves[0].label], colors=[plot.curves[0].color], marker_sizes=[0.0]
     )
     visualizers: dict[EntityPath | str, rrb.Visualizer] = {
-        view.source.entity: lines.visualizer(mappings=[_values(plot.component)])
+        view.source.entity: lines.visualizer(mappings=[_values_mapping(plot.component)])
     }
     if plot.span is None:
-        visualizers[view.source.ticks] = ticks.visualizer(mappings=[_values(view.ticks)])
+        visualizers[view.source.ticks] = ticks.visualizer(mappings=[_values_mapping(view.ticks)])
     start = (
         rrb.TimeRangeBoundary.absolute(seconds=0.0)
         if view.window_s == WHOLE_S
@@ -291,7 +320,8 @@ def _plot(view: TimeView) -> "rrb.TimeSeriesView":
     )
 
 
-def _values(component: str) -> "VisualizerComponentMapping":
+def _values_mapping(component: str) -> "VisualizerComponentMapping":
+    """Return the mapping that makes Rerun plot the values of a component."""
     from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
     return VisualizerComponentMapping(
@@ -300,7 +330,7 @@ def _values(component: str) -> "VisualizerComponentMapping":
 
 
 def chart_view(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatial2DView":
-    """Return the view of a chart.
+    """Return Rerun's view of a chart whose horizontal axis is not time.
 
     Parameters
     ----------
@@ -324,7 +354,7 @@ def chart_view(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatia
 def chart_page(
     wide: "rrb.Spatial2DView", *narrow: "rrb.Spatial2DView", name: str | None = None
 ) -> "rrb.Vertical":
-    """Return a wide chart above a row of narrow ones.
+    """Return a tab with a wide chart above a row of narrow charts.
 
     Parameters
     ----------
@@ -341,24 +371,26 @@ def chart_page(
 
 
 def _summary() -> "rrb.TextDocumentView":
+    """Return the view of the session's summary."""
     import rerun.blueprint as rrb
 
-    return rrb.TextDocumentView(name="Health", origin=SUMMARY)
+    return rrb.TextDocumentView(name="Health", origin=SUMMARY_ENTITY)
 
 
 def _recent_events() -> "rrb.TextDocumentView":
-    """Return the view of the newest events, a document, because a log does not wrap its lines."""
+    """Return the view of the newest events: a document, because a log does not wrap its lines."""
     import rerun.blueprint as rrb
 
-    return rrb.TextDocumentView(name="Events, newest first", origin=RECENT_EVENTS)
+    return rrb.TextDocumentView(name="Events, newest first", origin=RECENT_EVENTS_ENTITY)
 
 
 def _log() -> "rrb.TextLogView":
+    """Return the view of the session's log."""
     import rerun.blueprint as rrb
 
     return rrb.TextLogView(
         name="Events",
-        origin=EVENTS,
+        origin=EVENTS_ENTITY,
         columns=rrb.TextLogColumns(
             timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]
         ),
@@ -367,120 +399,141 @@ def _log() -> "rrb.TextLogView":
 
 # Axis labels
 
-LEAST_SPACING: Final = 24.0
-"""Space between labels, in points: Rerun omits labels nearer than 20, and fades those at 21."""
-MARGINS: Final = 1.1
-"""Ratio of an axis to the range of its values."""
+LEAST_LABEL_SPACING_PT: Final = 24.0
+"""Least distance between axis labels, in points.
 
-_STEP_NS: Final = 100_000_000
-"""Time interval over which the extremes are computed."""
-_MOST_SPANS: Final = 1e9
-"""Ratio of values to the shortest axis above which the axis is left to Rerun."""
-_ABSURDLY_SMALL, _ABSURDLY_LARGE = 1e-300, 1e300
-_Mark = tuple[int, float]
-"""Time since the start of the session in ns, and a value."""
+Rerun omits labels nearer than 20 points, and fades those at 21."""
+AXIS_TO_RANGE_RATIO: Final = 1.1
+"""Ratio of an axis's length to the range of the plotted values: Rerun leaves a margin at both ends.
+"""
+
+_EXTREMES_INTERVAL_NS: Final = 100_000_000
+"""Length of the intervals, in nanoseconds, over which the extremes of the values are computed."""
+_MOST_VALUE_TO_AXIS_RATIO: Final = 1e9
+"""Ratio of the largest value to the least axis length above which Rerun alone chooses the axis."""
+_LEAST_LABEL_SPACING, _MOST_LABEL_SPACING = 1e-300, 1e300
+"""Smallest and largest distance between axis labels, in the unit of the values, for which points
+are added.
+
+Outside these bounds Rerun alone chooses the axis."""
+_CurvePoint = tuple[int, float]
+"""Point of a curve: time since the start of the session in ns, and value."""
 
 
 class Scale:
-    """Tracker of the extremes of one source in its views, which adds points for axis labels.
+    """Tracker of the extremes of a source's plots, which adds invisible points for axis labels.
 
     Parameters
     ----------
     source
-        Source of the values.
+        Source of the plotted values.
     views
-        Views; those of other sources and those with fixed axes are ignored.
+        Views of the window. Those of other sources and those with fixed axes are ignored.
     """
 
     def __init__(self, source: "Source", views: "Sequence[TimeView]") -> None:
         self._entity = source.ticks
         self._axes = [
-            _Axis(view) for view in views if view.source is source and view.plot.span is None
+            _AxisExtremes(view)
+            for view in views
+            if view.source is source and view.plot.span is None
         ]
 
     def frame(self) -> list["Drawing"]:
-        """Return the first drawings: a view reports missing components as errors."""
-        nothing = {axis.view.ticks: np.array([[np.nan]]) for axis in self._axes}
+        """Return functions that send an empty first point, without which Rerun reports an error."""
+        empty_values = {axis.view.ticks: np.array([[np.nan]]) for axis in self._axes}
         start_ns = np.array([0])
-        return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=nothing)]
+        return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=empty_values)]
 
     def draw(self, t_ns: npt.NDArray[np.int64], columns: Mapping[str, Values]) -> list["Drawing"]:
-        """Return the drawings of the points that values lack for their axis labels.
+        """Return functions that send the invisible points that the axes need for their labels.
 
         The values have shape (n, k), by component, at times (n,). Values that are not finite are
         ignored, as in Rerun.
         """
-        steps = (t_ns - t_ns[0]) // _STEP_NS
-        begins = np.append(0, np.flatnonzero(np.diff(steps)) + 1)
-        times_ns = t_ns[np.append(begins[1:], len(t_ns)) - 1].tolist()
+        interval_indices = (t_ns - t_ns[0]) // _EXTREMES_INTERVAL_NS
+        interval_starts = np.append(0, np.flatnonzero(np.diff(interval_indices)) + 1)
+        times_ns = t_ns[np.append(interval_starts[1:], len(t_ns)) - 1].tolist()
         lows, highs = (
             {
-                component: extreme.reduceat(values.ravel(), begins * values.shape[1]).tolist()
+                component: reduction.reduceat(
+                    values.ravel(), interval_starts * values.shape[1]
+                ).tolist()
                 for component, values in columns.items()
             }
-            for extreme in (np.fmin, np.fmax)
+            for reduction in (np.fmin, np.fmax)
         )
         drawings: list[Drawing] = []
         for axis in self._axes:
             component = axis.view.plot.component
-            marks = [
-                mark
-                for moment in zip(times_ns, lows[component], highs[component], strict=True)
-                for mark in axis.take(*moment)
+            points = [
+                point
+                for interval in zip(times_ns, lows[component], highs[component], strict=True)
+                for point in axis.take(*interval)
             ]
-            if marks:
-                drawings.append(self._ticks(axis.view.ticks, marks))
+            if points:
+                drawings.append(self._tick_points_drawing(axis.view.ticks, points))
         return drawings
 
-    def _ticks(self, component: str, marks: Sequence[_Mark]) -> "Drawing":
-        times_ns, values = zip(*marks, strict=True)
+    def _tick_points_drawing(self, component: str, points: Sequence[_CurvePoint]) -> "Drawing":
+        """Return the function that sends invisible points (time, value) of one axis."""
+        times_ns, values = zip(*points, strict=True)
         columns = {component: np.array(values)[:, None]}
         return partial(send_columns, entity=self._entity, t_ns=np.array(times_ns), columns=columns)
 
 
-class _Axis:
-    """Extremes within the window of one view, and the last points that were added."""
+class _AxisExtremes:
+    """Least and greatest plotted value in a time window, and the invisible points sent last."""
 
     def __init__(self, view: "TimeView") -> None:
         self.view = view
         self._window_ns = round(1e9 * view.window_s)
-        self._greatest, self._least = _Greatest(self._window_ns), _Greatest(self._window_ns)
-        self._below: _Mark | None = None
-        self._above: _Mark | None = None
+        self._greatest, self._least = (
+            _RunningMaximum(self._window_ns),
+            _RunningMaximum(self._window_ns),
+        )
+        self._below: _CurvePoint | None = None
+        self._above: _CurvePoint | None = None
 
-    def take(self, t_ns: int, low: float, high: float) -> list[_Mark]:
-        """Add the extremes of a moment; return the points to draw."""
+    def take(self, t_ns: int, low: float, high: float) -> list[_CurvePoint]:
+        """Add the least and greatest value of an interval; return the invisible points to send."""
         if not (math.isfinite(low) and math.isfinite(high)):
             return []
         high_ns, high = self._greatest.take(t_ns, high)
         low_ns, minus_low = self._least.take(t_ns, -low)
-        below, above = missing_ticks(-minus_low, high, self.view.height, self.view.plot.least_span)
+        value_below, value_above = missing_ticks(
+            -minus_low, high, self.view.height, self.view.plot.least_span
+        )
         # When either extreme leaves the window, the missing points are computed again.
-        earlier_ns = min(low_ns, high_ns)
-        added = []
-        if above is not None and self._lacks(self._above, above, t_ns):
-            self._above = earlier_ns, above
-            added.append(self._above)
-        if below is not None and self._lacks(self._below, below, t_ns):
-            self._below = earlier_ns, below
-            added.append(self._below)
-        return added
+        first_extreme_ns = min(low_ns, high_ns)
+        new_points = []
+        if value_above is not None and self._must_send(self._above, value_above, t_ns):
+            self._above = first_extreme_ns, value_above
+            new_points.append(self._above)
+        if value_below is not None and self._must_send(self._below, value_below, t_ns):
+            self._below = first_extreme_ns, value_below
+            new_points.append(self._below)
+        return new_points
 
-    def _lacks(self, last: _Mark | None, value: float, t_ns: int) -> bool:
-        """Return whether a value is missing because the last one differs or leaves the window."""
-        return last is None or last[1] != value or last[0] <= t_ns - self._window_ns + _STEP_NS
+    def _must_send(self, last_point: _CurvePoint | None, value: float, t_ns: int) -> bool:
+        """Return whether to send an invisible point: its value changes, or it leaves the window."""
+        return (
+            last_point is None
+            or last_point[1] != value
+            or last_point[0] <= t_ns - self._window_ns + _EXTREMES_INTERVAL_NS
+        )
 
 
-class _Greatest:
-    """Running maximum over a window of time."""
+class _RunningMaximum:
+    """Running maximum of a signal over a time window."""
 
     def __init__(self, window_ns: int) -> None:
         self._window_ns = window_ns
-        # Each is greater than all later ones.
-        self._marks: collections.deque[_Mark] = collections.deque()
+        # Each value is greater than all later ones.
+        self._marks: collections.deque[_CurvePoint] = collections.deque()
 
-    def take(self, t_ns: int, value: float) -> _Mark:
-        """Add the newest value; return the greatest one with its time."""
+    def take(self, t_ns: int, value: float) -> _CurvePoint:
+        """Add the newest value and return the largest value in the window, with its time."""
         while self._marks and self._marks[-1][1] <= value:
             self._marks.pop()
         self._marks.append((t_ns, value))
@@ -492,52 +545,59 @@ class _Greatest:
 def missing_ticks(
     low: float, high: float, height: float, least_span: float = 0.0
 ) -> tuple[float | None, float | None]:
-    """Return the values that an axis needs to have its least length and two labels.
+    """Return the values to add to a plot so that its axis has two labels and its least length.
 
     Parameters
     ----------
     low, high
-        Extremes of the values.
+        Least and greatest plotted value.
     height
         Height of the plot, in points.
     least_span
-        Shortest length of the axis.
+        Least length of the axis, in the unit of the values.
 
     Returns
     -------
-    below, above
-        Additional values of the axis; None if none is needed.
+    value_below, value_above
+        Values to add below and above the plotted values; None if none is needed on that side.
     """
-    if 0.0 <= high - low < least_span and max(-low, high) < _MOST_SPANS * least_span:
-        # In steps, so that noise does not move the axis.
+    if 0.0 <= high - low < least_span and max(-low, high) < _MOST_VALUE_TO_AXIS_RATIO * least_span:
+        # The ends are multiples of a step, so that noise does not move the axis.
         step = least_span / 2
-        first, last = math.floor(low / step), math.ceil(high / step)
-        if last - first < 2:
-            first, last = (
-                (first - 1, last + 1)
-                if first == last
+        first_multiple, last_multiple = math.floor(low / step), math.ceil(high / step)
+        if last_multiple - first_multiple < 2:
+            first_multiple, last_multiple = (
+                (first_multiple - 1, last_multiple + 1)
+                if first_multiple == last_multiple
                 else (
-                    (first - 1, last)
-                    if low - first * step < last * step - high
-                    else (first, last + 1)
+                    (first_multiple - 1, last_multiple)
+                    if low - first_multiple * step < last_multiple * step - high
+                    else (first_multiple, last_multiple + 1)
                 )
             )
-        ends = first * step, last * step
+        ends = first_multiple * step, last_multiple * step
         ticks = missing_ticks(*ends, height)
-        below, above = (
+        value_below, value_above = (
             end if tick is None else tick for end, tick in zip(ends, ticks, strict=True)
         )
-        return below if below < low else None, above if above > high else None
-    spacing = MARGINS * (high - low) / height * LEAST_SPACING
+        return (
+            value_below if value_below < low else None,
+            value_above if value_above > high else None,
+        )
+    spacing = AXIS_TO_RANGE_RATIO * (high - low) / height * LEAST_LABEL_SPACING_PT
     # Rerun shows a single value with one unit on either side.
-    if not _ABSURDLY_SMALL < spacing < _ABSURDLY_LARGE:
+    if not _LEAST_LABEL_SPACING < spacing < _MOST_LABEL_SPACING:
         return None, None
     step = 10.0 ** math.ceil(math.log10(spacing))
-    first, last = math.ceil(low / step), math.floor(high / step)
-    if last > first:
+    first_multiple, last_multiple = math.ceil(low / step), math.floor(high / step)
+    if last_multiple > first_multiple:
         return None, None
-    below, above = (first - 1) * step, (last + 1) * step
-    if last < first:
-        return below, above
+    value_below, value_above = (first_multiple - 1) * step, (last_multiple + 1) * step
+    if last_multiple < first_multiple:
+        return value_below, value_above
     # Prefer above: the point stays there while a signal oscillates, and makes room for the legend.
-    return (None, above) if above - high <= 2.0 * (low - below) else (below, None)
+    return (
+        (None, value_above)
+        if value_above - high <= 2.0 * (low - value_below)
+        else (value_below, None)
+    )

@@ -1,4 +1,4 @@
-"""Recorded sessions in Rerun."""
+"""Drawing of recorded sessions in Rerun, as if they were live."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -28,34 +28,38 @@ if TYPE_CHECKING:
 
 
 Records = npt.NDArray[Any]
+"""Structured array of samples or timings, shape (n,)."""
 
 _BLOCK_S: Final = 1.0
-"""Duration of a block that is drawn at once: the period of the charts."""
-_MOST_SPAN: Final = 10
-"""Limit of ticks per sample: filling longer gaps would invent data and fill the disk."""
-_DRAWN_AFTER_S: Final = 0.2
-"""Delay of a touch's drawing, so that the antenna's shapes around it exist."""
+"""Duration of the blocks of samples that are drawn together: the period of the charts."""
+_MOST_TICKS_PER_SAMPLE: Final = 10
+"""Largest ratio of a record's length in ticks to its number of samples.
+
+Filling longer gaps would invent data and fill the disk."""
+_TOUCH_DRAWING_DELAY_S: Final = 0.2
+"""Time after a touch at which it is drawn, so that the antenna's lines around it exist."""
 _LAST_UTC_NS: Final = 2**63 - 1
-_DESCRIPTIONS: Final = ("specimen.toml", "profile.toml")
-"""Attachments with the nominal damping; the first that has it counts."""
+"""Latest start of a session, in nanoseconds since 1970: the limit of a 64-bit integer."""
+_ATTACHMENTS_WITH_DAMPING: Final = ("specimen.toml", "profile.toml")
+"""Attachments of a session file that may state the nominal damping; the first that does is used."""
 
 
 def subject_of_session(
     session: Session, timings: Records | None = None, *, fitted: bool = False
 ) -> Subject:
-    """Return the data of a recorded session for its views.
+    """Return the description of a recorded session that its views need.
 
-    A stopped session is shown with its planned length, as it was live. Without segments the whole
-    record is the sweep.
+    A stopped session is shown with its planned length, as it was live. If the file states no
+    segments, the whole record counts as the sweep.
 
     Parameters
     ----------
     session
-        The session.
+        Session as read from its file.
     timings
-        Ages (n,) of the readings, of ``TIMING_DTYPE``; None without any.
+        Ages (n,) of the readings, of ``TIMING_DTYPE``; None if the file has none.
     fitted
-        Whether the file has a fit from the session (`rigd.session.fit_of`).
+        Whether the file contains a fit of the session's record (`rigd.session.fit_of`).
 
     Raises
     ------
@@ -65,29 +69,29 @@ def subject_of_session(
     ticks = session.samples["tick"]
     if len(ticks) == 0:
         raise SessionError(f"{session.path}: no samples were recorded, so there is nothing to see.")
-    first, end = int(ticks[0]), int(ticks[-1]) + 1
+    first_tick, end = int(ticks[0]), int(ticks[-1]) + 1
     if session.start_utc_ns > _LAST_UTC_NS:
         raise SessionError(
             f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, "
             "which Rerun cannot show. The writing program must correct it."
         )
-    if end - first > _MOST_SPAN * len(ticks):
+    if end - first_tick > _MOST_TICKS_PER_SAMPLE * len(ticks):
         raise SessionError(
-            f"{session.path}: only {len(ticks)} of the {end - first} ticks from {first} to "
-            f"{end - 1} have a sample, too few to be shown as a session."
+            f"{session.path}: only {len(ticks)} of the {end - first_tick} ticks from "
+            f"{first_tick} to {end - 1} have a sample, too few to be shown as a session."
         )
-    attached = [session.attachments.get(name, b"") for name in _DESCRIPTIONS]
+    attachments = [session.attachments.get(name, b"") for name in _ATTACHMENTS_WITH_DAMPING]
     return Subject(
         name=session.metadata.get("id") or session.path.stem,
-        rate_hz=_within(session, "rate_hz", 1.0, 1e5),
-        ticks=max(end, *(planned for _, planned in session.segments.values()), 0),
-        sweep=sweep_of({"sweep": (first, end), **session.segments}),
+        rate_hz=_number_in_range(session, "rate_hz", 1.0, 1e5),
+        ticks=max(end, *(segment_end for _, segment_end in session.segments.values()), 0),
+        sweep=sweep_of({"sweep": (first_tick, end), **session.segments}),
         beam=Beam(
-            _within(session, "beam_length_m", 1e-3, 1e3),
-            _within(session, "beam_density_kg_per_m", 1e-6, 1e3),
-            _within(session, "beam_bending_stiffness_n_m2", 1e-9, 1e9),
+            _number_in_range(session, "beam_length_m", 1e-3, 1e3),
+            _number_in_range(session, "beam_density_kg_per_m", 1e-6, 1e3),
+            _number_in_range(session, "beam_bending_stiffness_n_m2", 1e-9, 1e9),
         ),
-        damping=next(filter(None, map(nominal_damping, attached)), None),
+        damping=next(filter(None, map(nominal_damping, attachments)), None),
         tool_inertia_kg_m2=session.number("tool_inertia_kg_m2", 0.0),
         angle_delay_s=session.number("angle_delay_s", 0.0),
         torque_delay_s=session.number("torque_delay_s", 0.0),
@@ -95,15 +99,15 @@ def subject_of_session(
         sweep_hz=band_of(session.metadata.get("excitation", ""), session.metadata),
         back=session.segments.get("back"),
         specimen=session.metadata.get("specimen", ""),
-        limits=_stated_limits(attached[-1]),
-        absent=_absent(session, timings),
+        limits=_stated_limits(attachments[-1]),
+        absent=_components_without_values(session, timings),
         recorded=True,
         # The file has only the last fit.
         fit_modes=0 if fitted else None,
     )
 
 
-_LIMITS: Final = {
+_PROFILE_KEYS_OF_LIMITS: Final = {
     "angle": ("limits", "angle_rad"),
     "velocity": ("limits", "velocity_rad_s"),
     "tracking_error": ("limits", "tracking_error_rad"),
@@ -111,37 +115,37 @@ _LIMITS: Final = {
     "i2t": ("motor", "continuous_torque_nm"),
     "missed": ("limits", "missed_percent"),
 }
-"""Section and key of a profile with the limit of each gauge."""
+"""Section and key of a profile with the limit of each gauge, by the name of the gauge."""
 
 
 def _stated_limits(profile: bytes) -> dict[str, float]:
-    """Return the usable limits in a profile of any version."""
+    """Return the positive limits that a profile of any version states, by gauge name."""
     try:
         table = parse_toml(decode_text(profile))
     except (UnicodeDecodeError, DocumentError):
         return {}
     limits = {}
-    for name, (section, key) in _LIMITS.items():
+    for name, (section, key) in _PROFILE_KEYS_OF_LIMITS.items():
         with suppress(KeyError, TypeError, ValueError, OverflowError):
             if (limit := float(table[section][key]["value"])) > 0.0:
                 limits[name] = limit
     return limits
 
 
-def _absent(session: Session, timings: Records | None) -> frozenset[str]:
-    """Return the components of plots without values in a file."""
-    absent = {plot.component for plot in HEALTH.plots if plot is not FAULTY_TICKS}
+def _components_without_values(session: Session, timings: Records | None) -> frozenset[str]:
+    """Return the component names of plots for which a recorded session has no values."""
+    components = {plot.component for plot in HEALTH.plots if plot is not FAULTY_TICKS}
     if timings is None or len(timings) == 0:
-        absent.add(AGES.component)
+        components.add(AGES.component)
     if not (session.samples["lateness_ns"].any() or session.samples["work_ns"].any()):
-        absent |= OF_REAL_TIME
-    return frozenset(absent)
+        components |= OF_REAL_TIME
+    return frozenset(components)
 
 
 def nominal_damping(profile: bytes) -> Damping | None:
-    """Return the nominal damping in a profile or specimen; None if there is no usable one.
+    """Return the nominal damping in a profile or specimen; None if it states no usable one.
 
-    Only these numbers are read, so the profile may be of any version.
+    Only the damping parameters are read, so the profile may be of any version.
     """
     try:
         table = parse_toml(decode_text(profile))["beam"]["damping"]
@@ -151,8 +155,8 @@ def nominal_damping(profile: bytes) -> Damping | None:
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
     # Comparisons with NaN are false.
-    usable = 0.0 <= zeta <= 1.0 and 0.0 <= alpha < 2.0 and 0.0 <= gamma < np.inf
-    return Damping(zeta, alpha, gamma, lambda_) if usable and 0.0 <= lambda_ < 2.0 else None
+    is_plausible = 0.0 <= zeta <= 1.0 and 0.0 <= alpha < 2.0 and 0.0 <= gamma < np.inf
+    return Damping(zeta, alpha, gamma, lambda_) if is_plausible and 0.0 <= lambda_ < 2.0 else None
 
 
 def draw_session(
@@ -174,9 +178,9 @@ def draw_session(
     timings
         Ages (n,) of the readings, of ``TIMING_DTYPE``; may be empty.
     front
-        Tabs before those of the live view.
+        Tabs to show before those of the live view.
     on_progress
-        Called from time to time with the fraction that is drawn.
+        Function that is called from time to time with the fraction of the session that is drawn.
 
     Raises
     ------
@@ -185,48 +189,52 @@ def draw_session(
     """
     fit = fit_of(session.outcome)
     subject = subject_of_session(session, timings, fitted=fit is not None)
-    picture = Scene(
+    scene = Scene(
         subject, lambda: recorded_blueprint(front, subject.absent, fit_modes=subject.fit_modes)
     )
     outcome = session.outcome or {}
     state = ended(outcome.get("outcome", "no outcome"), outcome.get("reason", ""))
-    picture.state(0, replace(state, over=False))
-    # Hide the time of drawing.
+    scene.state(0, replace(state, over=False))
+    # The viewer shows session time only, not the time of drawing.
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.send_recording_start_time_nanos(session.start_utc_ns)
-    for draw in picture.frame():
-        draw(stream)
+    for send_drawing in scene.frame():
+        send_drawing(stream)
     touches = _touches(session)
-    for draw in picture.events(sorted(_notes(session, touches), key=lambda note: note.t_ns)):
-        draw(stream)
+    for send_drawing in scene.events(sorted(_notes(session, touches), key=lambda note: note.t_ns)):
+        send_drawing(stream)
     samples = session.samples
     counts = np.zeros(3, np.int64)
-    done, last_tick = 0, -1
+    drawn_samples, last_tick = 0, -1
     block_ticks = max(1, round(_BLOCK_S * subject.rate_hz))
-    for block, ages in _blocks(samples, timings, block_ticks):
-        done += len(block)
-        counts += _counts(block, last_tick)
+    for block, block_timings in _blocks(samples, timings, block_ticks):
+        drawn_samples += len(block)
+        counts += _count_faulty_ticks(block, last_tick)
         last_tick, t_ns = int(block["tick"][-1]), int(block["t_ns"][-1])
-        missed, late, lost = counts.tolist()
-        health = Health(missed_ticks=missed, late_ticks=late, lost_ticks=lost)
-        for draw in (
-            *picture.timings(ages),
-            *picture.samples(block),
-            *picture.health(t_ns, health),
+        missed_ticks, late_ticks, lost_ticks = counts.tolist()
+        health = Health(missed_ticks=missed_ticks, late_ticks=late_ticks, lost_ticks=lost_ticks)
+        for send_drawing in (
+            *scene.timings(block_timings),
+            *scene.samples(block),
+            *scene.health(t_ns, health),
         ):
-            draw(stream)
-        drawn = [each for each in touches if _DRAWN_AFTER_S + each["time_s"]["value"] < 1e-9 * t_ns]
-        for draw in picture.touches(drawn):
-            draw(stream)
-        touches = touches[len(drawn) :]
-        on_progress(done / len(samples))
-    for draw in (
-        *picture.finish(),
-        *picture.touches(touches),
-        *(picture.fit(fit) if fit is not None else ()),
+            send_drawing(stream)
+        due_touches = [
+            touch
+            for touch in touches
+            if _TOUCH_DRAWING_DELAY_S + touch["time_s"]["value"] < 1e-9 * t_ns
+        ]
+        for send_drawing in scene.touches(due_touches):
+            send_drawing(stream)
+        touches = touches[len(due_touches) :]
+        on_progress(drawn_samples / len(samples))
+    for send_drawing in (
+        *scene.finish(),
+        *scene.touches(touches),
+        *(scene.fit(fit) if fit is not None else ()),
     ):
-        draw(stream)
+        send_drawing(stream)
 
 
 def recorded_blueprint(
@@ -234,30 +242,30 @@ def recorded_blueprint(
     absent: Collection[str] = (),
     fit_modes: int | None = None,
 ) -> "rrb.Blueprint":
-    """Return the layout of the live view, with playback from the start.
+    """Return the layout of the live view for a recorded session, with playback from the start.
 
     Parameters
     ----------
     front
-        Tabs before those of the live view.
+        Tabs to show before those of the live view.
     absent
-        Components of plots to omit.
+        Component names of plots to omit, because the session has no values for them.
     fit_modes
-        As `Subject.fit_modes`.
+        0: add a tab with a table of the last fit. None: no tab Fit.
     """
     import rerun.blueprint as rrb
 
-    live = blueprint(absent=absent, fit_modes=fit_modes)
+    live_layout = blueprint(absent=absent, fit_modes=fit_modes)
     return rrb.Blueprint(
-        rrb.Tabs(*front, *live.root_container.contents),
+        rrb.Tabs(*front, *live_layout.root_container.contents),
         rrb.TimePanel(timeline=TIMELINE, play_state="playing", state="collapsed"),
-        live.blueprint_panel,
-        live.selection_panel,
+        live_layout.blueprint_panel,
+        live_layout.selection_panel,
     )
 
 
-def _within(session: Session, key: str, least: float, most: float) -> float:
-    """Return a number of the file, or raise if it is outside the plausible range."""
+def _number_in_range(session: Session, key: str, least: float, most: float) -> float:
+    """Return a number that the session file states, or raise if it is not in a plausible range."""
     value = session.number(key)
     if not least <= value <= most:
         raise SessionError(
@@ -268,7 +276,7 @@ def _within(session: Session, key: str, least: float, most: float) -> float:
 
 
 def _notes(session: Session, touches: Sequence[Mapping[str, Any]]) -> Iterator[Note]:
-    """Yield the log of the session, with its touches and its outcome."""
+    """Yield the log lines of a session, its touches and its outcome as notes for the views."""
     for event in session.events:
         yield Note(event.t_ns, event.level, event.message)
     for touch in touches:
@@ -280,26 +288,30 @@ def _notes(session: Session, touches: Sequence[Mapping[str, Any]]) -> Iterator[N
 
 
 def _touches(session: Session) -> list[dict[str, Any]]:
-    """Return the touches with a time within the record, in order of time."""
+    """Return the session's touches with an estimated time within the record, in order of time."""
     last_s = 1e-9 * int(session.samples["t_ns"][-1])
-    timed = [touch for touch in touches_of(session.outcome) if touch["time_s"] is not None]
-    within = [touch for touch in timed if 0.0 <= touch["time_s"]["value"] <= last_s]
-    return sorted(within, key=lambda touch: touch["time_s"]["value"])
+    touches_with_time = [
+        touch for touch in touches_of(session.outcome) if touch["time_s"] is not None
+    ]
+    touches_in_record = [
+        touch for touch in touches_with_time if 0.0 <= touch["time_s"]["value"] <= last_s
+    ]
+    return sorted(touches_in_record, key=lambda touch: touch["time_s"]["value"])
 
 
-def _counts(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:
-    """Return the numbers of missed, late and lost ticks after `last_tick`, shape (3,)."""
+def _count_faulty_ticks(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:
+    """Return the number of missed, late and lost ticks since the tick `last_tick`, shape (3,)."""
     gaps = np.diff(samples["tick"].astype(np.int64), prepend=last_tick) - 1
     status = samples["status"]
-    lost = np.where(status & Status.AFTER_LOST, gaps, 0)
-    late = (status & Status.LATE) != 0
-    return np.array([(gaps - lost).sum(), late.sum(), lost.sum()], np.int64)
+    lost_ticks = np.where(status & Status.AFTER_LOST, gaps, 0)
+    is_late = (status & Status.LATE) != 0
+    return np.array([(gaps - lost_ticks).sum(), is_late.sum(), lost_ticks.sum()], np.int64)
 
 
 def _blocks(
     samples: Records, timings: Records, block_ticks: int
 ) -> Iterator[tuple[Records, Records]]:
-    """Yield blocks of samples of `block_ticks` ticks each, with the timings of the same ticks."""
+    """Yield samples in blocks of `block_ticks` ticks, each with the timings of the same ticks."""
     starts = np.flatnonzero(np.diff(samples["tick"] // block_ticks)) + 1
     ends = np.append(starts, len(samples))
     last_ticks = samples["tick"][ends - 1]

@@ -1,4 +1,4 @@
-"""Scene of one session, which turns records, events and health into drawings for Rerun."""
+"""Scene of one session: turns records, events and health into functions that draw in Rerun."""
 
 import collections
 from collections.abc import Callable, Mapping, Sequence
@@ -40,33 +40,36 @@ if TYPE_CHECKING:
     from rigd.view._session_info import Health, Note, Subject
 
 Records = npt.NDArray[Any]
+"""Structured array of samples, timings or other records of a session, shape (n,)."""
 
 Drawing = Callable[["RecordingStream"], None]
-"""Function that sends one item to Rerun."""
+"""Function that sends one item to a Rerun recording."""
 
-_BLOCK_S: Final = 0.1
-"""Least duration of a block of records: the cost of a block hardly depends on its size."""
-_CHARTS_S: Final = 1.0
-"""Session time between drawings of the charts, for each of which a response is computed."""
-_STEP_S: Final = 0.5
-"""Time between columns of the spectrogram."""
-_MOST_NOTES: Final = 200
-"""Log lines that are sent again to a new connection."""
+_LEAST_BLOCK_S: Final = 0.1
+"""Least duration of a block of records that is drawn at once.
+
+The computation time for a block hardly depends on its size, so few large blocks are cheaper."""
+_CHART_UPDATE_PERIOD_S: Final = 1.0
+"""Session time between two updates of the charts; each update computes a frequency response."""
+_SPECTROGRAM_STEP_S: Final = 0.5
+"""Time between adjacent columns of the spectrogram."""
+_MOST_STORED_NOTES: Final = 200
+"""Largest number of log lines that are stored and sent again to a new connection."""
 
 
 class Scene:
-    """Scene of one session: it computes continuously and returns drawings.
+    """Scene of one session: computes its displays and returns the functions that draw them.
 
-    It sends nothing itself, so a stalled viewer cannot disturb its computations.
+    The scene itself sends nothing, so that a stalled viewer cannot disturb its computations.
 
     Parameters
     ----------
     subject
         The session.
     layout
-        Returns the layout of the window; None: that of the live view.
+        Function that returns the layout of the window; None: the layout of the live view.
     last
-        Response of the last session of the same specimen, drawn for comparison.
+        Response of the last session of the same specimen, which is drawn for comparison.
     """
 
     def __init__(
@@ -85,14 +88,18 @@ class Scene:
         self._response = SweepResponse(subject, last_hz)
         self.response_charts = ResponseCharts(subject, last)
         self._response_is_final = False
-        self._spectrogram = RunningSpectrogram(subject.rate_hz, step_s=_STEP_S, last_hz=last_hz)
-        self._spectrogram_chart = SpectrogramChart(subject, self._spectrogram.frequency_hz, _STEP_S)
+        self._spectrogram = RunningSpectrogram(
+            subject.rate_hz, step_s=_SPECTROGRAM_STEP_S, last_hz=last_hz
+        )
+        self._spectrogram_chart = SpectrogramChart(
+            subject, self._spectrogram.frequency_hz, _SPECTROGRAM_STEP_S
+        )
         self._columns: list[tuple[float, npt.NDArray[Any]]] = []
-        self._notes: collections.deque[Note] = collections.deque(maxlen=_MOST_NOTES)
+        self._notes: collections.deque[Note] = collections.deque(maxlen=_MOST_STORED_NOTES)
         self._touches: dict[int, list[Drawing]] = {}
-        self._charts_due = _Periodically(_CHARTS_S)
-        self._samples = _Gathering(subject.rate_hz)
-        self._timings = _Gathering(subject.rate_hz)
+        self._charts_due = _PeriodicTimer(_CHART_UPDATE_PERIOD_S)
+        self._samples = _BlockBuffer(subject.rate_hz)
+        self._timings = _BlockBuffer(subject.rate_hz)
         self._scales = {source: Scale(source, TIME_VIEWS) for source in (SIGNALS, READINGS, HEALTH)}
         # An empty record first: a view reports missing components as errors.
         self._fits = [fit_record(None, subject.fit_modes or 0)]
@@ -103,17 +110,17 @@ class Scene:
             self._scales[source] = Scale(source, fit_views(source))
         self._gauges = Gauges(subject.rate_hz, subject.limits, subject.thermal_time_constant_s)
         self._peaks: dict[str, Gauge] = {}
-        self._peaks_shown = False
+        self._peaks_are_drawn = False
         self._state, self._health, self._health_ns = preparing(), Health(), 0
         self._t_ns = 0
 
     @property
     def last_response(self) -> LastResponse | None:
-        """Response of this session so far, for the next session of the specimen."""
-        return self.response_charts.as_last(self._subject)
+        """Frequency response of this session so far, to compare a later session with."""
+        return self.response_charts.as_last_response(self._subject)
 
     def frame(self) -> list[Drawing]:
-        """Return the first drawings of a connection: name, layout, axes, and present contents."""
+        """Return functions that draw the window of a new connection with all contents so far."""
         name = self._subject.name
         return [
             lambda stream: stream.send_recording_name(name),
@@ -127,42 +134,45 @@ class Scene:
             *(drawing for drawings in self._touches.values() for drawing in drawings),
             *self._draw_fits(np.concatenate(self._fits)),
             *(partial(send_note, note=note) for note in self._notes),
-            self._recent(self._t_ns),
-            *self._banner(),
+            self._draw_recent_events(self._t_ns),
+            *self._draw_banner(),
         ]
 
     def samples(self, samples: Records) -> list[Drawing]:
-        """Return the drawings of samples (n,) of ``SAMPLE_DTYPE``, in order, maybe with gaps."""
+        """Return functions that draw new samples (n,) of ``SAMPLE_DTYPE``.
+
+        The samples are in order. Gaps are allowed.
+        """
         return self._draw_samples(self._samples.add(samples))
 
     def timings(self, timings: Records) -> list[Drawing]:
-        """Return the drawings of ages (n,) of the readings, of ``TIMING_DTYPE``."""
+        """Return functions that draw the ages (n,) of readings, of ``TIMING_DTYPE``."""
         return self._draw_timings(self._timings.add(timings))
 
     def events(self, events: Sequence[Note]) -> list[Drawing]:
-        """Return the drawings of log events."""
+        """Return functions that add events to the log in the window."""
         if not events:
             return []
         self._notes.extend(events)
         return [
             *(partial(send_note, note=note) for note in events),
-            self._recent(max(self._t_ns, events[-1].t_ns)),
+            self._draw_recent_events(max(self._t_ns, events[-1].t_ns)),
         ]
 
     def touches(self, touches: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Return the drawings of touches (JSON documents), which replace earlier estimates."""
-        drawn = {touch["number"]: self._antenna.touch(touch) for touch in touches}
-        self._touches |= drawn
-        return [drawing for drawings in drawn.values() for drawing in drawings]
+        """Return functions that draw touches (JSON documents), which replace earlier estimates."""
+        drawings_of_touches = {touch["number"]: self._antenna.touch(touch) for touch in touches}
+        self._touches |= drawings_of_touches
+        return [drawing for drawings in drawings_of_touches.values() for drawing in drawings]
 
     def fit(self, fit: Mapping[str, Any]) -> list[Drawing]:
-        """Return the drawings of a fit of the record so far (a JSON document)."""
+        """Return functions that draw a fit (JSON document) of the record so far."""
         self._fit = fit
         self._fits.append(fit_record(fit, self._subject.fit_modes or 0))
         return self._draw_fits(self._fits[-1])
 
     def state(self, t_ns: int, state: BannerState) -> list[Drawing]:
-        """Return the drawings of a new state of the session; none if it is unchanged.
+        """Return functions that draw a new state of the session; none if it is unchanged.
 
         Parameters
         ----------
@@ -174,65 +184,70 @@ class Scene:
         if state == self._state:
             return []
         self._state, self._health_ns = state, max(self._health_ns, t_ns)
-        return self._banner()
+        return self._draw_banner()
 
     def health(self, t_ns: int, health: Health) -> list[Drawing]:
-        """Return the drawings of a health reading, which comes a few times per second.
+        """Return functions that draw a health reading.
 
         Parameters
         ----------
         t_ns
             Time since the session's start.
         health
-            Health reading.
+            Health reading, which arrives a few times per second.
         """
         self._health, self._health_ns = health, t_ns
         drawings: list[Drawing] = [
             *self._plot(HEALTH, health_record(t_ns, health)),
             partial(send_summary, subject=self._subject, t_ns=t_ns, health=health),
-            *self._banner(),
+            *self._draw_banner(),
         ]
-        self._peaks_shown = True
+        self._peaks_are_drawn = True
         return drawings
 
     def finish(self) -> list[Drawing]:
-        """Return the final drawings, such as the final frequency response."""
+        """Return functions that draw the last samples and the final charts."""
         return [
-            *self._draw_samples(self._samples.rest()),
-            *self._draw_timings(self._timings.rest()),
-            *self._charts(),
+            *self._draw_samples(self._samples.take_remaining()),
+            *self._draw_timings(self._timings.take_remaining()),
+            *self._draw_charts(),
         ]
 
     def _draw_fits(self, records: Records) -> list[Drawing]:
+        """Return functions that draw records of fits and the table of the last fit."""
         if self._subject.fit_modes is None:
             return []
         source = self._fit_source
-        plotted = [] if source is None else self._plot(source, records)
-        return [*plotted, partial(send_table, fit=self._fit)]
+        plot_drawings = [] if source is None else self._plot(source, records)
+        return [*plot_drawings, partial(send_table, fit=self._fit)]
 
     def _draw_samples(self, samples: Records | None) -> list[Drawing]:
+        """Return functions that draw a block of samples; none if no block is complete."""
         if samples is None:
             return []
         self._t_ns = int(samples["t_ns"][-1])
-        self._take_peaks(samples)
+        self._update_peaks(samples)
         self._response.feed(samples)
         self._columns += self._spectrogram.feed(samples["tick"], samples["coupling_torque_nm"])
         drawings = [*self._plot(SIGNALS, samples), *self._antenna.samples(samples)]
         if self._charts_due(self._t_ns):
-            drawings += self._charts()
+            drawings += self._draw_charts()
         return drawings
 
-    def _take_peaks(self, samples: Records) -> None:
-        """Update the peaks since the values were drawn last."""
+    def _update_peaks(self, samples: Records) -> None:
+        """Update the largest magnitude of each signal since the gauges were last drawn."""
         peaks = self._gauges.take(samples)
-        if not self._peaks_shown:
-            peaks = {name: _larger(gauge, self._peaks.get(name)) for name, gauge in peaks.items()}
-        self._peaks, self._peaks_shown = peaks, False
+        if not self._peaks_are_drawn:
+            peaks = {
+                name: _gauge_with_larger_value(gauge, self._peaks.get(name))
+                for name, gauge in peaks.items()
+            }
+        self._peaks, self._peaks_are_drawn = peaks, False
 
-    def _banner(self) -> list[Drawing]:
-        """Return the drawings of the state, and of the values with their limits."""
+    def _draw_banner(self) -> list[Drawing]:
+        """Return functions that draw the session's state and its gauges."""
         subject, t_ns, health = self._subject, self._health_ns, self._health
-        missed = banner.missed_gauge(subject, t_ns, health)
+        gauge_of_missed_ticks = banner.missed_gauge(subject, t_ns, health)
         return [
             partial(
                 banner.send_banner, subject=subject, state=self._state, t_ns=t_ns, health=health
@@ -241,24 +256,28 @@ class Scene:
                 banner.send_values,
                 state=self._state,
                 t_ns=t_ns,
-                gauges={**self._peaks, "missed": missed},
+                gauges={**self._peaks, "missed": gauge_of_missed_ticks},
             ),
         ]
 
-    def _recent(self, t_ns: int) -> Drawing:
+    def _draw_recent_events(self, t_ns: int) -> Drawing:
+        """Return the function that draws the newest events as a document."""
         return partial(send_recent, t_ns=t_ns, notes=tuple(self._notes))
 
     def _draw_timings(self, timings: Records | None) -> list[Drawing]:
+        """Return functions that plot the ages of readings; none if no block of them is complete."""
         return [] if timings is None else self._plot(READINGS, timings)
 
     def _plot(self, source: Source, records: Records) -> list[Drawing]:
+        """Return functions that plot the records of a source over time."""
         t_ns, columns = records["t_ns"].astype(np.int64), source.columns(records)
         return [
             partial(send_columns, entity=source.entity, t_ns=t_ns, columns=columns),
             *self._scales[source].draw(t_ns, columns),
         ]
 
-    def _charts(self) -> list[Drawing]:
+    def _draw_charts(self) -> list[Drawing]:
+        """Return functions that draw the frequency response and the spectrogram so far."""
         drawings: list[Drawing] = []
         if not self._response_is_final and (estimate := self._response.estimate()) is not None:
             self.response_charts.update(self._t_ns, estimate)
@@ -272,14 +291,15 @@ class Scene:
         return drawings
 
 
-def _larger(gauge: Gauge, other: Gauge | None) -> Gauge:
+def _gauge_with_larger_value(gauge: Gauge, other: Gauge | None) -> Gauge:
+    """Return the gauge with the larger value; an unknown value counts as the smallest."""
     if other is None or other.value is None:
         return gauge
     return other if gauge.value is None or other.value > gauge.value else gauge
 
 
-class _Periodically:
-    """Timer in session time: a call returns whether the period has passed."""
+class _PeriodicTimer:
+    """Timer in session time: a call returns True once per period."""
 
     def __init__(self, period_s: float) -> None:
         self._period_ns = round(1e9 * period_s)
@@ -292,22 +312,22 @@ class _Periodically:
         return True
 
 
-class _Gathering:
-    """Collector that combines small blocks of records with a field ``tick`` into larger ones."""
+class _BlockBuffer:
+    """Buffer that combines small blocks of records with a field ``tick`` into larger blocks."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._ticks = max(1, round(_BLOCK_S * rate_hz))
+        self._ticks = max(1, round(_LEAST_BLOCK_S * rate_hz))
         self._parts: list[Records] = []
 
     def add(self, records: Records) -> Records | None:
-        """Add records (n,); return all of them once they span a block."""
+        """Add records (n,); return all buffered records once they span a block, else None."""
         if len(records) == 0:
             return None
         self._parts.append(records)
-        span = int(records["tick"][-1]) - int(self._parts[0]["tick"][0]) + 1
-        return self.rest() if span >= self._ticks else None
+        span_ticks = int(records["tick"][-1]) - int(self._parts[0]["tick"][0]) + 1
+        return self.take_remaining() if span_ticks >= self._ticks else None
 
-    def rest(self) -> Records | None:
-        """Return the remaining records; None if there are none."""
+    def take_remaining(self) -> Records | None:
+        """Return and remove the records that are still stored; None if there are none."""
         parts, self._parts = self._parts, []
         return np.concatenate(parts) if parts else None

@@ -1,4 +1,4 @@
-"""Session information for the viewer: data, log lines, health and summary of the session."""
+"""Description of a session for its views, and its log lines, health and summary in Rerun."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields
@@ -16,20 +16,24 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 
-EVENTS: Final = "/events"
-RECENT_EVENTS: Final = "/recent_events"
-SUMMARY: Final = "/summary"
+EVENTS_ENTITY: Final = "/events"
+"""Entity path in Rerun of the log."""
+RECENT_EVENTS_ENTITY: Final = "/recent_events"
+"""Entity path in Rerun of the document with the newest events."""
+SUMMARY_ENTITY: Final = "/summary"
+"""Entity path in Rerun of the table with the session's health."""
 
-_LOG_WIDTH: Final = 150
-"""Width of the log in characters: longer lines are wrapped, because the viewer would cut them."""
-_MOST_RECENT: Final = 20
-"""Number of events in the document of the newest events."""
-_SYMBOLS: Final = {"warning": "⚠ ", "error": "⚠ **ERROR** ", "fatal": "⚠ **FATAL** "}
+_LOG_WIDTH_CHARACTERS: Final = 150
+"""Width of the log in characters. Longer lines are wrapped, because the viewer would cut them."""
+_MOST_RECENT_EVENTS: Final = 20
+"""Largest number of events in the document with the newest events."""
+_LEVEL_PREFIXES: Final = {"warning": "⚠ ", "error": "⚠ **ERROR** ", "fatal": "⚠ **FATAL** "}
+"""Markdown prefixes of events in the document with the newest events, by level."""
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """Data of a session for its views.
+    """Description of a session that its views need: length, beam, limits and excitation.
 
     Attributes
     ----------
@@ -40,36 +44,40 @@ class Subject:
     ticks
         Scheduled ticks of the whole record.
     sweep
-        First tick and end (exclusive) of the excitation, or of the first of two sweeps.
+        First tick and end (exclusive) of the sweep; if there are two sweeps, those of the first.
     beam
-        The specimen.
+        Model of the specimen.
     damping
-        Nominal damping of the profile; None: unknown, and no model of the frequency response is
-        drawn.
+        Nominal damping of the specimen from the profile. None: unknown, and no model of the
+        frequency response is drawn.
     tool_inertia_kg_m2
         Inertia between the torque sensor and the beam, about the motor's axis.
     angle_delay_s, torque_delay_s
-        Age of either value at its time stamp; positive: the value is older.
+        Age of the angle or torque at its time stamp. Positive: the reading is older than the time
+        stamp.
     excitation
         Name of the excitation; empty if unknown.
     sweep_hz
-        Frequencies at the ends of a linear sweep; None: no linear sweep.
+        Frequencies at the start and end of a linear sweep; None if the excitation has no linear
+        sweep.
     back
-        First tick and end (exclusive) of a second sweep, back to the first frequency; None: none.
+        First tick and end (exclusive) of a second sweep, which returns from the last frequency to
+        the first; None if there is no second sweep.
     specimen
         Name of the specimen as the operator gave it.
     limits
         Limits by the names of the gauges (`rigd.view.Gauges`), and ``missed`` in percent of all
-        ticks; an absent one is no limit.
+        ticks. A signal that is absent has no limit.
     thermal_time_constant_s
         Time constant of the motor's rms torque.
     absent
-        Components of plots without values, such as the bus load without a bus.
+        Component names of plots for which the session has no values, such as the bus load without a
+        bus.
     recorded
-        Whether the session is played from a file.
+        Whether the session is read from a file instead of live.
     fit_modes
-        Number of modes whose fits are plotted over time; 0: only a table of the last fit; None:
-        the record is not fitted.
+        Number of modes whose fits are plotted over time. 0: only a table of the last fit is shown.
+        None: the record is not fitted.
     """
 
     name: str
@@ -92,7 +100,7 @@ class Subject:
     fit_modes: int | None = None
 
     def frequency_hz(self, tick: int) -> float | None:
-        """Return the frequency of the sweep at a tick; None before, after or without a sweep.
+        """Return the frequency of the sweep at a tick; None if the tick is in no linear sweep.
 
         Parameters
         ----------
@@ -106,25 +114,25 @@ class Subject:
 
 
 def sweep_of(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
-    """Return the part of a record over which its frequency response is estimated.
+    """Return the ticks (first, end) over which the frequency response of a record is estimated.
 
     Parameters
     ----------
     segments
-        First tick and end (exclusive) of each segment, one of which is the sweep.
+        First tick and end (exclusive) of each segment by its name; one of them is the sweep.
     """
-    # The segments of a search after its scan do not sweep the band. The first of two sweeps is the
-    # one that a chirp without a way back has.
+    # After its scan, the segments of a search do not sweep the band. The first of two sweeps is the
+    # same as the only sweep of other chirps.
     return next(segments[name] for name in ("scan", "there", "sweep") if name in segments)
 
 
 def band_of(kind: str, parameters: Mapping[str, float | int | str]) -> tuple[float, float] | None:
-    """Return the frequencies at the ends of a linear sweep; None for other excitations.
+    """Return the frequencies at the start and end of a linear sweep; None for other excitations.
 
     Parameters
     ----------
     kind, parameters
-        Excitation and its parameters, as numbers or as texts of a session file.
+        Name of the excitation and its parameters, as numbers or as texts of a session file.
     """
     if kind != "chirp":
         return None
@@ -136,7 +144,7 @@ def band_of(kind: str, parameters: Mapping[str, float | int | str]) -> tuple[flo
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A log event for the views.
+    """Line of the session's log, with its time and level.
 
     Attributes
     ----------
@@ -154,14 +162,14 @@ class Note:
 
 
 def outcome_note(t_ns: int, outcome: str, reason: str) -> Note:
-    """Return the last log event of a session: its outcome, at the time of the last sample.
+    """Return the last log line of a session, which states its outcome.
 
     Parameters
     ----------
     t_ns
-        Time of the last sample.
+        Time of the last sample since the start of the session.
     outcome, reason
-        Outcome of the session and its reason.
+        Outcome of the session ("complete", "stopped", "fault") and the reason for it.
     """
     return Note(
         t_ns, _LEVEL_OF_OUTCOME.get(outcome, "warning"), f"Outcome: {outcome}. {reason}".rstrip()
@@ -169,30 +177,31 @@ def outcome_note(t_ns: int, outcome: str, reason: str) -> Note:
 
 
 _LEVEL_OF_OUTCOME = {"complete": "info", "fault": "error"}
+"""Level of the log line that states an outcome; "warning" for all other outcomes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Health readings at one time; unknown values are None, such as the load without a bus.
+    """Condition of loop, recorder, disk and bus at one time; an unknown value is None.
 
     Attributes
     ----------
     missed_ticks
-        Ticks that the loop missed since the start of the session.
+        Number of ticks that the loop missed since the start of the session.
     late_ticks
-        Ticks with a late wake-up that were not missed, since the start.
+        Number of ticks since the start whose wake-up was late, without the missed ones.
     lost_ticks
-        Ticks whose samples were lost because the ring was full, since the start.
+        Number of samples lost since the start because the ring buffer was full.
     recorder_lag_ticks
-        Samples that wait in the ring for the recorder.
+        Number of samples in the ring buffer that the recorder has not written yet.
     disk_free_mb
         Free space on the disk of the session file, in 10⁶ bytes.
     view_dropped
-        Samples that could not be shown in time, since the start.
+        Number of samples since the start that the viewer could not show in time.
     bus_load_percent
         Load of the CAN bus or the serial line.
     bus_errors
-        Disturbed, damaged or missing messages, since the devices were connected.
+        Number of disturbed, damaged or missing messages since the devices were connected.
     sensor_status
         Status word of the force-torque sensor; 0: no fault.
     rate_hz
@@ -212,11 +221,11 @@ class Health:
 
 
 HEALTH_DTYPE: Final = np.dtype([("t_ns", "<i8")] + [(each.name, "<f8") for each in fields(Health)])
-"""Record of a reading; unknown values are NaN."""
+"""Data type of a health reading as a record, with its time in ns; unknown values are NaN."""
 
 
 def health_record(t_ns: int, health: Health) -> npt.NDArray[Any]:
-    """Return an array (1,) of ``HEALTH_DTYPE`` with the reading of one moment."""
+    """Return a health reading as an array (1,) of ``HEALTH_DTYPE``."""
     values = (np.nan if value is None else value for value in astuple(health))
     return np.array([(t_ns, *values)], HEALTH_DTYPE)
 
@@ -228,89 +237,98 @@ _RERUN_LEVELS: Final = {
     "error": "ERROR",
     "fatal": "CRITICAL",
 }
-"""Rerun's names of the levels, for which it has colours."""
+"""Rerun's names of the log levels, for which it has colours."""
 
 
 def send_note(stream: "RecordingStream", note: "Note") -> None:
-    """Add a line to the log."""
+    """Send a line of the session's log to Rerun."""
     import rerun as rr
 
-    # In milliseconds: more digits are hard to read.
+    # The time has milliseconds only, because more digits are hard to read.
     stream.set_time(TIMELINE, duration=1e-3 * round(1e-6 * note.t_ns))
     text = "\n".join(
-        line for part in note.message.splitlines() for line in wrap(part, _LOG_WIDTH) or [""]
+        line
+        for paragraph in note.message.splitlines()
+        for line in wrap(paragraph, _LOG_WIDTH_CHARACTERS) or [""]
     )
-    stream.log(EVENTS, rr.TextLog(text, level=_RERUN_LEVELS.get(note.level, "INFO")))
+    stream.log(EVENTS_ENTITY, rr.TextLog(text, level=_RERUN_LEVELS.get(note.level, "INFO")))
 
 
 def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -> None:
-    """Show the newest of `notes`, which are in order of time, as a document with wrapped lines."""
+    """Send the newest of `notes`, which are in order of time, as a document with wrapped lines."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     lines = []
-    for note in reversed(notes[-_MOST_RECENT:]):
+    for note in reversed(notes[-_MOST_RECENT_EVENTS:]):
         time_s = max(0.0, 1e-9 * note.t_ns)  # the first event may come a tick early
-        symbol = _SYMBOLS.get(note.level, "")
+        symbol = _LEVEL_PREFIXES.get(note.level, "")
         lines.append(f"**{time_s:.1f} s** {symbol}{plain(note.message)}")
-    stream.log(RECENT_EVENTS, rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN))
+    stream.log(
+        RECENT_EVENTS_ENTITY, rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN)
+    )
 
 
 def plain(text: str) -> str:
-    """Return a text escaped for Markdown.
+    """Return a text with Markdown's special characters escaped.
 
     Parameters
     ----------
     text
-        Any text from an operator or a process.
+        Text from an operator or a process.
     """
     escaped = "".join(f"\\{c}" if c in r"\`*_{}[]<>#|~$" else c for c in text)
     return escaped.replace("\n", "  \n")
 
 
 def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
-    """Return a Markdown table of the session's health, without unknown values."""
+    """Return a Markdown table of the session's progress and health, without unknown values."""
     elapsed_s = 1e-9 * t_ns
     total_s = subject.ticks / subject.rate_hz
     rows = [
-        ("rate", _number(health.rate_hz, "{:.1f} Hz"), True),
-        ("missed ticks", _number(health.missed_ticks), not health.missed_ticks),
-        ("late ticks", _number(health.late_ticks), not health.late_ticks),
-        ("lost ticks", _number(health.lost_ticks), not health.lost_ticks),
-        ("recorder backlog", _number(health.recorder_lag_ticks, "{:.0f} samples"), True),
-        ("dropped by the viewer", _number(health.view_dropped, "{:.0f} samples"), True),
-        ("bus load", _number(health.bus_load_percent, "{:.0f} %"), True),
-        ("bus errors", _number(health.bus_errors), not health.bus_errors),
-        ("sensor status", _status(health.sensor_status), not health.sensor_status),
-        ("free on the disk", _disk(health.disk_free_mb), True),
+        ("rate", _number_text(health.rate_hz, "{:.1f} Hz"), True),
+        ("missed ticks", _number_text(health.missed_ticks), not health.missed_ticks),
+        ("late ticks", _number_text(health.late_ticks), not health.late_ticks),
+        ("lost ticks", _number_text(health.lost_ticks), not health.lost_ticks),
+        ("recorder backlog", _number_text(health.recorder_lag_ticks, "{:.0f} samples"), True),
+        ("dropped by the viewer", _number_text(health.view_dropped, "{:.0f} samples"), True),
+        ("bus load", _number_text(health.bus_load_percent, "{:.0f} %"), True),
+        ("bus errors", _number_text(health.bus_errors), not health.bus_errors),
+        ("sensor status", _sensor_status_text(health.sensor_status), not health.sensor_status),
+        ("free on the disk", _disk_space_text(health.disk_free_mb), True),
     ]
     lines = [
-        f"| {name} | {text if well else f'⚠ **{text}**'} |" for name, text, well in rows if text
+        f"| {name} | {text if is_normal else f'⚠ **{text}**'} |"
+        for name, text, is_normal in rows
+        if text
     ]
-    head = f"| session | {elapsed_s:.0f} of {total_s:.0f} s |"
-    return "\n".join([head, "|---|---|", *lines])
+    session_row = f"| session | {elapsed_s:.0f} of {total_s:.0f} s |"
+    return "\n".join([session_row, "|---|---|", *lines])
 
 
 def send_summary(
     stream: "RecordingStream", subject: "Subject", t_ns: int, health: "Health"
 ) -> None:
-    """Show the summary at a time."""
+    """Send the table of the session's health to Rerun, for a time of the session."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     text = summary(subject, t_ns, health)
-    stream.log(SUMMARY, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    stream.log(SUMMARY_ENTITY, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
-def _number(value: float | None, form: str = "{:.0f}") -> str:
-    return "" if value is None else form.format(value)
+def _number_text(value: float | None, number_format: str = "{:.0f}") -> str:
+    """Return a number as text; an empty text for an unknown one."""
+    return "" if value is None else number_format.format(value)
 
 
-def _status(word: float | None) -> str:
-    if word is None:
+def _sensor_status_text(status_word: float | None) -> str:
+    """Return the sensor's status word as text: "OK" or hexadecimal; empty if unknown."""
+    if status_word is None:
         return ""
-    return f"0x{int(word):04x}" if word else "OK"
+    return f"0x{int(status_word):04x}" if status_word else "OK"
 
 
-def _disk(free_mb: float | None) -> str:
+def _disk_space_text(free_mb: float | None) -> str:
+    """Return the free disk space in GB as text; empty if unknown."""
     return "" if free_mb is None else f"{1e-3 * free_mb:.1f} GB"

@@ -1,11 +1,11 @@
-"""Banner of the overview: state of the session as text and colour, and values with their limits."""
+"""Banner of the overview: the session's state as text and colour, and gauges of its signals."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rigd.view._gauges import NEAR, Gauge
+from rigd.view._gauges import WARNING_FRACTION, Gauge
 from rigd.view._session_info import plain
 from rigd.view.chart import LABEL_DROP
 from rigd.view.plots import GREEN, GREY, ORANGE, RED, SKY_BLUE, TIMELINE, Color
@@ -16,22 +16,24 @@ if TYPE_CHECKING:
 
     from rigd.view._session_info import Health, Subject
 
-STATE: Final = "/state"
-VALUES: Final = "/values"
+STATE_ENTITY: Final = "/state"
+"""Entity path in Rerun of the text with the session's state."""
+GAUGES_ENTITY: Final = "/values"
+"""Entity path in Rerun of the gauges."""
 
 
 @dataclass(frozen=True, slots=True)
 class BannerState:
-    """State of a session in the banner.
+    """State of a session as the banner shows it.
 
     Attributes
     ----------
     word
-        State in capitals.
+        Name of the state in capitals.
     color
-        Colour of the band above the values: red for alarms only.
+        Colour of the band above the gauges. Red is for alarms only.
     reason
-        Reason of the state; empty without one.
+        Reason for the state; empty if there is none.
     over
         Whether the session is over, so that no remaining time is shown.
     """
@@ -43,17 +45,23 @@ class BannerState:
 
 
 RUNNING: Final = BannerState("RUNNING", GREEN)
+"""State while samples are recorded."""
 STOPPING: Final = BannerState("STOPPING", ORANGE)
+"""State after a stop was requested."""
 RETURNING: Final = BannerState("RETURNING", ORANGE, "The record is over.")
+"""State after the record, while the motor returns to its start."""
 FINISHING: Final = BannerState("FINISHING", ORANGE, "The record is over and the torque is off.")
+"""State after the record, when the torque is off."""
 SUPERVISOR_SILENT: Final = BannerState(
     "SUPERVISOR NOT RESPONDING",
     RED,
     "The session cannot be stopped now; it is aborted after 2 s. Check CPU load.",
 )
+"""State while the supervising process does not respond."""
 SUPERVISOR_SILENT_TORQUE_OFF: Final = BannerState(
     "SUPERVISOR NOT RESPONDING", RED, "The session has ended and the torque is off. Check CPU load."
 )
+"""State if the supervising process does not respond after the session ended."""
 SUPERVISOR_LOST: Final = BannerState(
     "SUPERVISOR LOST",
     RED,
@@ -61,44 +69,47 @@ SUPERVISOR_LOST: Final = BannerState(
     "off.",
     over=True,
 )
+"""State after the supervising process ended before the session."""
 SUPERVISOR_LOST_TORQUE_OFF: Final = BannerState(
     "SUPERVISOR LOST",
     RED,
     "The supervising process ended; the torque is off.",
     over=True,
 )
+"""State if the supervising process ended and the torque is off."""
 
 _COLOR_OF_OUTCOME: Final = {"complete": SKY_BLUE, "stopped": GREY, "fault": RED}
+"""Colour of the band after a session, by its outcome."""
 
 
-def preparing(doing: str = "") -> BannerState:
-    """Return the state of a session before its record.
+def preparing(activity: str = "") -> BannerState:
+    """Return the banner's state for a session before its record.
 
     Parameters
     ----------
-    doing
-        Present activity, as text.
+    activity
+        Text that says what the session does at present.
     """
-    return BannerState("PREPARING", ORANGE, doing)
+    return BannerState("PREPARING", ORANGE, activity)
 
 
 def ended(outcome: str, reason: str) -> BannerState:
-    """Return the state of a session that is over.
+    """Return the banner's state for a session that is over.
 
     Parameters
     ----------
     outcome, reason
-        Outcome of the session and its reason; an empty outcome is unknown.
+        Outcome of the session and the reason for it. An empty outcome means unknown.
     """
-    word = outcome.upper() or "ENDED"
-    return BannerState(word, _COLOR_OF_OUTCOME.get(outcome, ORANGE), reason, over=True)
+    state_name = outcome.upper() or "ENDED"
+    return BannerState(state_name, _COLOR_OF_OUTCOME.get(outcome, ORANGE), reason, over=True)
 
 
 # State in words
 
 
 def banner(subject: "Subject", state: BannerState, t_ns: int, health: "Health") -> str:
-    """Return the banner as Markdown: state, remaining time, reason and excitation.
+    """Return the banner's text as Markdown: state, remaining time, reason and excitation.
 
     Parameters
     ----------
@@ -109,12 +120,12 @@ def banner(subject: "Subject", state: BannerState, t_ns: int, health: "Health") 
     t_ns
         Time since the start of the session.
     health
-        Health at that time.
+        Health reading at that time.
     """
-    left_s = subject.ticks / subject.rate_hz - 1e-9 * t_ns
+    remaining_s = subject.ticks / subject.rate_hz - 1e-9 * t_ns
     heading = f"# {'Recorded: ' if subject.recorded else ''}{state.word}"
-    if state is RUNNING and left_s > 0.0:
-        heading += f" · {math.ceil(left_s)} s left"
+    if state is RUNNING and remaining_s > 0.0:
+        heading += f" · {math.ceil(remaining_s)} s left"
     lines = [heading]
     if state.reason:
         lines.append(f"**{plain(state.reason)}**" if state.color == RED else plain(state.reason))
@@ -123,56 +134,61 @@ def banner(subject: "Subject", state: BannerState, t_ns: int, health: "Health") 
         lines.append(
             f"Computer overloaded: {health.missed_ticks:.0f} ticks missed ({percentage:.2g} %)."
         )
-    what = f"**{plain(subject.excitation or 'session')}**"
+    description = f"**{plain(subject.excitation or 'session')}**"
     if subject.sweep_hz is not None:
         start_hz, stop_hz = subject.sweep_hz
-        back = "" if subject.back is None else f" → {start_hz:g}"
-        what += f" {start_hz:g} → {stop_hz:g}{back} Hz"
+        way_back = "" if subject.back is None else f" → {start_hz:g}"
+        description += f" {start_hz:g} → {stop_hz:g}{way_back} Hz"
     tick = round(1e-9 * t_ns * subject.rate_hz)
     if not state.over and (frequency_hz := subject.frequency_hz(tick)) is not None:
-        what += f", now **{frequency_hz:.3g} Hz**"
+        description += f", now **{frequency_hz:.3g} Hz**"
     if subject.specimen:
-        what += f", specimen **{plain(subject.specimen)}**"
-    lines.append(f"{what}, session {plain(subject.name)}")
+        description += f", specimen **{plain(subject.specimen)}**"
+    lines.append(f"{description}, session {plain(subject.name)}")
     return "\n\n".join(lines)
 
 
 def send_banner(
     stream: "RecordingStream", subject: "Subject", state: BannerState, t_ns: int, health: "Health"
 ) -> None:
-    """Show the banner at a time.
+    """Send the banner's text to Rerun, for a time of the session.
 
     Parameters
     ----------
     stream
-        Stream for the drawing.
+        Recording to send to.
     subject
         The session.
     state
-        Its state.
+        State of the session.
     t_ns
-        Time since its start.
+        Time since the start of the session.
     health
-        The readings of that time.
+        Health reading at that time.
     """
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     text = banner(subject, state, t_ns, health)
-    stream.log(STATE, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    stream.log(STATE_ENTITY, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
 # Values with their limits
 
 SIZE: Final = (700.0, 132.0)
-"""Width and height of the canvas, in points."""
-_BAND_HEIGHT: Final = 14.0
-_ROWS: Final = 6
-_FIRST_ROW, _ROW_HEIGHT = 32.0, 17.5
-_TEXT_WIDTH, _BAR_WIDTH, _BAR_HEIGHT = 225.0, 105.0, 8.0
-_TRACK: Color = (75, 75, 75)
+"""Width and height of the canvas with the gauges, in points."""
+_BAND_HEIGHT_PT: Final = 14.0
+"""Height of the coloured band above the gauges, in points."""
+_GAUGES_PER_COLUMN: Final = 6
+"""Number of gauges in a column."""
+_FIRST_ROW_Y_PT, _ROW_HEIGHT_PT = 32.0, 17.5
+"""Vertical position of the first row of gauges and distance between rows, in points."""
+_GAUGE_TEXT_WIDTH_PT, _BAR_WIDTH_PT, _BAR_HEIGHT_PT = 225.0, 105.0, 8.0
+"""Width of a gauge's text, and width and height of its bar, in points."""
+_EMPTY_BAR_COLOR: Color = (75, 75, 75)
+"""Colour of the empty part of a gauge's bar."""
 
-_LABELS: Final = {
+_GAUGE_LABELS: Final = {
     "angle": "angle",
     "velocity": "speed",
     "tracking_error": "tracking error",
@@ -186,119 +202,124 @@ _LABELS: Final = {
     "ty": "Ty",
     "tz": "Tz",
 }
-"""Labels of the gauges by name, first the left column and then the right one."""
+"""Labels of the gauges by signal name: first the left column, then the right one."""
 
 
 def missed_gauge(subject: "Subject", t_ns: int, health: "Health") -> Gauge:
-    """Return the percentage of missed ticks with its limit.
+    """Return the gauge of missed ticks, in percent of the ticks so far, with its limit.
 
     Parameters
     ----------
     subject
         The session.
     t_ns
-        Time since its start.
+        Time since the start of the session.
     health
-        Health at that time.
+        Health reading at that time.
     """
-    scheduled = max(1e-9 * t_ns, 10.0) * subject.rate_hz
-    missed = health.missed_ticks
-    percentage = None if missed is None else 100.0 * missed / scheduled
+    scheduled_ticks = max(1e-9 * t_ns, 10.0) * subject.rate_hz
+    missed_ticks = health.missed_ticks
+    percentage = None if missed_ticks is None else 100.0 * missed_ticks / scheduled_ticks
     return Gauge(percentage, subject.limits.get("missed"), "%")
 
 
 def gauge_text(label: str, gauge: Gauge) -> str:
-    """Return the text of a gauge: ``speed 1.05 of 15 rad/s``.
+    """Return the text of a gauge, such as ``speed 1.05 of 15 rad/s``.
 
     Parameters
     ----------
     label
-        Name of the signal.
+        Label of the signal.
     gauge
-        Its value and limit.
+        Value and limit of the signal.
     """
     if gauge.value is None:
         return f"{label} unknown"
     if gauge.limit is None:
         return f"{label} {gauge.value:.3g} {gauge.unit}"
-    # To a thousandth of the limit, with a constant number of digits.
+    # The resolution is a thousandth of the limit, with a constant number of digits.
     digits = max(0, 3 - math.floor(math.log10(gauge.limit)))
     return f"{label} {gauge.value:.{digits}f} of {gauge.limit:.3g} {gauge.unit}"
 
 
 def gauge_color(gauge: Gauge) -> Color:
-    """Return the colour of a gauge's bar: red at the limit, orange above 80 % of it.
+    """Return the colour of a gauge's bar: red at the limit, orange above 80 % of the limit.
 
     Parameters
     ----------
     gauge
-        Value and limit.
+        Value and limit of the signal.
     """
     fraction = gauge.fraction
     if fraction is None:
         return GREY
-    return RED if fraction >= 1.0 else ORANGE if fraction >= NEAR else GREEN
+    return RED if fraction >= 1.0 else ORANGE if fraction >= WARNING_FRACTION else GREEN
 
 
 def send_values(
     stream: "RecordingStream", state: BannerState, t_ns: int, gauges: Mapping[str, Gauge]
 ) -> None:
-    """Draw the band in the state's colour, and bars of the values relative to their limits.
+    """Send a band in the state's colour and the bars and texts of the gauges to Rerun.
 
     Parameters
     ----------
     stream
-        Stream for the drawing.
+        Recording to send to.
     state
         State of the session.
     t_ns
-        Time since its start.
+        Time since the start of the session.
     gauges
-        Values and limits by name, from `rigd.view.Gauges`.
+        Values and limits by signal name, from `rigd.view.Gauges`.
     """
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     width, _ = SIZE
-    strips, colors, radii = [[[0.0, 8.0], [width, 8.0]]], [state.color], [_BAND_HEIGHT / 2]
-    points, labels, label_colors = [], [], []
-    for index, (name, label) in enumerate(_LABELS.items()):
+    lines, colors, radii = [[[0.0, 8.0], [width, 8.0]]], [state.color], [_BAND_HEIGHT_PT / 2]
+    label_positions, labels, label_colors = [], [], []
+    for index, (name, label) in enumerate(_GAUGE_LABELS.items()):
         gauge = gauges.get(name)
         if gauge is None:
             continue
-        column, row = divmod(index, _ROWS)
-        x, y = column * (width / 2 + 10.0), _FIRST_ROW + row * _ROW_HEIGHT
+        column, row = divmod(index, _GAUGES_PER_COLUMN)
+        x, y = column * (width / 2 + 10.0), _FIRST_ROW_Y_PT + row * _ROW_HEIGHT_PT
         text, color = gauge_text(label, gauge), gauge_color(gauge)
         # Rerun centres a label, whose width is not known here.
-        points.append([x + _TEXT_WIDTH / 2, y - LABEL_DROP])
+        label_positions.append([x + _GAUGE_TEXT_WIDTH_PT / 2, y - LABEL_DROP])
         labels.append(text)
         label_colors.append(GREY if color == GREEN else color)
-        left = x + _TEXT_WIDTH
+        bar_left = x + _GAUGE_TEXT_WIDTH_PT
         if gauge.fraction is not None:
-            filled = left + _BAR_WIDTH * min(gauge.fraction, 1.0)
-            strips += [[[left, y], [left + _BAR_WIDTH, y]], [[left, y], [filled, y]]]
-            colors += [_TRACK, color]
-            radii += [_BAR_HEIGHT / 2] * 2
+            bar_end = bar_left + _BAR_WIDTH_PT * min(gauge.fraction, 1.0)
+            lines += [
+                [[bar_left, y], [bar_left + _BAR_WIDTH_PT, y]],
+                [[bar_left, y], [bar_end, y]],
+            ]
+            colors += [_EMPTY_BAR_COLOR, color]
+            radii += [_BAR_HEIGHT_PT / 2] * 2
     stream.log(
-        f"{VALUES}/bars",
-        rr.LineStrips2D(strips, colors=colors, radii=rr.Radius.ui_points(radii)),
+        f"{GAUGES_ENTITY}/bars",
+        rr.LineStrips2D(lines, colors=colors, radii=rr.Radius.ui_points(radii)),
     )
     stream.log(
-        f"{VALUES}/texts",
-        rr.Points2D(points, labels=labels, colors=label_colors, radii=0.0, show_labels=True),
+        f"{GAUGES_ENTITY}/texts",
+        rr.Points2D(
+            label_positions, labels=labels, colors=label_colors, radii=0.0, show_labels=True
+        ),
     )
 
 
 def views() -> "tuple[rrb.View, rrb.View]":
-    """Return the views of the state and of the values."""
+    """Return Rerun's views of the session's state and of the gauges."""
     import rerun.blueprint as rrb
 
     width, height = SIZE
     return (
-        rrb.TextDocumentView(name="State", origin=STATE),
+        rrb.TextDocumentView(name="State", origin=STATE_ENTITY),
         rrb.Spatial2DView(
             name="Values and limits",
-            origin=VALUES,
+            origin=GAUGES_ENTITY,
             visual_bounds=rrb.VisualBounds2D(x_range=[0.0, width], y_range=[0.0, height]),
         ),
     )

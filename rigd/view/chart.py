@@ -20,40 +20,44 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 Real = npt.NDArray[np.float64]
+"""Array of real numbers."""
 
 
 # Chart
 
-_LEFT, _TOP, _BOTTOM = 62.0, 44.0, 54.0
-"""Margins for tick labels and titles around the frame, in points."""
-_RIGHT = 24.0
-_TITLE_RISE = 27.0
-"""Distance of the middle of titles and legend from the frame, in points."""
+_LEFT_MARGIN, _TOP_MARGIN, _BOTTOM_MARGIN = 62.0, 44.0, 54.0
+"""Margins for tick labels and titles left of, above and below the frame, in points."""
+_RIGHT_MARGIN = 24.0
+"""Margin on the right of the frame, in points."""
+_TITLE_DISTANCE = 27.0
+"""Distance of the middle of titles and legend above the frame, in points."""
 
 LABEL_DROP = 12.0
-"""Distance of the middle of a label below its position in Rerun, in points."""
-_CHARACTER = 6.7
-"""Mean width of a character of a label, in points."""
+"""Distance by which Rerun draws the middle of a label below its position, in points."""
+_CHARACTER_WIDTH = 6.7
+"""Mean width of a character in a label, in points."""
 _DOT_SPACING = 6.0
-_CURVE_DOT = 1.0
-"""Radius of a dot of a dotted curve, in points."""
+"""Distance between the dots of a grid line, in points."""
+_CURVE_DOT_RADIUS = 1.0
+"""Radius of the dots of a dotted curve, in points."""
 _SHADE_OPACITY = 0.18
+"""Opacity of shaded areas, from 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """Axis of a chart.
+    """Axis of a chart: its title, range, ticks and grid lines.
 
     Attributes
     ----------
     title
         Title with its unit.
     first, last
-        Values at its ends.
+        Values at the lower (or left) end and at the upper (or right) end.
     ticks
-        Values with a label and a grid line.
+        Values with a tick label and a grid line.
     lines
-        Values with a grid line only.
+        Values with a grid line but without a tick label.
     logarithmic
         Whether the axis is logarithmic.
     """
@@ -66,25 +70,29 @@ class Axis:
     logarithmic: bool = False
 
     def fraction(self, values: npt.ArrayLike) -> Real:
-        """Return values as fractions of the axis, from 0 at its first to 1 at its last value."""
-        found, first, last = np.asarray(values, dtype=np.float64), self.first, self.last
+        """Return positions on the axis, from 0 (first value) to 1 (last value), clipped."""
+        positions, first, last = np.asarray(values, dtype=np.float64), self.first, self.last
         if self.logarithmic:
-            found, first, last = np.log(np.maximum(found, first)), np.log(first), np.log(last)
-        return np.clip((found - first) / (last - first), 0.0, 1.0)
+            positions, first, last = (
+                np.log(np.maximum(positions, first)),
+                np.log(first),
+                np.log(last),
+            )
+        return np.clip((positions - first) / (last - first), 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Key:
-    """An entry of a chart's legend.
+class LegendEntry:
+    """Entry of a chart's legend: label and style of a curve or a shaded area.
 
     Attributes
     ----------
     label
         Name of the curve or area.
     color, width
-        Color of the line, and its width in points.
+        Colour and width of the line, in points.
     is_area
-        Whether it is a shaded area instead of a line.
+        Whether the entry is a shaded area instead of a line.
     """
 
     label: str
@@ -95,12 +103,12 @@ class Key:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A frame with two axes on a canvas.
+    """Frame with two axes and a legend on a canvas.
 
     Attributes
     ----------
     entity
-        Entity path in Rerun.
+        Entity path of the chart in Rerun.
     width, height
         Size of the canvas, in points.
     x, y
@@ -116,9 +124,9 @@ class Chart:
     height: float
     x: Axis
     y: Axis
-    legend: tuple[Key, ...] = ()
-    left: float = _LEFT
-    right: float = _RIGHT
+    legend: tuple[LegendEntry, ...] = ()
+    left: float = _LEFT_MARGIN
+    right: float = _RIGHT_MARGIN
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
@@ -126,24 +134,24 @@ class Chart:
 
         As in all of Rerun's canvases, the vertical coordinate increases downwards.
         """
-        return self.left, _TOP, self.width - self.right, self.height - _BOTTOM
+        return self.left, _TOP_MARGIN, self.width - self.right, self.height - _BOTTOM_MARGIN
 
     def to_canvas(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Real:
-        """Return the canvas coordinates (n, 2) of points, from values (n,) of either axis.
+        """Return the canvas coordinates (n, 2) of points with given values on the axes.
 
-        Values beyond an axis are limited to its ends.
+        Values beyond an axis are clipped to its ends.
 
         Parameters
         ----------
         x, y
-            Values of either axis, shape (n,).
+            Values on the horizontal and on the vertical axis, shape (n,).
         """
         left, top, right, bottom = self.frame
-        across, up = np.broadcast_arrays(self.x.fraction(x), self.y.fraction(y))
-        return np.stack([left + (right - left) * across, bottom - (bottom - top) * up], axis=-1)
+        x_fraction, up = np.broadcast_arrays(self.x.fraction(x), self.y.fraction(y))
+        return np.stack([left + (right - left) * x_fraction, bottom - (bottom - top) * up], axis=-1)
 
     def draw_frame(self, stream: "RecordingStream") -> None:
-        """Draw the static parts: frame, grid, tick labels, titles and legend."""
+        """Send the static parts of the chart: frame, grid, tick labels, titles and legend."""
         import rerun as rr
 
         left, top, right, bottom = self.frame
@@ -160,13 +168,13 @@ class Chart:
         self._draw_legend(stream)
 
     def tick_labels(self) -> list[tuple[str, float, float]]:
-        """Return text and canvas coordinates of the middle of each tick label."""
+        """Return the text of each tick label and the canvas coordinates of its middle."""
         left, _, _, bottom = self.frame
         return [
-            (number(tick), float(self.to_canvas(tick, self.y.first)[0]), bottom + 14.0)
+            (tick_text(tick), float(self.to_canvas(tick, self.y.first)[0]), bottom + 14.0)
             for tick in self.x.ticks
         ] + [
-            (number(tick), left - 26.0, float(self.to_canvas(self.x.first, tick)[1]))
+            (tick_text(tick), left - 26.0, float(self.to_canvas(self.x.first, tick)[1]))
             for tick in self.y.ticks
         ]
 
@@ -175,57 +183,58 @@ class Chart:
         stream: "RecordingStream",
         name: str,
         strips: Sequence[Real],
-        key: Key,
+        key: LegendEntry,
         *,
         static: bool = False,
         dotted: bool = False,
         order: int = 0,
     ) -> None:
-        """Draw a curve, as a separate line through each strip of points (n, 2).
+        """Draw a curve as separate lines, one through each strip of points (n, 2).
 
         Parameters
         ----------
         stream, name, strips, key
-            Recording, name under the chart, points, and style of the curve.
+            Recording to draw into, name of the curve under the chart's entity path, points of each
+            strip, and style of the curve.
         static
-            Whether it never changes; static curves lie beneath all others.
+            Whether the curve never changes. Static curves lie beneath all others.
         dotted
-            Whether to draw the points only, if a line between them would have no meaning.
+            Whether to draw points only, because a line between them would have no meaning.
         order
-            Rank among the static or the other curves, from the lowest to the topmost.
+            Position in the stack of static curves or of other curves; higher numbers lie above.
         """
         import rerun as rr
 
-        drawn = [self.to_canvas(strip[:, 0], strip[:, 1]) for strip in strips]
+        canvas_strips = [self.to_canvas(strip[:, 0], strip[:, 1]) for strip in strips]
         draw_order = (20.0 if static else 30.0) + order
-        shape = (
+        drawn_curve = (
             rr.Points2D(
-                np.concatenate(drawn or [np.zeros((0, 2))]),
+                np.concatenate(canvas_strips or [np.zeros((0, 2))]),
                 colors=[key.color],
-                radii=rr.Radius.ui_points(_CURVE_DOT),
+                radii=rr.Radius.ui_points(_CURVE_DOT_RADIUS),
                 draw_order=draw_order,
             )
             if dotted
             else rr.LineStrips2D(
-                drawn,
+                canvas_strips,
                 colors=[key.color],
                 radii=rr.Radius.ui_points(key.width / 2),
                 draw_order=draw_order,
             )
         )
-        stream.log(f"{self.entity}/{name}", shape, static=static)
+        stream.log(f"{self.entity}/{name}", drawn_curve, static=static)
 
     def draw_note(self, stream: "RecordingStream", text: str, color: Color) -> None:
-        """Write a text into the middle of the frame; an empty one removes it.
+        """Write a text into the middle of the frame; an empty text removes the previous text.
 
         Parameters
         ----------
         stream
             Recording to draw into.
         text
-            Text to show; empty: none.
+            Text to show.
         color
-            Color of the text.
+            Colour of the text.
         """
         import rerun as rr
 
@@ -244,14 +253,16 @@ class Chart:
         )
 
     def draw_shade(self, stream: "RecordingStream", name: str) -> None:
-        """Draw the shade for `move_shade`: an image, because views do not fill other shapes.
+        """Send the image of a shaded area, which `move_shade` then moves to its position.
+
+        It is an image, because Rerun's views fill no other shapes.
 
         Parameters
         ----------
         stream
             Recording to draw into.
         name
-            Name of the shade.
+            Name of the shaded area under the chart's entity path.
         """
         import rerun as rr
 
@@ -271,33 +282,37 @@ class Chart:
         )
 
     def move_shade(self, stream: "RecordingStream", name: str, first: float, last: float) -> None:
-        """Move a shade between two values of the horizontal axis.
+        """Move a shaded area so that it lies between two values of the horizontal axis.
 
         Parameters
         ----------
         stream
             Recording to draw into.
         name
-            Name of the shade.
+            Name of the shaded area under the chart's entity path.
         first, last
-            Values of the horizontal axis.
+            Values of the horizontal axis at the left and right end of the area.
         """
         _, top, _, bottom = self.frame
         left, right = self.to_canvas([first, last], self.y.first)[:, 0]
-        self._put_shade(stream, name, (left, top, right, bottom))
+        self._position_shade(stream, name, (left, top, right, bottom))
 
     def _draw_labels(self, stream: "RecordingStream") -> None:
+        """Draw the tick labels, the titles of the axes and the labels of the legend."""
         import rerun as rr
 
         left, top, right, bottom = self.frame
         middle = (left + right) / 2
         labels = [
             *self.tick_labels(),
-            (self.y.title, left - 44.0 + _width(self.y.title) / 2, top - _TITLE_RISE),
+            (self.y.title, left - 44.0 + _label_width(self.y.title) / 2, top - _TITLE_DISTANCE),
         ]
         if self.x.title:
             labels.append((self.x.title, middle, bottom + 40.0))
-        labels += [(key.label, x + _width(key.label) / 2, y) for key, x, y in self._legend()]
+        labels += [
+            (key.label, x + _label_width(key.label) / 2, y)
+            for key, x, y in self._legend_positions()
+        ]
         stream.log(
             f"{self.entity}/labels",
             rr.Points2D(
@@ -312,43 +327,48 @@ class Chart:
         )
 
     def _draw_grid(self, stream: "RecordingStream") -> None:
-        """Draw dotted grid lines: solid ones are opaque and distract from the curves."""
+        """Draw dotted grid lines, since solid lines are opaque and distract from the curves."""
         import rerun as rr
 
         left, top, right, bottom = self.frame
         verticals = self.to_canvas([*self.x.ticks, *self.x.lines], self.y.first)[:, 0]
         horizontals = self.to_canvas(self.x.first, [*self.y.ticks, *self.y.lines])[:, 1]
-        dots = [
+        dot_positions = [
             *([x, y] for x in verticals for y in np.arange(bottom, top, -_DOT_SPACING)),
             *([x, y] for y in horizontals for x in np.arange(left, right, _DOT_SPACING)),
         ]
         stream.log(
             f"{self.entity}/grid",
-            rr.Points2D(dots, colors=[GREY], radii=rr.Radius.ui_points(0.5), draw_order=0.5),
+            rr.Points2D(
+                dot_positions, colors=[GREY], radii=rr.Radius.ui_points(0.5), draw_order=0.5
+            ),
             static=True,
         )
 
     def _draw_legend(self, stream: "RecordingStream") -> None:
+        """Draw the lines and shaded areas of the legend."""
         import rerun as rr
 
-        lines = [entry for entry in self._legend() if not entry[0].is_area]
-        if lines:
+        line_entries = [entry for entry in self._legend_positions() if not entry[0].is_area]
+        if line_entries:
             stream.log(
                 f"{self.entity}/legend",
                 rr.LineStrips2D(
-                    [[[x - 28.0, y], [x - 10.0, y]] for _, x, y in lines],
-                    colors=[key.color for key, _, _ in lines],
-                    radii=rr.Radius.ui_points([key.width / 2 for key, _, _ in lines]),
+                    [[[x - 28.0, y], [x - 10.0, y]] for _, x, y in line_entries],
+                    colors=[key.color for key, _, _ in line_entries],
+                    radii=rr.Radius.ui_points([key.width / 2 for key, _, _ in line_entries]),
                 ),
                 static=True,
             )
-        for key, x, y in self._legend():
+        for key, x, y in self._legend_positions():
             if key.is_area:
                 name = f"legend/{key.label.replace(' ', '_')}"
                 self.draw_shade(stream, name)
-                self._put_shade(stream, name, (x - 28.0, y - 7.0, x - 10.0, y + 7.0), static=True)
+                self._position_shade(
+                    stream, name, (x - 28.0, y - 7.0, x - 10.0, y + 7.0), static=True
+                )
 
-    def _put_shade(
+    def _position_shade(
         self,
         stream: "RecordingStream",
         name: str,
@@ -356,7 +376,7 @@ class Chart:
         *,
         static: bool = False,
     ) -> None:
-        """Position a shade between left, top, right and bottom on the canvas."""
+        """Move a shaded area to the rectangle (left, top, right, bottom) on the canvas."""
         import rerun as rr
 
         left, top, right, bottom = corners
@@ -368,34 +388,35 @@ class Chart:
             static=static,
         )
 
-    def _legend(self) -> list[tuple[Key, float, float]]:
+    def _legend_positions(self) -> list[tuple[LegendEntry, float, float]]:
         """Return the legend's entries with positions above the frame, aligned to the right."""
         _, top, right, _ = self.frame
         entries = []
         x = right
         for key in reversed(self.legend):
-            x -= _width(key.label)
-            entries.append((key, x, top - _TITLE_RISE))
+            x -= _label_width(key.label)
+            entries.append((key, x, top - _TITLE_DISTANCE))
             x -= 46.0
         return entries[::-1]
 
 
-def number(value: float) -> str:
-    """Return a number as the text of a tick label."""
+def tick_text(value: float) -> str:
+    """Return a number as the text of a tick label, with a true minus sign."""
     return f"{value + 0.0:.9g}".replace("-", "−")  # adding turns −0 into 0
 
 
-def _width(text: str) -> float:
-    return _CHARACTER * len(text)
+def _label_width(text: str) -> float:
+    """Return the approximate width of a text in a label, in points."""
+    return _CHARACTER_WIDTH * len(text)
 
 
 def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return ticks (1, 2 and 5 of each decade) and further grid lines of a logarithmic axis.
+    """Return ticks (1, 2 and 5 in each decade) and further grid lines of a logarithmic axis.
 
     Parameters
     ----------
     first, last
-        Ends of the axis, above 0.
+        Values at both ends of the axis, above 0.
 
     Examples
     --------
@@ -404,23 +425,23 @@ def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, 
     (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
     """
     exponents = range(int(np.floor(np.log10(first))), int(np.ceil(np.log10(last))) + 1)
-    found = [
+    multiples = [
         (digit, float(f"{digit}e{exponent}")) for exponent in exponents for digit in range(1, 10)
     ]
-    inside = [(digit, value) for digit, value in found if first <= value <= last]
+    multiples_in_range = [(digit, value) for digit, value in multiples if first <= value <= last]
     return (
-        tuple(value for digit, value in inside if digit in (1, 2, 5)),
-        tuple(value for digit, value in inside if digit not in (1, 2, 5)),
+        tuple(value for digit, value in multiples_in_range if digit in (1, 2, 5)),
+        tuple(value for digit, value in multiples_in_range if digit not in (1, 2, 5)),
     )
 
 
 def steps(first: float, last: float, most: int) -> tuple[float, ...]:
-    """Return at most `most` round values from `first` to `last`.
+    """Return at most `most` evenly spaced round values from `first` to `last`, for axis ticks.
 
     Parameters
     ----------
     first, last
-        Ends of the axis.
+        Values at both ends of the axis.
     most
         Largest number of values.
 
@@ -430,11 +451,15 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
     >>> steps(1.0, 47.0, 6)
     (10.0, 20.0, 30.0, 40.0)
     """
-    least = (last - first) / most
-    scale = 10.0 ** np.floor(np.log10(least))
-    step = next(digit * scale for digit in (1.0, 2.0, 5.0, 10.0) if digit * scale >= least)
-    begin, end = np.ceil(first / step - 1e-9), np.floor(last / step + 1e-9)
-    values = step * np.arange(begin, end + 1) + 0.0  # adding turns −0 into 0
+    least_step = (last - first) / most
+    power_of_ten = 10.0 ** np.floor(np.log10(least_step))
+    step = next(
+        digit * power_of_ten
+        for digit in (1.0, 2.0, 5.0, 10.0)
+        if digit * power_of_ten >= least_step
+    )
+    first_index, last_index = np.ceil(first / step - 1e-9), np.floor(last / step + 1e-9)
+    values = step * np.arange(first_index, last_index + 1) + 0.0  # adding turns −0 into 0
     return tuple(float(f"{value:.9g}") for value in values)
 
 
@@ -443,14 +468,15 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thinning:
-    """Min/max decimation of curves on a grid: keeps the extremes of each group of points.
+    """Decimation of a curve that retains the least and greatest value of each group of points.
 
     Attributes
     ----------
     grid
-        Increasing values, shape (n,).
+        Increasing values on the horizontal axis of the curve's points, shape (n,).
     groups
-        Indices into the grid, shape (k, m); each group is padded with its first index.
+        Indices of the points in each group, shape (k, m). Smaller groups are padded with their
+        first index.
     """
 
     grid: Real
@@ -458,14 +484,14 @@ class Thinning:
 
     @classmethod
     def logarithmic(cls, grid: Real, first: float, last: float, groups: int) -> "Thinning":
-        """Return the decimation with groups of equal frequency ratio, without empty groups.
+        """Return the decimation with groups of equal frequency ratio; empty groups are omitted.
 
         Parameters
         ----------
         grid
-            Frequencies of the points, increasing.
+            Frequencies of the points, increasing, shape (n,).
         first, last
-            Ends of the band; points outside are dropped.
+            Lowest and highest frequency. Points outside are dropped.
         groups
             Largest number of groups.
         """
@@ -474,30 +500,31 @@ class Thinning:
         edges[-1] = np.nextafter(last, np.inf)
         bounds = np.unique(np.searchsorted(grid, edges))
         starts, sizes = bounds[:-1], np.diff(bounds)
-        offsets = np.arange(sizes.max(initial=1))  # also without any group
+        offsets = np.arange(sizes.max(initial=1))  # 1 if there is no group
         return cls(grid, starts[:, None] + np.where(offsets < sizes[:, None], offsets, 0))
 
     def strips(self, values: Real) -> list[Real]:
-        """Return the curve as strips (p, 2) of grid point and value, interrupted at NaN.
+        """Return the decimated curve as strips (p, 2) of grid value and curve value.
 
-        The strips have the least and the greatest value of every group at their grid points.
+        Each strip contains the least and the greatest value of every group. A new strip begins
+        after each gap of NaN.
 
         Parameters
         ----------
         values
-            Values on the grid, shape (n,).
+            Values of the curve on the grid, shape (n,); NaN if unknown.
         """
-        rows, stored = self._extremes(values)
-        if rows.size == 0:
+        group_indices, extreme_indices = self._extremes(values)
+        if group_indices.size == 0:
             return []
-        breaks = np.flatnonzero(np.diff(rows) > 1) + 1
+        strip_starts = np.flatnonzero(np.diff(group_indices) > 1) + 1
         return [
-            np.column_stack([self.grid[part], values[part]])
-            for part in map(np.unique, np.split(stored, breaks))
+            np.column_stack([self.grid[indices], values[indices]])
+            for indices in map(np.unique, np.split(extreme_indices, strip_starts))
         ]
 
     def extremes(self, values: Real) -> npt.NDArray[np.intp]:
-        """Return the grid indices of the least and the greatest value of every group, in order.
+        """Return the grid indices of the least and greatest value of every group, in order.
 
         Parameters
         ----------
@@ -512,21 +539,21 @@ class Thinning:
         Parameters
         ----------
         values
-            As for `extremes`.
+            Values on the grid, shape (n,); NaN if unknown.
         """
-        rows, _ = self._extremes(values)
-        after = np.flatnonzero(np.diff(rows) > 1)
-        first = self.groups[rows[after] + 1, 0]
-        last = self.groups[rows[after + 1] - 1].max(axis=1)
-        return np.unique(np.concatenate([first, last]))
+        group_indices, _ = self._extremes(values)
+        before_gaps = np.flatnonzero(np.diff(group_indices) > 1)
+        first_indices = self.groups[group_indices[before_gaps] + 1, 0]
+        last_indices = self.groups[group_indices[before_gaps + 1] - 1].max(axis=1)
+        return np.unique(np.concatenate([first_indices, last_indices]))
 
     def _extremes(self, values: Real) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-        """Return the groups with known values, and the grid indices of both extremes of each."""
-        grouped = values[self.groups]
-        unknown = np.isnan(grouped)
-        rows = np.flatnonzero(~unknown.all(axis=1))
-        grouped, unknown = grouped[rows], unknown[rows]
-        least = np.where(unknown, np.inf, grouped).argmin(axis=1)
-        greatest = np.where(unknown, -np.inf, grouped).argmax(axis=1)
-        pair = np.stack([least, greatest], axis=1)
-        return rows, np.take_along_axis(self.groups[rows], pair, axis=1)
+        """Return the indices of groups with known values, and of both extremes of each group."""
+        grouped_values = values[self.groups]
+        is_unknown = np.isnan(grouped_values)
+        group_indices = np.flatnonzero(~is_unknown.all(axis=1))
+        grouped_values, is_unknown = grouped_values[group_indices], is_unknown[group_indices]
+        least_columns = np.where(is_unknown, np.inf, grouped_values).argmin(axis=1)
+        greatest_columns = np.where(is_unknown, -np.inf, grouped_values).argmax(axis=1)
+        columns = np.stack([least_columns, greatest_columns], axis=1)
+        return group_indices, np.take_along_axis(self.groups[group_indices], columns, axis=1)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from rigd.beam import Beam, Damping, transfer
 from rigd.session.layout import Status
 from rigd.spectral import RunningEstimate, RunningResponse, segmentation_of
-from rigd.view.chart import Axis, Chart, Key, Thinning, decades, steps
+from rigd.view.chart import Axis, Chart, LegendEntry, Thinning, decades, steps
 from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE
 
 if TYPE_CHECKING:
@@ -21,130 +21,158 @@ if TYPE_CHECKING:
 
 
 Real = npt.NDArray[np.float64]
+"""Array of real numbers."""
 Complex = npt.NDArray[np.complex128]
+"""Array of complex numbers."""
 
 
 # Estimate
 
-_HELD: Final = Status.ANGLE_STALE | Status.WRENCH_STALE
+_STALE_STATUS: Final = Status.ANGLE_STALE | Status.WRENCH_STALE
+"""Status bits of a sample whose angle or wrench repeats an earlier reading."""
 
 
 class SweepResponse:
-    """Welch estimate of torque over angle, with the default segments of `analyze`.
+    """Running estimate of the frequency response torque over angle in a sweep (Welch's method).
+
+    The segments are the default ones of `analyze`.
 
     Parameters
     ----------
     subject
         The session.
     last_hz
-        Highest frequency of the response.
+        Highest frequency of the estimated response.
     every
-        Divisor of the number of `analyze`'s bins, as far as the segments allow.
+        Divisor of the FFT length that `analyze` uses. The FFT is never shorter than a segment.
     """
 
     def __init__(self, subject: "Subject", last_hz: float, *, every: int = 1) -> None:
         self._first, end = subject.sweep
         samples = end - self._first
-        chosen = segmentation_of(samples, subject.rate_hz)
-        chosen = replace(chosen, nfft=max(chosen.nfft // every, chosen.segment_length))
+        segmentation = segmentation_of(samples, subject.rate_hz)
+        segmentation = replace(
+            segmentation, nfft=max(segmentation.nfft // every, segmentation.segment_length)
+        )
         self._running = RunningResponse(
-            subject.rate_hz, samples, last_hz=last_hz, segmentation=chosen
+            subject.rate_hz, samples, last_hz=last_hz, segmentation=segmentation
         )
         self._at_rest: list[npt.NDArray[np.float64]] = []
         self._rest_rad: float | None = None
 
     def feed(self, samples: npt.NDArray[Any]) -> None:
-        """Add samples (n,) of ``SAMPLE_DTYPE``, in order; there may be gaps."""
+        """Add samples (n,) of ``SAMPLE_DTYPE`` to the estimate.
+
+        The samples are in order. Gaps are allowed.
+        """
         ticks = samples["tick"].astype(np.int64) - self._first
-        before = int(np.searchsorted(ticks, 0))
-        if before:
-            self._at_rest.append(samples["angle_rad"][:before].copy())
-        if before == len(samples):
+        samples_before_sweep = int(np.searchsorted(ticks, 0))
+        if samples_before_sweep:
+            self._at_rest.append(samples["angle_rad"][:samples_before_sweep].copy())
+        if samples_before_sweep == len(samples):
             return
         # A constant angle causes no torque of the beam, but would leak into the lowest bins.
         if self._rest_rad is None:
             self._rest_rad = float(np.median(np.concatenate(self._at_rest or [np.zeros(1)])))
             self._at_rest = []
-        swept = samples[before:]
+        sweep_samples = samples[samples_before_sweep:]
         # A stale reading is not a measurement: its gap is filled like any other.
-        known = np.where(swept["status"] & _HELD, np.nan, 1.0)
+        fresh_or_nan = np.where(sweep_samples["status"] & _STALE_STATUS, np.nan, 1.0)
         self._running.feed(
-            ticks[before:],
-            swept["angle_reference_rad"] - self._rest_rad,
-            (swept["angle_rad"] - self._rest_rad) * known,
-            swept["coupling_torque_nm"],
+            ticks[samples_before_sweep:],
+            sweep_samples["angle_reference_rad"] - self._rest_rad,
+            (sweep_samples["angle_rad"] - self._rest_rad) * fresh_or_nan,
+            sweep_samples["coupling_torque_nm"],
         )
 
     def estimate(self) -> RunningEstimate | None:
-        """Return the estimate so far; None while there are too few samples."""
+        """Return the response estimated so far; None while there are too few samples."""
         return self._running.estimate()
 
 
 # Frequency response
 
 FIRST_HZ: Final = 0.5
-"""Lowest frequency shown: below it the torque is lower than the sensor's noise."""
+"""Lowest frequency shown. Below it the torque is lower than the sensor's noise."""
 LAST_HZ: Final = 60.0
-"""Highest frequency shown: above the band of the reference paper's chirp and the third mode."""
+"""Highest frequency shown: above the third mode and the band of the reference paper's chirp."""
 
-OVERVIEW_MAGNITUDE: Final = "/overview/magnitude"
-MAGNITUDE: Final = "/frequency_response/magnitude"
-PHASE: Final = "/frequency_response/phase"
-COHERENCE: Final = "/frequency_response/coherence"
+OVERVIEW_MAGNITUDE_ENTITY: Final = "/overview/magnitude"
+"""Entity path in Rerun of the magnitude's chart in the tab Overview."""
+MAGNITUDE_ENTITY: Final = "/frequency_response/magnitude"
+"""Entity path in Rerun of the magnitude's chart."""
+PHASE_ENTITY: Final = "/frequency_response/phase"
+"""Entity path in Rerun of the phase's chart."""
+COHERENCE_ENTITY: Final = "/frequency_response/coherence"
+"""Entity path in Rerun of the coherence's chart."""
 SIZES: Final = {
-    OVERVIEW_MAGNITUDE: (690.0, 285.0),
-    MAGNITUDE: (1280.0, 374.0),
-    PHASE: (640.0, 274.0),
-    COHERENCE: (640.0, 274.0),
+    OVERVIEW_MAGNITUDE_ENTITY: (690.0, 285.0),
+    MAGNITUDE_ENTITY: (1280.0, 374.0),
+    PHASE_ENTITY: (640.0, 274.0),
+    COHERENCE_ENTITY: (640.0, 274.0),
 }
-"""Width and height of the canvases, in points."""
+"""Width and height of each chart's canvas in points, by entity path."""
 
-MEASURED_KEY: Final = Key("measured", SKY_BLUE)
-UNCERTAIN_KEY: Final = Key("low coherence", GREY)
-"""Key of the measured response with a coherence below `LOW_COHERENCE`."""
-MODEL_KEY: Final = Key("nominal model", ORANGE, width=3.0)
-LAST_KEY: Final = Key("last session", PURPLE)
-"""Key of the response of the last session of the same specimen."""
-COHERENCE_KEY: Final = Key("coherence", GREEN)
-NOT_ESTIMATED_KEY: Final = Key("not estimated", GREY, is_area=True)
-"""Key of the bands that the reference has not excited so far."""
+MEASURED_ENTRY: Final = LegendEntry("measured", SKY_BLUE)
+"""Legend entry of the measured response."""
+UNCERTAIN_ENTRY: Final = LegendEntry("low coherence", GREY)
+"""Legend entry of the measured response with a coherence below `LOW_COHERENCE`."""
+MODEL_ENTRY: Final = LegendEntry("nominal model", ORANGE, width=3.0)
+"""Legend entry of the response of the nominal model."""
+LAST_SESSION_ENTRY: Final = LegendEntry("last session", PURPLE)
+"""Legend entry of the response of the last session of the same specimen."""
+COHERENCE_ENTRY: Final = LegendEntry("coherence", GREEN)
+"""Legend entry of the coherence."""
+NOT_ESTIMATED_ENTRY: Final = LegendEntry("not estimated", GREY, is_area=True)
+"""Legend entry of the frequency bands that the reference has not excited so far."""
 
 LOW_COHERENCE: Final = 0.8
-"""Coherence below which a response is drawn grey: the random error of its magnitude is then above
-0.35/√n, with n averages (J. S. Bendat and A. G. Piersol, Random Data, 4th ed., Table 9.6)."""
-NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
-NO_COHERENCE: Final = "Of a single segment there is no coherence"
+"""Coherence below which a response is drawn grey.
 
-_NARROW: Final = 700.0
-"""Width up to which a chart cannot hold a legend of five entries, in points."""
-_SHADES: Final = ("not_estimated_below", "not_estimated_above")
-_GROUPS: Final = 200
-"""Groups of points along the axis, each drawn as two points: enough for the pixels of a view."""
-_PHASE_FROM_DEG: Final = -90.0
-"""Start of the phase axis: phases near 0 and 180 degrees do not wrap here."""
+The random error of its magnitude is then above 0.35/√n, with n averages (J. S. Bendat and A. G.
+Piersol, Random Data, 4th ed., Table 9.6)."""
+NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
+"""Text in the coherence chart before the second segment, which the coherence needs."""
+NO_COHERENCE: Final = "Of a single segment there is no coherence"
+"""Text in the coherence chart of a finished response from a single segment."""
+
+_MOST_WIDTH_FOR_FOUR_ENTRIES: Final = 700.0
+"""Width in points above which a chart's legend has room for a fifth entry."""
+_SHADE_NAMES: Final = ("not_estimated_below", "not_estimated_above")
+"""Names of the shaded areas over the bands that are not estimated."""
+_FREQUENCY_GROUPS: Final = 200
+"""Number of groups of points along the frequency axis, each drawn as two points.
+
+This is enough for the pixels of a view."""
+_PHASE_AXIS_START_DEG: Final = -90.0
+"""Start of the phase axis in degrees, such that phases near 0 and 180 degrees do not wrap."""
 PHASE_AXIS: Final = Axis(
     "Phase (degrees)",
-    _PHASE_FROM_DEG,
-    _PHASE_FROM_DEG + 360.0,
+    _PHASE_AXIS_START_DEG,
+    _PHASE_AXIS_START_DEG + 360.0,
     (-90.0, 0.0, 90.0, 180.0, 270.0),
 )
+"""Vertical axis of the phase."""
 COHERENCE_AXIS: Final = Axis("Coherence (1)", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0))
-_STEP_DB: Final = 20.0
+"""Vertical axis of the coherence."""
+_MAGNITUDE_TICK_STEP_DB: Final = 20.0
+"""Distance between ticks of a magnitude axis, in dB."""
 _MODEL_STEP_HZ: Final = 0.01
-_FAINT: Final = Damping(zeta=3e-4)
-"""Damping for the upper end of the magnitude axis if the beam's is unknown."""
-_DEEPEST_DB: Final = 140.0
-"""Largest range of a magnitude axis."""
+"""Distance between the frequencies of the nominal model's response."""
+_ASSUMED_DAMPING: Final = Damping(zeta=3e-4)
+"""Damping from which the magnitude axis is computed if the beam's damping is unknown."""
+_MOST_MAGNITUDE_RANGE_DB: Final = 140.0
+"""Largest range of a magnitude axis, in dB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LastResponse:
-    """Response of an earlier session.
+    """Frequency response of an earlier session of the specimen.
 
     Attributes
     ----------
     session, specimen
-        Names of that session and of its specimen.
+        Name of the earlier session and name of its specimen.
     frequency_hz
         Increasing frequencies, shape (n,).
     response
@@ -158,173 +186,209 @@ class LastResponse:
 
 
 @dataclass(frozen=True, slots=True)
-class _Graph:
+class _ResponseCurve:
+    """Measured curve in one chart of the frequency response."""
+
     chart: Chart
-    key: Key
+    """Chart that contains the curve."""
+    key: LegendEntry
+    """Label and style of the curve."""
     values: Callable[["FrequencyResponse"], Real]
-    of_response: Callable[[Complex], Real] | None = None
+    """Function from an estimated response to the values of the curve."""
+    from_complex: Callable[[Complex], Real] | None = None
+    """Function from complex values to the values of the curve; None for the coherence."""
 
 
 class ResponseCharts:
-    """The charts of one session's frequency response.
+    """Charts of a session's frequency response: magnitude, phase and coherence.
 
     Parameters
     ----------
     subject
         The session.
     last
-        Response of the last session, drawn beneath the present one.
+        Response of the last session of the specimen, which is drawn beneath the present one; None
+        if there is none.
     """
 
     def __init__(self, subject: "Subject", last: LastResponse | None = None) -> None:
         frequency_hz, model = nominal_response(
-            subject.beam, subject.damping or _FAINT, subject.tool_inertia_kg_m2
+            subject.beam, subject.damping or _ASSUMED_DAMPING, subject.tool_inertia_kg_m2
         )
         model_db = magnitude_db(model)
         magnitude = magnitude_axis(model_db.min() - 3.0, model_db.max() + 6.0)
-        known = subject.damping is not None
-        extra_keys = ((MODEL_KEY,) if known else ()) + ((LAST_KEY,) if last else ())
-        keys = (MEASURED_KEY, UNCERTAIN_KEY, *extra_keys)
+        damping_is_known = subject.damping is not None
+        extra_keys = ((MODEL_ENTRY,) if damping_is_known else ()) + (
+            (LAST_SESSION_ENTRY,) if last else ()
+        )
+        keys = (MEASURED_ENTRY, UNCERTAIN_ENTRY, *extra_keys)
         # The title of the view names the quantity.
-        short = replace(magnitude, title="dB re 1 N·m/rad")
-        self._graphs = (
+        axis_with_short_title = replace(magnitude, title="dB re 1 N·m/rad")
+        self._response_curves = (
             *(
-                _Graph(_chart(entity, axis, *keys), MEASURED_KEY, _magnitude_db, magnitude_db)
-                for entity, axis in ((OVERVIEW_MAGNITUDE, short), (MAGNITUDE, magnitude))
+                _ResponseCurve(
+                    _chart(entity, axis, *keys), MEASURED_ENTRY, _magnitude_db, magnitude_db
+                )
+                for entity, axis in (
+                    (OVERVIEW_MAGNITUDE_ENTITY, axis_with_short_title),
+                    (MAGNITUDE_ENTITY, magnitude),
+                )
             ),
-            _Graph(_chart(PHASE, PHASE_AXIS, *keys), MEASURED_KEY, _phase_deg, phase_deg),
-            _Graph(_chart(COHERENCE, COHERENCE_AXIS, COHERENCE_KEY), COHERENCE_KEY, _coherence),
+            _ResponseCurve(
+                _chart(PHASE_ENTITY, PHASE_AXIS, *keys), MEASURED_ENTRY, _phase_deg, phase_deg
+            ),
+            _ResponseCurve(
+                _chart(COHERENCE_ENTITY, COHERENCE_AXIS, COHERENCE_ENTRY),
+                COHERENCE_ENTRY,
+                _coherence,
+            ),
         )
         self._delays_s = {
             "input_delay_s": subject.angle_delay_s,
             "output_delay_s": subject.torque_delay_s,
         }
         thinning = response_thinning(frequency_hz)
-        of_magnitude = thinning.strips(model_db)
+        magnitude_strips = thinning.strips(model_db)
         self._models = (
             {
-                OVERVIEW_MAGNITUDE: of_magnitude,
-                MAGNITUDE: of_magnitude,
-                PHASE: thinning.strips(phase_deg(model)),
+                OVERVIEW_MAGNITUDE_ENTITY: magnitude_strips,
+                MAGNITUDE_ENTITY: magnitude_strips,
+                PHASE_ENTITY: thinning.strips(phase_deg(model)),
             }
-            if known
+            if damping_is_known
             else {}
         )
-        self._lasts = {} if last is None else _curves_of(last, self._graphs)
+        self._last_curves = (
+            {} if last is None else _last_response_curves(last, self._response_curves)
+        )
         self._thinning: Thinning | None = None
         self._t_ns = 0
-        self._known: tuple[Real, Complex] | None = None
+        self._last_update: tuple[Real, Complex] | None = None
         self._curves: dict[str, Sequence[Real]] = {}
         self._uncertain: dict[str, Sequence[Real]] = {}
         self._excited_hz = (LAST_HZ, LAST_HZ)
         self._note = NO_COHERENCE_YET
 
     def chart(self, entity: str) -> Chart:
-        """Return the chart with an entity path."""
-        return next(graph.chart for graph in self._graphs if graph.chart.entity == entity)
+        """Return the chart with a given entity path."""
+        return next(
+            response_curve.chart
+            for response_curve in self._response_curves
+            if response_curve.chart.entity == entity
+        )
 
     def draw_frames(self, stream: "RecordingStream") -> None:
-        """Draw the static parts of the charts."""
-        for graph in self._graphs:
-            graph.chart.draw_frame(stream)
-            for name in _SHADES:
-                graph.chart.draw_shade(stream, name)
-            if graph.chart.entity in self._models:
-                graph.chart.draw_curve(
-                    stream, "model", self._models[graph.chart.entity], MODEL_KEY, static=True
+        """Send the static parts: frames, nominal model and the last session's response."""
+        for response_curve in self._response_curves:
+            response_curve.chart.draw_frame(stream)
+            for name in _SHADE_NAMES:
+                response_curve.chart.draw_shade(stream, name)
+            if response_curve.chart.entity in self._models:
+                response_curve.chart.draw_curve(
+                    stream,
+                    "model",
+                    self._models[response_curve.chart.entity],
+                    MODEL_ENTRY,
+                    static=True,
                 )
-            if graph.chart.entity in self._lasts:
-                graph.chart.draw_curve(
+            if response_curve.chart.entity in self._last_curves:
+                response_curve.chart.draw_curve(
                     stream,
                     "last",
-                    self._lasts[graph.chart.entity],
-                    LAST_KEY,
+                    self._last_curves[response_curve.chart.entity],
+                    LAST_SESSION_ENTRY,
                     static=True,
                     order=1,
                 )
 
     def update(self, t_ns: int, estimate: "RunningEstimate") -> None:
-        """Update the charts with the response at a time of the session.
+        """Compute the curves of a new estimate, which `draw` then sends.
 
         Parameters
         ----------
         t_ns
             Time since the start of the session.
         estimate
-            Response so far.
+            Response estimated so far.
         """
         response = estimate.response.without_delays(**self._delays_s)
-        grid = response.frequency_hz
-        if self._thinning is None or self._thinning.grid.size != grid.size:
-            self._thinning = response_thinning(grid)
-        excited = estimate.excited
+        frequency_hz = response.frequency_hz
+        if self._thinning is None or self._thinning.grid.size != frequency_hz.size:
+            self._thinning = response_thinning(frequency_hz)
+        is_excited = estimate.excited
         self._t_ns = t_ns
-        self._known = grid, np.where(excited, response.response, np.nan)
-        trusted = excited
+        self._last_update = frequency_hz, np.where(is_excited, response.response, np.nan)
+        is_coherent = is_excited
         if response.coherence is not None:
-            trusted = excited & (response.coherence >= LOW_COHERENCE)
+            is_coherent = is_excited & (response.coherence >= LOW_COHERENCE)
         strips = self._thinning.strips
         self._curves, self._uncertain = {}, {}
-        for graph in self._graphs:
-            values, entity = graph.values(response), graph.chart.entity
+        for response_curve in self._response_curves:
+            values, entity = response_curve.values(response), response_curve.chart.entity
             # The coherence itself is always reliable.
-            reliable = trusted if graph.of_response else excited
-            self._curves[entity] = strips(np.where(reliable, values, np.nan))
-            if graph.of_response:
-                self._uncertain[entity] = strips(np.where(excited, values, np.nan))
-        ends = grid[excited][[0, -1]] if excited.any() else (LAST_HZ, LAST_HZ)
-        self._excited_hz = float(ends[0]), float(ends[1])
-        missing = NO_COHERENCE if estimate.final else NO_COHERENCE_YET
-        self._note = missing if response.coherence is None else ""
+            is_reliable = is_coherent if response_curve.from_complex else is_excited
+            self._curves[entity] = strips(np.where(is_reliable, values, np.nan))
+            if response_curve.from_complex:
+                self._uncertain[entity] = strips(np.where(is_excited, values, np.nan))
+        excited_ends_hz = (
+            frequency_hz[is_excited][[0, -1]] if is_excited.any() else (LAST_HZ, LAST_HZ)
+        )
+        self._excited_hz = float(excited_ends_hz[0]), float(excited_ends_hz[1])
+        missing_text = NO_COHERENCE if estimate.final else NO_COHERENCE_YET
+        self._note = missing_text if response.coherence is None else ""
 
     def draw(self, stream: "RecordingStream") -> None:
-        """Draw the last update, at its time."""
+        """Send the curves that the last `update` computed to Rerun, at their session time."""
         stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
-        for graph in self._graphs:
-            chart = graph.chart
-            if graph.of_response:
+        for response_curve in self._response_curves:
+            chart = response_curve.chart
+            if response_curve.from_complex:
                 # The whole curve lies beneath, so that there is no gap at a change of colour.
-                below = self._uncertain.get(chart.entity, ())
-                chart.draw_curve(stream, "uncertain", below, UNCERTAIN_KEY)
-            curve = self._curves.get(chart.entity, ())
-            chart.draw_curve(stream, "measured", curve, graph.key, order=1)
+                uncertain_curve = self._uncertain.get(chart.entity, ())
+                chart.draw_curve(stream, "uncertain", uncertain_curve, UNCERTAIN_ENTRY)
+            measured_curve = self._curves.get(chart.entity, ())
+            chart.draw_curve(stream, "measured", measured_curve, response_curve.key, order=1)
             ends_hz = (FIRST_HZ, *self._excited_hz, LAST_HZ)
-            for name, first_hz, last_hz in zip(_SHADES, ends_hz[::2], ends_hz[1::2], strict=True):
+            for name, first_hz, last_hz in zip(
+                _SHADE_NAMES, ends_hz[::2], ends_hz[1::2], strict=True
+            ):
                 chart.move_shade(stream, name, first_hz, last_hz)
-        self.chart(COHERENCE).draw_note(stream, self._note, COHERENCE_KEY.color)
+        self.chart(COHERENCE_ENTITY).draw_note(stream, self._note, COHERENCE_ENTRY.color)
 
-    def as_last(self, subject: "Subject") -> LastResponse | None:
-        """Return the last update as the response of an earlier session; None without an update.
+    def as_last_response(self, subject: "Subject") -> LastResponse | None:
+        """Return the last update for comparison with a later session; None without an update.
 
         Parameters
         ----------
         subject
             Session of these charts.
         """
-        if self._known is None:
+        if self._last_update is None:
             return None
-        return LastResponse(subject.name, subject.specimen, *self._known)
+        return LastResponse(subject.name, subject.specimen, *self._last_update)
 
 
-def _curves_of(last: LastResponse, graphs: "Sequence[_Graph]") -> dict[str, Sequence[Real]]:
-    """Return the curves of a response, by the entities of its charts."""
+def _last_response_curves(
+    last: LastResponse, response_curves: "Sequence[_ResponseCurve]"
+) -> dict[str, Sequence[Real]]:
+    """Return the curves of an earlier session's response, by the entity path of their chart."""
     thinning = response_thinning(last.frequency_hz)
     return {
-        graph.chart.entity: thinning.strips(graph.of_response(last.response))
-        for graph in graphs
-        if graph.of_response
+        response_curve.chart.entity: thinning.strips(response_curve.from_complex(last.response))
+        for response_curve in response_curves
+        if response_curve.from_complex
     }
 
 
 def magnitude_db(response: Complex) -> Real:
-    """Return the magnitude in dB re 1 N·m/rad."""
+    """Return the magnitude of complex responses, in dB re 1 N·m/rad."""
     with np.errstate(divide="ignore"):
         magnitude: Real = 20.0 * np.log10(np.abs(response))
     return magnitude
 
 
 def phase_deg(response: Complex) -> Real:
-    """Return the phase in degrees, from −90 to below 270.
+    """Return the phase of complex responses in degrees, from −90 to below 270.
 
     Examples
     --------
@@ -333,19 +397,22 @@ def phase_deg(response: Complex) -> Real:
     >>> print(phase_deg(np.array([1.0, 1j, -1.0, -1j])))
     [  0.  90. 180. -90.]
     """
-    turned: Real = np.mod(np.degrees(np.angle(response)) - _PHASE_FROM_DEG, 360.0)
-    return turned + _PHASE_FROM_DEG
+    phase_from_start: Real = np.mod(np.degrees(np.angle(response)) - _PHASE_AXIS_START_DEG, 360.0)
+    return phase_from_start + _PHASE_AXIS_START_DEG
 
 
 def _magnitude_db(response: "FrequencyResponse") -> Real:
+    """Return the magnitude of an estimated response, in dB re 1 N·m/rad."""
     return magnitude_db(response.response)
 
 
 def _phase_deg(response: "FrequencyResponse") -> Real:
+    """Return the phase of an estimated response, in degrees."""
     return phase_deg(response.response)
 
 
 def _coherence(response: "FrequencyResponse") -> Real:
+    """Return the coherence of an estimated response; NaN if there is none."""
     if response.coherence is None:
         return np.full(response.frequency_hz.shape, np.nan)
     return response.coherence
@@ -354,14 +421,14 @@ def _coherence(response: "FrequencyResponse") -> Real:
 def nominal_response(
     beam: Beam, damping: Damping, tool_inertia_kg_m2: float
 ) -> tuple[Real, Complex]:
-    """Return the model response of a beam at the sensor, in the band that is shown.
+    """Return the nominal response torque over angle at the sensor, in the band that is shown.
 
     Parameters
     ----------
     beam, damping
-        Model of the specimen.
+        Model of the specimen and its damping.
     tool_inertia_kg_m2
-        Inertia between sensor and beam.
+        Inertia between the sensor and the beam, about the motor's axis.
 
     Returns
     -------
@@ -374,44 +441,52 @@ def nominal_response(
 
 
 def response_thinning(frequency_hz: Real) -> Thinning:
-    """Return the decimation of a response for the charts.
+    """Return the decimation of curves over frequency for the charts.
 
     Parameters
     ----------
     frequency_hz
-        Increasing frequencies, shape (n,). Those outside the band of the charts are dropped.
+        Increasing frequencies of the curves' points, shape (n,). Points outside the band of the
+        charts are dropped.
     """
-    return Thinning.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _GROUPS)
+    return Thinning.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _FREQUENCY_GROUPS)
 
 
 def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
-    """Return a magnitude axis in steps of 20 dB, at most 140 dB long.
+    """Return the axis of magnitudes in dB, with ticks every 20 dB and at most 140 dB long.
 
     Parameters
     ----------
     lowest_db, highest_db
-        Range of the values, in dB re 1 N·m/rad. If it is too large, the axis begins above the
-        lowest value.
+        Range of the magnitudes, in dB re 1 N·m/rad. If the range is larger than the axis, the axis
+        begins above the lowest magnitude.
     """
-    last = _STEP_DB * np.ceil(highest_db / _STEP_DB)
-    first = max(_STEP_DB * np.floor(lowest_db / _STEP_DB), last - _DEEPEST_DB)
-    ticks = steps(first, last, max(1, round((last - first) / _STEP_DB)))
+    last = _MAGNITUDE_TICK_STEP_DB * np.ceil(highest_db / _MAGNITUDE_TICK_STEP_DB)
+    first = max(
+        _MAGNITUDE_TICK_STEP_DB * np.floor(lowest_db / _MAGNITUDE_TICK_STEP_DB),
+        last - _MOST_MAGNITUDE_RANGE_DB,
+    )
+    ticks = steps(first, last, max(1, round((last - first) / _MAGNITUDE_TICK_STEP_DB)))
     return Axis("Magnitude (dB re 1 N·m/rad)", float(first), float(last), ticks)
 
 
 def response_chart(
-    entity: str, size: tuple[float, float], band_hz: tuple[float, float], y: Axis, *keys: Key
+    entity: str,
+    size: tuple[float, float],
+    band_hz: tuple[float, float],
+    y: Axis,
+    *keys: LegendEntry,
 ) -> Chart:
     """Return a chart with a logarithmic frequency axis.
 
     Parameters
     ----------
     entity
-        Entity path in Rerun.
+        Entity path of the chart in Rerun.
     size
         Width and height of the canvas, in points.
     band_hz
-        Ends of the frequency axis, above 0.
+        Lowest and highest frequency of the axis, above 0.
     y
         Vertical axis.
     *keys
@@ -422,59 +497,65 @@ def response_chart(
     return Chart(entity, *size, frequency, y, keys)
 
 
-def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
+def _chart(entity: str, y: Axis, *keys: LegendEntry) -> Chart:
+    """Return a chart of the frequency response, with a legend entry for bands without estimate."""
     size = SIZES[entity]
-    if LAST_KEY not in keys or size[0] > _NARROW:  # there is room for another entry
-        keys = (*keys, NOT_ESTIMATED_KEY)
+    if (
+        LAST_SESSION_ENTRY not in keys or size[0] > _MOST_WIDTH_FOR_FOUR_ENTRIES
+    ):  # there is room for another entry
+        keys = (*keys, NOT_ESTIMATED_ENTRY)
     return response_chart(entity, size, (FIRST_HZ, LAST_HZ), y, *keys)
 
 
 # Spectrogram
 
-SPECTROGRAM: Final = "/spectrogram"
+SPECTROGRAM_ENTITY: Final = "/spectrogram"
+"""Entity path of the spectrogram in Rerun."""
 SIZE: Final = (1280.0, 677.0)
-"""Width and height of the canvas, in points."""
+"""Width and height of the spectrogram's canvas, in points."""
 
 LOWEST_DB, HIGHEST_DB = -80.0, 0.0
-"""Levels in dB re 1 N·m at the two ends of the colour scale."""
+"""Levels at the lower and upper end of the colour scale, in dB re 1 N·m."""
 MOST_COLUMNS: Final = 300
-"""Limit of the image's columns: further ones are merged, with the highest level."""
+"""Largest number of columns of the spectrogram.
 
-_BAR = 28.0
+In longer sessions, a column shows the highest level of several time windows."""
+
+_COLOR_BAR_WIDTH = 28.0
 """Width of the colour bar, in points."""
 _BAR_MARGIN = 120.0
 """Margin for the colour bar and its labels, in points."""
 
 
 class SpectrogramChart:
-    """The chart of one session's spectrogram.
+    """Chart of a session's spectrogram, with its colour bar.
 
     Parameters
     ----------
     subject
         The session.
     frequency_hz
-        Frequencies of the levels, shape (m,), evenly spaced from 0.
+        Frequencies of the rows in Hz, shape (m,), evenly spaced from 0.
     step_s
-        Time between columns.
+        Time between adjacent columns.
 
     Attributes
     ----------
     chart
-        Chart of the spectrogram.
+        Axes of the spectrogram.
     """
 
     def __init__(self, subject: "Subject", frequency_hz: Real, step_s: float) -> None:
         duration_s = max(subject.ticks / subject.rate_hz, step_s)
-        self._slot_s = max(step_s, duration_s / MOST_COLUMNS)
-        slots = int(np.ceil(duration_s / self._slot_s))
-        end_s = slots * self._slot_s
-        half_row_hz = float(frequency_hz[1] - frequency_hz[0]) / 2
-        end_hz = float(frequency_hz[-1]) + half_row_hz
-        self._lowest_hz = float(frequency_hz[1]) - half_row_hz
+        self._column_s = max(step_s, duration_s / MOST_COLUMNS)
+        column_count = int(np.ceil(duration_s / self._column_s))
+        end_s = column_count * self._column_s
+        half_bin_hz = float(frequency_hz[1] - frequency_hz[0]) / 2
+        end_hz = float(frequency_hz[-1]) + half_bin_hz
+        self._lowest_hz = float(frequency_hz[1]) - half_bin_hz
         width, height = SIZE
         self.chart = Chart(
-            SPECTROGRAM,
+            SPECTROGRAM_ENTITY,
             width,
             height,
             Axis("Time since the start of the session (s)", 0.0, end_s, steps(0.0, end_s, 15)),
@@ -482,67 +563,69 @@ class SpectrogramChart:
             right=_BAR_MARGIN,
         )
         self._bar = Chart(
-            f"{SPECTROGRAM}/bar",
+            f"{SPECTROGRAM_ENTITY}/bar",
             width,
             height,
             Axis("", 0.0, 1.0, ()),
             Axis("dB re 1 N·m", LOWEST_DB, HIGHEST_DB, steps(LOWEST_DB, HIGHEST_DB, 8)),
-            left=width - _BAR - 24.0,
+            left=width - _COLOR_BAR_WIDTH - 24.0,
         )
         # Row 0 is at the top. The mean torque is omitted, because it is no motion.
-        self._image = np.zeros((frequency_hz.size - 1, slots), np.uint8)
+        self._image = np.zeros((frequency_hz.size - 1, column_count), np.uint8)
         self._filled = 0
         self._t_ns = 0
 
     @property
     def image(self) -> npt.NDArray[np.uint8]:
-        """Levels so far, 0–255, shape (frequencies, times), from the highest frequency down."""
+        """Levels so far as bytes (0–255), shape (frequencies, times), highest frequency first."""
         return self._image[:, : self._filled]
 
     def draw_frame(self, stream: "RecordingStream") -> None:
-        """Draw the static parts: the axes and the colour bar."""
+        """Send the static parts of the chart: the axes and the colour bar."""
         corners = self.chart.to_canvas(
             [0.0, self.chart.x.last], [self._lowest_hz, self.chart.y.last]
         )
-        _position_image(stream, f"{SPECTROGRAM}/levels", corners, self._image.shape)
+        _position_image(stream, f"{SPECTROGRAM_ENTITY}/levels", corners, self._image.shape)
         corners = self._bar.to_canvas([0.0, 1.0], [LOWEST_DB, HIGHEST_DB])
         bar = np.arange(255, -1, -1, dtype=np.uint8)[:, None]
-        _position_image(stream, f"{SPECTROGRAM}/colors", corners, bar.shape)
-        _send_image(stream, f"{SPECTROGRAM}/colors", bar, static=True)
+        _position_image(stream, f"{SPECTROGRAM_ENTITY}/colors", corners, bar.shape)
+        _send_image(stream, f"{SPECTROGRAM_ENTITY}/colors", bar, static=True)
         self.chart.draw_frame(stream)
         self._bar.draw_frame(stream)
 
     def update(self, t_ns: int, columns: Sequence[tuple[float, Real]]) -> None:
-        """Add columns of the spectrogram.
+        """Add columns to the spectrogram, which `draw` then sends.
 
         Parameters
         ----------
         t_ns
             Time since the start of the session.
         columns
-            Middle of each column's window in s, with its levels (m,) in dB re 1 N·m.
+            Time in s of the middle of each column's window, and the column's levels (m,) in dB re 1
+            N·m.
         """
         self._t_ns = t_ns
         for time_s, level_db in columns:
-            slot = min(max(int(time_s / self._slot_s), 0), self._image.shape[1] - 1)
+            column_index = min(max(int(time_s / self._column_s), 0), self._image.shape[1] - 1)
             fraction = (level_db[:0:-1] - LOWEST_DB) / (HIGHEST_DB - LOWEST_DB)
             column = (255.0 * np.clip(fraction, 0.0, 1.0)).astype(np.uint8)
-            np.maximum(self._image[:, slot], column, out=self._image[:, slot])
-            self._filled = max(self._filled, slot + 1)
+            np.maximum(self._image[:, column_index], column, out=self._image[:, column_index])
+            self._filled = max(self._filled, column_index + 1)
 
     def draw(self, stream: "RecordingStream") -> None:
-        """Draw the spectrogram so far."""
+        """Send the columns of the spectrogram so far to Rerun."""
         if self._filled:
             stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
-            _send_image(stream, f"{SPECTROGRAM}/levels", self.image)
+            _send_image(stream, f"{SPECTROGRAM_ENTITY}/levels", self.image)
 
 
 def _position_image(
     stream: "RecordingStream", entity: str, corners: Real, shape: tuple[int, ...]
 ) -> None:
-    """Log position and colour map of an image of levels (0–255).
+    """Send the position and colour map of an image of levels (0–255).
 
-    `corners` has its bottom left and top right on the canvas, (2, 2); `shape` its rows and columns.
+    `corners` contains the bottom left and the top right corner on the canvas, shape (2, 2). `shape`
+    contains the number of rows and columns.
     """
     import rerun as rr
 
@@ -564,6 +647,7 @@ def _position_image(
 def _send_image(
     stream: "RecordingStream", entity: str, levels: npt.NDArray[np.uint8], *, static: bool = False
 ) -> None:
+    """Send an image of levels (0–255) to Rerun."""
     import rerun as rr
 
     rows, columns = levels.shape

@@ -1,7 +1,7 @@
 """Plots over time: their curves, units and colours.
 
 Colours are red, green and blue from 0 to 255. Those of Okabe and Ito (2008) are distinguishable
-with any colour vision. The ones used here contrast with Rerun's dark and light backgrounds.
+with any colour vision. The colours used here contrast with Rerun's dark and light backgrounds.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 # Colours
 
 Color = tuple[int, int, int]
+"""Colour as red, green and blue from 0 to 255."""
 
 ORANGE: Color = (230, 159, 0)
 SKY_BLUE: Color = (86, 180, 233)
@@ -37,26 +38,27 @@ Records = npt.NDArray[Any]
 """Structured array (n,) with a field ``t_ns``."""
 
 Values = npt.NDArray[np.float64]
+"""Array of plotted values, shape (n,) or (n, curves)."""
 
 APPLICATION_ID: Final = "rigd"
-"""Name of the application, for which Rerun stores one layout."""
+"""Name of the application in Rerun, which stores one window layout for each name."""
 
 TIMELINE: Final = "session_time"
-"""Timeline of the time since the start of the session, from ``t_ns``."""
+"""Name in Rerun of the timeline of the time since the start of the session, from ``t_ns``."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlotCurve:
-    """One curve of a plot.
+    """Curve of a plot over time: label, style and values.
 
     Attributes
     ----------
     label
         Name in the legend, with its unit.
     color
-        Color of the line.
+        Colour of the line.
     values
-        Function from records (n,) to values (n,).
+        Function from records (n,) to the curve's values (n,).
     width
         Width of the line, in points.
     """
@@ -69,21 +71,21 @@ class PlotCurve:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Curves over time with a common axis.
+    """Plot over time: curves with a common vertical axis.
 
     Attributes
     ----------
     component
-        Component name of the values in Rerun, which ends in the unit.
+        Component name of the plotted values in Rerun, which ends in the unit.
     title
         Title of the axis, with its unit.
     curves
         Curves from the lowest to the topmost.
     span
-        Ends of a fixed axis; None: the axis fits the values.
+        Ends of a fixed axis; None if the axis follows the values.
     least_span
-        Least length of the axis, in the unit of the curves, so that noise is not drawn as large as
-        a signal.
+        Least length of the axis in the unit of the curves, so that noise is not drawn as large as a
+        signal.
     """
 
     component: str
@@ -95,15 +97,15 @@ class Plot:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Plots whose values come from the same records.
+    """Group of plots whose values come from the same kind of records.
 
     Attributes
     ----------
     entity
-        Entity path of the values in Rerun. All plots have the same, because the cost of sending
-        depends on the number of entities.
+        Entity path of all values in Rerun. The plots have the same entity, because the cost of
+        sending depends on the number of entities.
     plots
-        Plots of each record.
+        Plots that each record has values for.
     """
 
     entity: str
@@ -111,11 +113,11 @@ class Source:
 
     @property
     def ticks(self) -> str:
-        """Entity path in Rerun of the invisible points that extend the axes."""
+        """Entity path in Rerun of the invisible points that extend the plots' axes."""
         return f"{self.entity}/ticks"
 
     def columns(self, records: Records) -> dict[str, Values]:
-        """Return values (n, curves of the plot) by the plot's component, from records (n,)."""
+        """Return the values (n, curves) of each plot from records (n,), by component name."""
         return {
             plot.component: np.column_stack([curve.values(records) for curve in plot.curves])
             for plot in self.plots
@@ -128,18 +130,18 @@ def send_columns(
     t_ns: npt.NDArray[np.int64],
     columns: Mapping[str, Values],
 ) -> None:
-    """Send values to an entity.
+    """Send values over time to an entity in Rerun.
 
     Parameters
     ----------
     stream
-        Stream to send to.
+        Recording to send to.
     entity
         Entity path in Rerun.
     t_ns
-        (n,) times since the start of the session.
+        Times since the start of the session, shape (n,).
     columns
-        Values (n, k) at these times, by component.
+        Values (n, k) at these times, by component name.
     """
     import rerun as rr
 
@@ -150,20 +152,20 @@ def send_columns(
 
 
 def _column(component: str, values: Values) -> "ComponentColumn":
-    """Return values (n, k) as Rerun's column of k scalars per row."""
+    """Return values (n, k) in the form that Rerun stores, with k scalars in each row."""
     import rerun as rr
 
-    rows, width = values.shape
-    batch = rr.components.ScalarBatch(values.ravel())
+    row_count, values_per_row = values.shape
+    scalar_batch = rr.components.ScalarBatch(values.ravel())
     return rr.ComponentColumn(
-        rr.ComponentDescriptor(component, component_type=batch.component_type()),
-        batch,
-        offsets=np.arange(0, rows * width + 1, width, dtype=np.int32),
+        rr.ComponentDescriptor(component, component_type=scalar_batch.component_type()),
+        scalar_batch,
+        offsets=np.arange(0, row_count * values_per_row + 1, values_per_row, dtype=np.int32),
     )
 
 
 def _axes(field: str, symbol: str, unit: str) -> tuple[PlotCurve, ...]:
-    """Return the curves of the sensor's three axes; `field` is a pattern such as ``f{}_n``."""
+    """Return the curves of the sensor's three axes. `field` is a name pattern such as ``f{}_n``."""
     return tuple(
         PlotCurve(f"{symbol}{axis} ({unit})", color, itemgetter(field.format(axis)))
         for axis, color in zip("xyz", (ORANGE, SKY_BLUE, PURPLE), strict=True)
@@ -180,6 +182,7 @@ ANGLE = Plot(
     ),
     least_span=4.0,
 )
+"""Plot of the motor's measured angle and its reference."""
 TRACKING_ERROR = Plot(
     "tracking_error_mrad",
     "Tracking error, reference − measured (mrad)",
@@ -192,22 +195,27 @@ TRACKING_ERROR = Plot(
     ),
     least_span=2.0,
 )
+"""Plot of the difference of reference and measured angle."""
 COUPLING_TORQUE = Plot(
     "coupling_torque_nm",
     "Coupling torque, tared (N·m)",
     (PlotCurve("coupling torque (N·m)", GREEN, lambda r: r["coupling_torque_nm"]),),
     least_span=0.1,
 )
+"""Plot of the torque between motor and beam."""
 TORQUE_COMMAND = Plot(
     "torque_command_nm",
     "Torque command, after limits (N·m)",
     (PlotCurve("torque command (N·m)", PURPLE, lambda r: r["torque_command_nm"]),),
     least_span=0.1,
 )
+"""Plot of the torque that the motor is commanded to apply."""
 FORCES = Plot("forces_n", "Forces at the sensor (N)", _axes("f{}_n", "F", "N"), least_span=1.0)
+"""Plot of the three forces at the sensor."""
 TORQUES = Plot(
     "torques_nm", "Torques at the sensor (N·m)", _axes("t{}_nm", "T", "N·m"), least_span=0.1
 )
+"""Plot of the three torques at the sensor."""
 LOOP = Plot(
     "loop_us",
     "Wake-up latency and execution time of the loop (µs)",
@@ -217,11 +225,12 @@ LOOP = Plot(
     ),
     least_span=100.0,
 )
+"""Plot of the control loop's wake-up latency and execution time."""
 SIGNALS = Source(
     "/signals",
     (ANGLE, TRACKING_ERROR, COUPLING_TORQUE, TORQUE_COMMAND, FORCES, TORQUES, LOOP),
 )
-"""Plots drawn from samples."""
+"""Plots of the samples."""
 
 AGES = Plot(
     "ages_ms",
@@ -232,8 +241,9 @@ AGES = Plot(
     ),
     least_span=1.0,
 )
+"""Plot of the age of angle and wrench readings."""
 READINGS = Source("/readings", (AGES,))
-"""Plots drawn from timings."""
+"""Plots of the readings' timings."""
 
 FAULTY_TICKS = Plot(
     "faulty_ticks",
@@ -245,6 +255,7 @@ FAULTY_TICKS = Plot(
     ),
     least_span=10.0,
 )
+"""Plot of the number of missed, late and lost ticks."""
 BACKLOG = Plot(
     "backlog_samples",
     "Backlog of the recorder, dropped by the viewer (samples)",
@@ -254,32 +265,37 @@ BACKLOG = Plot(
     ),
     least_span=100.0,
 )
+"""Plot of samples that the recorder has not written yet and that the viewer dropped."""
 BUS_LOAD = Plot(
     "bus_load_percent",
     "Bus load (%)",
     (PlotCurve("bus load (%)", SKY_BLUE, lambda r: r["bus_load_percent"]),),
     span=(0.0, 105.0),
 )
+"""Plot of the load of the bus."""
 BUS_ERRORS = Plot(
     "bus_errors",
     "Bus errors since the devices were connected (count)",
     (PlotCurve("bus errors (count)", VERMILION, lambda r: r["bus_errors"]),),
     least_span=10.0,
 )
+"""Plot of the number of bus errors."""
 SENSOR_STATUS = Plot(
     "sensor_status",
     "Status word of the sensor (0: OK)",
     (PlotCurve("sensor status (word)", PURPLE, lambda r: r["sensor_status"]),),
 )
+"""Plot of the sensor's status word."""
 DISK = Plot(
     "disk_free_gb",
     "Free on the disk (GB)",
     (PlotCurve("free on the disk (GB)", GREEN, lambda r: 1e-3 * r["disk_free_mb"]),),
     least_span=1.0,
 )
+"""Plot of the free disk space."""
 OF_A_BUS: Final = frozenset(plot.component for plot in (BUS_LOAD, BUS_ERRORS, SENSOR_STATUS))
-"""Components of the plots that have no values without a bus."""
+"""Component names of the plots that have values only with a bus."""
 OF_REAL_TIME: Final = frozenset(plot.component for plot in (LOOP, AGES))
-"""Components of the plots that have no values with the virtual clock."""
+"""Component names of the plots that have no values with the virtual clock of a simulation."""
 HEALTH = Source("/health", (FAULTY_TICKS, BACKLOG, BUS_LOAD, BUS_ERRORS, SENSOR_STATUS, DISK))
-"""Plots drawn from health records."""
+"""Plots of the health readings."""

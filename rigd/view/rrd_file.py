@@ -1,4 +1,4 @@
-"""Rerun files, and the environment of Rerun's SDK.
+"""Rerun files (*.rrd), and the environment variables of Rerun's SDK.
 
 This module is quick to import, because the command line checks a file before it draws anything.
 """
@@ -18,16 +18,18 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 SUFFIX: Final = ".rrd"
-"""Suffix by which Rerun's viewer recognises its files."""
+"""File name suffix by which Rerun's viewer recognises its files."""
 
-_MAGIC: Final = b"RRF"
-_TRIAL_BYTES: Final = 1 << 20
-_OS_ERROR: Final = re.compile(r"os error (\d+)")
-"""Pattern of the system's error number in messages of the SDK."""
+_RRD_FIRST_BYTES: Final = b"RRF"
+"""First bytes of every Rerun file."""
+_TRIAL_WRITE_BYTES: Final = 1 << 20
+"""Number of bytes that are written to find out why a file cannot grow."""
+_OS_ERROR_PATTERN: Final = re.compile(r"os error (\d+)")
+"""Pattern of the operating system's error number in messages of Rerun's SDK."""
 
 
 def without_settings(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return an environment without the variables of Rerun, such as ``RERUN=off``."""
+    """Return an environment without Rerun's variables, such as ``RERUN=off``."""
     return {
         name: value
         for name, value in environment.items()
@@ -36,9 +38,10 @@ def without_settings(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def settle_sdk() -> None:
-    """Prepare this process's environment for the SDK; call it before the SDK is imported.
+    """Prepare the environment of this process for Rerun's SDK, before the SDK is imported.
 
-    It silences the SDK's log, because the callers report a lost server or a full disk themselves.
+    Rerun's variables are removed. The SDK's log is switched off, because the callers report a lost
+    server or a full disk themselves.
     """
     for name in os.environ.keys() - without_settings(os.environ).keys():
         del os.environ[name]
@@ -46,12 +49,14 @@ def settle_sdk() -> None:
 
 
 class RrdFileError(FailureError):
-    """A Rerun file cannot be written, or a file is no Rerun file."""
+    """Error: a Rerun file cannot be written, or a file is not a Rerun file."""
 
 
 @contextlib.contextmanager
 def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
-    """Provide a recording that is written to a file, which gets its name when it is complete.
+    """Provide a recording that is written to a new file, as a context manager.
+
+    The file gets its name when the recording is complete.
 
     Raises
     ------
@@ -65,20 +70,20 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
     from rigd.view.plots import APPLICATION_ID
 
     check_new(path)
-    part = path.with_name(f".rigd-{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
+    temporary_path = path.with_name(f".rigd-{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
     stream = rr.RecordingStream(APPLICATION_ID, recording_id=str(uuid.uuid4()))
     try:
-        with _write_errors(path, part):
+        with _translate_write_errors(path, temporary_path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            stream.save(part)
+            stream.save(temporary_path)
         yield stream
-        with _write_errors(path, part):
+        with _translate_write_errors(path, temporary_path):
             stream.flush()
             stream.disconnect()
-            rename_new(part, path)
+            rename_new(temporary_path, path)
     finally:
         stream.disconnect()
-        part.unlink(missing_ok=True)
+        temporary_path.unlink(missing_ok=True)
 
 
 def check_new(path: Path) -> None:
@@ -99,17 +104,17 @@ def check_new(path: Path) -> None:
 
 
 def check_rrd_file(path: Path) -> None:
-    """Raise RrdFileError if a file does not begin as a Rerun recording does."""
+    """Raise RrdFileError if a file does not begin with the first bytes of a Rerun file."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             raise RrdFileError(f"{path} is not a file. Give a recording of Rerun's (*.rrd).")
         with path.open("rb") as file:
-            found = file.read(len(_MAGIC))
+            first_bytes = file.read(len(_RRD_FIRST_BYTES))
     except OSError as error:
         raise RrdFileError(
             f"{path} cannot be read: {error.strerror}. Check the path and its permissions."
         ) from None
-    if found != _MAGIC:
+    if first_bytes != _RRD_FIRST_BYTES:
         raise RrdFileError(
             f"{path} is not a Rerun recording, though its name says so. Give a session file "
             "(*.mcap), or what `rigd replay … --save` or `analyze … --rerun` wrote."
@@ -117,8 +122,8 @@ def check_rrd_file(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _write_errors(path: Path, part: Path) -> Iterator[None]:
-    """Translate errors of writing a file into RrdFileError."""
+def _translate_write_errors(path: Path, temporary_path: Path) -> Iterator[None]:
+    """Raise RrdFileError within the context instead of errors from writing a file."""
     try:
         yield
     except FileExistsError:
@@ -128,16 +133,19 @@ def _write_errors(path: Path, part: Path) -> Iterator[None]:
     except OSError as error:
         raise RrdFileError(f"{path} cannot be written: {error.strerror}.") from None
     except RuntimeError as error:  # from the SDK
-        number = _OS_ERROR.search(str(error))
-        cause = os.strerror(int(number[1])) if number else _write_failure(part)
+        number = _OS_ERROR_PATTERN.search(str(error))
+        cause = os.strerror(int(number[1])) if number else _reason_of_write_failure(temporary_path)
         raise RrdFileError(f"{path} cannot be written: {cause}.") from None
 
 
-def _write_failure(part: Path) -> str:
-    """Return the reason why a file cannot grow, by a trial; the SDK may not report it."""
+def _reason_of_write_failure(temporary_path: Path) -> str:
+    """Return why the operating system refuses to append to a file, by an attempt.
+
+    Rerun's SDK may not report the reason.
+    """
     try:
-        with part.open("ab") as file:
-            file.write(bytes(_TRIAL_BYTES))
+        with temporary_path.open("ab") as file:
+            file.write(bytes(_TRIAL_WRITE_BYTES))
     except OSError as error:
         return error.strerror or str(error)
     return "Rerun gave up"

@@ -11,7 +11,7 @@ from analysis.campaigns import best_models
 from analysis.campaigns._statistics import mean_deviations
 from analysis.models import STRUCTURES, FrequencyResponseModel
 from analysis.paper import Peak, resonant_peaks
-from analysis.report._paper_tables import papers_table3, papers_table4, papers_wmse
+from analysis.report._paper_tables import published_table3, published_table4, published_wmse
 from rigd.beam import transfer
 
 DATA = Path(__file__).parents[1] / "data"
@@ -87,13 +87,13 @@ def test_nominal_model_is_of_the_mean_parameters(make_fit, make_session, campaig
 def test_the_paper_s_numbers_are_those_of_the_reference():
     with (DATA / "paper_table3.csv").open() as file:
         for row in csv.DictReader(file):
-            told = papers_table3()[row["type"], row["weighting"], row["parameter"]]
+            told = published_table3()[row["type"], row["weighting"], row["parameter"]]
             for name in ("mean", "median", "std", "min", "max"):
                 assert getattr(told, name) == float(row[name])
-    assert len(papers_table3()) == 24
-    assert len(papers_table4()) == 72
-    assert papers_table4()["VI", "const", "frequency_rad_s", 2] == 0.190
-    assert papers_wmse() == {("III", "omega"): 4.491, ("VI", "omega"): 3.469}
+    assert len(published_table3()) == 24
+    assert len(published_table4()) == 72
+    assert published_table4()["VI", "const", "frequency_rad_s", 2] == 0.190
+    assert published_wmse() == {("III", "omega"): 4.491, ("VI", "omega"): 3.469}
 
 
 def test_table_4_follows_from_table_3_s_means(truth):
@@ -113,16 +113,16 @@ def test_table_4_follows_from_table_3_s_means(truth):
     model = FrequencyResponseModel(frequency_hz, link)
     mode_hz = np.array([16.045, 100.55, 281.55]) / (2 * math.pi)
     off = []
-    for structure, weighting in {key[:2] for key in papers_table3()}:
+    for structure, weighting in {key[:2] for key in published_table3()}:
         means = {
-            name: papers_table3()[structure, weighting, name].mean
+            name: published_table3()[structure, weighting, name].mean
             for name in STRUCTURES[structure].free
         }
         response = model.evaluate(STRUCTURES[structure].damping(means))
         peaks = resonant_peaks(frequency_hz, response, mode_hz)
         for deviation in mean_deviations(measured, peaks):
             for quantity in ("frequency_rad_s", "magnitude_db"):
-                told = papers_table4()[structure, weighting, quantity, deviation.mode]
+                told = published_table4()[structure, weighting, quantity, deviation.mode]
                 off.append(abs(getattr(deviation, quantity) - told))
     assert len(off) == 72
     assert sum(each <= 0.1 for each in off) >= 40

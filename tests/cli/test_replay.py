@@ -28,7 +28,7 @@ from rigd.session import SessionError, SessionWriter, read_session, read_timings
 from rigd.session.layout import SAMPLE_SIZE, TIMING_SIZE, Status, pack_sample_into, pack_timing_into
 from rigd.view import draw_session, nominal_damping
 from rigd.view._recorded import subject_of_session
-from rigd.view.frequency_charts import MAGNITUDE, ResponseCharts
+from rigd.view.frequency_charts import MAGNITUDE_ENTITY, ResponseCharts
 from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
 
 pytestmark = pytest.mark.process
@@ -135,10 +135,10 @@ def test_every_sample_is_shown_in_the_units_of_the_plots(paper):
 
 def test_the_frequency_response_grows_with_the_sweep(paper):
     session, found, _ = paper
-    chart = ResponseCharts(subject_of_session(session)).chart(MAGNITUDE)
+    chart = ResponseCharts(subject_of_session(session)).chart(MAGNITUDE_ENTITY)
     left, _, right, _ = chart.frame
     first_hz, last_hz = chart.x.first, chart.x.last
-    drawn = rows(found[f"{MAGNITUDE}/measured"], "LineStrips2D:strips")
+    drawn = rows(found[f"{MAGNITUDE_ENTITY}/measured"], "LineStrips2D:strips")
     assert len({t_ns for t_ns, _ in drawn}) > 50  # once a second
     for time_s, least_hz, most_hz in ((0.5, 0.0, 0.0), (21.0, 7.0, 10.0), (41.0, 15.0, 19.0)):
         # What a viewer shows at that time is the last that was drawn before.
@@ -154,10 +154,10 @@ def test_the_frequency_response_grows_with_the_sweep(paper):
 
 def test_the_last_frequency_response_is_that_of_analyze(paper):
     session, found, _ = paper
-    chart = ResponseCharts(subject_of_session(session)).chart(MAGNITUDE)
+    chart = ResponseCharts(subject_of_session(session)).chart(MAGNITUDE_ENTITY)
     left, top, right, bottom = chart.frame
     # All of it, coherent or not.
-    *_, (_, strips) = rows(found[f"{MAGNITUDE}/uncertain"], "LineStrips2D:strips")
+    *_, (_, strips) = rows(found[f"{MAGNITUDE_ENTITY}/uncertain"], "LineStrips2D:strips")
     points = np.concatenate([np.asarray(strip, dtype=np.float64) for strip in strips])
     share = (points[:, 0] - left) / (right - left)
     frequency_hz = chart.x.first * (chart.x.last / chart.x.first) ** share
@@ -322,8 +322,8 @@ def test_the_ages_of_the_readings_are_shown(write, saved):
 
 def test_a_file_with_the_least_there_may_be_is_shown_without_a_model(write, saved):
     found = saved(write("least.mcap", np.arange(6000)))
-    assert f"{MAGNITUDE}/model" not in found
-    assert f"{MAGNITUDE}/measured" in found
+    assert f"{MAGNITUDE_ENTITY}/model" not in found
+    assert f"{MAGNITUDE_ENTITY}/measured" in found
     assert len(columns(found["/antenna/beam"], "LineStrips3D:strips")["t_ns"]) == 120
 
 

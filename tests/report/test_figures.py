@@ -18,7 +18,7 @@ from analysis.report._record_figures import plain_logarithmic
 from analysis.report._signal_figures import (
     best_model,
     paper_signals_figure,
-    resonance_moments,
+    resonance_intervals,
     torque_figure,
     torque_in_band,
 )
@@ -233,7 +233,7 @@ MODES_HZ = np.array([2.5537, 16.003, 44.810])
 @pytest.mark.fit
 def test_each_mode_has_a_stretch_round_the_moment_the_chirp_passes_it(paper_analysis):
     record = paper_analysis.record
-    moments = resonance_moments(record, 3)
+    moments = resonance_intervals(record, 3)
     assert [moment.name for moment in moments] == [
         "Mode 1, 2.55 Hz", "Mode 2, 16 Hz", "Mode 3, 44.8 Hz"
     ]  # fmt: skip

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from analysis.report.folder import (
-    LIST,
+    CHECKSUM_LIST_NAME,
     OutputError,
     OutputExistsError,
     check_new_file,
@@ -89,7 +89,7 @@ def contents(folder):
     return {
         path.relative_to(folder).as_posix(): path.read_text()
         for path in folder.rglob("*")
-        if path.is_file() and path.name != LIST
+        if path.is_file() and path.name != CHECKSUM_LIST_NAME
     }
 
 
@@ -97,9 +97,9 @@ def contents(folder):
 def test_a_report_lists_its_files_as_sha256sum_does(tmp_path):
     out = tmp_path / "out"
     write_report(out, overwrite=False, a="1", sub_in_b="2")
-    check = [shutil.which("sha256sum"), "--check", "--strict", LIST]
+    check = [shutil.which("sha256sum"), "--check", "--strict", CHECKSUM_LIST_NAME]
     assert subprocess.run(check, cwd=out, capture_output=True, check=True).stderr == b""
-    assert len((out / LIST).read_text().splitlines()) == 2
+    assert len((out / CHECKSUM_LIST_NAME).read_text().splitlines()) == 2
 
 
 def test_a_report_is_replaced_and_what_others_put_there_stays(tmp_path):
@@ -114,7 +114,7 @@ def test_a_report_is_replaced_and_what_others_put_there_stays(tmp_path):
     mine = {"notes": "mine", "sub/notes": "mine, too"}
     assert contents(out) == {"a": "4", "d": "5", **mine}
     assert not (out / "gone").exists()
-    assert len((out / LIST).read_text().splitlines()) == 2
+    assert len((out / CHECKSUM_LIST_NAME).read_text().splitlines()) == 2
 
 
 @pytest.mark.parametrize("change", ["edited", "a link", "a folder", "foreign"])
@@ -140,8 +140,8 @@ def test_a_list_cannot_reach_beyond_its_folder(tmp_path):
     out, outside = tmp_path / "out", tmp_path / "mine"
     write_report(out, a="1")
     outside.write_text("1")
-    checksum = (out / LIST).read_text().split()[0]
-    (out / LIST).write_text(f"{checksum}  ../mine\n{checksum}  {outside}\n")
+    checksum = (out / CHECKSUM_LIST_NAME).read_text().split()[0]
+    (out / CHECKSUM_LIST_NAME).write_text(f"{checksum}  ../mine\n{checksum}  {outside}\n")
     (out / "a").unlink()
     write_report(out, b="2")
     assert outside.read_text() == "1"
@@ -171,7 +171,7 @@ def test_a_folder_that_is_no_report_is_not_replaced(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "a").write_text("mine")
-    with pytest.raises(OutputExistsError, match=f"no list of its files .{LIST}"):
+    with pytest.raises(OutputExistsError, match=f"no list of its files .{CHECKSUM_LIST_NAME}"):
         report_folders([tmp_path / "x.mcap"], out, overwrite=True)
     (tmp_path / "x.report").write_text("a file")
     with pytest.raises(OutputExistsError, match=r"x\.report is not one"):

@@ -14,7 +14,7 @@ from analysis.models import STRUCTURES
 from analysis.report import document, illustrations, result_text
 from analysis.report.bands import excited_band_hz, supported_band_hz
 from analysis.report.record_report import record_page, report_tables
-from analysis.report.table import MARK, Cell, csv_text, unreported
+from analysis.report.table import NOT_REPORTED_MARK, Cell, csv_text, unreported_parameters
 
 pytestmark = pytest.mark.fit
 
@@ -36,12 +36,12 @@ def careful(record_result, retold):
 
 
 def test_an_order_takes_its_coefficient_with_it():
-    assert unreported(STRUCTURES["VI"], ALPHA) == {"alpha", "zeta"}
-    assert unreported(STRUCTURES["III"], {"lambda", "alpha"}) == {
+    assert unreported_parameters(STRUCTURES["VI"], ALPHA) == {"alpha", "zeta"}
+    assert unreported_parameters(STRUCTURES["III"], {"lambda", "alpha"}) == {
         "zeta", "alpha", "gamma", "lambda"
     }  # fmt: skip
-    assert unreported(STRUCTURES["II"], ALPHA) == frozenset()
-    assert unreported(STRUCTURES["VI"], ()) == frozenset()
+    assert unreported_parameters(STRUCTURES["II"], ALPHA) == frozenset()
+    assert unreported_parameters(STRUCTURES["VI"], ()) == frozenset()
 
 
 def test_tables_mark_every_such_number_and_no_other(careful):
@@ -50,11 +50,11 @@ def test_tables_mark_every_such_number_and_no_other(careful):
     for symbol, name in (("ζ", "zeta"), ("α", "alpha")):
         number = shown[symbol]["value"]
         assert (number.value, number.doubtful) == (careful.whole.fit.parameters[name], True)
-        assert MARK in number.text
+        assert NOT_REPORTED_MARK in number.text
         assert shown[symbol]["remark"] == REASON
     assert [shown["α"][end].value for end in ("low_95", "high_95")] == [0.9, 1.2]
     assert shown["λ"]["value"].value == careful.whole.fit.parameters["lambda"]
-    assert MARK not in shown["λ"]["value"].text
+    assert NOT_REPORTED_MARK not in shown["λ"]["value"].text
     unsupported = ("zeta", "zeta_std", "alpha", "alpha_std")
     for table in (structures, welch):
         for row in table.rows:
@@ -62,11 +62,13 @@ def test_tables_mark_every_such_number_and_no_other(careful):
             assert cells.keys() >= {*unsupported, "gamma", "lambda"}
             for key, cell in cells.items():
                 assert cell.doubtful == (key in unsupported and cell.value is not None)
-        assert any(MARK in note and "α" in note and "λ" not in note for note in table.notes)
+        assert any(
+            NOT_REPORTED_MARK in note and "α" in note and "λ" not in note for note in table.notes
+        )
     by_type = {row["type"]: row for row in csv.DictReader(csv_text(structures).splitlines())}
     assert by_type["VI"]["not_reported"] == "alpha zeta"
     assert float(by_type["VI"]["alpha"]) == careful.whole.fit.parameters["alpha"]
-    assert [row[0].text for row in modes.shown_rows] == ["1", "2", f"3{MARK}"]
+    assert [row[0].text for row in modes.shown_rows] == ["1", "2", f"3{NOT_REPORTED_MARK}"]
     assert "does not show" in modes.notes[-1]
 
 
@@ -80,9 +82,11 @@ def test_of_absent_damping_no_fit_tells_the_order(record_result, retold):
     assert result.unsupported == {"lambda"}
     _modes, (*_others, structures), (welch, _peaks) = report_tables(result)
     for table in (structures, welch):
-        assert any(MARK in note and "λ" in note for note in table.notes)
+        assert any(NOT_REPORTED_MARK in note and "λ" in note for note in table.notes)
         for row in table.rows:
-            marks = [MARK in row[name].text for name in ("zeta", "alpha", "gamma", "lambda")]
+            marks = [
+                NOT_REPORTED_MARK in row[name].text for name in ("zeta", "alpha", "gamma", "lambda")
+            ]
             external = row["type"] not in ("I", "IV")
             assert marks == [False, False, external, external]
     for fit in document([result])["fits"]:
@@ -92,7 +96,7 @@ def test_of_absent_damping_no_fit_tells_the_order(record_result, retold):
 def test_nothing_is_marked_where_all_is_supported(record_result):
     modes, tables, of_paper = report_tables(record_result)
     for table in (modes, *tables, *of_paper):
-        assert MARK not in csv_text(table) + "".join(table.notes)
+        assert NOT_REPORTED_MARK not in csv_text(table) + "".join(table.notes)
         assert not any(cell.doubtful for row in table.shown_rows for cell in row)
 
 
@@ -103,18 +107,18 @@ def test_page_terminal_and_text_tables_show_the_mark(careful, as_text):
     alpha = careful.whole.fits["VI"].parameters["alpha"]
     cells = re.findall(rf'<td class="number withheld"><data value="{alpha!r}">([^<]+)', text)
     assert len(cells) == 2  # among the parameters, and among the structures
-    assert all(cell.endswith(MARK) for cell in cells)
+    assert all(cell.endswith(NOT_REPORTED_MARK) for cell in cells)
     complete = as_text(result_text(replace(careful, welch=None), verbose=True))
-    assert f"3{MARK}" in complete
+    assert f"3{NOT_REPORTED_MARK}" in complete
     (row,) = [line.split() for line in complete.splitlines() if line.split()[:1] == ["α"]]
-    assert row[4].endswith(MARK)
+    assert row[4].endswith(NOT_REPORTED_MARK)
     assert " ".join(REASON.split()) in " ".join(complete.split())
     welch = as_text(result_text(careful, verbose=True)).partition("Welch method")[2]
     fits, *others = [line for line in welch.splitlines() if re.match(r"VI\s+omega", line)]
-    assert fits.count(MARK) == 2
-    assert MARK not in "".join(others)
-    assert f"{MARK} not reported" in welch
-    assert MARK not in as_text(result_text(replace(careful, whole=None), verbose=True))
+    assert fits.count(NOT_REPORTED_MARK) == 2
+    assert NOT_REPORTED_MARK not in "".join(others)
+    assert f"{NOT_REPORTED_MARK} not reported" in welch
+    assert NOT_REPORTED_MARK not in as_text(result_text(replace(careful, whole=None), verbose=True))
 
 
 def test_the_document_flags_and_keeps_the_numbers(careful):

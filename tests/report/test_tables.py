@@ -8,12 +8,12 @@ from analysis.paper import analyse
 from analysis.record import load_record
 from analysis.report import result_text, summary_table
 from analysis.report.table import (
-    WORDS,
+    TEXT_FORMAT,
     Cell,
     Column,
     Table,
     csv_text,
-    estimate,
+    estimate_cells,
     json_rows,
     terminal_table,
 )
@@ -35,8 +35,8 @@ from rigd.beam import modes
     ],
 )
 def test_a_value_shows_the_digits_its_spread_leaves(value, std, text, as_text):
-    columns = (Column("value", "value"), Column("std", "std", spread=True))
-    table = Table.of("name", "", columns, [estimate((value, std), std)])
+    columns = (Column("value", "value"), Column("std", "std", std_of_previous=True))
+    table = Table.of("name", "", columns, [estimate_cells((value, std), std)])
     assert as_text(terminal_table(table)).split("\n")[2].strip() == text
 
 
@@ -154,8 +154,9 @@ def test_modes_that_left_their_resonance_are_marked(paper_analysis, tables_text)
 def test_one_table_is_shown_in_its_units_and_written_in_full(as_text):
     """A file's name may look like markup, a value may be missing, unknown or for programs only."""
     columns = (
-        Column("file", "file", WORDS), Column("ζ (1e-5)", "zeta", ".2f", 1e5),
-        Column("std", "zeta_std", ".2f", 1e5, spread=True), Column("used", "used", WORDS),
+        Column("file", "file", TEXT_FORMAT), Column("ζ (1e-5)", "zeta", ".2f", 1e5),
+        Column("std", "zeta_std", ".2f", 1e5, std_of_previous=True),
+        Column("used", "used", TEXT_FORMAT),
     )  # fmt: skip
     rows = (
         {"file": Cell("/a/[b]x[/b]", "[b]x[/b]"), "zeta": 1.23456789e-5, "zeta_std": 1e-7,
@@ -178,7 +179,7 @@ def test_one_table_is_shown_in_its_units_and_written_in_full(as_text):
 
 
 def test_rows_that_belong_together_are_ruled_off(as_text):
-    columns = (Column("type", "type", WORDS), Column("n", "n"))
+    columns = (Column("type", "type", TEXT_FORMAT), Column("n", "n"))
     table = Table.of("name", "", columns, [("I", 1), ("I", 2), ("II", 3)], grouped=True)
     lines = [line.strip() for line in as_text(terminal_table(table)).splitlines()]
     assert [line.split() for line in lines[2:]] == [["I", "1"], ["I", "2"], [], ["II", "3"]]

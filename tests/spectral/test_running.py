@@ -52,7 +52,7 @@ def exact_torque(angle_rad, window_per_s=0.1):
     return torque * np.exp(window_per_s * t)
 
 
-def sweep_of(excitation):
+def sweep_of_excitation(excitation):
     angle_rad = lagging(excitation.reference_rad)
     torque_nm = exact_torque(angle_rad)
     part = slice(*excitation.segments["sweep"])
@@ -62,7 +62,7 @@ def sweep_of(excitation):
 @pytest.fixture(scope="module")
 def paper():
     """The paper's chirp without noise."""
-    return sweep_of(chirp(rate_hz=RATE_HZ))
+    return sweep_of_excitation(chirp(rate_hz=RATE_HZ))
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_ends_as_welchs_estimate(noisy):
 
 @pytest.mark.parametrize("duration_s", [5.0, 10.0, 20.0])
 def test_short_records_end_as_analyze_divides_them(duration_s):
-    sweep = sweep_of(chirp(rate_hz=RATE_HZ, duration_s=duration_s, ring_down_s=0.0))
+    sweep = sweep_of_excitation(chirp(rate_hz=RATE_HZ, duration_s=duration_s, ring_down_s=0.0))
     samples = sweep.reference.size
     chosen = segmentation_of(samples, RATE_HZ)
     *earlier, (_, found) = estimates(sweep, samples // 20)
@@ -212,7 +212,7 @@ def test_a_multisine_has_excited_its_band_from_the_beginning():
 
 def test_a_step_excites_nothing_that_segments_could_tell_and_a_hold_nothing():
     excitation = step(rate_hz=RATE_HZ, duration_s=20.0)
-    stepped = sweep_of(excitation)
+    stepped = sweep_of_excitation(excitation)
     held = replace(stepped, reference=np.zeros(stepped.reference.size))
     for sweep in (stepped, held):
         seen = [found for _, found in estimates(sweep, 5000) if found is not None]

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.process
 
 ANTENNA = "/antenna"
 BEAM, TRAIL, LABEL, TOUCH = (f"{ANTENNA}/{name}" for name in ("beam", "trail", "label", "touch"))
-FACTOR = 2.0
+ENLARGEMENT = 2.0
 DRAWN_HZ = 20.0
 TRAIL_S = 0.5
 STRIPS = "LineStrips3D:strips"
@@ -68,11 +68,13 @@ def test_what_is_drawn_is_the_computed_shape_times_the_factor(subject, samples, 
         np.testing.assert_allclose(beam[:, 0] * length_m, bends.x_m, atol=1e-6)
         # What moves it across the line it rests on: the angle, and what it bends from there.
         np.testing.assert_allclose(
-            beam[:, 1] * length_m / FACTOR,
+            beam[:, 1] * length_m / ENLARGEMENT,
             block["angle_rad"][-1] * bends.x_m + deflection_m,
             atol=1e-6,
         )
-        np.testing.assert_allclose((beam - line)[:, 1] * length_m / FACTOR, deflection_m, atol=1e-6)
+        np.testing.assert_allclose(
+            (beam - line)[:, 1] * length_m / ENLARGEMENT, deflection_m, atol=1e-6
+        )
         assert np.all(beam[:, 2] == 0)
     assert largest_m > 0.05
 
@@ -80,11 +82,11 @@ def test_what_is_drawn_is_the_computed_shape_times_the_factor(subject, samples, 
 def test_the_factor_stands_at_the_tip(samples, follow):
     sent = follow(blocks(samples, 50))[LABEL]
     labels = [label for batch in sent for label in batch.column("Points3D:labels").to_pylist()]
-    assert all(f"drawn × {FACTOR:g}" in label[0] for label in labels)
+    assert all(f"drawn × {ENLARGEMENT:g}" in label[0] for label in labels)
     assert 10 <= len(labels) <= 15  # readable: four a second
 
 
-def label(tip_m, drawn=f"drawn × {FACTOR:g}"):
+def label(tip_m, drawn=f"drawn × {ENLARGEMENT:g}"):
     """Return the text of a deflection: two figures, but no less than tenths of a mm."""
     tip_mm = 1e3 * tip_m
     text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.2g}'):.0f}"
@@ -242,7 +244,7 @@ def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(subject, sam
     deflection_m = filter_.feed(samples["angle_rad"][:2013])
     place = 0.49 / subject.beam.length_m
     across = np.interp(0.49, filter_.x_m, deflection_m) / subject.beam.length_m
-    y = FACTOR * (samples["angle_rad"][2012] * place + across)
+    y = ENLARGEMENT * (samples["angle_rad"][2012] * place + across)
     # Between two drawn shapes, 50 ms apart, it is interpolated.
     assert point == pytest.approx([place, y, 0.0], abs=4e-3)
     _, (interval,) = values_of(sent[f"{TOUCH}/3/interval"], STRIPS)
@@ -251,7 +253,7 @@ def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(subject, sam
     _, (origin,) = values_of(sent[f"{TOUCH}/3/force"], "Arrows3D:origins")
     before = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
     then = np.interp(0.49, before.x_m, before.feed(samples["angle_rad"][:1970]))
-    forward = y - FACTOR * (samples["angle_rad"][1969] * place + then / subject.beam.length_m)
+    forward = y - ENLARGEMENT * (samples["angle_rad"][1969] * place + then / subject.beam.length_m)
     assert force[1] * forward < 0
     assert origin + force == pytest.approx(point, abs=1e-6)
     _, labels = values_of(sent[f"{TOUCH}/label"], "Points3D:labels")

@@ -6,10 +6,10 @@ import pytest
 
 from rigd.view import Gauge, Health, Note, Scene, sweep_of
 from rigd.view.banner import (
+    GAUGES_ENTITY,
     RUNNING,
-    STATE,
+    STATE_ENTITY,
     SUPERVISOR_LOST,
-    VALUES,
     banner,
     ended,
     gauge_color,
@@ -120,12 +120,12 @@ def test_state_and_values_are_drawn_as_they_come(sweep, make_samples, shown):
     drawings += scene.health(1_000_000_000, Health(missed_ticks=0))
     drawings += scene.state(1_000_000_000, FAULT)
     found = shown(drawings)
-    words = [text.split("\n")[0] for (text,) in found[STATE].values["TextDocument:text"]]
+    words = [text.split("\n")[0] for (text,) in found[STATE_ENTITY].values["TextDocument:text"]]
     assert words == ["# PREPARING", "# RUNNING · 136 s left", "# RUNNING · 135 s left", "# FAULT"]
-    bands = [colors[0] for colors in found[f"{VALUES}/bars"].values["LineStrips2D:colors"]]
+    bands = [colors[0] for colors in found[f"{GAUGES_ENTITY}/bars"].values["LineStrips2D:colors"]]
     assert bands == [packed(color) for color in (ORANGE, GREEN, GREEN, RED)]
-    assert "angle 0.900 of 1 rad" in found[f"{VALUES}/texts"].values["Points2D:labels"][-1]
-    colors = found[f"{VALUES}/bars"].values["LineStrips2D:colors"][-1]
+    assert "angle 0.900 of 1 rad" in found[f"{GAUGES_ENTITY}/texts"].values["Points2D:labels"][-1]
+    colors = found[f"{GAUGES_ENTITY}/bars"].values["LineStrips2D:colors"][-1]
     assert packed(ORANGE) in colors  # the bar of the angle
 
 
@@ -137,7 +137,7 @@ def test_a_peak_between_two_drawings_is_not_lost(sweep, make_samples, shown):
     for i in range(0, 1000, 100):
         scene.samples(samples[i : i + 100])
     found = shown(scene.health(1_000_000_000, Health()))
-    assert "angle 0.500 of 1 rad" in found[f"{VALUES}/texts"].values["Points2D:labels"][-1]
+    assert "angle 0.500 of 1 rad" in found[f"{GAUGES_ENTITY}/texts"].values["Points2D:labels"][-1]
 
 
 @pytest.mark.process

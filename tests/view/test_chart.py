@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.view.chart import Axis, Chart, Key, decades, number, steps
+from rigd.view.chart import Axis, Chart, LegendEntry, decades, steps, tick_text
 from rigd.view.plots import SKY_BLUE, TIMELINE
 
 AXIS_ENDS = st.tuples(st.floats(-1e3, 1e3), st.floats(1e-3, 1e3), st.integers(1, 12))
@@ -76,13 +76,13 @@ def test_ticks_are_round():
     assert steps(0.0, 136.0, 15) == tuple(range(0, 140, 10))
     assert str(steps(0.0, 136.0, 15)[0]) == "0.0"  # which equals -0.0
     assert steps(-60.0, 40.0, 5) == (-60.0, -40.0, -20.0, 0.0, 20.0, 40.0)
-    assert number(-0.0) == "0"
-    assert number(-20.0) == "−20"
+    assert tick_text(-0.0) == "0"
+    assert tick_text(-20.0) == "−20"
 
 
 def test_what_is_drawn_is_where_it_is_said_to_be(shown):
     axis = Axis("Frequency (Hz)", 1.0, 100.0, (1.0, 10.0, 100.0), logarithmic=True)
-    key = Key("measured", SKY_BLUE, width=3.0)
+    key = LegendEntry("measured", SKY_BLUE, width=3.0)
     chart = Chart("/c", 800.0, 400.0, axis, Axis("Level (dB)", 0.0, 1.0, (0.0, 1.0)), (key,))
     left, top, right, bottom = chart.frame
     curve = np.array([[1.0, 0.0], [10.0, 1.0], [100.0, 0.5]])

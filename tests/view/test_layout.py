@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from rigd.view import Scene, plots
+from rigd.view.banner import GAUGES_ENTITY
 from rigd.view.banner import SIZE as VALUES_SIZE
-from rigd.view.banner import VALUES
 from rigd.view.frequency_charts import SIZES
 from rigd.view.plots import TIMELINE
 
@@ -124,7 +124,7 @@ def test_charts_fill_their_views(tabs):
         for view in views
         if view.class_identifier == "2D"
     }
-    sizes = {**SIZES, VALUES: VALUES_SIZE}
+    sizes = {**SIZES, GAUGES_ENTITY: VALUES_SIZE}
     assert charts.keys() == {*sizes, "/spectrogram"}
     for entity, (width, height) in sizes.items():
         bounds = charts[entity].properties["VisualBounds2D"].as_component_batches()

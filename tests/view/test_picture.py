@@ -16,7 +16,7 @@ from rigd.beam import Damping
 from rigd.session import read_session
 from rigd.session.layout import Status
 from rigd.view import Health, Note, Scene, Subject, draw_session
-from rigd.view.frequency_charts import MAGNITUDE, SweepResponse
+from rigd.view.frequency_charts import MAGNITUDE_ENTITY, SweepResponse
 
 pytestmark = pytest.mark.process
 
@@ -97,11 +97,11 @@ def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, show
     drawings = picture.finish()
     found = shown(drawings)
     # All of it lies beneath what is coherent.
-    (strip,) = found[f"{MAGNITUDE}/uncertain"].values["LineStrips2D:strips"][-1]
+    (strip,) = found[f"{MAGNITUDE_ENTITY}/uncertain"].values["LineStrips2D:strips"][-1]
     points = np.array(strip)
     expected, _ = estimate(record, WelchSettings())
     expected_db = 20 * np.log10(abs(expected.response))
-    chart = picture.response_charts.chart(MAGNITUDE)
+    chart = picture.response_charts.chart(MAGNITUDE_ENTITY)
     at = chart.to_canvas(expected.frequency_hz, expected_db)
     inside = (points[:, 0] > at[0, 0]) & (points[:, 0] < at[-1, 0])
     assert 300 < inside.sum() <= 400
@@ -156,7 +156,7 @@ def test_a_new_connection_is_shown_what_is_known_already(path, record, shown):
         picture.samples(block)
     picture.events([Note(1_000_000, "info", "The record begins.")])
     found = shown(picture.frame())
-    assert found[f"{MAGNITUDE}/measured"].values["LineStrips2D:strips"][-1][0]
+    assert found[f"{MAGNITUDE_ENTITY}/measured"].values["LineStrips2D:strips"][-1][0]
     assert found["/spectrogram/levels"].last("DepthImage:buffer")
     assert found["/events"].values["TextLog:text"] == [["The record begins."]]
 

@@ -8,12 +8,12 @@ import pytest
 from rigd.beam import transfer
 from rigd.spectral import FrequencyResponse, RunningEstimate
 from rigd.view.frequency_charts import (
-    COHERENCE,
+    COHERENCE_ENTITY,
     FIRST_HZ,
     LAST_HZ,
-    MAGNITUDE,
-    OVERVIEW_MAGNITUDE,
-    PHASE,
+    MAGNITUDE_ENTITY,
+    OVERVIEW_MAGNITUDE_ENTITY,
+    PHASE_ENTITY,
     ResponseCharts,
     magnitude_db,
     phase_deg,
@@ -65,9 +65,9 @@ def test_measured_response_lies_on_the_model_it_was_made_of(
     charts.update(20_000_000_000, estimate(subject, delays_s=delays_s))
     found = shown([charts.draw_frames, charts.draw])
     for entity, of in (
-        (MAGNITUDE, magnitude_db),
-        (OVERVIEW_MAGNITUDE, magnitude_db),
-        (PHASE, phase_deg),
+        (MAGNITUDE_ENTITY, magnitude_db),
+        (OVERVIEW_MAGNITUDE_ENTITY, magnitude_db),
+        (PHASE_ENTITY, phase_deg),
     ):
         for name, last_hz in (("measured", 20.0), ("model", LAST_HZ)):
             (strip,) = strips(found[f"{entity}/{name}"])
@@ -81,14 +81,16 @@ def test_measured_response_lies_on_the_model_it_was_made_of(
             # Read off a canvas, at a frequency read off a canvas: where it is steep, not so well.
             assert np.median(abs(seen - expected)) < 1e-3 * (axis.last - axis.first)
             assert np.mean(abs(seen - expected) < 5e-3 * (axis.last - axis.first)) > 0.97
-    (strip,) = strips(found[f"{COHERENCE}/measured"])
-    assert values(charts, COHERENCE, strip)[1] == pytest.approx(np.full(len(strip), 0.9), abs=1e-5)
+    (strip,) = strips(found[f"{COHERENCE_ENTITY}/measured"])
+    assert values(charts, COHERENCE_ENTITY, strip)[1] == pytest.approx(
+        np.full(len(strip), 0.9), abs=1e-5
+    )
 
 
 def test_peaks_of_the_model_are_drawn_at_their_height(subject, shown):
     charts = ResponseCharts(subject)
-    (strip,) = strips(shown([charts.draw_frames])[f"{MAGNITUDE}/model"])
-    frequency_hz, seen = values(charts, MAGNITUDE, strip)
+    (strip,) = strips(shown([charts.draw_frames])[f"{MAGNITUDE_ENTITY}/model"])
+    frequency_hz, seen = values(charts, MAGNITUDE_ENTITY, strip)
     fine_hz = np.arange(0.5, 60.0, 1e-3)
     exact_db = magnitude_db(transfer(2j * np.pi * fine_hz, subject.beam, subject.damping))
     assert len(strip) <= 400
@@ -96,7 +98,7 @@ def test_peaks_of_the_model_are_drawn_at_their_height(subject, shown):
         near = (frequency_hz > first_hz) & (frequency_hz < last_hz)
         peak_db = exact_db[(fine_hz > first_hz) & (fine_hz < last_hz)].max()
         assert seen[near].max() == pytest.approx(peak_db, abs=0.2)
-    axis = charts.chart(MAGNITUDE).y
+    axis = charts.chart(MAGNITUDE_ENTITY).y
     assert axis.first <= exact_db.min()
     assert axis.last > exact_db.max()
 
@@ -104,15 +106,15 @@ def test_peaks_of_the_model_are_drawn_at_their_height(subject, shown):
 def test_band_not_yet_excited_is_shaded_and_empty(subject, shown):
     charts = ResponseCharts(subject)
     before = shown([charts.draw_frames, charts.draw])
-    assert strips(before[f"{MAGNITUDE}/measured"]) == []
+    assert strips(before[f"{MAGNITUDE_ENTITY}/measured"]) == []
     charts.update(20_000_000_000, estimate(subject, excited_up_to_hz=20.0))
     after = shown([charts.draw])
-    chart = charts.chart(MAGNITUDE)
+    chart = charts.chart(MAGNITUDE_ENTITY)
     left, _, right, _ = chart.frame
     at_20_hz = chart.to_canvas(20.0, chart.y.first)[0]
 
     def shaded(found, name) -> tuple[float, float]:
-        shade = found[f"{MAGNITUDE}/not_estimated_{name}"]
+        shade = found[f"{MAGNITUDE_ENTITY}/not_estimated_{name}"]
         x, _, _ = shade.last("Transform3D:translation")
         width, _, _ = shade.last("Transform3D:scale")
         return x, x + width
@@ -120,9 +122,9 @@ def test_band_not_yet_excited_is_shaded_and_empty(subject, shown):
     assert shaded(before, "below") == pytest.approx((left, right))
     assert shaded(after, "above") == pytest.approx((at_20_hz, right), abs=1e-3)
     assert shaded(after, "below") == pytest.approx((left, left))
-    (strip,) = strips(after[f"{MAGNITUDE}/measured"])
+    (strip,) = strips(after[f"{MAGNITUDE_ENTITY}/measured"])
     assert strip[:, 0].max() == pytest.approx(at_20_hz, abs=0.5)
-    times_ns = after[f"{MAGNITUDE}/measured"].times_ns["LineStrips2D:strips"]
+    times_ns = after[f"{MAGNITUDE_ENTITY}/measured"].times_ns["LineStrips2D:strips"]
     assert times_ns == [20_000_000_000]
 
 
@@ -132,7 +134,7 @@ def test_where_the_coherence_is_low_the_response_is_grey(subject, shown):
     coherence = np.where((GRID > 5.0) & (GRID < 8.0), 0.5, 0.9)
     charts.update(0, replace(known, response=replace(known.response, coherence=coherence)))
     found = shown([charts.draw])
-    for entity in (MAGNITUDE, OVERVIEW_MAGNITUDE, PHASE):
+    for entity in (MAGNITUDE_ENTITY, OVERVIEW_MAGNITUDE_ENTITY, PHASE_ENTITY):
         below, above = strips(found[f"{entity}/measured"])
         assert values(charts, entity, below)[0].max() == pytest.approx(5.0, rel=0.02)
         assert values(charts, entity, above)[0].min() == pytest.approx(8.0, rel=0.02)
@@ -140,26 +142,26 @@ def test_where_the_coherence_is_low_the_response_is_grey(subject, shown):
         ends_hz = values(charts, entity, grey)[0][[0, -1]]
         assert ends_hz == pytest.approx((FIRST_HZ, 20.0), rel=5e-3)
         assert found[f"{entity}/uncertain"].last("LineStrips2D:colors") == packed(GREY)
-    (whole,) = strips(found[f"{COHERENCE}/measured"])
-    assert values(charts, COHERENCE, whole)[1].min() == pytest.approx(0.5, abs=1e-3)
+    (whole,) = strips(found[f"{COHERENCE_ENTITY}/measured"])
+    assert values(charts, COHERENCE_ENTITY, whole)[1].min() == pytest.approx(0.5, abs=1e-3)
 
 
 def test_the_last_session_s_response_is_drawn_beneath(subject, shown):
     before = ResponseCharts(replace(subject, name="before", specimen="A"))
-    assert before.as_last(subject) is None
+    assert before.as_last_response(subject) is None
     before.update(0, estimate(subject))
-    last = before.as_last(replace(subject, name="before", specimen="A"))
+    last = before.as_last_response(replace(subject, name="before", specimen="A"))
     assert (last.session, last.specimen) == ("before", "A")
     charts = ResponseCharts(subject, last)
     found = shown([charts.draw_frames])
-    for entity in (MAGNITUDE, OVERVIEW_MAGNITUDE, PHASE):
+    for entity in (MAGNITUDE_ENTITY, OVERVIEW_MAGNITUDE_ENTITY, PHASE_ENTITY):
         (strip,) = strips(found[f"{entity}/last"])
         (model,) = strips(found[f"{entity}/model"])
         assert values(charts, entity, strip)[0][-1] == pytest.approx(20.0, rel=5e-3)
         inside = model[:, 0] < strip[:, 0].max()
         assert np.median(abs(np.interp(model[inside, 0], *strip.T) - model[inside, 1])) < 1.0
         assert "last session" in [key.label for key in charts.chart(entity).legend]
-    assert f"{COHERENCE}/last" not in found
+    assert f"{COHERENCE_ENTITY}/last" not in found
 
 
 def packed(color) -> int:
@@ -170,7 +172,7 @@ def test_an_empty_coherence_chart_says_why(subject, shown):
     charts = ResponseCharts(subject)
 
     def note() -> list[str]:
-        return shown([charts.draw])[f"{COHERENCE}/note"].values["Points2D:labels"][-1]
+        return shown([charts.draw])[f"{COHERENCE_ENTITY}/note"].values["Points2D:labels"][-1]
 
     assert note() == ["Coherence begins with the second segment"]
     known = estimate(subject)
@@ -187,7 +189,7 @@ def test_without_a_nominal_model_none_is_drawn(subject, shown):
     charts = ResponseCharts(replace(subject, damping=None))
     found = shown([charts.draw_frames])
     assert not [entity for entity in found if entity.endswith("/model")]
-    (labels,) = found[f"{MAGNITUDE}/labels"].values["Points2D:labels"]
+    (labels,) = found[f"{MAGNITUDE_ENTITY}/labels"].values["Points2D:labels"]
     assert "nominal model" not in labels
     assert "measured" in labels
 
@@ -195,10 +197,10 @@ def test_without_a_nominal_model_none_is_drawn(subject, shown):
 def test_axes_state_their_units(subject, shown):
     found = shown([ResponseCharts(subject).draw_frames])
     titles = {
-        MAGNITUDE: "Magnitude (dB re 1 N·m/rad)",
-        OVERVIEW_MAGNITUDE: "dB re 1 N·m/rad",  # the title of its view says of what
-        PHASE: "Phase (degrees)",
-        COHERENCE: "Coherence (1)",
+        MAGNITUDE_ENTITY: "Magnitude (dB re 1 N·m/rad)",
+        OVERVIEW_MAGNITUDE_ENTITY: "dB re 1 N·m/rad",  # the title of its view says of what
+        PHASE_ENTITY: "Phase (degrees)",
+        COHERENCE_ENTITY: "Coherence (1)",
     }
     for entity, title in titles.items():
         (labels,) = found[f"{entity}/labels"].values["Points2D:labels"]

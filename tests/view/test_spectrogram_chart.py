@@ -8,7 +8,7 @@ from rigd.view.frequency_charts import (
     HIGHEST_DB,
     LOWEST_DB,
     MOST_COLUMNS,
-    SPECTROGRAM,
+    SPECTROGRAM_ENTITY,
     SpectrogramChart,
 )
 
@@ -40,8 +40,8 @@ def tone(subject, shown):
 
 def test_a_tone_is_where_and_when_it_was_and_as_loud(tone):
     chart, found = tone
-    image = pixels(found[f"{SPECTROGRAM}/levels"])
-    corner, size = placed(found[f"{SPECTROGRAM}/levels"])
+    image = pixels(found[f"{SPECTROGRAM_ENTITY}/levels"])
+    corner, size = placed(found[f"{SPECTROGRAM_ENTITY}/levels"])
     rows, columns = np.nonzero(image > 128)
     at = corner + size * np.column_stack([columns + 0.5, rows + 0.5])
     assert at[:, 1] == pytest.approx(chart.to_canvas(0.0, 25.0)[1], abs=45.0)
@@ -64,13 +64,13 @@ def test_a_tone_is_where_and_when_it_was_and_as_loud(tone):
 
 def test_the_bar_has_the_colours_of_the_levels(tone):
     _, found = tone
-    levels, bar = found[f"{SPECTROGRAM}/levels"], found[f"{SPECTROGRAM}/colors"]
+    levels, bar = found[f"{SPECTROGRAM_ENTITY}/levels"], found[f"{SPECTROGRAM_ENTITY}/colors"]
     for name in ("colormap", "depth_range"):
         assert levels.last(f"DepthImage:{name}") == bar.last(f"DepthImage:{name}")
     assert pixels(bar)[:, 0].tolist() == list(range(255, -1, -1))
     _, size = placed(bar)
-    (labels,) = found[f"{SPECTROGRAM}/bar/labels"].values["Points2D:labels"]
-    (points,) = found[f"{SPECTROGRAM}/bar/labels"].values["Points2D:positions"]
+    (labels,) = found[f"{SPECTROGRAM_ENTITY}/bar/labels"].values["Points2D:labels"]
+    (points,) = found[f"{SPECTROGRAM_ENTITY}/bar/labels"].values["Points2D:positions"]
     heights = {text: y for text, (_, y) in zip(labels, points, strict=True)}
     assert heights["−80"] - heights["0"] == pytest.approx(256 * size[1])
     assert "dB re 1 N·m" in labels
