@@ -15,7 +15,7 @@ from rigd.excitation.targets import Precision, parse_target
 from rigd.profile import load_profile
 from rigd.runner._precision_search import (
     ExcitationPlanner,
-    in_words,
+    estimates_text,
     target_estimates,
     targets_json,
 )
@@ -95,10 +95,10 @@ class Bench:
 
     def told(self, share, held=0, before=None, **more):
         document = answer(self.profile, self.search.due + held, share, **more)
-        return list(self.search.decide(document, held, held if before is None else before))
+        return list(self.search.plan_next(document, held, held if before is None else before))
 
     def problem(self, text="Nothing is excited yet."):
-        return list(self.search.decide({"tick": self.search.due, "problem": text}, 0, 0))
+        return list(self.search.plan_next({"tick": self.search.due, "problem": text}, 0, 0))
 
 
 def test_a_search_may_state_the_uniformity_of_the_beam():
@@ -241,11 +241,11 @@ def test_ticks_that_were_held_after_a_piece_do_not_shift_it(bench):
 
 
 def test_a_piece_that_was_not_begun_is_no_segment(bench):
-    assert bench.search.is_begun(0)
+    assert bench.search.has_last_segment_begun(0)
     bench.told(ON_THE_WAY)
     place = bench.search.due
-    assert bench.search.is_begun(bench.writer.ticks)
-    assert not bench.search.is_begun(0)
+    assert bench.search.has_last_segment_begun(bench.writer.ticks)
+    assert not bench.search.has_last_segment_begun(0)
     segments = bench.search.ended(place + 400, 0, 0).segments
     assert segments.keys() == {"scan", "sweep"}
 
@@ -310,7 +310,7 @@ def test_damping_that_is_absent_cannot_be_told(profile):
         document["plant"]["damping"] |= {"zeta": 0.0}
         document["covariance"]["names"].remove("zeta")
         document["parameters"] = {}
-        found = bench.search.decide(document, 0, 0)
+        found = bench.search.plan_next(document, 0, 0)
         ends = [m for m in found if isinstance(m, SearchEnded)]
     assert ends[0].reason.startswith("Out of reach: internal damping is absent")
 
@@ -318,10 +318,10 @@ def test_damping_that_is_absent_cannot_be_told(profile):
 def test_an_absent_mode_is_not_stated(profile):
     (found,) = target_estimates(answer(profile, 1, CERTAIN), [parse_target("damping", "7:1%")])
     assert found.ratio == np.inf
-    assert in_words([found]) == "damping of mode 7: no such mode was found in the band"
+    assert estimates_text([found]) == "damping of mode 7: no such mode was found in the band"
     none = answer(profile, 1, CERTAIN) | {"modes": []}
     (found,) = target_estimates(none, [parse_target("frequency", "1%")])
-    assert in_words([found]) == "frequency of any mode: no such mode was found in the band"
+    assert estimates_text([found]) == "frequency of any mode: no such mode was found in the band"
 
 
 def test_a_flag_on_what_is_asked_never_counts_as_reached(profile, quick_pauses):
@@ -332,7 +332,7 @@ def test_a_flag_on_what_is_asked_never_counts_as_reached(profile, quick_pauses):
         document = answer(profile, bench.search.due, CERTAIN)
         damping = document["modes"][1]["damping_ratio"]
         damping["flag"] = "part of the record is unexplained"
-        told = list(bench.search.decide(document, 0, 0))
+        told = list(bench.search.plan_next(document, 0, 0))
         ends = [m for m in told if isinstance(m, SearchEnded)]
     assert not ends[0].reached
     assert "damping of mode 2: part of the record is unexplained" in ends[0].reason
@@ -343,7 +343,7 @@ def test_modes_that_are_not_those_of_a_uniform_beam_are_excited_where_they_are(p
     bench = Bench(profile, "damping 2:0.1%", at_most_s=40.0)
     document = answer(profile, bench.search.due, ON_THE_WAY)
     document["plant"]["stiffness_offsets"] = [0.04, 0.0]
-    *_, piece = bench.search.decide(document, 0, 0)
+    *_, piece = bench.search.plan_next(document, 0, 0)
     bands_hz = [
         (float(low) + float(high)) / 2 for low, high in re.findall(r"([\d.]+)–([\d.]+)", piece.name)
     ]

@@ -118,7 +118,7 @@ def test_none_runs_beside_a_session(looks, tmp_path, started):
 
 
 def test_one_that_hangs_is_killed_and_not_for_the_time_of_a_session(looks, tmp_path, monkeypatch):
-    monkeypatch.setattr(quick_looks, "_LONGEST_S", 0.4)
+    monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.4)
     looks.begin(tmp_path / "hangs.mcap")
     with looks.held():
         time.sleep(0.5)
@@ -129,7 +129,7 @@ def test_one_that_hangs_is_killed_and_not_for_the_time_of_a_session(looks, tmp_p
 
 
 def test_the_wait_for_a_processor_does_not_count(looks, tmp_path, monkeypatch):
-    monkeypatch.setattr(quick_looks, "_LONGEST_S", 0.05)
+    monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.05)
     used_s = 0.0
     monkeypatch.setattr(quick_looks, "processor_use", lambda _: (True, used_s))
     looks.begin(tmp_path / "waits.mcap")
@@ -156,7 +156,7 @@ def test_what_a_process_does_with_the_processors():
 
 
 def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeypatch):
-    monkeypatch.setattr(quick_looks, "_LONGEST_S", 0.05)
+    monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.05)
     monkeypatch.setattr(quick_looks, "_END_S", 0.05)
     # As on a busy computer, it has no time to end in; at last it is killed, lest a failure hang.
     monkeypatch.setattr(subprocess.Popen, "kill", lambda _: None)

@@ -236,7 +236,7 @@ def test_progress_alone_has_the_line_drawn_anew_some_times_a_second(monkeypatch)
     line, drawn, now_s = ProgressLine(), [], 0.0
     with monkeypatch.context() as patched:
         patched.setattr("rigd.runner._console.time.monotonic", lambda: now_s)
-        patched.setattr(line._changed, "set", lambda: drawn.append(now_s))
+        patched.setattr(line._has_changed, "set", lambda: drawn.append(now_s))
         for tick in range(1000):
             now_s = tick / 1000
             line.update(Phase.RUNNING, tick, 1000, missed=0, late=0)

@@ -21,7 +21,7 @@ COUNTS = {"scheduled": 1200, "missed": 0, "late": 0, "stale_angles": 0, "stale_w
 def close():
     """Close a session whose fit process failed, or did not; with a file, or without."""
 
-    def closed(finished, failure, shortcoming="", *, recorded=True, slow=lambda poll: poll):
+    def closed(finished, failure, unmet_reason="", *, recorded=True, slow=lambda poll: poll):
         profile = load_shipped("sim")
         order = Order(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
         group = MagicMock()
@@ -31,7 +31,7 @@ def close():
         )
         connected = Connected({}, {}, {"clock": "virtual"}, simulated=True)
         session = SessionRun(order, group, connected, None, lambda *_: None, always)
-        session._fit = MagicMock(failure=failure, shortcoming=shortcoming, segments={})
+        session._fit = MagicMock(failure=failure, unmet_reason=unmet_reason, segments={})
         session._fit.finish.return_value = {}
         session._fit.poll.return_value = []
 
