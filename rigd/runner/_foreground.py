@@ -259,7 +259,7 @@ def _print(text: str, *, err: bool) -> None:
 
 def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
     """Wait for the last quick looks to be completed, up to a time limit or another Ctrl-C."""
-    stop.sessions_are_over()
+    stop.ignore_stop_signal()
     was_stopped, is_skipped = stop.requested, False
 
     def skip() -> None:
