@@ -209,19 +209,19 @@ class _TerminalProgress:
     def __exit__(self, *_: object) -> None:
         self._close()
 
-    def begins(self, number: int, path: Path) -> None:  # noqa: ARG002 - printed when it exists
+    def on_start(self, number: int, path: Path) -> None:  # noqa: ARG002 - printed when it exists
         self._number = f"{number}/{self._repeat}" if self._repeat > 1 else ""
         self._progress_line = ProgressLine()
 
-    def says(self, level: str, text: str) -> None:
+    def on_message(self, level: str, text: str) -> None:
         self._print(f"Warning: {text}" if level == "warning" else text)
 
-    def shown(self, where: str) -> None:
+    def on_live_view(self, where: str) -> None:
         if where != self._last_view_text:
             self._print(where)
             self._last_view_text = where
 
-    def update(self, progress: SessionProgress, events: list[LogEvent]) -> None:
+    def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         assert self._progress_line is not None
         for event in events:
             if event.level in ("warning", "error", "fatal"):
@@ -237,7 +237,7 @@ class _TerminalProgress:
             number=self._number,
         )
 
-    def ended(self, result: RunResult, *, look_follows: bool) -> None:  # noqa: ARG002
+    def on_result(self, result: RunResult, *, look_follows: bool) -> None:  # noqa: ARG002
         self._close()
         self._print(result_line(result.as_dict()))
         if result.path is not None:

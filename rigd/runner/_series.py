@@ -30,22 +30,22 @@ _POLL_S: Final = 0.05
 class SeriesWatcher(Protocol):
     """Receiver of the progress of a series of sessions."""
 
-    def begins(self, number: int, path: Path) -> None:
+    def on_start(self, number: int, path: Path) -> None:
         """Process the start of a session, with its number from 1 and the path of its file.
 
         An exception ends the series.
         """
 
-    def says(self, level: Literal["info", "warning"], text: str) -> None:
+    def on_message(self, level: Literal["info", "warning"], text: str) -> None:
         """Process a message for the operator before the first session."""
 
-    def shown(self, where: str) -> None:
+    def on_live_view(self, where: str) -> None:
         """Process the text with the address of the live view, or with the reason for none."""
 
-    def update(self, progress: SessionProgress, events: list[LogEvent]) -> None:
+    def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         """Process progress and new events of a session, about fifty times a second."""
 
-    def ended(self, result: RunResult, *, look_follows: bool) -> None:
+    def on_result(self, result: RunResult, *, look_follows: bool) -> None:
         """Process the result of a session; `look_follows` states whether a quick look follows."""
 
 
@@ -191,7 +191,7 @@ class Series:
             is_numbered = self._repeat > 1
             path = choose_path(self._folder, self._excitation.kind, number if is_numbered else None)
             notes = self._notes | ({"series": f"{number} of {self._repeat}"} if is_numbered else {})
-            watcher.begins(number, path)
+            watcher.on_start(number, path)
             order = Order(
                 self._profile,
                 self._excitation,
@@ -211,12 +211,12 @@ class Series:
             )
             with contextlib.nullcontext() if quick_looks is None else quick_looks.held():
                 if live:
-                    watcher.shown(rig.show(order, stop))
-                result = rig.run(order, stop, watcher.update, can_receive_stop)
+                    watcher.on_live_view(rig.show(order, stop))
+                result = rig.run(order, stop, watcher.on_progress, can_receive_stop)
             self.results.append(result)
             # The record of a vibration-free move contains no information on the modes.
             analysed_path = result.path if self._excitation.shows_modes else None
-            watcher.ended(
+            watcher.on_result(
                 result, look_follows=quick_looks is not None and analysed_path is not None
             )
             if quick_looks is not None and analysed_path is not None:
@@ -243,7 +243,7 @@ class Series:
         from rigd.runner import _probing  # late: a simulation in this process needs none
 
         result = _probing.verify_by_probing(
-            self._profile, rig, stop, watcher.says, motor=not self._identifies_motor
+            self._profile, rig, stop, watcher.on_message, motor=not self._identifies_motor
         )
         return {} if result is None else result.as_metadata()
 

@@ -35,11 +35,11 @@ class RunningProcess:
     command: tuple[str, ...]
     """Command line: program and arguments."""
     caught: int
-    """Bit mask of the signals that have a handler; bit n-1 stands for signal n."""
+    """Bit mask of the signals that have a handler; bit n-1 represents signal n."""
     ignored: int
-    """Bit mask of the ignored signals; bit n-1 stands for signal n."""
+    """Bit mask of the ignored signals; bit n-1 represents signal n."""
     pending: int
-    """Bit mask of the signals that were sent but not received yet; bit n-1 stands for signal n."""
+    """Bit mask of the signals that were sent but not received yet; bit n-1 represents signal n."""
     suspended: bool
     """Whether the process is suspended by a signal or a debugger."""
 

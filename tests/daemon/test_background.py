@@ -17,7 +17,7 @@ from rigd.runner.planning import excitation_for, plan_session
 CHIRP = {"excitation": "chirp", "parameters": {"duration_s": 5.0, "ring_down_s": 1.0}}
 LITTLE_MEMORY = """
 from rigd.daemon import background
-background._memory_limit = lambda: background._LEAST_BYTES
+background._memory_limit = lambda: background._MIN_MEMORY_BYTES
 background.main()
 """
 

@@ -17,7 +17,7 @@ import logging
 from rigd.daemon import _log as log
 from rigd.daemon._log import NAME, Log
 
-log._FLUSH_S = 60.0  # the machine may stand still for longer than a daemon would wait
+log._FLUSH_TIMEOUT_S = 60.0  # the machine may stand still for longer than a daemon would wait
 with Log():
     for number in range(5):
         logging.getLogger(NAME).warning("line %d", number)

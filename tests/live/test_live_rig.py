@@ -26,8 +26,8 @@ from rigd.session import read_session
 @pytest.fixture
 def rig(write_profile, runtime_folder, monkeypatch):
     # How long its start takes is the machine's affair: what is asked for is what it shows then.
-    monkeypatch.setattr(live_view, "_PATIENCE_S", 60.0)
-    monkeypatch.setattr(live_view, "_BEGIN_PATIENCE_S", 60.0)
+    monkeypatch.setattr(live_view, "_ADDRESS_TIMEOUT_S", 60.0)
+    monkeypatch.setattr(live_view, "_SHOW_TIMEOUT_S", 60.0)
     rig = Rig(load_profile(str(write_profile("sim"))), fast=True, live=True)
     rig.connect()
     yield rig
@@ -221,7 +221,7 @@ def test_one_that_is_only_starting_has_time_on_a_busy_computer(monkeypatch, hear
     monkeypatch.setattr(live_view.time, "monotonic", lambda: now_s[0])
     group = StillGroup()
     view = live_view.LiveView(group, "rig")
-    view._answered = heard
+    view._has_address = heard
     while group.started == 1:
         now_s[0] += 0.1
         view.check()

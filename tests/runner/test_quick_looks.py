@@ -50,7 +50,7 @@ def started():
 def looks(tmp_path, monkeypatch, started):
     (tmp_path / "look_program.py").write_text(PROGRAM)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(quick_looks, "_PROGRAM", "look_program")
+    monkeypatch.setattr(quick_looks, "_QUICK_LOOK_MODULE", "look_program")
     told = []
     looks = QuickLooks(told.append)
     looks.told = told
@@ -157,7 +157,7 @@ def test_what_a_process_does_with_the_processors():
 
 def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeypatch):
     monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.05)
-    monkeypatch.setattr(quick_looks, "_END_S", 0.05)
+    monkeypatch.setattr(quick_looks, "_KILL_TIMEOUT_S", 0.05)
     # As on a busy computer, it has no time to end in; at last it is killed, lest a failure hang.
     monkeypatch.setattr(subprocess.Popen, "kill", lambda _: None)
     for end in (looks.poll, looks.close):
