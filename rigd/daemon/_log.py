@@ -12,7 +12,7 @@ import threading
 import time
 from typing import Final
 
-NAME: Final = "rigd.serve"
+LOGGER_NAME: Final = "rigd.serve"
 """Name of the daemon's logger."""
 _MAX_WAITING_RECORDS: Final = 1000
 """Maximum number of log records that wait to be written."""
@@ -35,7 +35,7 @@ class _DroppingQueueHandler(logging.handlers.QueueHandler):
         if self._dropped and not self._queue.full():
             text = f"{self._dropped} lines before this one were dropped (log not read)"
             self._queue.put_nowait(
-                logging.LogRecord(NAME, logging.WARNING, "", 0, text, None, None)
+                logging.LogRecord(LOGGER_NAME, logging.WARNING, "", 0, text, None, None)
             )
             self._dropped = 0
         try:
@@ -44,7 +44,7 @@ class _DroppingQueueHandler(logging.handlers.QueueHandler):
             self._dropped += 1
 
 
-class Log:
+class DaemonLog:
     """Context in which the records of the daemon's logger are written to standard error."""
 
     def __init__(self) -> None:
@@ -53,14 +53,14 @@ class Log:
 
     def __enter__(self) -> None:
         logging.raiseExceptions = False  # a closed terminal must not end the daemon
-        logger = logging.getLogger(NAME)
+        logger = logging.getLogger(LOGGER_NAME)
         logger.setLevel(logging.INFO)
         logger.addHandler(self._handler)
         # A daemon thread: it may hang when the program ends.
         threading.Thread(target=self._write_records, daemon=True).start()
 
     def __exit__(self, *_: object) -> None:
-        logging.getLogger(NAME).removeHandler(self._handler)
+        logging.getLogger(LOGGER_NAME).removeHandler(self._handler)
         deadline_s = time.monotonic() + _FLUSH_TIMEOUT_S
         while self._queue.unfinished_tasks and time.monotonic() < deadline_s:
             time.sleep(0.01)

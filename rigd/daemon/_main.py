@@ -9,11 +9,11 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-from rigd.daemon._log import NAME, Log
+from rigd.daemon._log import LOGGER_NAME, DaemonLog
 from rigd.daemon._server import Server
 from rigd.daemon._service import Service
 from rigd.daemon._states import resolve_user
-from rigd.daemon.address import COMMON, bind, socket_path
+from rigd.daemon.address import GROUP_FOLDER, bind, socket_path
 from rigd.devices import (
     ActuationTarget,
     actuation_target,
@@ -26,7 +26,7 @@ from rigd.runtime import STOP_SIGNAL, RigLock
 
 _END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 
-_log = logging.getLogger(NAME)
+_log = logging.getLogger(LOGGER_NAME)
 
 
 def run_daemon(
@@ -73,12 +73,12 @@ def run_daemon(
     """
     target = actuation_target(profile.rig)
     with ExitStack() as resources:
-        resources.enter_context(Log())
+        resources.enter_context(DaemonLog())
         resolve_user(os.getuid())
         resources.enter_context(
             RigLock(profile.name, "rigd serve", hardware=target is ActuationTarget.HARDWARE)
         )
-        path = socket_path(profile.name, None if group is None else COMMON)
+        path = socket_path(profile.name, None if group is None else GROUP_FOLDER)
         listener = resources.enter_context(bind(path, group))
         resources.callback(path.unlink, missing_ok=True)
         worker = resources.enter_context(ThreadPoolExecutor(1, "rig"))
@@ -100,7 +100,7 @@ def run_daemon(
         if page:
             from rigd.daemon._page import PageProcess
 
-            page_process = PageProcess(profile, folder, path, page_port, service.set_page)
+            page_process = PageProcess(profile, folder, path, page_port, service.set_page_address)
             resources.callback(page_process.close)
         return asyncio.run(_run_until_signal(server, service))
 

@@ -18,7 +18,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.daemon._log import NAME
+from rigd.daemon._log import LOGGER_NAME
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, signals_blocked
 from rigd.runtime.addresses import announce, file_name, read_address, runtime_folder, started_at
 
@@ -38,7 +38,7 @@ _RESTART_PAUSE_S: Final = 1.0
 _END_TIMEOUT_S: Final = 3.0
 """Time in seconds that the process has to end before it is killed."""
 
-_log = logging.getLogger(NAME)
+_log = logging.getLogger(LOGGER_NAME)
 
 
 class PageProcess:

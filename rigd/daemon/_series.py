@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.daemon import _protocol as protocol
-from rigd.daemon._log import NAME
+from rigd.daemon._log import LOGGER_NAME
 from rigd.daemon._states import DaemonState, Document, fit_document
 from rigd.engine.shared_state import LogEvent
 from rigd.runner import RigError, Series, result_line
@@ -25,7 +25,7 @@ _LOGGING_LEVELS = {
 Publish = Callable[[Document], None]
 """Function that sends an event to the clients that have subscribed."""
 
-_log = logging.getLogger(NAME)
+_log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(slots=True)

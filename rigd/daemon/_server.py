@@ -21,7 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final, cast
 
-from rigd.daemon._log import NAME
+from rigd.daemon._log import LOGGER_NAME
 from rigd.daemon._protocol import (
     MAX_LINE_BYTES,
     AnyRequest,
@@ -58,7 +58,7 @@ _MAX_WAITING_LINES = 64
 _CLOSE_TIMEOUT_S = 1.0
 """Maximum time in seconds in which a client's last output is sent before it is disconnected."""
 
-_log = logging.getLogger(NAME)
+_log = logging.getLogger(LOGGER_NAME)
 
 
 class Server:
@@ -92,9 +92,9 @@ class Server:
 
     def publish(self, event: Document) -> None:
         """Send an event to all clients that have subscribed to it."""
-        watching = [client for client in self._clients if client.is_subscribed_to(event)]
-        data = _json_line(event) if watching else b""
-        for client in watching:
+        is_subscribed = [client for client in self._clients if client.is_subscribed_to(event)]
+        data = _json_line(event) if is_subscribed else b""
+        for client in is_subscribed:
             client.write(data)
 
     async def close(self) -> None:
@@ -124,7 +124,7 @@ class Server:
 
     def can_subscribe(self) -> bool:
         """Return whether another client may subscribe to events."""
-        return sum(client.watching for client in self._clients) < MAX_SUBSCRIBERS
+        return sum(client.is_subscribed for client in self._clients) < MAX_SUBSCRIBERS
 
     # Connections without a complete line
 
@@ -322,7 +322,7 @@ class _ClientConnection(asyncio.Protocol):
         self._has_ended = False
         self._is_leaving = False
         self.connecting: asyncio.Task[None] | None = None
-        self.watching = False
+        self.is_subscribed = False
         self._is_subscribed_to_signals = False
         self.last_received_s = time.monotonic()
 
@@ -331,7 +331,7 @@ class _ClientConnection(asyncio.Protocol):
         """Whether the client neither subscribes to events, controls the rig nor awaits a reply."""
         return not (
             self._received
-            or self.watching
+            or self.is_subscribed
             or self._tasks
             or self._waiting_lines
             or self._service.controller == self._peer
@@ -344,7 +344,9 @@ class _ClientConnection(asyncio.Protocol):
 
     def is_subscribed_to(self, event: Document) -> bool:
         """Return whether the client has subscribed to an event."""
-        return self.watching and (self._is_subscribed_to_signals or event["event"] != "signals")
+        return self.is_subscribed and (
+            self._is_subscribed_to_signals or event["event"] != "signals"
+        )
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Process the lines that were received before the connection became a client."""
@@ -433,7 +435,7 @@ class _ClientConnection(asyncio.Protocol):
         except RequestError as error:
             self.write(_json_line(_refusal_document(error.request_id, str(error))))
             return
-        if request.command == "watch" and not self.watching:
+        if request.command == "watch" and not self.is_subscribed:
             if not self._server.can_subscribe():
                 text = f"{MAX_SUBSCRIBERS} clients are watching already; use status instead."
                 self.write(
@@ -442,7 +444,7 @@ class _ClientConnection(asyncio.Protocol):
                     )
                 )
                 return
-            self.watching = True
+            self.is_subscribed = True
         if isinstance(request, WatchRequest):
             self._is_subscribed_to_signals |= request.signals
         task = asyncio.create_task(self._execute_and_reply(request))

@@ -19,7 +19,7 @@ from typing import TypeVar
 from rigd.checks import check_on_paper
 from rigd.daemon import _protocol as protocol
 from rigd.daemon import background
-from rigd.daemon._log import NAME
+from rigd.daemon._log import LOGGER_NAME
 from rigd.daemon._protocol import CommandError
 from rigd.daemon._series import Publish, SeriesReporter, ServedSeries
 from rigd.daemon._states import (
@@ -60,7 +60,7 @@ _SHUTTING_DOWN = "The daemon is being shut down."
 
 T = TypeVar("T")
 
-_log = logging.getLogger(NAME)
+_log = logging.getLogger(LOGGER_NAME)
 
 
 class Service:
@@ -167,7 +167,7 @@ class Service:
             if self._quick_looks is not None:
                 self._quick_looks.poll()
             # This returns at once while the worker thread is busy, so that the polls continue.
-            await self.watch()
+            await self.check_connection()
 
     async def stream_signals(self) -> None:
         """Publish signals to subscribed clients until cancelled."""
@@ -203,9 +203,9 @@ class Service:
             self._quick_looks.close()
         await self._call_in_worker(self._rig.disconnect)
         if self.state is DaemonState.READY:
-            self._state_machine.move(DaemonState.IDLE, reason)
+            self._state_machine.change_to(DaemonState.IDLE, reason)
 
-    def set_page(self, address: str | None) -> None:
+    def set_page_address(self, address: str | None) -> None:
         """Store the address of the operator's page for the status; any thread may call this."""
         self._page_address = address
 
@@ -298,7 +298,7 @@ class Service:
         if not series.stop.requested:
             series.stop.request()
             if self.state is DaemonState.RUNNING:
-                self._state_machine.move(DaemonState.STOPPING, reason)
+                self._state_machine.change_to(DaemonState.STOPPING, reason)
         return {"stopping": True}
 
     def poll_status(self) -> None:
@@ -314,7 +314,7 @@ class Service:
         if progress is not None:
             self._publish({"event": "progress", **progress})
 
-    async def watch(self) -> None:
+    async def check_connection(self) -> None:
         """Check between sessions that the rig is still connected; otherwise enter a fault."""
         # The command `check` does not use the worker thread, so the rig is checked meanwhile.
         is_busy = self._current_command not in ("", "check")
@@ -328,7 +328,7 @@ class Service:
             await self._call_in_worker(self._rig.watch)
         except RigError as error:
             if not self._is_closing and self.state is DaemonState.READY:
-                self._state_machine.move(DaemonState.FAULT, str(error))
+                self._state_machine.change_to(DaemonState.FAULT, str(error))
 
     # Commands
 
@@ -439,7 +439,7 @@ class Service:
             _log.warning("series %d: %s", series.number, warning)
         series.planned = planned
         repeat_text = f", {request.repeat} sessions" if request.repeat > 1 else ""
-        self._state_machine.move(
+        self._state_machine.change_to(
             DaemonState.RUNNING, f"{series.description} was started{repeat_text}"
         )
         self._task = asyncio.create_task(self._run_series_to_end(series, planned))
@@ -453,7 +453,7 @@ class Service:
             return await self._call_in_worker(measure)
         except RigError as error:
             if not self._rig.connected and self.state is DaemonState.READY:
-                self._state_machine.move(DaemonState.FAULT, str(error))
+                self._state_machine.change_to(DaemonState.FAULT, str(error))
             raise CommandError(str(error)) from None
         finally:
             self._current_command = ""
@@ -469,12 +469,12 @@ class Service:
                 except RigError:
                     pass  # the rig was disconnected, and is connected again below
                 else:
-                    self._state_machine.move(DaemonState.READY, "reset by the operator")
+                    self._state_machine.change_to(DaemonState.READY, "reset by the operator")
                     return {"zero_lost": self._rig.zero_lost}
             if self._is_closing:
                 raise CommandError(_SHUTTING_DOWN)
             fault = self._fault_reason
-            self._state_machine.move(DaemonState.IDLE, "reset by the operator")
+            self._state_machine.change_to(DaemonState.IDLE, "reset by the operator")
             await self._connect(reset_fault=True, fault=fault)
         finally:
             self._current_command = ""
@@ -506,7 +506,7 @@ class Service:
         if self._is_closing:
             await self._call_in_worker(self._rig.disconnect)
             raise CommandError(_SHUTTING_DOWN)
-        self._state_machine.move(DaemonState.READY, f"{target.value} is connected")
+        self._state_machine.change_to(DaemonState.READY, f"{target.value} is connected")
 
     def _enter_fault(self, reason: str, fault: str) -> None:
         """Enter the state of fault for a reason.
@@ -514,7 +514,7 @@ class Service:
         `fault` is the reason of an earlier fault that could not be reset, or empty.
         """
         is_same_fault = not fault or fault == reason
-        self._state_machine.move(
+        self._state_machine.change_to(
             DaemonState.FAULT, reason if is_same_fault else f"{reason} Not reset: {fault}"
         )
         self._fault_reason = fault or reason
@@ -557,7 +557,7 @@ class Service:
             _log.exception("the last signals could not be sent")
         series.running = False
         series.failed = bool(fault or (series.reason and not series.stop.requested))
-        self._state_machine.move(*series.state_after(fault))
+        self._state_machine.change_to(*series.state_after(fault))
         self._publish({"event": "series", **series.as_document()})
 
     async def _disconnect_safely(self) -> None:

@@ -120,7 +120,7 @@ class DaemonStateMachine:
         """Reason for which the present state was entered."""
         return self.history[-1].reason if self.history else "the daemon was started"
 
-    def move(self, after: DaemonState, reason: str) -> None:
+    def change_to(self, next_state: DaemonState, reason: str) -> None:
         """Change the daemon's state for a reason.
 
         Raises
@@ -128,10 +128,10 @@ class DaemonStateMachine:
         IllegalTransitionError
             If this state must not follow the present state.
         """
-        if after not in _NEXT_STATES[self.state]:
-            raise IllegalTransitionError(f"{self.state} does not lead to {after} ({reason}).")
-        transition = Transition(self._utc_ns(), self.state, after, reason)
-        self.state = after
+        if next_state not in _NEXT_STATES[self.state]:
+            raise IllegalTransitionError(f"{self.state} does not lead to {next_state} ({reason}).")
+        transition = Transition(self._utc_ns(), self.state, next_state, reason)
+        self.state = next_state
         self.history.append(transition)
         self._on_change(transition)
 

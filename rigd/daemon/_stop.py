@@ -19,7 +19,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.daemon.address import COMMON, SUFFIX, own_sockets, peer_at
+from rigd.daemon.address import GROUP_FOLDER, SOCKET_SUFFIX, own_sockets, peer_at
 from rigd.daemon.client import UNKNOWN_STATE, await_end, stop_session
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.errors import RigdError
@@ -107,7 +107,7 @@ class _StopOfAll:
         self._is_end_awaited = wait
         self._uid = os.getuid()
         self._report = StopReport()
-        self._find_supervisors: dict[tuple[int, int], _SupervisorStop] = {}
+        self._own_supervisors: dict[tuple[int, int], _SupervisorStop] = {}
         self._supervisors_of_others: list[_SupervisorStop] = []
         """Supervisors of other users."""
         self._began_s = time.monotonic()
@@ -119,14 +119,14 @@ class _StopOfAll:
             daemon.begin()
         unended = self._stop_supervisors(daemons)
         ended_pids = {
-            each.process.pid for each in self._find_supervisors.values() if each not in unended
+            each.process.pid for each in self._own_supervisors.values() if each not in unended
         }
         trusted_pids = set()
         for daemon in daemons:
             daemon.report_to(self._report, disabled=daemon.pid in ended_pids)
             if not daemon.doubt:
                 trusted_pids.add(daemon.pid)
-        for supervisor in self._find_supervisors.values():
+        for supervisor in self._own_supervisors.values():
             if supervisor.process.pid not in trusted_pids:
                 has_ended = supervisor not in unended
                 supervisor.report_to(self._report, ended=has_ended, waited=self._is_end_awaited)
@@ -154,17 +154,17 @@ class _StopOfAll:
         except OSError as error:
             report.doubts.append(f"The list of sockets cannot be read ({error.strerror}).")
             paths = set()
-        for folder in [*known_folders(self._uid or None), COMMON]:
+        for folder in [*known_folders(self._uid or None), GROUP_FOLDER]:
             report.searched.append(str(folder))
-            fault = folder_fault(folder, shared=folder == COMMON)
+            fault = folder_fault(folder, shared=folder == GROUP_FOLDER)
             if fault:
                 report.doubts.append(fault)
             try:
-                sockets = [path for path in folder.iterdir() if path.name.endswith(SUFFIX)]
+                sockets = [path for path in folder.iterdir() if path.name.endswith(SOCKET_SUFFIX)]
             except (FileNotFoundError, NotADirectoryError):
                 continue
             except PermissionError as error:
-                if folder == COMMON or _may_folder_belong_to(folder, self._uid):
+                if folder == GROUP_FOLDER or _may_folder_belong_to(folder, self._uid):
                     report.doubts.append(f"The folder {folder} cannot be read ({error.strerror}).")
                 continue
             except OSError as error:
@@ -173,7 +173,7 @@ class _StopOfAll:
             paths.update(sockets)
         daemons = []
         for path in sorted(paths):
-            rig = path.name.removesuffix(SUFFIX)
+            rig = path.name.removesuffix(SOCKET_SUFFIX)
             if self._rig in (None, rig):
                 with suppress(ConnectionRefusedError, FileNotFoundError):  # of a dead daemon
                     try:
@@ -206,7 +206,7 @@ class _StopOfAll:
             for supervisor in self._update_supervisors(table):
                 if supervisor.process.pid in sufficient_pids:
                     continue
-                self._find_supervisors.setdefault(supervisor.key, supervisor)
+                self._own_supervisors.setdefault(supervisor.key, supervisor)
                 supervisor.send_due_signals(self._elapsed_s)
                 if not supervisor.is_over:
                     unended.append(supervisor)
@@ -228,8 +228,8 @@ class _StopOfAll:
         """Return whether the report of a daemon is still awaited."""
         if daemon.is_done:
             return False
-        known = self._find_supervisors.values()
-        if any(each.suspended and each.process.pid == daemon.pid for each in known):
+        supervisors = self._own_supervisors.values()
+        if any(each.suspended and each.process.pid == daemon.pid for each in supervisors):
             return False
         patience_s = _DOUBTED_REPLY_TIMEOUT_S if daemon.doubt else 2.0 * _END_TIMEOUT_S
         return self._elapsed_s < patience_s
@@ -245,7 +245,7 @@ class _StopOfAll:
             if self._uid not in (0, process.uid):
                 self._supervisors_of_others.append(_SupervisorStop(process, controls))
                 continue
-            supervisor = self._find_supervisors.get((process.pid, process.born or 0))
+            supervisor = self._own_supervisors.get((process.pid, process.born or 0))
             if supervisor is None:
                 supervisor = _SupervisorStop(process, controls)
                 if self._rig is not None and not supervisor.may_run_rig(self._rig):
@@ -299,8 +299,8 @@ class _DaemonStop:
 
     def _reason_to_doubt(self, pid: int, uid: int) -> str:
         """Return why replies of a process on this socket are not trusted, or "" if they are."""
-        folder, rig = self._path.parent, self._path.name.removesuffix(SUFFIX)
-        is_group_folder = folder == COMMON
+        folder, rig = self._path.parent, self._path.name.removesuffix(SOCKET_SUFFIX)
+        is_group_folder = folder == GROUP_FOLDER
         if folder_fault(folder, shared=is_group_folder):
             return "Other users can write to its folder."
         try:
@@ -321,7 +321,7 @@ class _DaemonStop:
 
         `disabled` states whether the process table shows that the drive is disabled.
         """
-        rig = self._path.name.removesuffix(SUFFIX)
+        rig = self._path.name.removesuffix(SOCKET_SUFFIX)
         if self.doubt:
             who = f"process {self.pid}" if self.pid else "the process"
             report.doubts.append(

@@ -13,9 +13,9 @@ from rigd.errors import FailureError, UserError
 from rigd.runtime.addresses import address_files, answers, file_name, folder_fault, runtime_folder
 from rigd.runtime.processes import listening_sockets
 
-COMMON = Path("/run/rigd")
+GROUP_FOLDER = Path("/run/rigd")
 """Folder for sockets of daemons that a group may use, since others cannot enter a user's folder."""
-SUFFIX = ".daemon"
+SOCKET_SUFFIX = ".daemon"
 """Suffix of the file name of a daemon's socket."""
 _CREDENTIALS_FORMAT = struct.Struct("3i")
 
@@ -38,7 +38,7 @@ def socket_path(rig: str, folder: Path | None = None) -> Path:
     folder
         Folder of the socket, or None for the user's runtime folder.
     """
-    return (folder or runtime_folder()) / f"{file_name(rig)}{SUFFIX}"
+    return (folder or runtime_folder()) / f"{file_name(rig)}{SOCKET_SUFFIX}"
 
 
 def peer_of(link: socket.socket) -> tuple[int, int]:
@@ -103,7 +103,7 @@ def bind(path: Path, group: str | None) -> socket.socket:
 
 def running() -> list[Path]:
     """Return the paths of the sockets of all daemons that this user can connect to."""
-    sockets = address_files(f"*{SUFFIX}", *_searched_folders())
+    sockets = address_files(f"*{SOCKET_SUFFIX}", *_searched_folders())
     return [path for path in sockets if answers(path)]
 
 
@@ -128,14 +128,18 @@ def find(rig: str | None) -> Path:
     if not sockets:
         raise AddressError(f"No daemon {_not_found_reason(None)}rigd serve --profile NAME.")
     if len(sockets) > 1:
-        rigs = ", ".join(path.name.removesuffix(SUFFIX) for path in sockets)
+        rigs = ", ".join(path.name.removesuffix(SOCKET_SUFFIX) for path in sockets)
         raise AddressError(f"Several daemons are running ({rigs}); name one with --profile.")
     return sockets[0]
 
 
 def _searched_folders() -> list[Path]:
     """Return the folders to search for sockets of daemons, except for an unsafe group folder."""
-    return [runtime_folder()] if folder_fault(COMMON, shared=True) else [runtime_folder(), COMMON]
+    return (
+        [runtime_folder()]
+        if folder_fault(GROUP_FOLDER, shared=True)
+        else [runtime_folder(), GROUP_FOLDER]
+    )
 
 
 def _not_found_reason(rig: str | None) -> str:
@@ -143,12 +147,12 @@ def _not_found_reason(rig: str | None) -> str:
 
     `rig` is the rig's name as in file names, or None for any rig.
     """
-    fault = folder_fault(COMMON, shared=True)
-    sockets_in_unsafe_folder = address_files(f"*{SUFFIX}", COMMON) if fault else []
+    fault = folder_fault(GROUP_FOLDER, shared=True)
+    sockets_in_unsafe_folder = address_files(f"*{SOCKET_SUFFIX}", GROUP_FOLDER) if fault else []
     sockets_elsewhere = []
     with suppress(OSError):
         sockets_elsewhere = [
-            path for path in own_sockets() if rig in (None, path.name.removesuffix(SUFFIX))
+            path for path in own_sockets() if rig in (None, path.name.removesuffix(SOCKET_SUFFIX))
         ]
     folders = " or ".join(map(str, _searched_folders()))
     if sockets_in_unsafe_folder:
@@ -174,7 +178,7 @@ def own_sockets() -> list[Path]:
     sockets = []
     for path in listening_sockets():
         folder = path.parent.name
-        if path.name.endswith(SUFFIX) and (folder == "rigd" or folder.startswith("rigd-")):
+        if path.name.endswith(SOCKET_SUFFIX) and (folder == "rigd" or folder.startswith("rigd-")):
             with suppress(OSError, ValueError):  # it was removed, or is in another user's folder
                 status = path.lstat()
                 if stat.S_ISSOCK(status.st_mode) and os.getuid() in (0, status.st_uid):

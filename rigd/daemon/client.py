@@ -365,10 +365,10 @@ def stop_session(path: Path) -> Document:
     began_s = time.monotonic()
     peer: tuple[int, int] | None = None
     signalled = False
-    answer_s = _FIRST_STOP_REPLY_TIMEOUT_S
+    reply_timeout_s = _FIRST_STOP_REPLY_TIMEOUT_S
     while True:
         try:
-            with Client(path, answer_s, answer_s) as client:
+            with Client(path, reply_timeout_s, reply_timeout_s) as client:
                 peer = client.pid, client.uid
                 return client.ask("stop") | {"signalled": signalled, "peer": peer}
         except (DaemonGoneError, _TooManyClientsError) as error:
@@ -379,7 +379,7 @@ def stop_session(path: Path) -> Document:
         if waited_s > _STOP_TIMEOUT_S or not path.exists():
             break
         # A daemon that lacks processor time stops its session, but replies late.
-        answer_s = min(2.0 * answer_s, _STOP_TIMEOUT_S)
+        reply_timeout_s = min(2.0 * reply_timeout_s, _STOP_TIMEOUT_S)
         time.sleep(_RETRY_PAUSE_S)
     if peer is None:
         raise DaemonGoneError(failure)

@@ -274,7 +274,7 @@ def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
     while (
         quick_looks.busy
         and not is_skipped
-        and quick_looks.spent_s < _QUICK_LOOK_MAX_RUN_TIME_S
+        and quick_looks.run_time_s < _QUICK_LOOK_MAX_RUN_TIME_S
         and time.monotonic() < deadline_s
     ):
         time.sleep(_POLL_S)
@@ -282,7 +282,7 @@ def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
     if quick_looks.busy and not is_skipped:
         reason = (
             "took too long"
-            if quick_looks.spent_s >= _QUICK_LOOK_MAX_RUN_TIME_S
+            if quick_looks.run_time_s >= _QUICK_LOOK_MAX_RUN_TIME_S
             else "got no processor time"
         )
         _print(

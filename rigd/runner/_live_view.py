@@ -140,25 +140,28 @@ class LiveView:
     def _process_message_for(self, timeout_s: float) -> None:
         """Process a message of the publisher, waiting for it for a time in seconds."""
         try:
-            answer = self._group[LIVE].poll(timeout_s)
+            message = self._group[LIVE].poll(timeout_s)
         except ChildError as error:
             self._restart(str(error))
         else:
-            if answer is not None:
-                self._process_message(answer)
+            if message is not None:
+                self._process_message(message)
 
-    def _process_message(self, answer: object) -> None:
+    def _process_message(self, message: object) -> None:
         """Process a message of the publisher: its address, its readiness, or its failure."""
-        match answer:
+        match message:
             case LiveShown():
                 self._is_session_shown = True
             case LiveAddress():
-                before, self.address = self.address, answer
+                previous_address, self.address = self.address, message
                 self._has_address = True
-                if before is not None and before.viewer_url != answer.viewer_url:
-                    self._add_event("info", f"Live view: {answer.viewer_url}")
+                if (
+                    previous_address is not None
+                    and previous_address.viewer_url != message.viewer_url
+                ):
+                    self._add_event("info", f"Live view: {message.viewer_url}")
             case _:
-                self._failure = answer.reason if isinstance(answer, Failed) else str(answer)
+                self._failure = message.reason if isinstance(message, Failed) else str(message)
                 self.address = None
                 if self._session is not None:
                     self._add_event(

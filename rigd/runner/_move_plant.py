@@ -92,18 +92,18 @@ def move_plant_of(
     disturbances = Disturbances(
         motor.coulomb_nm, rig.encoder.resolution_rad, torque_noise_nm(profile)
     )
-    compensated = replace(loop, model=model)
+    compensated_loop = replace(loop, model=model)
 
-    def disturbed(reference_rad: Real, modes: int) -> tuple[Real, Real]:
+    def respond_disturbed(reference_rad: Real, modes: int) -> tuple[Real, Real]:
         response = simulate_disturbed(
-            compensated, reference_rad, disturbances, modes=modes, draws=_NOISE_REALISATIONS
+            compensated_loop, reference_rad, disturbances, modes=modes, draws=_NOISE_REALISATIONS
         )
         return response.angle_rad, response.mode_torque_nm
 
     return MovePlant(
         rate_hz=model.rate_hz,
         respond=loop.simulate,
-        disturbed=disturbed,
+        disturbed=respond_disturbed,
         poles_rad_s=closed_loop_poles,
         torque_per_state_nm_s=torque_per_angle
         * np.abs(loop.response(np.abs(closed_loop_poles) / (2.0 * math.pi))),

@@ -108,10 +108,10 @@ class FitSupervisor:
     def _check_heartbeat(self) -> None:
         """Kill the fit process if its last heartbeat is too long ago."""
         assert FIT.hung_after_s is not None
-        still_s = self._heartbeat.stalled_for(
+        stalled_s = self._heartbeat.stalled_for(
             self._shared_state[StateField.FIT_BEAT], time.monotonic()
         )
-        if still_s > FIT.hung_after_s:
+        if stalled_s > FIT.hung_after_s:
             self._group[FIT].kill()
             self._continue_without_process(
                 f"The fit process hung for {FIT.hung_after_s:g} s and was ended."
@@ -119,8 +119,8 @@ class FitSupervisor:
 
     def take_new_estimates(self) -> list[Mapping[str, Any]]:
         """Return the estimates that were received since the last call."""
-        take_new_estimates, self._new_estimates = self._new_estimates, []
-        return take_new_estimates
+        estimates, self._new_estimates = self._new_estimates, []
+        return estimates
 
     def finish(self, ticks: int, meanwhile: Callable[[], None]) -> dict[str, Any]:
         """Wait for the fit of the whole record; return the last estimate as a JSON dictionary.

@@ -166,9 +166,9 @@ class _PlannedInterval:
 class ExcitationPlanner:
     """Chooses the segments of the reference until the requested precision is reached.
 
-    `due` is the tick of the reference up to which the next decision needs samples, or None after
-    the last decision. If `may_be_last` is True, the next estimate may end the session, and must be
-    a fit of all damping structures.
+    `due_tick` is the tick of the reference up to which the next decision needs samples, or None
+    after the last decision. If `may_be_last` is True, the next estimate may end the session, and
+    must be a fit of all damping structures.
     """
 
     def __init__(
@@ -197,13 +197,13 @@ class ExcitationPlanner:
         profile_percent = profile.uncertainty.uniformity_percent
         self._uniformity = (profile_percent if stated_percent is None else stated_percent) / 100.0
         self._column_names: list[str] = []
-        self.due: int | None = scan_tick + scan_rad.size
+        self.due_tick: int | None = scan_tick + scan_rad.size
         self.may_be_last = False
 
     def plan_next(
         self, document: Mapping[str, Any], held_ticks: int, held_ticks_before: int
     ) -> Iterator[object]:
-        """Plan the next segment from a fit of the samples before `due`.
+        """Plan the next segment from a fit of the samples before `due_tick`.
 
         Yields the messages for the supervisor. The angle was held for `held_ticks` ticks because no
         segment was available in time. `held_ticks_before` of these precede the segment that began
@@ -259,7 +259,9 @@ class ExcitationPlanner:
         This provides start values for the fit of all structures after the pause.
         """
         return (
-            self._intervals[-1].name == "pause" and not self._has_full_fit and self.due is not None
+            self._intervals[-1].name == "pause"
+            and not self._has_full_fit
+            and self.due_tick is not None
         )
 
     def has_last_segment_begun(self, begun: int) -> bool:
@@ -270,7 +272,7 @@ class ExcitationPlanner:
         """
         return len(self._intervals) == 1 or begun > self._intervals[-1].reference_tick
 
-    def ended(self, ticks: int, held_ticks_before: int, begun: int) -> SearchEnded:
+    def end_of_record(self, ticks: int, held_ticks_before: int, begun: int) -> SearchEnded:
         """Return the message that ends the search after a record of `ticks` ticks has ended."""
         if self.has_last_segment_begun(begun):
             last = self._intervals[-1]
@@ -333,7 +335,7 @@ class ExcitationPlanner:
             return
         self._segment_count += 1
         self._append(f"piece_{self._segment_count}", segment.reference_rad)
-        self.due = self._intervals[-1].reference_tick
+        self.due_tick = self._intervals[-1].reference_tick
         # Another structure, such as a compliant clamp, may fit where a uniform beam does not.
         self.may_be_last = bool(doubt) and not self.may_be_last
         yield PlannedSegment(segment.name, self._expectation_document(segment, estimates))
@@ -389,13 +391,13 @@ class ExcitationPlanner:
         if self._max_ticks - self._writer.ticks - held_ticks < scan_rad.size:
             return False
         self._append(name, scan_rad)
-        self.due = self._writer.ticks
+        self.due_tick = self._writer.ticks
         return True
 
     def _append_pause(self, duration_s: float) -> None:
         """Append a pause, after which all damping structures are fitted to the whole record."""
         self._append("pause", np.zeros(round(duration_s * self._rate_hz)))
-        self.due, self.may_be_last = self._writer.ticks, True
+        self.due_tick, self.may_be_last = self._writer.ticks, True
 
     def _append(self, name: str, reference_rad: Real) -> None:
         """Append a named segment to the reference that the control loop reads."""
@@ -473,7 +475,7 @@ class ExcitationPlanner:
 
     def _end_message(self, reason: str, *, reached: bool) -> SearchEnded:
         """Return the message that ends the search with the planned segments."""
-        self.due = None
+        self.due_tick = None
         segments = {
             each.name: (each.record_tick, each.record_tick + each.size)
             for each in self._intervals

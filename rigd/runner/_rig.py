@@ -19,7 +19,13 @@ from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner.request import Order
-from rigd.runner.session import RunResult, SessionFailedError, SessionRun, Watcher, always
+from rigd.runner.session import (
+    ProgressCallback,
+    RunResult,
+    SessionFailedError,
+    SessionRun,
+    can_always_receive_stop,
+)
 from rigd.runner.signal_blocks import SignalBlock, SignalReader
 from rigd.runner.status import RigStatus, StatusReader
 from rigd.runtime import StopRequest
@@ -117,12 +123,12 @@ class Rig:
         """Metadata on its settings that the connected drive reports, empty while not connected."""
         return {} if self._connection is None or not self.connected else self._connection.drive
 
-    def connect(self, moving: ActuationTarget | None = None, *, reset_fault: bool = False) -> None:
+    def connect(self, target: ActuationTarget | None = None, *, reset_fault: bool = False) -> None:
         """Start the processes and connect the devices, while the torque stays off.
 
         Parameters
         ----------
-        moving
+        target
             Actuation target that was announced to the operator; any other target is refused.
         reset_fault
             Reset a fault of the drive first, as the operator has decided.
@@ -139,19 +145,21 @@ class Rig:
             self.disconnect()
         try:
             # For processes that are started here, it is not yet known which sessions follow.
-            any_session = self._group is None
+            may_be_observed = self._group is None
             group = self._group = self._group or ProcessGroup(live=self._live)
-            granted = self._raise_priority(group)
+            granted_settings = self._raise_priority(group)
             if reset_fault:
-                self._reset_fault(moving)
+                self._reset_fault(target)
             _allocate_shared_memory(
-                group, self._profile.rig.rate_hz, fast=self._fast, may_be_observed=any_session
+                group, self._profile.rig.rate_hz, fast=self._fast, may_be_observed=may_be_observed
             )
-            job = ControlJob(self._profile, moving, group.channels.specs, self._fast)
+            job = ControlJob(self._profile, target, group.channels.specs, self._fast)
             group.idle_process(CONTROL).start(job)
             connection = self._await_message(_CONNECT_TIMEOUT_S)
             assert isinstance(connection, Connected)
-            self._connection = replace(connection, realtime={**connection.realtime, **granted})
+            self._connection = replace(
+                connection, realtime={**connection.realtime, **granted_settings}
+            )
         except (RigError, ChildError, OSError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
@@ -165,8 +173,8 @@ class Rig:
         self,
         order: Order,
         stop: StopRequest,
-        watcher: Watcher,
-        can_receive_stop: Callable[[], bool] = always,
+        watcher: ProgressCallback,
+        can_receive_stop: Callable[[], bool] = can_always_receive_stop,
     ) -> RunResult:
         """Run one session to its end, and return its result.
 
@@ -263,9 +271,9 @@ class Rig:
         RigError
             If the motor moves.
         """
-        answer = self._measure(Zero(), 0.0)
+        reply = self._measure(Zero(), 0.0)
         self._is_zero_set, self.zero_lost = True, False
-        return answer
+        return reply
 
     def probe(self, profile: Profile, stop: StopRequest) -> dict[str, Any]:
         """Make the probing move, which estimates friction and the scales of motor and sensors.
@@ -302,24 +310,24 @@ class Rig:
             request_stop()
         try:
             group.control.send(Probe(profile))
-            answer = self._await_probe(group, profile)
+            reply = self._await_probe(group, profile)
         except (ChildError, RigError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
         finally:
             stop.on_request = _ignore_stop_request
             _reset_session_fields(shared_state)
-        if isinstance(answer, Refused):
-            raise RigError(answer.reason)
-        assert isinstance(answer, Measured)
-        return answer.values
+        if isinstance(reply, Refused):
+            raise RigError(reply.reason)
+        assert isinstance(reply, Measured)
+        return reply.values
 
     def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
         """Monitor the control process until it sends the result of a probing move, return that.
 
         A hung control process is killed.
         """
-        shared_state, pulse = group.channels.shared_state, Heartbeat()
+        shared_state, heartbeat = group.channels.shared_state, Heartbeat()
         assert CONTROL.hung_after_s is not None
         hung_after_s = (
             _VIRTUAL_CLOCK_HEARTBEAT_TIMEOUT_S
@@ -328,15 +336,15 @@ class Rig:
         )
         until_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_TIMEOUT_S
         while True:
-            answer = group.control.poll(_POLL_S)
+            reply = group.control.poll(_POLL_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
-            if isinstance(answer, Ended):
-                raise RigError(answer.reason or "It was stopped.")
-            if answer is not None:
-                return answer
+            if isinstance(reply, Ended):
+                raise RigError(reply.reason or "It was stopped.")
+            if reply is not None:
+                return reply
             now_s = time.monotonic()
-            still_s = pulse.stalled_for(shared_state[StateField.CONTROL_BEAT], now_s)
-            if still_s > hung_after_s or now_s > until_s:
+            stalled_s = heartbeat.stalled_for(shared_state[StateField.CONTROL_BEAT], now_s)
+            if stalled_s > hung_after_s or now_s > until_s:
                 group.control.kill()
                 raise RigError(
                     "The control process did not end the probing move and was killed: without its "
@@ -362,13 +370,13 @@ class Rig:
         shared_state = group.channels.shared_state
         shared_state.beat(StateField.SUPERVISOR_BEAT)
         assert CONTROL.hung_after_s is not None
-        still_s = self._heartbeat.stalled_for(
+        stalled_s = self._heartbeat.stalled_for(
             shared_state[StateField.CONTROL_BEAT], time.monotonic()
         )
-        if message is None and still_s > CONTROL.hung_after_s:
+        if message is None and stalled_s > CONTROL.hung_after_s:
             group.control.kill()
             message = Ended(
-                f"The control process has not responded for {still_s:.1f} s. Check CPU load."
+                f"The control process has not responded for {stalled_s:.1f} s. Check CPU load."
             )
         if message is not None:
             self.disconnect()
@@ -417,12 +425,12 @@ class Rig:
         group.cores = self._precedence.cores_before
         return {f"supervisor_{name}": text for name, text in self._precedence.take().items()}
 
-    def _reset_fault(self, moving: ActuationTarget | None) -> None:
+    def _reset_fault(self, target: ActuationTarget | None) -> None:
         """Reset the fault of the drive; raise RigError if that fails."""
         try:
             from rigd.devices import reset_drive  # late: loads the drivers, needed only here
 
-            reset_drive(self._profile.rig, moving)
+            reset_drive(self._profile.rig, target)
         except (DeviceError, OSError) as error:
             raise RigError(str(error)) from None
 
@@ -440,14 +448,14 @@ class Rig:
         group = self._connected_group()
         try:
             group.control.send(order)
-            answer = self._await_message(_MEASUREMENT_TIMEOUT_S + duration_s)
+            reply = self._await_message(_MEASUREMENT_TIMEOUT_S + duration_s)
         except (ChildError, RigError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
-        if isinstance(answer, Refused):
-            raise RigError(answer.reason)
-        assert isinstance(answer, Measured)
-        return answer.values
+        if isinstance(reply, Refused):
+            raise RigError(reply.reason)
+        assert isinstance(reply, Measured)
+        return reply.values
 
     def _await_message(self, timeout_s: float) -> object:
         """Wait for a message of the control process, and return it.
@@ -456,15 +464,15 @@ class Rig:
         died.
         """
         assert self._group is not None
-        answer = self._group.control.poll(timeout_s)
-        if answer is None:
+        message = self._group.control.poll(timeout_s)
+        if message is None:
             raise RigError(
                 f"The control process does not answer within {timeout_s:g} s; check that the "
                 "devices are on, and check CPU load."
             )
-        if isinstance(answer, Ended):
-            raise RigError(answer.reason or "It was stopped.")
-        return answer
+        if isinstance(message, Ended):
+            raise RigError(message.reason or "It was stopped.")
+        return message
 
     def _await_closed_devices(self) -> None:
         """Wait until the control process has closed all devices after one failed; disconnect."""

@@ -18,7 +18,7 @@ from rigd.runner._touch_search import touch_search
 from rigd.runner.planning import RefusedError, plan_document, plan_session, predicted_metadata
 from rigd.runner.quick_looks import QuickLooks
 from rigd.runner.request import Order, check_required, choose_path, require_disk_space
-from rigd.runner.session import RunResult, SessionProgress, always
+from rigd.runner.session import RunResult, SessionProgress, can_always_receive_stop
 from rigd.runtime import StopRequest
 
 _QUICK_LOOK_MAX_PAUSE_S: Final = 8.0
@@ -144,7 +144,7 @@ class Series:
         watcher: SeriesWatcher,
         *,
         live: bool,
-        can_receive_stop: Callable[[], bool] = always,
+        can_receive_stop: Callable[[], bool] = can_always_receive_stop,
         quick_looks: QuickLooks | None = None,
     ) -> None:
         """Run the sessions until a stop or the first incomplete session.
@@ -209,7 +209,7 @@ class Series:
                 self._seed(number),
                 self.plan.clearance.accepted,
             )
-            with contextlib.nullcontext() if quick_looks is None else quick_looks.held():
+            with contextlib.nullcontext() if quick_looks is None else quick_looks.suspended():
                 if live:
                     watcher.on_live_view(rig.show(order, stop))
                 result = rig.run(order, stop, watcher.on_progress, can_receive_stop)

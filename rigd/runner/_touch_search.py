@@ -179,8 +179,8 @@ class TouchEstimates:
 
     def take_new_estimates(self) -> list[dict[str, Any]]:
         """Return the estimates that were received since the last call."""
-        take_new_estimates, self._new_estimates = self._new_estimates, []
-        return take_new_estimates
+        estimates, self._new_estimates = self._new_estimates, []
+        return estimates
 
     def _process_messages(self, timeout_s: float) -> None:
         """Process the messages of the touch process, waiting for them for a time in seconds."""

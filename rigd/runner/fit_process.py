@@ -61,11 +61,11 @@ def main() -> None:
         pin_off_loop_core(job.realtime.cpu)
     try:
         with FitProgram() as program:
-            follower = _SessionFit(job, parent, program, attach_channels(job.channels))
+            session_fit = _SessionFit(job, parent, program, attach_channels(job.channels))
             try:
-                follower.run()
+                session_fit.run()
             except BrokenPipeError:
-                raise program.ended() from None
+                raise program.end_error() from None
     except FitProgramError as error:
         parent.send(Failed(str(error)))
         raise SystemExit(1) from None
@@ -88,10 +88,10 @@ class FitProgram:
             ) from None
         self.input = cast("BinaryIO", self._process.stdin)
         """Standard input of the program, in the format of `rigd.session.online_fit`."""
-        self._answers: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+        self._estimates: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         threading.Thread(target=self._read_estimates, daemon=True).start()
 
-    def answer(self) -> dict[str, Any] | None:
+    def next_estimate(self) -> dict[str, Any] | None:
         """Return the program's next estimate, or None if there is no new one.
 
         Raises
@@ -100,14 +100,14 @@ class FitProgram:
             If the program has ended.
         """
         try:
-            answer = self._answers.get_nowait()
+            estimate = self._estimates.get_nowait()
         except queue.Empty:
             return None
-        if answer is None:
-            raise self.ended()
-        return answer
+        if estimate is None:
+            raise self.end_error()
+        return estimate
 
-    def ended(self) -> FitProgramError:
+    def end_error(self) -> FitProgramError:
         """Return the error that states how the program ended, after waiting for its end."""
         code = self._process.wait()
         how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
@@ -118,8 +118,8 @@ class FitProgram:
         assert self._process.stdout is not None
         with contextlib.suppress(ValueError):  # incomplete line: the program ended while writing
             for line in self._process.stdout:
-                self._answers.put(json.loads(line))
-        self._answers.put(None)
+                self._estimates.put(json.loads(line))
+        self._estimates.put(None)
 
     def __enter__(self) -> Self:
         return self
@@ -158,7 +158,7 @@ class _SessionFit:
         while True:
             self._shared_state.beat(StateField.FIT_BEAT)
             has_passed_samples = self._pass_samples()
-            estimate = self._program.answer()
+            estimate = self._program.next_estimate()
             if estimate is not None and self._process_estimate(estimate):
                 return
             self._request_if_possible(is_drained=not has_passed_samples)
@@ -171,12 +171,14 @@ class _SessionFit:
                     self._begin(message)
                 case RecordEnded(ticks):
                     self._record_ticks = ticks
-                    if self._search is not None and self._search.due is not None:
+                    if self._search is not None and self._search.due_tick is not None:
                         held_ticks_before, begun = (
                             self._shared_state[StateField.HELD_BEFORE],
                             self._shared_state[StateField.BEGUN],
                         )
-                        self._parent.send(self._search.ended(ticks, held_ticks_before, begun))
+                        self._parent.send(
+                            self._search.end_of_record(ticks, held_ticks_before, begun)
+                        )
 
     def _begin(self, header: FileHeader) -> None:
         """Send the header of the session file to the fit program, and prepare the planning."""
@@ -211,12 +213,12 @@ class _SessionFit:
                 self._request(self._record_ticks, whole=True)
         elif (
             search is not None
-            and search.due is not None
+            and search.due_tick is not None
             and search.has_last_segment_begun(self._shared_state[StateField.BEGUN])
         ):
             # The count of held ticks is read after the samples, because the loop increases it
             # before it publishes the sample.
-            tick = search.due + self._shared_state[StateField.HELD]
+            tick = search.due_tick + self._shared_state[StateField.HELD]
             if self._passed_ticks >= tick:
                 self._request(tick, whole=search.may_be_last, from_last=True)
 

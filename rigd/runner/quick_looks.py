@@ -113,7 +113,7 @@ class QuickLooks:
         return self._process is not None or bool(self._waiting_sessions)
 
     @property
-    def spent_s(self) -> float:
+    def run_time_s(self) -> float:
         """Run time of the present quick look in seconds, without waits for a processor."""
         return self._run_time_s
 
@@ -131,7 +131,7 @@ class QuickLooks:
             self._on_result(each)
 
     @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
+    def suspended(self) -> Iterator[None]:
         """Suspend the running quick look while the context, a session, lasts."""
         with self._lock:
             self._is_suspended = True

@@ -118,28 +118,28 @@ def load_rig(
     refusals = objections(profile.rig)
     if refusals:
         raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
-    moving = actuation_target(profile.rig)
-    if hardware and moving is not ActuationTarget.HARDWARE:
+    target = actuation_target(profile.rig)
+    if hardware and target is not ActuationTarget.HARDWARE:
         raise RefusedError(
-            f"--hardware: {describe_actuation_target(profile.rig, moving)} Omit the option, or end "
+            f"--hardware: {describe_actuation_target(profile.rig, target)} Omit the option, or end "
             "the simulated rig."
         )
-    if moving is ActuationTarget.HARDWARE and not hardware:
+    if target is ActuationTarget.HARDWARE and not hardware:
         _refuse_unreachable_simulators(profile)
-    if fast and not moving.any_clock:
+    if fast and not target.any_clock:
         raise RefusedError(
-            f"--fast: {moving.value} of {profile.path} moves in real time, which cannot be "
+            f"--fast: {target.value} of {profile.path} moves in real time, which cannot be "
             "skipped; omit the option."
             + (
                 " Or start rigd simulate with --lock-step."
-                if moving is ActuationTarget.SIMULATOR
+                if target is ActuationTarget.SIMULATOR
                 else ""
             )
         )
     if seed is not None:
-        if moving is ActuationTarget.HARDWARE:
+        if target is ActuationTarget.HARDWARE:
             raise RefusedError(
-                f"--seed: {moving.value} of {profile.path} moves, whose noise is not simulated; "
+                f"--seed: {target.value} of {profile.path} moves, whose noise is not simulated; "
                 "omit the option."
             )
         if profile.rig.simulation is None:
@@ -150,18 +150,18 @@ def load_rig(
         simulation = replace(profile.rig.simulation, seed=seed)
         profile = replace(profile, rig=replace(profile.rig, simulation=simulation))
     if obstacles:
-        if moving is not ActuationTarget.SIMULATED:
+        if target is not ActuationTarget.SIMULATED:
             raise RefusedError(
-                f"--obstacle: {moving.value} of {profile.path} is not simulated here; omit the "
+                f"--obstacle: {target.value} of {profile.path} is not simulated here; omit the "
                 "option."
                 + (
                     " Or inject the obstacle into the simulated rig (rigd inject obstacle,x=…)."
-                    if moving is ActuationTarget.SIMULATOR
+                    if target is ActuationTarget.SIMULATOR
                     else ""
                 )
             )
         profile = replace(profile, rig=with_obstacles(profile.rig, obstacles))
-    return profile, moving
+    return profile, target
 
 
 def _refuse_unreachable_simulators(profile: Profile) -> None:
@@ -293,14 +293,14 @@ def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
     return _unused_path(path)
 
 
-def part_of(path: Path) -> Path:
+def part_path(path: Path) -> Path:
     """Return the path that a session file has until it is complete: X.mcap.part for X.mcap."""
     return path.with_name(path.name + PART_SUFFIX)
 
 
 def _unused_path(path: Path) -> Path:
     """Return a path at which no session file exists, with a number appended if necessary."""
-    while path.exists() or part_of(path).exists():
+    while path.exists() or part_path(path).exists():
         path = another_path(path)
     return path
 
@@ -327,7 +327,7 @@ def remaining_file_text(path: Path | None) -> str:
 
     if path is None:
         return "It has no file."
-    part = part_of(path)
+    part = part_path(path)
     try:
         part_exists, file_exists = part.exists(), path.exists()
     except OSError as error:
@@ -338,7 +338,7 @@ def remaining_file_text(path: Path | None) -> str:
         )
     if not holds_samples(part):
         return f"Nothing was recorded; {part} holds no sample and can be removed."
-    old, new = (shlex.quote(str(part_of(name))) for name in (path, _unused_path(path)))
+    old, new = (shlex.quote(str(part_path(name))) for name in (path, _unused_path(path)))
     if not file_exists:
         return f"What was recorded is in {part}; rigd recover {old} makes a clean file of it."
     return (

@@ -36,7 +36,7 @@ from rigd.runner._live_view import LiveView
 from rigd.runner._online_fit import FitSupervisor
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._touch_search import TouchEstimates
-from rigd.runner.request import Order, another_path, file_header, part_of
+from rigd.runner.request import Order, another_path, file_header, part_path
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.02
@@ -88,12 +88,12 @@ class SessionFailedError(FailureError):
         part, complete_path = self.saved_path, None
         if part is None and self.path is not None:
             try:
-                if part_of(self.path).exists():
-                    part = part_of(self.path)
+                if part_path(self.path).exists():
+                    part = part_path(self.path)
                 elif self.path.exists():
                     complete_path = self.path  # the recorder was only slow, and completed the file
             except OSError:
-                part = part_of(self.path)  # the folder cannot be read
+                part = part_path(self.path)  # the folder cannot be read
         return RunResult(
             path=complete_path,
             outcome="fault",
@@ -197,9 +197,9 @@ class SessionProgress:
     """Fits of the record that were made since the last report, as in JSON documents."""
 
 
-Watcher = Callable[[SessionProgress, list[LogEvent]], None]
+ProgressCallback = Callable[[SessionProgress, list[LogEvent]], None]
 """Callback for the progress of a session and its events since the last call."""
-T = TypeVar("T")
+MessageType = TypeVar("MessageType")
 
 
 class SessionRun:
@@ -233,7 +233,7 @@ class SessionRun:
         group: ProcessGroup,
         connected: Connected,
         live: LiveView | None,
-        watcher: Watcher,
+        watcher: ProgressCallback,
         can_receive_stop: Callable[[], bool],
     ) -> None:
         self._order = order
@@ -493,7 +493,9 @@ class SessionRun:
             return message.reason
         return None if message is None else str(message)
 
-    def _await_recorder(self, expected: type[T], timeout_s: float = _REPLY_TIMEOUT_S) -> T:
+    def _await_recorder(
+        self, expected: type[MessageType], timeout_s: float = _REPLY_TIMEOUT_S
+    ) -> MessageType:
         """Wait for a message of a given type from the recorder, and return it.
 
         Progress is reported meanwhile, because the motor may be held. Raises SessionFailedError if
@@ -615,7 +617,7 @@ def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
     return {"sessions": [result.as_dict() for result in results], **touches}
 
 
-def always() -> bool:
+def can_always_receive_stop() -> bool:
     """Return True: a process that is stopped by signals can always receive a stop request."""
     return True
 

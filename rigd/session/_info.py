@@ -14,7 +14,7 @@ import numpy as np
 from rigd.printable import counts_text, grouped, listed, printable
 from rigd.session import limits
 from rigd.session._errors import SessionError
-from rigd.session._reader import SURVEY_FIELDS, LoggedEvent, Session, read_session
+from rigd.session._reader import ORDER_AND_FLAG_FIELDS, LoggedEvent, Session, read_session
 from rigd.session.layout import Status
 from rigd.session.online_fit import mode_line
 from rigd.session.quick_look import fit_of
@@ -82,9 +82,9 @@ class SessionInfo:
     """Events of the session's log, with texts cut to a readable length."""
     attachments: dict[str, int]
     """Name of an attached file → its length in bytes."""
-    left_out: list[str]
+    omission_texts: list[str]
     """Sentences that state which contents of the file are too long to be shown."""
-    absent: str = ""
+    missing_samples_text: str = ""
     """Sentence that states which recorded samples are missing from the file; empty if none are."""
 
     def as_dict(self) -> dict[str, Any]:
@@ -112,8 +112,8 @@ class SessionInfo:
                 for event in self.events
             ],
             "attachments": self.attachments,
-            "left_out": self.left_out,
-            "absent": self.absent,
+            "left_out": self.omission_texts,
+            "absent": self.missing_samples_text,
         }
 
     def lines(self) -> list[str]:
@@ -121,8 +121,8 @@ class SessionInfo:
         rows = [
             ("file", f"{self.path} ({self.size_bytes / 1e6:.2f} MB)"),
             ("started", _time_text(datetime.fromisoformat(self.start_utc))),
-            *_outcome_rows(self.outcome or {}, is_whole=not self.absent),
-            *([("absent", self.absent)] if self.absent else []),
+            *_outcome_rows(self.outcome or {}, is_whole=not self.missing_samples_text),
+            *([("absent", self.missing_samples_text)] if self.missing_samples_text else []),
             *(("recovered", f"{k}: {v}") for k, v in _recovery_items(self.outcome or {}).items()),
             (
                 "samples",
@@ -147,7 +147,7 @@ class SessionInfo:
                 (f"{event.t_ns / 1e9:.3f} s", f"{event.level}: {event.message} [{event.name}]")
                 for event in self.events
             ),
-            *(("not shown", sentence) for sentence in self.left_out),
+            *(("not shown", sentence) for sentence in self.omission_texts),
         ]
         width = min(max(len(key) for key, _ in rows), _MAX_KEY_COLUMN_WIDTH)
         return [f"{printable(key):{width}}  {printable(value)}" for key, value in rows]
@@ -169,7 +169,9 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
     (1000.0, 21500, 'complete')
     """
     path = Path(path)
-    session = read_session(path, fields=SURVEY_FIELDS, max_samples=limits.MAX_SURVEYED)
+    session = read_session(
+        path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
+    )
     rate_hz = session.number("rate_hz")
     if rate_hz <= 0:
         raise SessionError(
@@ -178,14 +180,16 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
         )
     ticks = session.samples["tick"]
     ticks_spanned = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
-    left_out: list[str] = []
+    omission_texts: list[str] = []
     # Ticks missing at the end leave no gap; only the outcome states them.
-    scheduled = (session.outcome or {}).get("scheduled", "")
-    if scheduled.isascii() and scheduled.isdigit():
-        if _is_count(scheduled):
-            ticks_spanned = max(ticks_spanned, int(scheduled))
+    scheduled_text = (session.outcome or {}).get("scheduled", "")
+    if scheduled_text.isascii() and scheduled_text.isdigit():
+        if _is_count(scheduled_text):
+            ticks_spanned = max(ticks_spanned, int(scheduled_text))
         else:
-            left_out.append(f"scheduled of the outcome, a number of {len(scheduled)} digits")
+            omission_texts.append(
+                f"scheduled of the outcome, a number of {len(scheduled_text)} digits"
+            )
     return SessionInfo(
         path=path,
         size_bytes=path.stat().st_size,
@@ -196,19 +200,21 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
         duration_s=ticks_spanned / rate_hz,
         missing_ticks=ticks_spanned - len(ticks),
         status_counts=_status_counts(session),
-        segments=_EntryLimiter("segments", 50_000, left_out).mapping(session.segments),
-        metadata=_EntryLimiter("keys", _MAX_METADATA_CHARACTERS, left_out).texts(session.metadata),
+        segments=_EntryLimiter("segments", 50_000, omission_texts).mapping(session.segments),
+        metadata=_EntryLimiter("keys", _MAX_METADATA_CHARACTERS, omission_texts).texts(
+            session.metadata
+        ),
         outcome=None
         if session.outcome is None
-        else _EntryLimiter("keys of the outcome", 100_000, left_out).texts(session.outcome),
-        events=_EntryLimiter("messages of the log", 500_000, left_out).events(
-            session.events, session.events_left_out
+        else _EntryLimiter("keys of the outcome", 100_000, omission_texts).texts(session.outcome),
+        events=_EntryLimiter("messages of the log", 500_000, omission_texts).events(
+            session.events, session.omitted_event_count
         ),
-        attachments=_EntryLimiter("attachments", 50_000, left_out).mapping(
+        attachments=_EntryLimiter("attachments", 50_000, omission_texts).mapping(
             {name: len(data) for name, data in session.attachments.items()}
         ),
-        left_out=left_out,
-        absent=_missing_samples_sentence(session),
+        omission_texts=omission_texts,
+        missing_samples_text=_missing_samples_sentence(session),
     )
 
 
@@ -264,21 +270,21 @@ def readable_texts(values: Mapping[str, str], what: str) -> tuple[dict[str, str]
     -------
     The first texts by their keys, and a list with a line on the omitted texts, if there are any.
     """
-    left_out: list[str] = []
-    shown_texts = _EntryLimiter(what, _MAX_METADATA_CHARACTERS, left_out).texts(values)
-    return {printable(key): printable(value) for key, value in shown_texts.items()}, left_out
+    omission_texts: list[str] = []
+    shown_texts = _EntryLimiter(what, _MAX_METADATA_CHARACTERS, omission_texts).texts(values)
+    return {printable(key): printable(value) for key, value in shown_texts.items()}, omission_texts
 
 
 class _EntryLimiter:
     """Cuts one kind of a file's entries, such as its events, to a total number of characters.
 
     `what` is a plural noun for the entries. `most` is the maximum number of characters in text or
-    JSON form. A line on omitted entries is appended to `left_out`.
+    JSON form. A line on omitted entries is appended to `omission_texts`.
     """
 
-    def __init__(self, what: str, max_characters: int, left_out: list[str]) -> None:
-        self._what = what
-        self._left_out = left_out
+    def __init__(self, what: str, max_characters: int, omission_texts: list[str]) -> None:
+        self._entries_noun = what
+        self._omission_texts = omission_texts
         self._remaining_characters = max_characters
 
     def mapping(self, values: Mapping[str, _Value]) -> dict[str, _Value]:
@@ -327,7 +333,7 @@ class _EntryLimiter:
     def _report_omitted(self, count: int) -> None:
         """Append a line on `count` omitted entries, unless there are none."""
         if count:
-            self._left_out.append(f"… and {count} more {self._what} not shown")
+            self._omission_texts.append(f"… and {count} more {self._entries_noun} not shown")
 
 
 def _status_counts(session: Session) -> dict[str, int]:
@@ -381,12 +387,12 @@ def _rounded_row(key: str, value: str) -> tuple[str, str]:
         if key.endswith(_UTC_KEY_SUFFIX):
             return key.removesuffix(_UTC_KEY_SUFFIX), _time_text(_utc_datetime(int(value)))
         digits = _TARE_DIGITS if key.startswith("tare_") else _SIGNIFICANT_DIGITS
-        shown = [
+        rounded_numbers = [
             f"{float(each):.{digits}g}" if "." in each else f"{int(each)}"
             for each in value.split(",")
         ]
         name = key.removesuffix(suffix_of(key)).replace("_", " ")
-        return name, f"{', '.join(shown)} {unit_of(key)}".rstrip()
+        return name, f"{', '.join(rounded_numbers)} {unit_of(key)}".rstrip()
     return key.replace("_", " "), value
 
 

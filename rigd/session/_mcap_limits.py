@@ -55,7 +55,7 @@ class ReadingBudget:
         self._unpacked_bytes = 0
         self._declared_bytes = 0
         self._declared_text_bytes = 0
-        self._key_count = 0
+        self._count_keys = 0
 
     def count_steps(self, steps: int) -> None:
         """Count steps of work; raise McapTooLargeError beyond `MAX_STEPS` for the file."""
@@ -90,7 +90,7 @@ class ReadingBudget:
         if opcode != Opcode.ATTACHMENT:
             self._declared_text_bytes += len(content)
         if opcode in (Opcode.METADATA, Opcode.CHANNEL):
-            self._key_count += _key_count(content, opcode, limits.MAX_ENTRIES)
+            self._count_keys += _count_keys(content, opcode, limits.MAX_ENTRIES)
         for used_bytes, max_bytes, unit_text in (
             (
                 self._declared_bytes,
@@ -108,7 +108,7 @@ class ReadingBudget:
                     "declares channels, schemas, metadata and attachments without limit: more than "
                     f"{max_bytes >> 20} {unit_text}{where}"
                 )
-        if self._key_count > limits.MAX_ENTRIES:
+        if self._count_keys > limits.MAX_ENTRIES:
             raise McapError(f"has more than {limits.MAX_ENTRIES} keys in its metadata{where}")
 
 
@@ -117,7 +117,7 @@ def zstd_decompressor() -> zstandard.ZstdDecompressor:
     return zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW_BYTES)
 
 
-def unpacked(
+def decompressed_chunk(
     zstd: zstandard.ZstdDecompressor, compression: bytes, packed: memoryview, size: int, where: str
 ) -> bytes:
     """Return the decompressed content of a chunk, which must have exactly `size` bytes.
@@ -158,13 +158,13 @@ def unpacked(
     return records
 
 
-def unpacked_parts(
+def decompressed_parts(
     zstd: zstandard.ZstdDecompressor, compression: bytes, packed: memoryview, size: int, where: str
 ) -> Iterator[Buffer]:
     """Yield the decompressed content of a long chunk in parts.
 
     The parts together may exceed `size` by one part. Parameters and errors are those of
-    :func:`unpacked`, but the caller compares the length.
+    :func:`decompressed_chunk`, but the caller compares the length.
     """
     unpacked_bytes = 0
     try:
@@ -205,7 +205,7 @@ def _check_zstd_size(packed: memoryview, size: int, where: str) -> None:
         raise McapDamageError(f"states two different sizes{where}")
 
 
-def prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:
+def read_prefixed_bytes(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:
     """Return the bytes that follow a length field at `position`, and the offset of their end.
 
     `prefix` is the length field's format for the module ``struct``.
@@ -217,7 +217,7 @@ def prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryvie
     return content[start : start + length], start + length
 
 
-def _key_count(content: Buffer, opcode: int, max_count: int) -> int:
+def _count_keys(content: Buffer, opcode: int, max_count: int) -> int:
     """Return the number of keys in the map of a metadata or channel record, up to `max_count` + 1.
 
     Counting ends at a malformed entry, which raises an error when the record is parsed.
@@ -226,15 +226,15 @@ def _key_count(content: Buffer, opcode: int, max_count: int) -> int:
     count = 0
     try:
         if opcode == Opcode.METADATA:
-            _, position = prefixed(view, 0, "<I")
+            _, position = read_prefixed_bytes(view, 0, "<I")
         else:
-            _, position = prefixed(view, 4, "<I")
-            _, position = prefixed(view, position, "<I")
-        entries, _ = prefixed(view, position, "<I")
+            _, position = read_prefixed_bytes(view, 4, "<I")
+            _, position = read_prefixed_bytes(view, position, "<I")
+        entries, _ = read_prefixed_bytes(view, position, "<I")
         position = 0
         while position < len(entries) and count <= max_count:
-            _, position = prefixed(entries, position, "<I")
-            _, position = prefixed(entries, position, "<I")
+            _, position = read_prefixed_bytes(entries, position, "<I")
+            _, position = read_prefixed_bytes(entries, position, "<I")
             count += 1
     except struct.error:
         pass

@@ -36,15 +36,15 @@ from rigd.session._mcap_limits import (
     McapError,
     McapTooLargeError,
     ReadingBudget,
-    prefixed,
-    unpacked,
-    unpacked_parts,
+    decompressed_chunk,
+    decompressed_parts,
+    read_prefixed_bytes,
     zstd_decompressor,
 )
-from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD
+from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD_FORMAT
 from rigd.session.layout import Buffer
 
-RECORD_HEAD: Final = struct.Struct("<BQ")
+RECORD_HEAD_FORMAT: Final = struct.Struct("<BQ")
 # Opcode, length and channel, which are equal throughout a run: 11 bytes, as two overlapping
 # 8-byte integers.
 _RUN_HEAD_FORMAT: Final = struct.Struct("<BQH")
@@ -54,7 +54,7 @@ _RUN_HEAD_DTYPE: Final = np.dtype(
 _CHUNK_HEAD_FORMAT: Final = struct.Struct("<QQQI")
 _DECLARATION_OPCODES: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
 _CHANNEL_NUMBER_FORMAT: Final = struct.Struct("<H")
-FOOTER: Final = struct.Struct("<BQ QQI")
+FOOTER_FORMAT: Final = struct.Struct("<BQ QQI")
 _FOOTER_CONTENT_SIZE: Final = 20
 _MAX_GROUP_MESSAGES: Final = 250
 """Maximum number of messages outside of chunks that are treated like one chunk."""
@@ -202,10 +202,13 @@ def read_mcap(
 
 def _has_footer(data: memoryview) -> bool:
     """Return whether an MCAP file ends with a footer record and the magic bytes."""
-    start = len(data) - len(MAGIC) - FOOTER.size
+    start = len(data) - len(MAGIC) - FOOTER_FORMAT.size
     if start < len(MAGIC) or bytes(data[-len(MAGIC) :]) != MAGIC:
         return False
-    return RECORD_HEAD.unpack_from(data, start) == (Opcode.FOOTER, _FOOTER_CONTENT_SIZE)
+    return RECORD_HEAD_FORMAT.unpack_from(data, start) == (
+        Opcode.FOOTER_FORMAT,
+        _FOOTER_CONTENT_SIZE,
+    )
 
 
 def _locate_record(data: Buffer, position: int, where: str) -> tuple[int, int, int]:
@@ -213,10 +216,10 @@ def _locate_record(data: Buffer, position: int, where: str) -> tuple[int, int, i
 
     `where` ends the error message for a truncated record.
     """
-    content = position + RECORD_HEAD.size
+    content = position + RECORD_HEAD_FORMAT.size
     if content > len(data):
         raise _truncated_record_error(position, where)
-    opcode, length = RECORD_HEAD.unpack_from(data, position)
+    opcode, length = RECORD_HEAD_FORMAT.unpack_from(data, position)
     if opcode == 0:
         raise _missing_record_error(position, where)
     end = content + length
@@ -283,7 +286,7 @@ class _ContainerReader:
                 self._check_summary(end)
                 contents.sound_bytes = len(data)
                 return
-            elif opcode == Opcode.FOOTER:
+            elif opcode == Opcode.FOOTER_FORMAT:
                 break
             else:
                 try:
@@ -291,13 +294,13 @@ class _ContainerReader:
                 except McapDamageError as error:
                     if not self._salvage:
                         raise
-                    self._skip(str(error))
+                    self._add_skipped(str(error))
             contents.sound_bytes = end
             if end - self._released_end > _RELEASE_INTERVAL_BYTES:
                 self._release_up_to(end)
         raise McapDamageError("has no end of its data section")
 
-    def _skip(self, damage: str) -> None:
+    def _add_skipped(self, damage: str) -> None:
         """Store the description of a skipped record; beyond `MAX_SKIPPED` store a count only."""
         self._skipped += 1
         skipped = self.contents.skipped
@@ -308,10 +311,10 @@ class _ContainerReader:
 
     def _release_up_to(self, end: int) -> None:
         """Update the checksum of the data section up to `end`, and release the memory before it."""
-        self._crc = self._crc_of(self._released_end, end, self._crc)
+        self._crc = self._crc_of_range(self._released_end, end, self._crc)
         self._released_end = end
 
-    def _crc_of(self, start: int, end: int, crc: int = 0) -> int:
+    def _crc_of_range(self, start: int, end: int, crc: int = 0) -> int:
         """Return the CRC-32 of the bytes from `start` to `end`, continuing from `crc`."""
         for position in range(start, end, _RELEASE_INTERVAL_BYTES):
             crc = zlib.crc32(
@@ -332,9 +335,9 @@ class _ContainerReader:
         The first message is the record from `start` to `first_end`.
         """
         where = f" at byte {start}"
-        if first_end - start < MESSAGE_HEAD.size:
+        if first_end - start < MESSAGE_HEAD_FORMAT.size:
             raise McapDamageError(f"has a message that is too short{where}")
-        if self._is_stray(_RUN_HEAD_FORMAT.unpack_from(self._data, start)[2]):
+        if self._is_stray_message(_RUN_HEAD_FORMAT.unpack_from(self._data, start)[2]):
             # The writing program uses chunks: this is another record, with a damaged opcode.
             raise McapDamageError(f"has a message outside of a chunk{where}")
         if self._group_room == 0:
@@ -346,7 +349,7 @@ class _ContainerReader:
         self._group_room -= count
         return end
 
-    def _is_stray(self, channel: int) -> bool:
+    def _is_stray_message(self, channel: int) -> bool:
         """Return whether a message outside of chunks belongs to a channel declared in chunks."""
         return self._salvage and channel in self.contents.declared_in_chunks
 
@@ -362,24 +365,24 @@ class _ContainerReader:
             return
         self._budget.count_declared(opcode, content, where)
         if opcode == Opcode.SCHEMA:
-            schema = parsed(Schema.read, content, where)
+            schema = parse_record(Schema.read, content, where)
             if contents.schemas.setdefault(schema.id, schema) != schema:
                 raise McapDamageError(f"declares schema {schema.id} twice, differently{where}")
             self._declarations[number] = bytes(content)
         elif opcode == Opcode.CHANNEL:
-            channel = parsed(Channel.read, content, where)
+            channel = parse_record(Channel.read, content, where)
             if contents.channels.setdefault(channel.id, channel) != channel:
                 raise McapDamageError(f"declares channel {channel.id} twice, differently{where}")
             self._is_wanted[channel.id] = self._topics is None or channel.topic in self._topics
             self._declarations[number] = bytes(content)
         elif opcode == Opcode.METADATA:
-            contents.metadata.append(parsed(Metadata.read, content, where))
+            contents.metadata.append(parse_record(Metadata.read, content, where))
         elif opcode == Opcode.ATTACHMENT:
             if len(content) >= 4:
                 (crc,) = struct.unpack_from("<I", content, len(content) - 4)
                 if crc not in (0, zlib.crc32(content[:-4])):
                     raise McapDamageError(f"has an attachment with a wrong checksum{where}")
-            contents.attachments.append(parsed(Attachment.read, content, where))
+            contents.attachments.append(parse_record(Attachment.read, content, where))
 
     def _read_chunk(self, content: memoryview, start: int) -> None:
         """Decompress a chunk, verify its checksum, and read the records in it."""
@@ -387,14 +390,14 @@ class _ContainerReader:
         where = f" in the chunk at byte {start}"
         try:
             *_, size, crc = _CHUNK_HEAD_FORMAT.unpack_from(content)
-            name, position = prefixed(content, _CHUNK_HEAD_FORMAT.size, "<I")
-            packed, _ = prefixed(content, position, "<Q")
+            name, position = read_prefixed_bytes(content, _CHUNK_HEAD_FORMAT.size, "<I")
+            packed, _ = read_prefixed_bytes(content, position, "<Q")
         except struct.error:
             raise McapDamageError(f"has a malformed head{where}") from None
         self._budget.count_unpacked(size, where)
         compression = bytes(name[:20])
         if size <= MAX_UNPACKED_BYTES:
-            records = unpacked(self._zstd, compression, packed, size, where)
+            records = decompressed_chunk(self._zstd, compression, packed, size, where)
             if crc not in (0, zlib.crc32(records)):
                 raise McapDamageError(f"has a wrong checksum{where}")
             end = self._read_records(records, 0, start, where)
@@ -403,7 +406,7 @@ class _ContainerReader:
             return
         # Too long for memory: decompressed once to verify the checksum, and again to be read.
         unpacked_bytes, unpacked_crc = 0, 0
-        for part in unpacked_parts(self._zstd, compression, packed, size, where):
+        for part in decompressed_parts(self._zstd, compression, packed, size, where):
             unpacked_bytes += len(part)
             unpacked_crc = zlib.crc32(part, unpacked_crc)
             self._release_pages()
@@ -411,7 +414,9 @@ class _ContainerReader:
             raise McapDamageError(f"decompresses to a wrong size{where}")
         if crc not in (0, unpacked_crc):
             raise McapDamageError(f"has a wrong checksum{where}")
-        self._read_parts(unpacked_parts(self._zstd, compression, packed, size, where), start, where)
+        self._read_parts(
+            decompressed_parts(self._zstd, compression, packed, size, where), start, where
+        )
 
     def _read_parts(self, parts: Iterator[Buffer], chunk_position: int, where: str) -> None:
         """Read the records of a chunk that arrives in parts; a record may span several parts."""
@@ -450,7 +455,7 @@ class _ContainerReader:
             if self._is_wanted.get(channel, True) and self._is_accepted_length(length, where):
                 return 0
             self.contents.message_counts[channel] += 1
-        return int(length) + RECORD_HEAD.size
+        return int(length) + RECORD_HEAD_FORMAT.size
 
     def _is_accepted_length(self, length: int, where: str) -> bool:
         """Return whether a message is within the maximum length; record a longer one as skipped.
@@ -465,7 +470,7 @@ class _ContainerReader:
         )
         if not self._salvage:
             raise McapDamageError(damage)
-        self._skip(damage)
+        self._add_skipped(damage)
         return False
 
     def _read_records(self, records: bytes, base: int, chunk_position: int, where: str) -> int:
@@ -479,12 +484,12 @@ class _ContainerReader:
             end, count = self._read_messages(records, start, len(records), chunk_position, where)
             if count:
                 continue
-            if start + RECORD_HEAD.size > len(records):
+            if start + RECORD_HEAD_FORMAT.size > len(records):
                 return start
-            opcode, length = RECORD_HEAD.unpack_from(records, start)
+            opcode, length = RECORD_HEAD_FORMAT.unpack_from(records, start)
             if opcode == 0:
                 raise _missing_record_error(base + start, where)
-            content = start + RECORD_HEAD.size
+            content = start + RECORD_HEAD_FORMAT.size
             end = content + length
             if end > len(records):
                 return start
@@ -517,11 +522,15 @@ class _ContainerReader:
         position = start
         message_count = run_count = 0  # number of messages, and number of runs of messages
         try:
-            while position + MESSAGE_HEAD.size <= limit and run_count < _MAX_BLOCK_RUNS:
+            while position + MESSAGE_HEAD_FORMAT.size <= limit and run_count < _MAX_BLOCK_RUNS:
                 run_head = unpack(records, position)
                 opcode, length, channel = run_head
-                size = length + RECORD_HEAD.size
-                if opcode != Opcode.MESSAGE or size < MESSAGE_HEAD.size or position + size > limit:
+                size = length + RECORD_HEAD_FORMAT.size
+                if (
+                    opcode != Opcode.MESSAGE
+                    or size < MESSAGE_HEAD_FORMAT.size
+                    or position + size > limit
+                ):
                     break
                 is_wanted = wanted.get(channel)
                 if is_wanted is None:
@@ -529,7 +538,7 @@ class _ContainerReader:
                         f"has a message of an undeclared channel {channel}{where}"
                     )
                 if max_messages is not None and (
-                    message_count == max_messages or self._is_stray(channel)
+                    message_count == max_messages or self._is_stray_message(channel)
                 ):
                     break
                 end = position + size
@@ -559,7 +568,7 @@ class _ContainerReader:
         if len(content) < 4:
             raise McapDamageError(f"has a malformed end of its data section at byte {start}")
         (crc,) = struct.unpack_from("<I", content)
-        if crc != 0 and crc != self._crc_of(self._released_end, start, self._crc):
+        if crc != 0 and crc != self._crc_of_range(self._released_end, start, self._crc):
             raise McapDamageError("has a wrong checksum over its data section")
         self.contents.verified = crc != 0
 
@@ -570,20 +579,20 @@ class _ContainerReader:
             raise McapDamageError(
                 "ends in the middle of its summary, or something was appended to it"
             )
-        footer = len(data) - len(MAGIC) - FOOTER.size
-        *_, summary_start, _, crc = FOOTER.unpack_from(data, footer)
+        footer = len(data) - len(MAGIC) - FOOTER_FORMAT.size
+        *_, summary_start, _, crc = FOOTER_FORMAT.unpack_from(data, footer)
         if summary_start not in (0, start) or (summary_start == 0 and footer != start):
             raise McapDamageError(
                 f"has a footer that contradicts its data section at byte {footer}"
             )
-        if crc not in (0, self._crc_of(start, footer + FOOTER.size - 4)):
+        if crc not in (0, self._crc_of_range(start, footer + FOOTER_FORMAT.size - 4)):
             raise McapDamageError("has a wrong checksum over its summary")
         for opcode, content in self._summary_records(start, footer):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 # A channel without messages may be declared in the summary only.
                 self._read_declaration(opcode, content, " in the summary")
             elif opcode == Opcode.STATISTICS:
-                statistics = parsed(Statistics.read, content, " in the summary")
+                statistics = parse_record(Statistics.read, content, " in the summary")
                 read_counts = self.contents.message_counts
                 stated_counts = statistics.channel_message_counts
                 if any(read_counts[channel] != count for channel, count in stated_counts.items()):
@@ -608,23 +617,23 @@ class _ContainerReader:
         Returns an empty dictionary if the summary has no correct checksum.
         """
         data = self._data
-        footer = len(data) - len(MAGIC) - FOOTER.size
-        *_, start, _, crc = FOOTER.unpack_from(data, footer)
+        footer = len(data) - len(MAGIC) - FOOTER_FORMAT.size
+        *_, start, _, crc = FOOTER_FORMAT.unpack_from(data, footer)
         if not len(MAGIC) <= start <= footer:
             return {}
-        if crc == 0 or crc != self._crc_of(start, footer + FOOTER.size - 4):
+        if crc == 0 or crc != self._crc_of_range(start, footer + FOOTER_FORMAT.size - 4):
             return {}
         try:
             for opcode, content in self._summary_records(start, footer):
                 if opcode == Opcode.STATISTICS:
-                    statistics = parsed(Statistics.read, content, "")
+                    statistics = parse_record(Statistics.read, content, "")
                     return dict(statistics.channel_message_counts)
         except McapDamageError:
             pass
         return {}
 
 
-def parsed(read: Callable[[ReadDataStream], _Record], content: Buffer, where: str) -> _Record:
+def parse_record(read: Callable[[ReadDataStream], _Record], content: Buffer, where: str) -> _Record:
     """Return a record parsed with the ``mcap`` package; raise McapDamageError if malformed."""
     try:
         stream = ReadDataStream(BytesIO(content))

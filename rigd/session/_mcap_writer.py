@@ -41,7 +41,7 @@ _FOOTER_HEAD_FORMAT: Final = struct.Struct("<BQ QQ")
 RECORD_HEAD_SIZE: Final = 9
 """Number of bytes of a record's opcode and length, which that length does not include."""
 
-MESSAGE_HEAD: Final = struct.Struct("<BQ HIQQ")
+MESSAGE_HEAD_FORMAT: Final = struct.Struct("<BQ HIQQ")
 """Format of the bytes before a message's data: opcode, length, channel, sequence, log and publish
 time."""
 LOG_TIME_OFFSET: Final = RECORD_HEAD_SIZE + 2 + 4

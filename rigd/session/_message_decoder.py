@@ -17,7 +17,7 @@ import numpy.typing as npt
 from rigd.session import limits
 from rigd.session._errors import SessionError
 from rigd.session._mcap_reader import McapContents, MessageBlock, message_starts
-from rigd.session._mcap_writer import MESSAGE_HEAD
+from rigd.session._mcap_writer import MESSAGE_HEAD_FORMAT
 from rigd.session._schema import (
     CONTROL_SCHEMA,
     CONTROL_TOPIC,
@@ -96,7 +96,7 @@ class MessageLayout:
 
 def _record_dtype(wire_dtype: np.dtype[np.void]) -> np.dtype[np.void]:
     """Return the array type of an MCAP message record whose data has the type `wire_dtype`."""
-    return np.dtype([("head", f"V{MESSAGE_HEAD.size}"), ("wire", wire_dtype)])
+    return np.dtype([("head", f"V{MESSAGE_HEAD_FORMAT.size}"), ("wire", wire_dtype)])
 
 
 SAMPLES: Final = MessageLayout(
@@ -318,7 +318,9 @@ class MessageDecoder:
             (indices,) = np.nonzero(~is_fixed)
         else:
             indices = np.arange(len(out))
-        data = np.frombuffer(records, np.uint8).reshape(len(out), size)[:, MESSAGE_HEAD.size :]
+        data = np.frombuffer(records, np.uint8).reshape(len(out), size)[
+            :, MESSAGE_HEAD_FORMAT.size :
+        ]
         self._decode_by_offsets(channel, data, indices, out)
 
     def _decode_by_offsets(
@@ -537,9 +539,9 @@ def class_of_channel(path: Path, contents: McapContents, channel_id: int) -> "ty
     schema = contents.schemas.get(channel.schema_id)
     if channel.message_encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
         raise SessionError(
-            f"{path}: {channel.topic} has the encoding {quoted(channel.message_encoding)} and the "
-            f"schema encoding {quoted(schema.encoding if schema else '')}. A session file has "
-            "protobuf there, for both."
+            f"{path}: {channel.topic} has the encoding {quoted_excerpt(channel.message_encoding)} "
+            f"and the schema encoding {quoted_excerpt(schema.encoding if schema else '')}. A "
+            "session file has protobuf there, for both."
         )
     try:
         return message_class(schema.name, schema.data)
@@ -568,7 +570,7 @@ def decoded_message(
         ) from None
 
 
-def quoted(text: str) -> str:
+def quoted_excerpt(text: str) -> str:
     """Return a text from a file in quotes, with escaped characters, and cut to 40 characters."""
     return repr(text if len(text) <= 40 else text[:40] + "…")
 

@@ -18,7 +18,7 @@ from rigd.session import limits
 from rigd.session._errors import SessionAccessError, SessionError
 from rigd.session._mcap_limits import McapError, McapTooLargeError
 from rigd.session._mcap_reader import McapContents, MessageBlock, OnBlock, read_mcap
-from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD
+from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD_FORMAT
 from rigd.session._message_decoder import (
     CONTROLS,
     SAMPLES,
@@ -28,7 +28,7 @@ from rigd.session._message_decoder import (
     MessageLayout,
     class_of_channel,
     decoded_message,
-    quoted,
+    quoted_excerpt,
 )
 from rigd.session._schema import EVENT_LEVELS, EVENT_TOPIC, FORMAT_VERSION, SAMPLE_TOPIC
 from rigd.session._writer import is_being_written
@@ -38,7 +38,7 @@ from rigd.units import unit_of
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
-SURVEY_FIELDS: Final = ("t_ns", "tick", "status")
+ORDER_AND_FLAG_FIELDS: Final = ("t_ns", "tick", "status")
 """Sample fields that are read to learn number, order and flags of the samples, without signals."""
 MAX_EVENTS: Final = 100_000
 """Maximum number of events that are read from a session's log."""
@@ -89,7 +89,7 @@ class Session:
     """Events of the session's log, in the order of the file."""
     attachments: dict[str, bytes]
     """Name of an attached file → its contents."""
-    events_left_out: int = 0
+    omitted_event_count: int = 0
     """Number of further events in the file, which were not read because of the limits."""
 
     def number(self, key: str, default: float | None = None) -> float:
@@ -120,8 +120,8 @@ class Session:
             value = float("nan")
         if not isfinite(value):
             raise SessionError(
-                f"{self.path}: {key} in the metadata 'session' is {quoted(text)}, which is not a "
-                f"finite number. The writing program must state it as a number{unit}."
+                f"{self.path}: {key} in the metadata 'session' is {quoted_excerpt(text)}, which is "
+                f"not a finite number. The writing program must state it as a number{unit}."
             )
         return value
 
@@ -170,8 +170,8 @@ def read_session(
     version = metadata.get("format_version", FORMAT_VERSION)
     if version != FORMAT_VERSION:
         raise SessionError(
-            f"{path} is of session format version {quoted(version)}, and this program reads "
-            f"version {FORMAT_VERSION}. Use a newer version of it."
+            f"{path} is of session format version {quoted_excerpt(version)}, and this program "
+            f"reads version {FORMAT_VERSION}. Use a newer version of it."
         )
     array = samples.finish(contents)
     _check_ticks(path, array)
@@ -185,7 +185,7 @@ def read_session(
         outcome=merged_metadata(contents, "outcome"),
         events=log.events(path, contents, start_utc_ns),
         attachments={attachment.name: attachment.data for attachment in contents.attachments},
-        events_left_out=log.left_out,
+        omitted_event_count=log.omitted_count,
     )
 
 
@@ -266,8 +266,8 @@ class TopicBuffer:
         self._max_messages = max_messages
         self._on_messages = on_messages
         # Unused memory of the array is never allocated, and most files need no more.
-        expected = min(_file_size(path) // _MIN_SAMPLE_BYTES, max_messages)
-        self._array = np.empty(expected, layout.dtype_of(fields))
+        expected_messages = min(_file_size(path) // _MIN_SAMPLE_BYTES, max_messages)
+        self._array = np.empty(expected_messages, layout.dtype_of(fields))
         self._message_count = 0
 
     def array_for(self, count: int) -> npt.NDArray[np.void]:
@@ -283,8 +283,8 @@ class TopicBuffer:
             )
         if end > len(self._array):
             # Resized without a copy, by a small fraction: two arrays would take too much memory.
-            grown = max(end, len(self._array) + max(_MIN_ARRAY_GROWTH, len(self._array) // 8))
-            self._array.resize(min(grown, self._max_messages), refcheck=False)
+            new_length = max(end, len(self._array) + max(_MIN_ARRAY_GROWTH, len(self._array) // 8))
+            self._array.resize(min(new_length, self._max_messages), refcheck=False)
         if self._on_messages is not None:
             return np.empty(count, self.decoder.dtype)
         return self._array[self._message_count : end]
@@ -323,7 +323,7 @@ class _UndecodedLog:
     def __init__(self) -> None:
         self.first_log_time: int | None = None
         """Log time of the file's first sample, in nanoseconds since the Unix epoch."""
-        self.left_out = 0
+        self.omitted_count = 0
         """Number of log messages that were not stored because of the limits."""
         self._stored_messages: list[tuple[int, int, bytes | int]] = []
         """For each log message: channel, log time in ns, and its data or the length of it."""
@@ -336,21 +336,21 @@ class _UndecodedLog:
             topic = contents.channels[channel].topic
             if topic == SAMPLE_TOPIC:
                 if self.first_log_time is None:
-                    self.first_log_time = int(MESSAGE_HEAD.unpack_from(records, start)[4])
+                    self.first_log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, start)[4])
                 continue
             remaining = MAX_EVENTS - len(self._stored_messages)
             for first in range(start, start + size * min(count, remaining), size):
-                log_time = int(MESSAGE_HEAD.unpack_from(records, first)[4])
-                length = size - MESSAGE_HEAD.size
+                log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, first)[4])
+                length = size - MESSAGE_HEAD_FORMAT.size
                 if length > MAX_EVENT_BYTES:
                     self._stored_messages.append((channel, log_time, length))
                 elif self._stored_bytes + length > MAX_LOG_BYTES:
-                    self.left_out += 1
+                    self.omitted_count += 1
                 else:
                     self._stored_bytes += length
-                    data = bytes(records[first + MESSAGE_HEAD.size : first + size])
+                    data = bytes(records[first + MESSAGE_HEAD_FORMAT.size : first + size])
                     self._stored_messages.append((channel, log_time, data))
-            self.left_out += max(count - remaining, 0)
+            self.omitted_count += max(count - remaining, 0)
 
     def events(self, path: Path, contents: McapContents, start_utc_ns: int) -> list[LoggedEvent]:
         """Return the decoded log messages; a log whose encoding is not protobuf is left out."""
@@ -408,7 +408,7 @@ def load_contents(
     The arguments are those of `rigd.session._mcap_reader.read_mcap`. Raises SessionError if the
     file is missing, empty, too large or not an MCAP file.
     """
-    with opened(path) as file:
+    with open_mcap_file(path) as file:
         mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         return read_mcap(
             memoryview(mapped), topics, on_block=on_block, salvage=salvage, on_progress=on_progress
@@ -423,12 +423,12 @@ def check_beginning(path: Path) -> None:
     SessionError
         If the file is missing, empty or not an MCAP file.
     """
-    with opened(path) as file:
+    with open_mcap_file(path) as file:
         read_mcap(memoryview(file.read(len(MAGIC))), ())
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
+def open_mcap_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file for reading, and convert errors of the enclosed code into SessionError."""
     try:
         _require_nonempty_file(path)
@@ -465,16 +465,18 @@ def _format_error(path: Path, error: McapError) -> SessionError:
 
 def _damage_message(path: Path, contents: McapContents) -> str:
     """Return the error message for an incomplete or damaged file, with the remedy."""
-    from rigd.session._recovery import remedy  # imported here, because it imports this module
+    from rigd.session._recovery import (
+        recovery_advice,
+    )  # imported here, because it imports this module
 
     if contents.complete:
-        return f"{path} is damaged: it {contents.damage}{remedy(path, was_whole=True)}"
+        return f"{path} is damaged: it {contents.damage}{recovery_advice(path, was_whole=True)}"
     if is_being_written(path):
         return (
             f"{path} is incomplete, because it is still being recorded. Wait for the end of the "
             "session, or stop it."
         )
-    return f"{path} is incomplete: it {contents.damage}{remedy(path, was_whole=False)}"
+    return f"{path} is incomplete: it {contents.damage}{recovery_advice(path, was_whole=False)}"
 
 
 def merged_metadata(contents: McapContents, name: str) -> dict[str, str] | None:
@@ -511,8 +513,8 @@ def _start_utc_ns(
         if text.isascii() and text.isdigit() and len(text) < 20:
             return int(text)
         raise SessionError(
-            f"{path}: start_utc_ns in the metadata 'session' is {quoted(text)}. The writing "
-            "program must state it as a whole number of ns since 1970, or leave it out."
+            f"{path}: start_utc_ns in the metadata 'session' is {quoted_excerpt(text)}. The "
+            "writing program must state it as a whole number of ns since 1970, or leave it out."
         )
     if log_time is not None and len(samples):
         return log_time - int(samples["t_ns"][0])
@@ -529,13 +531,13 @@ def _parsed_segments(path: Path, texts: dict[str, str]) -> dict[str, tuple[int, 
             or len(text) > 40
         ):
             raise SessionError(
-                f"{path}: the segment {quoted(name)} is {quoted(text)}. The writing program "
-                "must state it as 'first,end', two whole numbers of ticks."
+                f"{path}: the segment {quoted_excerpt(name)} is {quoted_excerpt(text)}. The "
+                "writing program must state it as 'first,end', two whole numbers of ticks."
             )
         first, end = (int(n) for n in numbers)
         if end < first:
             raise SessionError(
-                f"{path}: the segment {quoted(name)} ends at tick {end}, before its first, "
+                f"{path}: the segment {quoted_excerpt(name)} ends at tick {end}, before its first, "
                 f"{first}. The writing program must correct it."
             )
         segments[name] = (first, end)

@@ -6,7 +6,7 @@ has its own checksum. The record ``outcome`` is used only if the checksum of the
 is correct. The file of another program may lack some checksums. It is recovered and marked as
 unprotected.
 
-`remedy` states how much of an incomplete file can be recovered, and by which command.
+`recovery_advice` states how much of an incomplete file can be recovered, and by which command.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ from rigd.session._mcap_reader import McapContents, MessageBlock, message_starts
 from rigd.session._mcap_writer import INDEX_DTYPE, LOG_TIME_OFFSET, McapWriter
 from rigd.session._message_decoder import SAMPLES, MessageDecoder
 from rigd.session._reader import (
-    SURVEY_FIELDS,
+    ORDER_AND_FLAG_FIELDS,
     TopicBuffer,
     load_contents,
     merged_metadata,
@@ -169,9 +169,9 @@ def recover(
         on_progress=_scaled_progress(on_progress, 0.0, _FIRST_READING_FRACTION),
     )  # fmt: skip
     selection.finish(contents)
-    if contents.damage is None and not contents.skipped and selection.left_out is None:
+    if contents.damage is None and not contents.skipped and selection.order_error is None:
         return _copy_sound_file(path, target)
-    damages = [contents.damage, *contents.skipped, selection.left_out]
+    damages = [contents.damage, *contents.skipped, selection.order_error]
     damage, *other_damage = [each for each in damages if each is not None]
     if not selection.is_copied.any():
         raise SessionError(
@@ -192,8 +192,8 @@ def recover(
         try:
             read_session(
                 temporary,
-                fields=SURVEY_FIELDS,
-                max_samples=limits.MAX_SURVEYED,
+                fields=ORDER_AND_FLAG_FIELDS,
+                max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
                 on_samples=read_back_digest.add,
             )
         except SessionError as error:
@@ -227,13 +227,15 @@ class _SampleSelection:
     """First reading of a damaged file, which selects the samples to copy to the new file."""
 
     def __init__(self, path: Path) -> None:
-        self.left_out: str | None = None
+        self.order_error: str | None = None
         """Text that completes "The file …" if samples repeat or are out of order, else None."""
         self.is_copied: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
         """For each sample in the file, whether it is copied to the new file."""
         self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)
         """Time, tick and status of the samples that are copied."""
-        self._samples = TopicBuffer(path, SAMPLES, SURVEY_FIELDS, limits.MAX_SURVEYED)
+        self._samples = TopicBuffer(
+            path, SAMPLES, ORDER_AND_FLAG_FIELDS, limits.MAX_SAMPLES_WITHOUT_SIGNALS
+        )
         self._samples_per_chunk: dict[
             int, int
         ] = {}  # position of a chunk in the file → number of samples
@@ -254,7 +256,7 @@ class _SampleSelection:
         self.is_copied = _increasing_ticks_mask(ticks)
         (excluded,) = np.nonzero(~self.is_copied)
         if len(excluded):
-            self.left_out = (
+            self.order_error = (
                 f"has {len(excluded)} samples that repeat or precede others, the first of them "
                 f"with tick {ticks[excluded[0]]}"
             )
@@ -297,7 +299,7 @@ def holds_samples(path: Path) -> bool:
     return is_longer or contents.count(SAMPLE_TOPIC) > 0
 
 
-def remedy(path: Path, *, was_whole: bool) -> str:
+def recovery_advice(path: Path, *, was_whole: bool) -> str:
     """Return the end of an error message: how much of a damaged file is intact and recoverable.
 
     The text begins with the punctuation mark that follows the description of the damage.
@@ -351,7 +353,9 @@ def _scaled_progress(
 
 def _copy_sound_file(path: Path, target: Path) -> Recovery:
     """Copy a complete ``.part`` file to its final name; leave any other complete file alone."""
-    session = read_session(path, fields=SURVEY_FIELDS, max_samples=limits.MAX_SURVEYED)
+    session = read_session(
+        path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
+    )
     is_part = path.name.endswith(PART_SUFFIX)
     if is_part:
         _require_target_absent(path, target)
@@ -415,7 +419,7 @@ def _planned_recovery(
     samples = selection.samples
     bytes_lost = path.stat().st_size - contents.sound_bytes
     # The recorded outcome describes all samples: it is used only if none is missing.
-    is_outcome_valid = contents.verified and selection.left_out is None
+    is_outcome_valid = contents.verified and selection.order_error is None
     recovery = Recovery(
         source=path,
         path=target,
@@ -647,9 +651,9 @@ class _MessageCopier:
         )
 
 
-def _true_blocks(is_copied: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _true_blocks(mask: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return start index and length of each block of consecutive True values."""
-    edges = np.flatnonzero(np.diff(is_copied, prepend=False, append=False))
+    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
     return list(zip(edges[::2].tolist(), (edges[1::2] - edges[::2]).tolist(), strict=True))
 
 

@@ -48,12 +48,12 @@ def _fixed_layout_file(schema_name: str, types: dict[str, str]) -> "FileDescript
         name=f"{package}/{name.lower()}.proto", package=package, syntax="proto3"
     )
     message = file.message_type.add(name=name)
-    for number, (field, kind) in enumerate(types.items(), start=1):
+    for number, (field, protobuf_type) in enumerate(types.items(), start=1):
         message.field.add(
             name=field,
             number=number,
             label=FieldDescriptorProto.LABEL_OPTIONAL,
-            type=FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}"),
+            type=FieldDescriptorProto.Type.Value(f"TYPE_{protobuf_type.upper()}"),
         )
     return file
 
@@ -83,12 +83,12 @@ def _event_file() -> "FileDescriptorProto":
         ("file", FieldDescriptorProto.TYPE_STRING, None),
         ("line", FieldDescriptorProto.TYPE_FIXED32, None),
     )
-    for number, (name, kind, type_name) in enumerate(fields, start=1):
+    for number, (name, protobuf_type, type_name) in enumerate(fields, start=1):
         message.field.add(
             name=name,
             number=number,
             label=FieldDescriptorProto.LABEL_OPTIONAL,
-            type=kind,
+            type=protobuf_type,
             type_name=type_name,
         )
     return file

@@ -18,9 +18,15 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, MetadataIndex, Statistics
 
 from rigd.session._mcap_limits import McapDamageError
-from rigd.session._mcap_reader import FOOTER, RECORD_HEAD, McapContents, parsed, read_mcap
+from rigd.session._mcap_reader import (
+    FOOTER_FORMAT,
+    RECORD_HEAD_FORMAT,
+    McapContents,
+    parse_record,
+    read_mcap,
+)
 from rigd.session._mcap_writer import MAGIC
-from rigd.session._reader import load_contents, merged_metadata, no_samples_error, opened
+from rigd.session._reader import load_contents, merged_metadata, no_samples_error, open_mcap_file
 from rigd.session._schema import SAMPLE_TOPIC
 from rigd.session._writer import is_being_written
 
@@ -69,7 +75,7 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
     ('chirp', 'complete', 21500)
     """
     path = Path(path)
-    with opened(path) as file:
+    with open_mcap_file(path) as file:
         contents = _read_by_summary(file, path.stat().st_size)
         if contents is None:
             file.seek(0)
@@ -109,21 +115,23 @@ def _read_by_summary(file: BinaryIO, size: int) -> McapContents | None:
 
     Returns None if the file of `size` bytes has no usable summary section with a correct checksum.
     """
-    footer_start = size - len(MAGIC) - FOOTER.size
+    footer_start = size - len(MAGIC) - FOOTER_FORMAT.size
     if footer_start < len(MAGIC) or file.read(len(MAGIC)) != MAGIC:
         return None
     file.seek(footer_start)
     footer_and_magic = file.read()
-    if len(footer_and_magic) != FOOTER.size + len(MAGIC) or not footer_and_magic.endswith(MAGIC):
+    if len(footer_and_magic) != FOOTER_FORMAT.size + len(MAGIC) or not footer_and_magic.endswith(
+        MAGIC
+    ):
         return None
-    opcode, length, summary_start, _, crc = FOOTER.unpack_from(footer_and_magic)
-    if (opcode, length) != (Opcode.FOOTER, FOOTER.size - RECORD_HEAD.size):
+    opcode, length, summary_start, _, crc = FOOTER_FORMAT.unpack_from(footer_and_magic)
+    if (opcode, length) != (Opcode.FOOTER_FORMAT, FOOTER_FORMAT.size - RECORD_HEAD_FORMAT.size):
         return None
     if not len(MAGIC) < summary_start <= footer_start <= summary_start + _MAX_SUMMARY_BYTES:
         return None
     file.seek(summary_start)
     summary = file.read(footer_start - summary_start)
-    checked_length = FOOTER.size - _CHECKSUM_SIZE
+    checked_length = FOOTER_FORMAT.size - _CHECKSUM_SIZE
     if crc == 0 or zlib.crc32(footer_and_magic[:checked_length], zlib.crc32(summary)) != crc:
         return None
     try:
@@ -142,28 +150,31 @@ def _contents_from_summary(file: BinaryIO, summary: bytes) -> McapContents | Non
     statistics: Statistics | None = None
     position = 0
     while position < len(summary):
-        opcode, length = RECORD_HEAD.unpack_from(summary, position)
-        content = position + RECORD_HEAD.size
+        opcode, length = RECORD_HEAD_FORMAT.unpack_from(summary, position)
+        content = position + RECORD_HEAD_FORMAT.size
         position = content + length
         record = summary[content:position]
         if opcode == Opcode.CHANNEL:
-            channel = parsed(Channel.read, record, "")
+            channel = parse_record(Channel.read, record, "")
             contents.channels[channel.id] = channel
         elif opcode == Opcode.STATISTICS:
-            statistics = parsed(Statistics.read, record, "")
+            statistics = parse_record(Statistics.read, record, "")
         elif opcode == Opcode.METADATA_INDEX:
-            indexes.append(parsed(MetadataIndex.read, record, ""))
+            indexes.append(parse_record(MetadataIndex.read, record, ""))
             if len(indexes) > _MAX_METADATA_RECORDS:
                 return None
     if statistics is None or len(indexes) != statistics.metadata_count:
         return None
     contents.message_counts |= statistics.channel_message_counts
     for index in indexes:
-        if not RECORD_HEAD.size <= index.length <= _MAX_METADATA_BYTES:
+        if not RECORD_HEAD_FORMAT.size <= index.length <= _MAX_METADATA_BYTES:
             return None
         file.seek(index.offset)
         record = file.read(index.length)
-        if RECORD_HEAD.unpack_from(record) != (Opcode.METADATA, index.length - RECORD_HEAD.size):
+        if RECORD_HEAD_FORMAT.unpack_from(record) != (
+            Opcode.METADATA,
+            index.length - RECORD_HEAD_FORMAT.size,
+        ):
             return None
-        contents.metadata.append(parsed(Metadata.read, record[RECORD_HEAD.size :], ""))
+        contents.metadata.append(parse_record(Metadata.read, record[RECORD_HEAD_FORMAT.size :], ""))
     return contents

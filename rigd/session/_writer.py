@@ -23,7 +23,7 @@ from mcap.records import Channel, Schema
 
 import rigd
 from rigd.session._errors import SessionError, SessionExistsError
-from rigd.session._mcap_writer import INDEX_DTYPE, MESSAGE_HEAD, RECORD_HEAD_SIZE, McapWriter
+from rigd.session._mcap_writer import INDEX_DTYPE, MESSAGE_HEAD_FORMAT, RECORD_HEAD_SIZE, McapWriter
 from rigd.session._schema import (
     CONTROL_SCHEMA,
     CONTROL_TOPIC,
@@ -77,7 +77,7 @@ _MESSAGE_HEAD_FIELDS: Final = [
     ("log_time", "<u8"),
     ("publish_time", "<u8"),
 ]
-"""NumPy fields of the head of an MCAP message record, in the order of `MESSAGE_HEAD`."""
+"""NumPy fields of the head of an MCAP message record, in the order of `MESSAGE_HEAD_FORMAT`."""
 
 _CHANNEL_NUMBERS_AND_SCHEMAS: Final = {
     SAMPLE_TOPIC: (1, SAMPLE_SCHEMA),
@@ -343,10 +343,10 @@ class SessionWriter:
                     self._stream.flush()
                     os.fsync(self._stream.fileno())
         finally:
-            saved = self._path_of_contents()
+            path_of_contents = self._path_of_contents()
             with contextlib.suppress(OSError):  # the failure to write was reported already
                 self._stream.close()
-        return saved
+        return path_of_contents
 
     def discard(self) -> None:
         """Remove the empty ``.part`` file of a session that was not begun."""
@@ -429,8 +429,8 @@ class SessionWriter:
         timings = np.frombuffer(self._timings, TIMING_WIRE_DTYPE)
         if not everything:
             controls, timings = (
-                others[: np.searchsorted(others["t_ns"], samples["t_ns"][-1], side="right")]
-                for others in (controls, timings)
+                messages[: np.searchsorted(messages["t_ns"], samples["t_ns"][-1], side="right")]
+                for messages in (controls, timings)
             )
         chunk_parts: list[bytes] = []
         indexes: dict[int, npt.NDArray[np.void]] = {}
@@ -509,8 +509,8 @@ def _event_records(
     index = np.empty(len(events), INDEX_DTYPE)
     for i, (log_time, data) in enumerate(events):
         index[i] = (log_time, offset + len(records))
-        length = MESSAGE_HEAD.size - RECORD_HEAD_SIZE + len(data)
-        records += MESSAGE_HEAD.pack(
+        length = MESSAGE_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(data)
+        records += MESSAGE_HEAD_FORMAT.pack(
             Opcode.MESSAGE, length, channel, first_sequence + i, log_time, log_time
         )
         records += data

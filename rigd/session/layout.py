@@ -130,14 +130,16 @@ def field_tag(number: int, protobuf_type: str) -> int:
 def _native_dtype(types: dict[str, str]) -> np.dtype[np.void]:
     """Return the array type of a decoded message with the given fields and protobuf types."""
     # Aligned: NumPy's loops over one field are then as fast as over any strided array.
-    return np.dtype([(name, _NUMPY_TYPES[kind]) for name, kind in types.items()], align=True)
+    return np.dtype(
+        [(name, _NUMPY_TYPES[protobuf_type]) for name, protobuf_type in types.items()], align=True
+    )
 
 
 def _wire_dtype(types: dict[str, str]) -> np.dtype[np.void]:
     """Return the array type of an encoded message: each field after its tag byte ``tag_NAME``."""
     fields: list[tuple[str, str]] = []
-    for name, kind in types.items():
-        fields += [(f"tag_{name}", "u1"), (name, _NUMPY_TYPES[kind])]
+    for name, protobuf_type in types.items():
+        fields += [(f"tag_{name}", "u1"), (name, _NUMPY_TYPES[protobuf_type])]
     return np.dtype(fields)
 
 
@@ -372,8 +374,8 @@ def _encode_messages(
 ) -> bytes:
     """Return messages encoded in the fixed layout, from field name → values (n,)."""
     wire = np.zeros(np.size(columns["tick"]), wire_dtype)
-    for number, (name, kind) in enumerate(types.items(), start=1):
-        wire[f"tag_{name}"] = field_tag(number, kind)
+    for number, (name, protobuf_type) in enumerate(types.items(), start=1):
+        wire[f"tag_{name}"] = field_tag(number, protobuf_type)
         if name in columns:
             wire[name] = columns[name]
     return wire.tobytes()
@@ -393,8 +395,8 @@ def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.ND
     """
     offsets, tags = _tag_offsets_and_values(wire.dtype, tuple(types.items()))
     data = np.ascontiguousarray(wire).view(np.uint8).reshape(wire.size, wire.dtype.itemsize)
-    fixed: npt.NDArray[np.bool_] = (data[:, offsets] == tags).all(axis=1)
-    return fixed
+    is_fixed: npt.NDArray[np.bool_] = (data[:, offsets] == tags).all(axis=1)
+    return is_fixed
 
 
 @cache
@@ -404,7 +406,9 @@ def _tag_offsets_and_values(
     """Return the offsets and the values of the tag bytes in an encoded message."""
     assert wire_dtype.fields is not None
     offsets = [wire_dtype.fields[f"tag_{name}"][1] for name, _ in types]
-    tags = [field_tag(number, kind) for number, (_, kind) in enumerate(types, start=1)]
+    tags = [
+        field_tag(number, protobuf_type) for number, (_, protobuf_type) in enumerate(types, start=1)
+    ]
     return np.array(offsets), np.array(tags, dtype=np.uint8)
 
 
@@ -435,9 +439,11 @@ def _decode_messages(
             f"a block of {size} bytes is not a whole number of {wire_dtype.itemsize}-byte messages"
         )
     wire = np.frombuffer(block, wire_dtype)
-    fixed = is_fixed_layout(wire, types)
-    if not fixed.all():
-        raise ValueError(f"message {int(np.argmin(fixed))} of the block is not of the fixed layout")
+    is_fixed = is_fixed_layout(wire, types)
+    if not is_fixed.all():
+        raise ValueError(
+            f"message {int(np.argmin(is_fixed))} of the block is not of the fixed layout"
+        )
     native = np.empty(wire.shape, dtype)
     to_native(wire, types, native)
     return native

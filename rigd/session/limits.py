@@ -9,7 +9,7 @@ MAX_SAMPLES: Final = 2_400_000
 """Maximum number of samples of a record that is planned, recorded, imported, analysed, exported or
 replayed: 40 minutes at 1 kHz. The samples take 0.27 GB of memory. An analysis, which is limited to
 1 GB, takes 0.16 GB and 0.29 kB for each sample, which is 0.53 GB for 1.27 million samples."""
-MAX_SURVEYED: Final = 7_200_000
+MAX_SAMPLES_WITHOUT_SIGNALS: Final = 7_200_000
 """Maximum number of samples if only times, ticks and flags are read: two hours at 1 kHz, the
 longest recording of an earlier version."""
 

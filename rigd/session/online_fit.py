@@ -112,9 +112,9 @@ def write_request(stream: BinaryIO, request: EstimateRequest) -> None:
     _write_frame(stream, _REQUEST_FRAME, json.dumps(asdict(request)).encode())
 
 
-def _write_frame(stream: BinaryIO, kind: bytes, content: Buffer) -> None:
+def _write_frame(stream: BinaryIO, frame_kind: bytes, content: Buffer) -> None:
     """Write a frame (kind, length, content) to the stream."""
-    stream.write(_FRAME_HEAD_FORMAT.pack(kind, memoryview(content).nbytes))
+    stream.write(_FRAME_HEAD_FORMAT.pack(frame_kind, memoryview(content).nbytes))
     stream.write(content)
     stream.flush()
 
@@ -158,19 +158,19 @@ def read_frames(stream: BinaryIO) -> Iterator[npt.NDArray[np.void] | EstimateReq
     while head := stream.read(_FRAME_HEAD_FORMAT.size):
         if len(head) < _FRAME_HEAD_FORMAT.size:
             raise _stream_error("it ended within a frame")
-        kind, length = _FRAME_HEAD_FORMAT.unpack(head)
+        frame_kind, length = _FRAME_HEAD_FORMAT.unpack(head)
         if length > _MAX_FRAME_BYTES:
             raise _stream_error(f"a frame of {length} bytes")
         content = stream.read(length)
         if len(content) < length:
             raise _stream_error("it ended within a frame")
         try:
-            if kind == _SAMPLES_FRAME:
+            if frame_kind == _SAMPLES_FRAME:
                 yield decode_samples(content)
-            elif kind == _REQUEST_FRAME:
+            elif frame_kind == _REQUEST_FRAME:
                 yield _parsed_request(json.loads(content))
             else:
-                raise _stream_error(f"a frame of unknown kind {kind!r}")
+                raise _stream_error(f"a frame of unknown kind {frame_kind!r}")
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
             raise _stream_error(f"a frame that cannot be read ({error!r})") from None
 

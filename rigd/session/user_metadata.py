@@ -46,12 +46,12 @@ def check_name(name: str) -> None:
         raise MetadataError(f"metadata {name}: has its own place; give it as {name} instead.")
 
 
-def metadata_keys(given: Mapping[str, object]) -> dict[str, str]:
+def metadata_keys(values: Mapping[str, object]) -> dict[str, str]:
     """Check user metadata, and return them as keys and texts for the record ``session``.
 
     Parameters
     ----------
-    given
+    values
         Name → value: a number, a number's text, or any other text.
 
     Returns
@@ -70,10 +70,10 @@ def metadata_keys(given: Mapping[str, object]) -> dict[str, str]:
     >>> metadata_keys({"temperature_c": "21.40", "batch": "B 7"})
     {'meta_temperature_c': '21.4', 'meta_batch': 'B 7'}
     """
-    if len(given) > _MAX_NAMES:
-        raise MetadataError(f"metadata: {len(given)} names are more than {_MAX_NAMES}.")
+    if len(values) > _MAX_NAMES:
+        raise MetadataError(f"metadata: {len(values)} names are more than {_MAX_NAMES}.")
     keys = {}
-    for name, value in given.items():
+    for name, value in values.items():
         check_name(name)
         keys[META_PREFIX + name] = (
             _number_text(name, value) if unit_of(name) else _checked_text(name, value)
@@ -94,13 +94,13 @@ def added_metadata(session: Mapping[str, str]) -> dict[str, float | str]:
     dict of str to (float or str)
         Name → number if the name ends in a unit and the text is a finite number, else the text.
     """
-    added: dict[str, float | str] = {}
+    metadata: dict[str, float | str] = {}
     for key, text in session.items():
         if key.startswith(META_PREFIX):
             name = key.removeprefix(META_PREFIX)
             number = _finite_or_none(text) if unit_of(name) else None
-            added[name] = text if number is None else number
-    return added
+            metadata[name] = text if number is None else number
+    return metadata
 
 
 def _number_text(name: str, value: object) -> str:

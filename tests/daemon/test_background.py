@@ -123,7 +123,7 @@ def test_a_check_asks_no_device_and_keeps_a_start_waiting(operated, monkeypatch)
 
     async def look_first(job, perform=background.perform):
         asked.append(await operated.handle("start", **CHIRP))
-        await operated.service.watch()
+        await operated.service.check_connection()
         return await perform(job)
 
     monkeypatch.setattr(background, "perform", look_first)

@@ -171,7 +171,7 @@ def test_nothing_that_clients_do_harms_a_running_session(served, monkeypatch):
         for _ in range(2000):
             served.server.publish({"event": "message", "text": "x" * 1000})
         await asyncio.sleep(0.01)
-        assert all(not client.watching for client in served.server._clients)
+        assert all(not client.is_subscribed for client in served.server._clients)
 
         status = await (await served.connect()).ask({"command": "status"})
         assert status["state"] == "running"
@@ -364,7 +364,7 @@ def test_a_folder_that_there_cannot_be_is_refused_with_the_remedy(tmp_path):
 
 
 def test_daemons_are_found(runtime_folder, monkeypatch):
-    monkeypatch.setattr(address, "COMMON", runtime_folder / "common")
+    monkeypatch.setattr(address, "GROUP_FOLDER", runtime_folder / "common")
     with pytest.raises(AddressError, match="rigd serve"):
         find(None)
     with (

@@ -320,7 +320,7 @@ class Operated:
         return self
 
     def watch(self):
-        self.loop.run_until_complete(self.service.watch())
+        self.loop.run_until_complete(self.service.check_connection())
 
     def close(self):
         self.loop.run_until_complete(self.service.close("the test is over"))

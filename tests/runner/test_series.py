@@ -140,7 +140,7 @@ class Looks:
         self.left -= 1
 
     @contextlib.contextmanager
-    def held(self):
+    def suspended(self):
         self.told.append("held")
         yield
         self.told.append("let go")

@@ -10,7 +10,7 @@ from shipped_profile import load_shipped
 from rigd.engine.messages import Closed, Connected, Finished
 from rigd.excitation import hold
 from rigd.runner.request import Order
-from rigd.runner.session import SessionFailedError, SessionRun, always
+from rigd.runner.session import SessionFailedError, SessionRun, can_always_receive_stop
 
 KILLED = "The fit process was killed by signal 9."
 STOPPED = "Stopped by the operator."
@@ -30,7 +30,9 @@ def close():
             oldest=0, written=0, capacity=16, record_size=1, buffer=bytes(1000)
         )
         connected = Connected({}, {}, {"clock": "virtual"}, simulated=True)
-        session = SessionRun(order, group, connected, None, lambda *_: None, always)
+        session = SessionRun(
+            order, group, connected, None, lambda *_: None, can_always_receive_stop
+        )
         session._fit = MagicMock(failure=failure, unmet_reason=unmet_reason, segments={})
         session._fit.finish.return_value = {}
         session._fit.poll.return_value = []
