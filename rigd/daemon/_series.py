@@ -22,7 +22,7 @@ _LOGGING_LEVELS = {
 }
 """Level of an event → level with which the event is logged."""
 
-Publish = Callable[[Document], None]
+PublishEvent = Callable[[Document], None]
 """Function that sends an event to the clients that have subscribed."""
 
 _log = logging.getLogger(LOGGER_NAME)
@@ -115,7 +115,7 @@ class SeriesReporter:
     """
 
     def __init__(
-        self, series: ServedSeries, publish: Publish, can_receive_stop: Callable[[], bool]
+        self, series: ServedSeries, publish: PublishEvent, can_receive_stop: Callable[[], bool]
     ) -> None:
         self._series = series
         self._publish = publish
@@ -132,8 +132,8 @@ class SeriesReporter:
     def on_message(self, level: str, text: str) -> None:
         self._report(level, text, notable=True)
 
-    def on_live_view(self, where: str) -> None:
-        self._report("info", where)
+    def on_live_view(self, view_text: str) -> None:
+        self._report("info", view_text)
 
     def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         for event in events:

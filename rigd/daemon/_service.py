@@ -21,7 +21,7 @@ from rigd.daemon import _protocol as protocol
 from rigd.daemon import background
 from rigd.daemon._log import LOGGER_NAME
 from rigd.daemon._protocol import CommandError
-from rigd.daemon._series import Publish, SeriesReporter, ServedSeries
+from rigd.daemon._series import PublishEvent, SeriesReporter, ServedSeries
 from rigd.daemon._states import (
     DaemonState,
     DaemonStateMachine,
@@ -97,7 +97,7 @@ class Service:
         profile: Profile,
         folder: Path,
         worker: Executor,
-        publish: Publish,
+        publish: PublishEvent,
         find_target: Callable[[], ActuationTarget],
         *,
         fast: bool = False,

@@ -63,9 +63,9 @@ class DaemonGoneError(FailureError):
         complete without further examination.
     """
 
-    def __init__(self, message: str, lost: tuple[int, int] | None = None) -> None:
+    def __init__(self, message: str, lost_process: tuple[int, int] | None = None) -> None:
         super().__init__(message)
-        self._lost_process = lost
+        self._lost_process = lost_process
 
     def full_message(self) -> str:
         """Return the text for the operator.

@@ -216,10 +216,10 @@ class _TerminalProgress:
     def on_message(self, level: str, text: str) -> None:
         self._print(f"Warning: {text}" if level == "warning" else text)
 
-    def on_live_view(self, where: str) -> None:
-        if where != self._last_view_text:
-            self._print(where)
-            self._last_view_text = where
+    def on_live_view(self, view_text: str) -> None:
+        if view_text != self._last_view_text:
+            self._print(view_text)
+            self._last_view_text = view_text
 
     def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         assert self._progress_line is not None

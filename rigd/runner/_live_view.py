@@ -138,7 +138,7 @@ class LiveView:
             self._restart(str(error))
 
     def _process_message_for(self, timeout_s: float) -> None:
-        """Process a message of the publisher, waiting for it for a time in seconds."""
+        """Process a message of the publisher, waiting up to `timeout_s` seconds for it."""
         try:
             message = self._group[LIVE].poll(timeout_s)
         except ChildError as error:

@@ -170,7 +170,7 @@ class FitSupervisor:
         return "Reached by the fit of the whole record."
 
     def _assess(self, estimates: Sequence[TargetEstimate]) -> tuple[bool | None, str]:
-        """Return whether the whole record has the requested precision, and text that explains it.
+        """Return whether the whole record has the requested precision, and text if it has not.
 
         The first value is None if the whole record was not fitted, whatever earlier estimates
         stated. The text is empty if the precision was reached.
@@ -213,7 +213,7 @@ class FitSupervisor:
             self._continue_without_process(str(error))
 
     def _process_messages(self, timeout_s: float) -> None:
-        """Process the messages of the fit process, waiting for them for a time in seconds."""
+        """Process messages of the fit process, waiting up to `timeout_s` seconds for them."""
         if self._failure:
             return
         try:

@@ -39,7 +39,7 @@ class SeriesWatcher(Protocol):
     def on_message(self, level: Literal["info", "warning"], text: str) -> None:
         """Process a message for the operator before the first session."""
 
-    def on_live_view(self, where: str) -> None:
+    def on_live_view(self, view_text: str) -> None:
         """Process the text with the address of the live view, or with the reason for none."""
 
     def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:

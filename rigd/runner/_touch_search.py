@@ -141,7 +141,7 @@ class TouchEstimates:
             self._continue_without_process(f"The touch process was {delay_text}.")
 
     def process_messages(self, timeout_s: float) -> bool:
-        """Process messages of the touch process for a time; return whether it is running."""
+        """Wait for messages of the touch process; return whether it is still running."""
         self._process_messages(timeout_s)
         return not self._failure
 
@@ -183,7 +183,7 @@ class TouchEstimates:
         return estimates
 
     def _process_messages(self, timeout_s: float) -> None:
-        """Process the messages of the touch process, waiting for them for a time in seconds."""
+        """Process messages of the touch process, waiting up to `timeout_s` seconds for them."""
         if self._failure:
             return
         try:

@@ -293,24 +293,28 @@ def predict_session(
     loop, instability_warning = stable_loop(loop_model_with(profile, excitation.model))
     prediction = predict(loop, excitation)
     violations, torque_violations = (
-        [finding for peak in channels if (finding := peak.violation())]
-        for channels in _limited_peaks(profile, prediction)
+        [violation_text for peak in peaks if (violation_text := peak.violation())]
+        for peaks in _limited_peaks(profile, prediction)
     )
     refusals = list(clearance.refusals)
     tip_slope = _limited_tip_slope(profile, prediction) if has_slope_limit(excitation) else None
     slope_violation = tip_slope is not None and tip_slope.violation()
     if violations or slope_violation or (torque_violations and not force):
         advice = _amplitude_advice(profile, excitation, force=force)
-        refusals += [f"{finding}; {advice}." for finding in violations]
+        refusals += [f"{violation_text}; {advice}." for violation_text in violations]
         if tip_slope is not None and slope_violation:
             remedy = slope_remedy(excitation, tip_slope.value, tip_slope.limit)
             refusals.append(f"{slope_violation}; {advice}{remedy}.")
         refusals += [
-            f"{finding}; {advice}, or allow clipping with --force." for finding in torque_violations
+            f"{violation_text}; {advice}, or allow clipping with --force."
+            for violation_text in torque_violations
         ]
     warnings = [*clearance.warnings, *([instability_warning] if instability_warning else [])]
     if not refusals:
-        warnings += [f"{finding}: it will be clipped and flagged." for finding in torque_violations]
+        warnings += [
+            f"{violation_text}: it will be clipped and flagged."
+            for violation_text in torque_violations
+        ]
     if excitation.approach is not None and not any(profile.rig.sensor.shear_projection):
         warnings.append(_UNKNOWN_FORCE_WARNING)
     return Plan(

@@ -347,32 +347,32 @@ def remaining_file_text(path: Path | None) -> str:
     )
 
 
-def file_header(order: Order, connected: Connected, tare: Mapping[str, str]) -> FileHeader:
+def file_header(order: Order, connection: Connected, tare: Mapping[str, str]) -> FileHeader:
     """Return the metadata, segments and attachments with which a session file begins.
 
     Parameters
     ----------
     order
         The session.
-    connected
+    connection
         Devices and real-time settings that the control process has reported.
     tare
         Metadata of the tare, and the seed of a simulated rig's noise.
     """
     specimen = order.profile.specimen
     return FileHeader(
-        metadata=_session_metadata(order, connected, tare),
+        metadata=_session_metadata(order, connection, tare),
         segments=dict(order.excitation.segments),
         attachments={
             "profile.toml": order.profile.text,
             **({} if specimen is None else {"specimen.toml": specimen.text}),
-            "calibration.json": json.dumps(connected.calibration, indent=1),
+            "calibration.json": json.dumps(connection.calibration, indent=1),
         },
     )
 
 
 def _session_metadata(
-    order: Order, connected: Connected, tare: Mapping[str, str]
+    order: Order, connection: Connected, tare: Mapping[str, str]
 ) -> dict[str, str]:
     """Return the record ``session`` of a session file: key → text."""
     rig = order.profile.rig
@@ -394,20 +394,20 @@ def _session_metadata(
         "sensor_projection": ",".join(map(repr, rig.sensor.projection)),
         "drive": rig.devices.drive,
         "sensor": rig.devices.sensor,
-        "simulated": str(connected.simulated).lower(),
+        "simulated": str(connection.simulated).lower(),
         "profile": order.profile.name,
         "software": f"rigd {__version__}",
         **software_commit(),
         "host": platform.node(),
-        **{f"realtime_{name}": value for name, value in connected.realtime.items()},
-        **connected.drive,
+        **{f"realtime_{name}": value for name, value in connection.realtime.items()},
+        **connection.drive,
         **tare,
         **dict(order.predicted),
         **dict(order.notes),
     }
     if order.accepted:
         metadata["accepted_checks"] = ", ".join(each.name for each in order.accepted)
-    serial_number = connected.calibration.get("serial_number")
+    serial_number = connection.calibration.get("serial_number")
     if isinstance(serial_number, str):
         metadata["sensor_serial_number"] = serial_number
     differences = simulated_differently(rig)

@@ -231,20 +231,20 @@ class SessionRun:
         self,
         order: Order,
         group: ProcessGroup,
-        connected: Connected,
+        connection: Connected,
         live: LiveView | None,
         watcher: ProgressCallback,
         can_receive_stop: Callable[[], bool],
     ) -> None:
         self._order = order
         self._group = group
-        self._connected = connected
+        self._connection = connection
         self._live = live
         self._shared_state = group.channels.shared_state
         self._events = Observer(group.channels.events)
         self._watcher = watcher
         self._can_receive_stop = can_receive_stop
-        self._is_virtual_clock = connected.realtime["clock"] == "virtual"
+        self._is_virtual_clock = connection.realtime["clock"] == "virtual"
         self._control_heartbeat = Heartbeat()
         self._recorder_failure: str | None = None
         self._is_control_busy = False
@@ -326,7 +326,7 @@ class SessionRun:
         group.control.send(job)
         message = self._await_control()
         if isinstance(message, Ready):
-            header = file_header(order, self._connected, message.tare)
+            header = file_header(order, self._connection, message.tare)
             group.recorder.send(header)
             if self._fit is not None:
                 self._fit.begin(header)
@@ -360,9 +360,9 @@ class SessionRun:
                 recorder_settings = {
                     f"recorder_{name}": text for name, text in opened.realtime.items()
                 }
-                previous_settings = self._connected.realtime
-                self._connected = replace(
-                    self._connected, realtime={**previous_settings, **recorder_settings}
+                previous_settings = self._connection.realtime
+                self._connection = replace(
+                    self._connection, realtime={**previous_settings, **recorder_settings}
                 )
                 return
         raise name_error
@@ -374,7 +374,7 @@ class SessionRun:
         """
         return {
             name: text
-            for name, text in self._connected.realtime.items()
+            for name, text in self._connection.realtime.items()
             if name.startswith(("supervisor_", "recorder_")) and text.startswith(REFUSED)
         }
 

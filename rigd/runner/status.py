@@ -83,7 +83,7 @@ class SignalStatisticsReader:
         return partial(_signal_statistics, self._rate_hz, tuple(self._recent_samples), self._peaks)
 
     def _include_samples(self, samples: npt.NDArray[Any]) -> None:
-        """Include samples in the peaks and in the window; tick 0 begins another record."""
+        """Update peaks and latest samples with new samples; tick 0 starts another record."""
         if samples.size == 0:
             return
         if samples["tick"][0] == 0:  # another record

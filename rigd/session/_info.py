@@ -289,14 +289,14 @@ class _EntryLimiter:
 
     def mapping(self, values: Mapping[str, _Value]) -> dict[str, _Value]:
         """Return the first entries of a mapping, up to the maximum, with long keys cut."""
-        shown: dict[str, _Value] = {}
+        shown_entries: dict[str, _Value] = {}
         for count, (key, value) in enumerate(values.items()):
             short_key = _shortened(key, _MAX_KEY_CHARACTERS)
             if not self._fits(short_key, str(value)):
                 self._report_omitted(len(values) - count)
                 break
-            shown[short_key] = value
-        return shown
+            shown_entries[short_key] = value
+        return shown_entries
 
     def texts(self, values: Mapping[str, str]) -> dict[str, str]:
         """Return the first entries of a mapping of texts, with long keys and long texts cut."""
@@ -309,7 +309,7 @@ class _EntryLimiter:
 
         `unread` is the number of further events in the file.
         """
-        shown: list[LoggedEvent] = []
+        shown_events: list[LoggedEvent] = []
         for event in events:
             short = replace(
                 event,
@@ -318,9 +318,9 @@ class _EntryLimiter:
             )
             if not self._fits(short.name, short.message):
                 break
-            shown.append(short)
-        self._report_omitted(len(events) - len(shown) + unread)
-        return shown
+            shown_events.append(short)
+        self._report_omitted(len(events) - len(shown_events) + unread)
+        return shown_events
 
     def _fits(self, *texts: str) -> bool:
         """Return whether another entry fits; subtract its length from the available length."""

@@ -36,15 +36,24 @@ _MAX_ZSTD_WINDOW_BYTES: Final = 32 << 20
 
 
 class McapError(Exception):
-    """Raised if bytes are not a usable MCAP file; the message completes "The file …"."""
+    """Raised if a file is not a usable MCAP file.
+
+    The message ends a sentence that begins with the file's name.
+    """
 
 
 class McapTooLargeError(McapError):
-    """Raised if reading a file would take too much memory or time; it completes "The file …"."""
+    """Raised if reading an MCAP file would take too much memory or time.
+
+    The message ends a sentence that begins with the file's name.
+    """
 
 
 class McapDamageError(Exception):
-    """Raised if a file violates the MCAP format; the message completes "The file …"."""
+    """Raised if a file is damaged or violates the MCAP format.
+
+    The message ends a sentence that begins with the file's name.
+    """
 
 
 class ReadingBudget:
@@ -67,7 +76,7 @@ class ReadingBudget:
                 "its work"
             )
 
-    def count_unpacked(self, size: int, where: str) -> None:
+    def count_unpacked(self, size: int, location_text: str) -> None:
         """Count the stated size of a chunk in bytes before the chunk is decompressed.
 
         Raises McapDamageError if the chunk, or all chunks of the file together, are too long.
@@ -75,16 +84,16 @@ class ReadingBudget:
         self._unpacked_bytes += size
         if size > limits.MAX_CHUNK_BYTES or self._unpacked_bytes > limits.MAX_TOTAL_BYTES:
             raise McapDamageError(
-                f"claims {size} bytes{where}, which is more than the "
+                f"claims {size} bytes{location_text}, which is more than the "
                 f"{limits.MAX_CHUNK_BYTES >> 20} MiB for a chunk or the "
                 f"{limits.MAX_TOTAL_BYTES >> 20} MiB for a file that are accepted"
             )
 
-    def count_declared(self, opcode: int, content: Buffer, where: str) -> None:
+    def count_declared(self, opcode: int, content: Buffer, location_text: str) -> None:
         """Count the memory of a schema, channel, metadata record or attachment before it is parsed.
 
-        `where` ends the error message. Raises McapError if there are too many such records in the
-        file, or if they are too long.
+        `location_text` ends the error message. Raises McapError if there are too many such records
+        in the file, or if they are too long.
         """
         self._declared_bytes += len(content) + _DECLARATION_MEMORY_BYTES
         if opcode != Opcode.ATTACHMENT:
@@ -106,10 +115,12 @@ class ReadingBudget:
             if used_bytes > max_bytes:
                 raise McapError(
                     "declares channels, schemas, metadata and attachments without limit: more than "
-                    f"{max_bytes >> 20} {unit_text}{where}"
+                    f"{max_bytes >> 20} {unit_text}{location_text}"
                 )
         if self._count_keys > limits.MAX_ENTRIES:
-            raise McapError(f"has more than {limits.MAX_ENTRIES} keys in its metadata{where}")
+            raise McapError(
+                f"has more than {limits.MAX_ENTRIES} keys in its metadata{location_text}"
+            )
 
 
 def zstd_decompressor() -> zstandard.ZstdDecompressor:
@@ -118,7 +129,11 @@ def zstd_decompressor() -> zstandard.ZstdDecompressor:
 
 
 def decompressed_chunk(
-    zstd: zstandard.ZstdDecompressor, compression: bytes, packed: memoryview, size: int, where: str
+    zstd: zstandard.ZstdDecompressor,
+    compression: bytes,
+    packed: memoryview,
+    size: int,
+    location_text: str,
 ) -> bytes:
     """Return the decompressed content of a chunk, which must have exactly `size` bytes.
 
@@ -144,22 +159,26 @@ def decompressed_chunk(
         if compression == b"":
             records = bytes(packed[: size + 1])
         elif compression == b"zstd":
-            _check_zstd_size(packed, size, where)
+            _check_zstd_size(packed, size, location_text)
             records = zstd.decompress(packed, max_output_size=size)
         elif compression == b"lz4":
             # One byte more than allowed, so that a longer chunk is detected.
             records = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
         else:
-            raise McapDamageError(f"uses the unknown compression {compression!r}{where}")
+            raise McapDamageError(f"uses the unknown compression {compression!r}{location_text}")
     except (zstandard.ZstdError, RuntimeError, ValueError):
-        raise McapDamageError(f"does not decompress{where}") from None
+        raise McapDamageError(f"does not decompress{location_text}") from None
     if len(records) != size:
-        raise McapDamageError(f"decompresses to a wrong size{where}")
+        raise McapDamageError(f"decompresses to a wrong size{location_text}")
     return records
 
 
 def decompressed_parts(
-    zstd: zstandard.ZstdDecompressor, compression: bytes, packed: memoryview, size: int, where: str
+    zstd: zstandard.ZstdDecompressor,
+    compression: bytes,
+    packed: memoryview,
+    size: int,
+    location_text: str,
 ) -> Iterator[Buffer]:
     """Yield the decompressed content of a long chunk in parts.
 
@@ -172,7 +191,7 @@ def decompressed_parts(
             for start in range(0, len(packed), MAX_UNPACKED_BYTES):
                 yield packed[start : start + MAX_UNPACKED_BYTES]
         elif compression == b"zstd":
-            _check_zstd_size(packed, size, where)
+            _check_zstd_size(packed, size, location_text)
             stream = zstd.stream_reader(packed)
             while unpacked_bytes <= size and (part := stream.read(MAX_UNPACKED_BYTES)):
                 unpacked_bytes += len(part)
@@ -190,19 +209,19 @@ def decompressed_parts(
                         break
                     lz4_input = b""
         else:
-            raise McapDamageError(f"uses the unknown compression {compression!r}{where}")
+            raise McapDamageError(f"uses the unknown compression {compression!r}{location_text}")
     except (zstandard.ZstdError, RuntimeError, ValueError, EOFError):
-        raise McapDamageError(f"does not decompress{where}") from None
+        raise McapDamageError(f"does not decompress{location_text}") from None
 
 
-def _check_zstd_size(packed: memoryview, size: int, where: str) -> None:
+def _check_zstd_size(packed: memoryview, size: int, location_text: str) -> None:
     """Raise if the Zstandard frame states another size than the chunk.
 
     The decompressor would allocate the size that the frame states.
     """
     stated_size = zstandard.get_frame_parameters(packed).content_size
     if stated_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-        raise McapDamageError(f"states two different sizes{where}")
+        raise McapDamageError(f"states two different sizes{location_text}")
 
 
 def read_prefixed_bytes(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:

@@ -102,8 +102,8 @@ class McapContents:
     declared_in_chunks: set[int] = field(default_factory=set)
     """Numbers of the channels that were declared in chunks, where a checksum covers them."""
     skipped: list[str] = field(default_factory=list)
-    """Texts that complete "The file …", one for each damaged record that was skipped. The last text
-    states how many more there are than `MAX_SKIPPED`."""
+    """Descriptions of the damaged records that were skipped, each as the end of a sentence that begins
+    with the file's name. The last one states how many more there are than `MAX_SKIPPED`."""
     stated_counts: dict[int, int] = field(default_factory=dict)
     """Channel number → number of messages that the file's statistics state, for a damaged file read
     in salvage mode. It is empty for a sound file and if the statistics are damaged."""
@@ -114,7 +114,8 @@ class McapContents:
     complete: bool = False
     """Whether the file ends with the footer and the magic bytes of a complete MCAP file."""
     damage: str | None = None
-    """Text that completes "The file …": why and where reading stopped; None at a sound end."""
+    """Why and where reading stopped, as the end of a sentence that begins with the file's name; None
+    if the file was read to a sound end."""
 
     def count(self, topic: str) -> int:
         """Return the number of messages of a topic that were read."""
@@ -211,31 +212,31 @@ def _has_footer(data: memoryview) -> bool:
     )
 
 
-def _locate_record(data: Buffer, position: int, where: str) -> tuple[int, int, int]:
+def _locate_record(data: Buffer, position: int, location_text: str) -> tuple[int, int, int]:
     """Return the opcode of the record at byte `position`, and where its content starts and ends.
 
-    `where` ends the error message for a truncated record.
+    `location_text` ends the error message for a truncated record.
     """
     content = position + RECORD_HEAD_FORMAT.size
     if content > len(data):
-        raise _truncated_record_error(position, where)
+        raise _truncated_record_error(position, location_text)
     opcode, length = RECORD_HEAD_FORMAT.unpack_from(data, position)
     if opcode == 0:
-        raise _missing_record_error(position, where)
+        raise _missing_record_error(position, location_text)
     end = content + length
     if end > len(data):
-        raise _truncated_record_error(position, where)
+        raise _truncated_record_error(position, location_text)
     return opcode, content, end
 
 
-def _truncated_record_error(position: int, where: str) -> McapDamageError:
+def _truncated_record_error(position: int, location_text: str) -> McapDamageError:
     """Return the error for a file that ends within a record."""
-    return McapDamageError(f"ends in the middle of a record, at byte {position}{where}")
+    return McapDamageError(f"ends in the middle of a record, at byte {position}{location_text}")
 
 
-def _missing_record_error(position: int, where: str) -> McapDamageError:
+def _missing_record_error(position: int, location_text: str) -> McapDamageError:
     """Return the error for bytes that are not a record, although one must begin there."""
-    return McapDamageError(f"has no record where one must be, at byte {position}{where}")
+    return McapDamageError(f"has no record where one must be, at byte {position}{location_text}")
 
 
 class _ContainerReader:
@@ -334,17 +335,17 @@ class _ContainerReader:
 
         The first message is the record from `start` to `first_end`.
         """
-        where = f" at byte {start}"
+        location_text = f" at byte {start}"
         if first_end - start < MESSAGE_HEAD_FORMAT.size:
-            raise McapDamageError(f"has a message that is too short{where}")
+            raise McapDamageError(f"has a message that is too short{location_text}")
         if self._is_stray_message(_RUN_HEAD_FORMAT.unpack_from(self._data, start)[2]):
             # The writing program uses chunks: this is another record, with a damaged opcode.
-            raise McapDamageError(f"has a message outside of a chunk{where}")
+            raise McapDamageError(f"has a message outside of a chunk{location_text}")
         if self._group_room == 0:
             self._group_position, self._group_room = start, _MAX_GROUP_MESSAGES
         limit = min(len(self._data), max(first_end, start + MAX_UNPACKED_BYTES))
         end, count = self._read_messages(
-            self._data, start, limit, self._group_position, where, self._group_room
+            self._data, start, limit, self._group_position, location_text, self._group_room
         )
         self._group_room -= count
         return end
@@ -353,7 +354,7 @@ class _ContainerReader:
         """Return whether a message outside of chunks belongs to a channel declared in chunks."""
         return self._salvage and channel in self.contents.declared_in_chunks
 
-    def _read_declaration(self, opcode: int, content: Buffer, where: str) -> None:
+    def _read_declaration(self, opcode: int, content: Buffer, location_text: str) -> None:
         """Store a schema, channel, metadata record or attachment; ignore other kinds of record."""
         contents = self.contents
         if opcode not in _DECLARATION_OPCODES:
@@ -363,62 +364,68 @@ class _ContainerReader:
         number = (opcode, bytes(content[: _CHANNEL_NUMBER_FORMAT.size]))
         if self._declarations.get(number) == content:
             return
-        self._budget.count_declared(opcode, content, where)
+        self._budget.count_declared(opcode, content, location_text)
         if opcode == Opcode.SCHEMA:
-            schema = parse_record(Schema.read, content, where)
+            schema = parse_record(Schema.read, content, location_text)
             if contents.schemas.setdefault(schema.id, schema) != schema:
-                raise McapDamageError(f"declares schema {schema.id} twice, differently{where}")
+                raise McapDamageError(
+                    f"declares schema {schema.id} twice, differently{location_text}"
+                )
             self._declarations[number] = bytes(content)
         elif opcode == Opcode.CHANNEL:
-            channel = parse_record(Channel.read, content, where)
+            channel = parse_record(Channel.read, content, location_text)
             if contents.channels.setdefault(channel.id, channel) != channel:
-                raise McapDamageError(f"declares channel {channel.id} twice, differently{where}")
+                raise McapDamageError(
+                    f"declares channel {channel.id} twice, differently{location_text}"
+                )
             self._is_wanted[channel.id] = self._topics is None or channel.topic in self._topics
             self._declarations[number] = bytes(content)
         elif opcode == Opcode.METADATA:
-            contents.metadata.append(parse_record(Metadata.read, content, where))
+            contents.metadata.append(parse_record(Metadata.read, content, location_text))
         elif opcode == Opcode.ATTACHMENT:
             if len(content) >= 4:
                 (crc,) = struct.unpack_from("<I", content, len(content) - 4)
                 if crc not in (0, zlib.crc32(content[:-4])):
-                    raise McapDamageError(f"has an attachment with a wrong checksum{where}")
-            contents.attachments.append(parse_record(Attachment.read, content, where))
+                    raise McapDamageError(f"has an attachment with a wrong checksum{location_text}")
+            contents.attachments.append(parse_record(Attachment.read, content, location_text))
 
     def _read_chunk(self, content: memoryview, start: int) -> None:
         """Decompress a chunk, verify its checksum, and read the records in it."""
         self._budget.count_steps(CHUNK_STEPS)
-        where = f" in the chunk at byte {start}"
+        location_text = f" in the chunk at byte {start}"
         try:
             *_, size, crc = _CHUNK_HEAD_FORMAT.unpack_from(content)
             name, position = read_prefixed_bytes(content, _CHUNK_HEAD_FORMAT.size, "<I")
             packed, _ = read_prefixed_bytes(content, position, "<Q")
         except struct.error:
-            raise McapDamageError(f"has a malformed head{where}") from None
-        self._budget.count_unpacked(size, where)
+            raise McapDamageError(f"has a malformed head{location_text}") from None
+        self._budget.count_unpacked(size, location_text)
         compression = bytes(name[:20])
         if size <= MAX_UNPACKED_BYTES:
-            records = decompressed_chunk(self._zstd, compression, packed, size, where)
+            records = decompressed_chunk(self._zstd, compression, packed, size, location_text)
             if crc not in (0, zlib.crc32(records)):
-                raise McapDamageError(f"has a wrong checksum{where}")
-            end = self._read_records(records, 0, start, where)
+                raise McapDamageError(f"has a wrong checksum{location_text}")
+            end = self._read_records(records, 0, start, location_text)
             if end < len(records):
-                raise _truncated_record_error(end, where)
+                raise _truncated_record_error(end, location_text)
             return
         # Too long for memory: decompressed once to verify the checksum, and again to be read.
         unpacked_bytes, unpacked_crc = 0, 0
-        for part in decompressed_parts(self._zstd, compression, packed, size, where):
+        for part in decompressed_parts(self._zstd, compression, packed, size, location_text):
             unpacked_bytes += len(part)
             unpacked_crc = zlib.crc32(part, unpacked_crc)
             self._release_pages()
         if unpacked_bytes != size:
-            raise McapDamageError(f"decompresses to a wrong size{where}")
+            raise McapDamageError(f"decompresses to a wrong size{location_text}")
         if crc not in (0, unpacked_crc):
-            raise McapDamageError(f"has a wrong checksum{where}")
+            raise McapDamageError(f"has a wrong checksum{location_text}")
         self._read_parts(
-            decompressed_parts(self._zstd, compression, packed, size, where), start, where
+            decompressed_parts(self._zstd, compression, packed, size, location_text),
+            start,
+            location_text,
         )
 
-    def _read_parts(self, parts: Iterator[Buffer], chunk_position: int, where: str) -> None:
+    def _read_parts(self, parts: Iterator[Buffer], chunk_position: int, location_text: str) -> None:
         """Read the records of a chunk that arrives in parts; a record may span several parts."""
         remainder = b""  # beginning of a record whose end is in a later part
         remainder_offset = 0  # offset of `rest` in the chunk
@@ -432,32 +439,36 @@ class _ContainerReader:
             remainder += part[bytes_to_skip:]
             remainder_offset += bytes_to_skip
             bytes_to_skip = 0
-            used_bytes = self._read_records(remainder, remainder_offset, chunk_position, where)
+            used_bytes = self._read_records(
+                remainder, remainder_offset, chunk_position, location_text
+            )
             remainder = remainder[used_bytes:]
             remainder_offset += used_bytes
             if len(remainder) >= _RUN_HEAD_FORMAT.size:
-                bytes_to_skip = self._skippable_bytes(remainder, remainder_offset, where)
+                bytes_to_skip = self._skippable_bytes(remainder, remainder_offset, location_text)
                 if bytes_to_skip:
                     remainder_offset += len(remainder)
                     bytes_to_skip -= len(remainder)
                     remainder = b""
         if remainder or bytes_to_skip:
-            raise _truncated_record_error(remainder_offset, where)
+            raise _truncated_record_error(remainder_offset, location_text)
 
-    def _skippable_bytes(self, records: bytes, base: int, where: str) -> int:
+    def _skippable_bytes(self, records: bytes, base: int, location_text: str) -> int:
         """Return the length of the first record in bytes if it can be skipped, else 0."""
         opcode, length, channel = _RUN_HEAD_FORMAT.unpack_from(records)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             if length > limits.MAX_TEXT_BYTES:
-                raise _truncated_record_error(base, where)
+                raise _truncated_record_error(base, location_text)
             return 0
         if opcode == Opcode.MESSAGE:
-            if self._is_wanted.get(channel, True) and self._is_accepted_length(length, where):
+            if self._is_wanted.get(channel, True) and self._is_accepted_length(
+                length, location_text
+            ):
                 return 0
             self.contents.message_counts[channel] += 1
         return int(length) + RECORD_HEAD_FORMAT.size
 
-    def _is_accepted_length(self, length: int, where: str) -> bool:
+    def _is_accepted_length(self, length: int, location_text: str) -> bool:
         """Return whether a message is within the maximum length; record a longer one as skipped.
 
         Raises McapDamageError for a longer message unless in salvage mode.
@@ -465,7 +476,7 @@ class _ContainerReader:
         if length <= limits.MAX_MESSAGE_BYTES:
             return True
         damage = (
-            f"has a message of {length} bytes{where}, more than the "
+            f"has a message of {length} bytes{location_text}, more than the "
             f"{limits.MAX_MESSAGE_BYTES >> 20} MiB that are accepted"
         )
         if not self._salvage:
@@ -473,7 +484,9 @@ class _ContainerReader:
         self._add_skipped(damage)
         return False
 
-    def _read_records(self, records: bytes, base: int, chunk_position: int, where: str) -> int:
+    def _read_records(
+        self, records: bytes, base: int, chunk_position: int, location_text: str
+    ) -> int:
         """Read the complete records of a buffer, and return the offset where the rest begins.
 
         `base` is the offset of the buffer in its chunk.
@@ -481,22 +494,24 @@ class _ContainerReader:
         end = 0
         while end < len(records):
             start = end
-            end, count = self._read_messages(records, start, len(records), chunk_position, where)
+            end, count = self._read_messages(
+                records, start, len(records), chunk_position, location_text
+            )
             if count:
                 continue
             if start + RECORD_HEAD_FORMAT.size > len(records):
                 return start
             opcode, length = RECORD_HEAD_FORMAT.unpack_from(records, start)
             if opcode == 0:
-                raise _missing_record_error(base + start, where)
+                raise _missing_record_error(base + start, location_text)
             content = start + RECORD_HEAD_FORMAT.size
             end = content + length
             if end > len(records):
                 return start
             self._budget.count_steps(1)
             if opcode == Opcode.MESSAGE:
-                raise McapDamageError(f"has a message that is too short{where}")
-            self._read_declaration(opcode, records[content:end], where)
+                raise McapDamageError(f"has a message that is too short{location_text}")
+            self._read_declaration(opcode, records[content:end], location_text)
             if opcode == Opcode.CHANNEL:
                 (channel,) = _CHANNEL_NUMBER_FORMAT.unpack_from(records, content)
                 self.contents.declared_in_chunks.add(channel)
@@ -508,7 +523,7 @@ class _ContainerReader:
         start: int,
         limit: int,
         chunk_position: int,
-        where: str,
+        location_text: str,
         max_messages: int | None = None,
     ) -> tuple[int, int]:
         """Pass the messages from `start` to the callback, up to another record or `limit`.
@@ -516,14 +531,14 @@ class _ContainerReader:
         `max_messages` limits the number of messages outside of chunks. Returns the offset after the
         last message, and the number of messages.
         """
-        unpack = _RUN_HEAD_FORMAT.unpack_from
-        wanted, counts = self._is_wanted, self.contents.message_counts
+        unpack_run_head = _RUN_HEAD_FORMAT.unpack_from
+        wanted_by_channel, message_counts = self._is_wanted, self.contents.message_counts
         runs: list[Run] = []
         position = start
         message_count = run_count = 0  # number of messages, and number of runs of messages
         try:
             while position + MESSAGE_HEAD_FORMAT.size <= limit and run_count < _MAX_BLOCK_RUNS:
-                run_head = unpack(records, position)
+                run_head = unpack_run_head(records, position)
                 opcode, length, channel = run_head
                 size = length + RECORD_HEAD_FORMAT.size
                 if (
@@ -532,10 +547,10 @@ class _ContainerReader:
                     or position + size > limit
                 ):
                     break
-                is_wanted = wanted.get(channel)
+                is_wanted = wanted_by_channel.get(channel)
                 if is_wanted is None:
                     raise McapDamageError(
-                        f"has a message of an undeclared channel {channel}{where}"
+                        f"has a message of an undeclared channel {channel}{location_text}"
                     )
                 if max_messages is not None and (
                     message_count == max_messages or self._is_stray_message(channel)
@@ -543,7 +558,7 @@ class _ContainerReader:
                     break
                 end = position + size
                 count = 1
-                while end + size <= limit and unpack(records, end) == run_head:
+                while end + size <= limit and unpack_run_head(records, end) == run_head:
                     end += size
                     count += 1
                     if count == _MAX_SINGLE_COMPARISONS:
@@ -551,9 +566,9 @@ class _ContainerReader:
                         break
                 if max_messages is not None:
                     count = min(count, max_messages - message_count)
-                if is_wanted and self._is_accepted_length(length, where):
+                if is_wanted and self._is_accepted_length(length, location_text):
                     runs.append((channel, size, position, count))
-                counts[channel] += count
+                message_counts[channel] += count
                 position += size * count
                 message_count += count
                 run_count += 1
@@ -633,13 +648,15 @@ class _ContainerReader:
         return {}
 
 
-def parse_record(read: Callable[[ReadDataStream], _Record], content: Buffer, where: str) -> _Record:
+def parse_record(
+    read: Callable[[ReadDataStream], _Record], content: Buffer, location_text: str
+) -> _Record:
     """Return a record parsed with the ``mcap`` package; raise McapDamageError if malformed."""
     try:
         stream = ReadDataStream(BytesIO(content))
         record = read(stream)
     except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError):
-        raise McapDamageError(f"has a malformed record{where}") from None
+        raise McapDamageError(f"has a malformed record{location_text}") from None
     return record
 
 

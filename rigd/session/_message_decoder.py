@@ -66,7 +66,12 @@ zeros writes a few layouts."""
 _MAX_LAYOUT_COMPARISONS: Final = 100_000
 """Maximum number of comparisons of messages with a field layout, which take about 100 µs each."""
 
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protobuf
+_VARINT_WIRE_TYPE, _FIXED64_WIRE_TYPE, _BYTES_WIRE_TYPE, _FIXED32_WIRE_TYPE = (
+    0,
+    1,
+    2,
+    5,
+)  # wire types of protobuf
 _MAX_FIELD_NUMBER: Final = (1 << 29) - 1
 _MAX_TAG_BYTES: Final = 5
 _MAX_VARINT_BYTES: Final = 9
@@ -134,7 +139,7 @@ TOUCHES: Final = MessageLayout(
 )
 
 # Type of the fixed layout → protobuf type in the file's schema → how to read it without loss.
-_LOSSLESS_READINGS: Final = {
+_LOSSLESS_CONVERSIONS: Final = {
     "double": {"TYPE_DOUBLE": "<f8", "TYPE_FLOAT": "<f4"},
     "sfixed64": {"TYPE_SFIXED64": "<i8", "TYPE_INT64": "varint", "TYPE_UINT32": "varint32"},
     "fixed32": {"TYPE_FIXED32": "<u4", "TYPE_UINT32": "varint32"},
@@ -371,12 +376,12 @@ class MessageDecoder:
             tag, position = _read_varint(message, start)
             number, wire_type = tag >> 3, tag & 7
             value_start = position
-            if wire_type == _VARINT:
+            if wire_type == _VARINT_WIRE_TYPE:
                 _, position = _read_varint(message, value_start)
                 mask[value_start:position] = 0x80
-            elif wire_type in (_FIXED64, _FIXED32):
-                position += 8 if wire_type == _FIXED64 else 4
-            elif wire_type == _BYTES:
+            elif wire_type in (_FIXED64_WIRE_TYPE, _FIXED32_WIRE_TYPE):
+                position += 8 if wire_type == _FIXED64_WIRE_TYPE else 4
+            elif wire_type == _BYTES_WIRE_TYPE:
                 length, position = _read_varint(message, value_start)
                 mask[value_start:position] = 0xFF
                 position += length
@@ -386,20 +391,20 @@ class MessageDecoder:
                 not 1 <= number <= _MAX_FIELD_NUMBER
                 or position > len(message)
                 or value_start - start > _MAX_TAG_BYTES
-                or (wire_type == _VARINT and position - value_start > _MAX_VARINT_BYTES)
+                or (wire_type == _VARINT_WIRE_TYPE and position - value_start > _MAX_VARINT_BYTES)
             ):
                 return None
             mask[start:value_start] = 0xFF
             field_descriptor = descriptor.fields_by_number.get(number)
             if field_descriptor is not None:
-                reading = self._array_reading(field_descriptor, wire_type)
-                if reading is None:
+                conversion = self._array_conversion(field_descriptor, wire_type)
+                if conversion is None:
                     return None
                 fields[field_descriptor.name] = (
                     field_descriptor.name,
                     value_start,
                     position - value_start,
-                    reading,
+                    conversion,
                 )
         names = self.dtype.names or ()
         absent = {name: getattr(empty_message, name, 0) for name in names if name not in fields}
@@ -412,7 +417,7 @@ class MessageDecoder:
             tuple(absent),
         )
 
-    def _array_reading(
+    def _array_conversion(
         self, field_descriptor: "FieldDescriptor | UpbFieldDescriptor", wire_type: int
     ) -> str | None:
         """Return the NumPy type, "varint" or "varint32" that decodes a field in many messages.
@@ -420,16 +425,22 @@ class MessageDecoder:
         Returns None if the field must be decoded message by message. `wire_type` is the number of
         the protobuf wire type.
         """
-        readings = _LOSSLESS_READINGS.get(self._layout.types.get(field_descriptor.name, ""), {})
-        for name, reading in readings.items():
+        conversions = _LOSSLESS_CONVERSIONS.get(
+            self._layout.types.get(field_descriptor.name, ""), {}
+        )
+        for name, conversion in conversions.items():
             if field_descriptor.type == getattr(field_descriptor, name):
                 required_wire_types = {
-                    "<f8": _FIXED64,
-                    "<i8": _FIXED64,
-                    "<f4": _FIXED32,
-                    "<u4": _FIXED32,
+                    "<f8": _FIXED64_WIRE_TYPE,
+                    "<i8": _FIXED64_WIRE_TYPE,
+                    "<f4": _FIXED32_WIRE_TYPE,
+                    "<u4": _FIXED32_WIRE_TYPE,
                 }
-                return reading if wire_type == required_wire_types.get(reading, _VARINT) else None
+                return (
+                    conversion
+                    if wire_type == required_wire_types.get(conversion, _VARINT_WIRE_TYPE)
+                    else None
+                )
         return None
 
     def _decode_one_by_one(
@@ -584,16 +595,16 @@ def _decode_at_offsets(
     """Decode messages `rows` (n, bytes) of one field layout into elements `indices` of `out`."""
     rows = np.ascontiguousarray(rows)
     count, size = rows.shape
-    for name, first, length, reading in layout.fields:
-        if reading.startswith("varint"):
+    for name, first, length, conversion in layout.fields:
+        if conversion.startswith("varint"):
             value = np.zeros(count, np.uint64)
             for i in range(length):
                 value |= (rows[:, first + i] & 0x7F).astype(np.uint64) << np.uint64(7 * i)
-            if reading == "varint32":
+            if conversion == "varint32":
                 value &= np.uint64(0xFFFFFFFF)
             out[name][indices] = value.astype(out.dtype[name])
         else:
-            out[name][indices] = np.ndarray(count, reading, rows, first, (size,))
+            out[name][indices] = np.ndarray(count, conversion, rows, first, (size,))
     for name in layout.absent:
         out[name][indices] = 0
 

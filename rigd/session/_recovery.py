@@ -37,7 +37,12 @@ from rigd.session._reader import (
     merged_metadata,
     read_session,
 )
-from rigd.session._schema import OWN_TOPICS, SAMPLE_TOPIC, protected_metadata, unprotected_metadata
+from rigd.session._schema import (
+    OWN_TOPICS,
+    SAMPLE_TOPIC,
+    metadata_for_channel,
+    metadata_from_channel,
+)
 from rigd.session._writer import (
     PART_SUFFIX,
     copy_new,
@@ -79,11 +84,12 @@ class Recovery:
     outcome: Mapping[str, str]
     """Record ``outcome`` of the new file, with the counts of lost ticks."""
     damage: str | None
-    """Text that completes "The file …" and describes the first damage, or None if there is none."""
+    """Description of the first damage, as the end of a sentence that begins with the file's name; None
+    if the file is intact."""
     bytes_lost: int
     """Number of bytes of `source` after the last intact record."""
     skipped: tuple[str, ...]
-    """Texts that complete "The file …", one for each further damage that was left out."""
+    """Descriptions of further damage that was left out, in the form of `damage`."""
     protected: bool
     """Whether checksums cover the sample rate, the beam data and the segments."""
 
@@ -228,7 +234,8 @@ class _SampleSelection:
 
     def __init__(self, path: Path) -> None:
         self.order_error: str | None = None
-        """Text that completes "The file …" if samples repeat or are out of order, else None."""
+        """Description of samples that repeat or are out of order, as the end of a sentence that begins
+        with the file's name; None if there are none."""
         self.is_copied: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
         """For each sample in the file, whether it is copied to the new file."""
         self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)
@@ -343,12 +350,12 @@ def _increasing_ticks_mask(ticks: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool
 
 
 def _scaled_progress(
-    on_progress: Callable[[float], None] | None, first: float, end: float
+    on_progress: Callable[[float], None] | None, start_fraction: float, end_fraction: float
 ) -> Callable[[float], None] | None:
-    """Return a callback that maps a fraction of one step to the range `first`–`end` of all."""
+    """Return a callback that scales the progress of one step to its range of the whole progress."""
     if on_progress is None:
         return None
-    return lambda fraction: on_progress(first + (end - first) * fraction)
+    return lambda fraction: on_progress(start_fraction + (end_fraction - start_fraction) * fraction)
 
 
 def _copy_sound_file(path: Path, target: Path) -> Recovery:
@@ -496,7 +503,7 @@ def _metadata_from_chunk(contents: McapContents) -> dict[str, dict[str, str]]:
     """
     for channel in contents.channels.values():
         if channel.topic == SAMPLE_TOPIC and channel.id in contents.declared_in_chunks:
-            records = unprotected_metadata(channel.metadata)
+            records = metadata_from_channel(channel.metadata)
             if "session" in records:
                 return records
     return {}
@@ -662,7 +669,7 @@ def _channels_to_copy(
 ) -> list[Channel]:
     """Return the channels to copy; the channel of the samples repeats the session's metadata."""
     only_protected = bool(_metadata_from_chunk(contents)) and not contents.verified
-    metadata = protected_metadata(records.get("session", {}), records.get("segments", {}))
+    metadata = metadata_for_channel(records.get("session", {}), records.get("segments", {}))
     candidates = [
         channel
         for channel in contents.channels.values()

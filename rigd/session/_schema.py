@@ -44,10 +44,10 @@ def _fixed_layout_file(schema_name: str, types: dict[str, str]) -> "FileDescript
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
     package, name = schema_name.split(".")
-    file = FileDescriptorProto(
+    file_descriptor = FileDescriptorProto(
         name=f"{package}/{name.lower()}.proto", package=package, syntax="proto3"
     )
-    message = file.message_type.add(name=name)
+    message = file_descriptor.message_type.add(name=name)
     for number, (field, protobuf_type) in enumerate(types.items(), start=1):
         message.field.add(
             name=field,
@@ -55,7 +55,7 @@ def _fixed_layout_file(schema_name: str, types: dict[str, str]) -> "FileDescript
             label=FieldDescriptorProto.LABEL_OPTIONAL,
             type=FieldDescriptorProto.Type.Value(f"TYPE_{protobuf_type.upper()}"),
         )
-    return file
+    return file_descriptor
 
 
 def _event_file() -> "FileDescriptorProto":
@@ -65,13 +65,13 @@ def _event_file() -> "FileDescriptorProto":
     """
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
-    file = FileDescriptorProto(
+    file_descriptor = FileDescriptorProto(
         name="foxglove/Log.proto",
         package="foxglove",
         syntax="proto3",
         dependency=["google/protobuf/timestamp.proto"],
     )
-    message = file.message_type.add(name="Log")
+    message = file_descriptor.message_type.add(name="Log")
     level = message.enum_type.add(name="Level")
     for value, name in enumerate(EVENT_LEVELS):
         level.value.add(name=name.upper(), number=value)
@@ -91,7 +91,7 @@ def _event_file() -> "FileDescriptorProto":
             type=protobuf_type,
             type_name=type_name,
         )
-    return file
+    return file_descriptor
 
 
 @cache
@@ -161,7 +161,7 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
     return message_factory.GetMessageClass(descriptor)
 
 
-def protected_metadata(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
+def metadata_for_channel(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
     """Return the records ``session`` and ``segments`` as metadata of the samples' channel.
 
     A checksum covers the channel. MCAP has no checksum for a metadata record, and the checksum of
@@ -173,10 +173,10 @@ def protected_metadata(session: Mapping[str, str], segments: Mapping[str, str]) 
     }
 
 
-def unprotected_metadata(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
+def metadata_from_channel(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
     """Return the records ``session`` and ``segments`` from the metadata of the samples' channel.
 
-    This is the inverse of `protected_metadata`. The result lacks a record without any key.
+    This is the inverse of `metadata_for_channel`. The result lacks a record without any key.
     """
     records: dict[str, dict[str, str]] = {}
     for key, value in channel.items():

@@ -38,7 +38,7 @@ from rigd.session._schema import (
     TOUCH_SCHEMA,
     TOUCH_TOPIC,
     event_class,
-    protected_metadata,
+    metadata_for_channel,
     schema_data,
 )
 from rigd.session.layout import (
@@ -207,7 +207,7 @@ class SessionWriter:
             for name, data in attachments.items():
                 media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
                 mcap.add_attachment(name, media_type, data, start_utc_ns)
-            mcap.declare(*_session_channels(protected_metadata(session, segments_record)))
+            mcap.declare(*_session_channels(metadata_for_channel(session, segments_record)))
             self._mcap = mcap
             self._sync()
             fsync_directory(self.part.parent)
@@ -262,7 +262,7 @@ class SessionWriter:
         message : text for the operator
         name : process or component that logs the event
         """
-        self._begun_writer()
+        self._require_writer()
         log_time = self._start_utc_ns + t_ns
         seconds, nanos = divmod(log_time, 10**9)
         event = event_class()(
@@ -298,7 +298,7 @@ class SessionWriter:
             If another file with the final path was created during the session. The complete session
             then remains in the ``.part`` file.
         """
-        mcap = self._begun_writer()
+        mcap = self._require_writer()
         with self._io_errors_explained():
             self._write_chunk(everything=True)
             if segments:
@@ -398,7 +398,7 @@ class SessionWriter:
                 return copy
         return None
 
-    def _begun_writer(self) -> McapWriter:
+    def _require_writer(self) -> McapWriter:
         """Return the MCAP writer; raise if `begin` was not called or writing has failed."""
         if self._mcap is None:
             raise RuntimeError("begin() comes first")
@@ -409,7 +409,7 @@ class SessionWriter:
 
     def _checked_view(self, block: Buffer, size: int) -> memoryview:
         """Return a view of the block; raise if its length is no multiple of `size` bytes."""
-        self._begun_writer()
+        self._require_writer()
         view = memoryview(block).cast("B")
         if len(view) % size:
             raise ValueError(
@@ -423,7 +423,7 @@ class SessionWriter:
         Controller terms and ages of readings that are later than the last sample stay for the next
         chunk, unless `everything` is True.
         """
-        mcap = self._begun_writer()
+        mcap = self._require_writer()
         samples = np.frombuffer(self._samples, SAMPLE_WIRE_DTYPE)
         controls = np.frombuffer(self._controls, CONTROL_WIRE_DTYPE)
         timings = np.frombuffer(self._timings, TIMING_WIRE_DTYPE)
@@ -534,16 +534,21 @@ def _chunk_samples(metadata: Mapping[str, str]) -> int:
 def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
     """Return schemas and channels of a session; the samples' channel repeats its metadata."""
     schemas, channels = [], []
-    for topic, (number, schema_name) in _CHANNEL_NUMBERS_AND_SCHEMAS.items():
+    for topic, (channel_number, schema_name) in _CHANNEL_NUMBERS_AND_SCHEMAS.items():
         schemas.append(
-            Schema(id=number, name=schema_name, encoding="protobuf", data=schema_data(schema_name))
+            Schema(
+                id=channel_number,
+                name=schema_name,
+                encoding="protobuf",
+                data=schema_data(schema_name),
+            )
         )
         channels.append(
             Channel(
-                id=number,
+                id=channel_number,
                 topic=topic,
                 message_encoding="protobuf",
-                schema_id=number,
+                schema_id=channel_number,
                 metadata=dict(metadata) if topic == SAMPLE_TOPIC else {},
             )
         )

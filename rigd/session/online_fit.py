@@ -73,7 +73,7 @@ class EstimateRequest:
 
 
 def write_start(stream: BinaryIO, start: StreamStart) -> None:
-    """Write the first line of the stream to the online fit.
+    """Write the first line of the online fit's input stream: the session's metadata.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def write_start(stream: BinaryIO, start: StreamStart) -> None:
 
 
 def write_samples(stream: BinaryIO, block: Buffer) -> None:
-    """Write a frame of consecutive samples to the stream to the online fit.
+    """Write consecutive samples to the online fit's input stream, as one frame.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def write_samples(stream: BinaryIO, block: Buffer) -> None:
 
 
 def write_request(stream: BinaryIO, request: EstimateRequest) -> None:
-    """Write a frame that requests an estimate to the stream to the online fit.
+    """Write a request for an estimate to the online fit's input stream, as one frame.
 
     Parameters
     ----------
@@ -120,12 +120,12 @@ def _write_frame(stream: BinaryIO, frame_kind: bytes, content: Buffer) -> None:
 
 
 def read_start(stream: BinaryIO) -> StreamStart:
-    """Read the first line of a stream to the online fit.
+    """Return the metadata in the first line of the online fit's input stream.
 
     Raises
     ------
     SessionError
-        If the line is not the beginning of such a stream, or of another version.
+        If the line is not the beginning of such a stream, or is of another version.
     """
     try:
         first_line = json.loads(stream.readline(_MAX_FIRST_LINE_BYTES))
@@ -144,7 +144,7 @@ def read_start(stream: BinaryIO) -> StreamStart:
 
 
 def read_frames(stream: BinaryIO) -> Iterator[npt.NDArray[np.void] | EstimateRequest]:
-    """Yield blocks of samples and requests from a stream to the online fit until it ends.
+    """Yield blocks of samples and requests from the online fit's input stream until its end.
 
     Yields
     ------

@@ -101,7 +101,7 @@ def last_quick_look(
     but: str = "",
     usable: Callable[[Document], object],
 ) -> tuple[Path, Document] | None:
-    """Return the quick look at the last session of a specimen that has a usable one.
+    """Return the last usable quick look at a session of a specimen.
 
     Parameters
     ----------

@@ -16,11 +16,11 @@ META_PREFIX: Final = "meta_"
 """Prefix that user metadata have in their keys in the record ``session``."""
 
 _NAME_PATTERN: Final = re.compile(r"[a-z][a-z0-9_]{0,39}")
-"""Pattern of an allowed name."""
+"""Regular expression that an allowed name of user metadata matches."""
 _MAX_NAMES: Final = 32
 """Maximum number of user metadata of a session."""
 _MAX_TEXT_CHARACTERS: Final = 200
-"""Maximum number of characters of a text value."""
+"""Maximum number of characters of a text that is a value of user metadata."""
 _MAX_SHOWN_CHARACTERS: Final = 40
 """Maximum number of characters of a value in an error message."""
 
