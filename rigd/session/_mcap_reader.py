@@ -102,7 +102,7 @@ class McapContents:
     declared_in_chunks: set[int] = field(default_factory=set)
     """Numbers of the channels that were declared in chunks, where a checksum covers them."""
     skipped: list[str] = field(default_factory=list)
-    """Descriptions of the damaged records that were skipped, each as the end of a sentence that begins
+    """Descriptions of the damaged records that were skipped, each the end of a sentence that begins
     with the file's name. The last one states how many more there are than `MAX_SKIPPED`."""
     stated_counts: dict[int, int] = field(default_factory=dict)
     """Channel number → number of messages that the file's statistics state, for a damaged file read
@@ -114,8 +114,9 @@ class McapContents:
     complete: bool = False
     """Whether the file ends with the footer and the magic bytes of a complete MCAP file."""
     damage: str | None = None
-    """Why and where reading stopped, as the end of a sentence that begins with the file's name; None
-    if the file was read to a sound end."""
+    """Why and where reading stopped, as the end of a sentence that begins with the file's name.
+
+    None if the file was read to a sound end."""
 
     def count(self, topic: str) -> int:
         """Return the number of messages of a topic that were read."""
@@ -207,7 +208,7 @@ def _has_footer(data: memoryview) -> bool:
     if start < len(MAGIC) or bytes(data[-len(MAGIC) :]) != MAGIC:
         return False
     return RECORD_HEAD_FORMAT.unpack_from(data, start) == (
-        Opcode.FOOTER_FORMAT,
+        Opcode.FOOTER,
         _FOOTER_CONTENT_SIZE,
     )
 
@@ -287,7 +288,7 @@ class _ContainerReader:
                 self._check_summary(end)
                 contents.sound_bytes = len(data)
                 return
-            elif opcode == Opcode.FOOTER_FORMAT:
+            elif opcode == Opcode.FOOTER:
                 break
             else:
                 try:

@@ -84,8 +84,9 @@ class Recovery:
     outcome: Mapping[str, str]
     """Record ``outcome`` of the new file, with the counts of lost ticks."""
     damage: str | None
-    """Description of the first damage, as the end of a sentence that begins with the file's name; None
-    if the file is intact."""
+    """Description of the first damage, as the end of a sentence that begins with the file's name.
+
+    None if the file is intact."""
     bytes_lost: int
     """Number of bytes of `source` after the last intact record."""
     skipped: tuple[str, ...]
@@ -234,8 +235,9 @@ class _SampleSelection:
 
     def __init__(self, path: Path) -> None:
         self.order_error: str | None = None
-        """Description of samples that repeat or are out of order, as the end of a sentence that begins
-        with the file's name; None if there are none."""
+        """Description of samples that repeat or are out of order, or None if there are none.
+
+        It is the end of a sentence that begins with the file's name."""
         self.is_copied: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
         """For each sample in the file, whether it is copied to the new file."""
         self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)

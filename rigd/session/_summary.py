@@ -125,7 +125,7 @@ def _read_by_summary(file: BinaryIO, size: int) -> McapContents | None:
     ):
         return None
     opcode, length, summary_start, _, crc = FOOTER_FORMAT.unpack_from(footer_and_magic)
-    if (opcode, length) != (Opcode.FOOTER_FORMAT, FOOTER_FORMAT.size - RECORD_HEAD_FORMAT.size):
+    if (opcode, length) != (Opcode.FOOTER, FOOTER_FORMAT.size - RECORD_HEAD_FORMAT.size):
         return None
     if not len(MAGIC) < summary_start <= footer_start <= summary_start + _MAX_SUMMARY_BYTES:
         return None
