@@ -78,7 +78,7 @@ class Service:
         Executor with one thread for slow calls of the rig.
     publish
         Function that sends an event to the clients that have subscribed.
-    moving
+    find_target
         Function that returns what would move if the rig were connected now.
     fast, live
         Options with which the rig was created.

@@ -58,7 +58,7 @@ class DaemonGoneError(FailureError):
     ----------
     message
         Text for the operator.
-    lost
+    lost_process
         Process id and user id of a daemon whose connection was lost, or None if the message is
         complete without further examination.
     """

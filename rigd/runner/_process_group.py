@@ -145,7 +145,7 @@ class ProcessGroup:
             Sample rate, in ticks per second.
         fast
             Whether the sessions run under the virtual clock.
-        watched
+        may_be_observed
             Whether processes that read samples, such as a fit, may be started later.
 
         Raises

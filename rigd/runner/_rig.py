@@ -184,7 +184,7 @@ class Rig:
             Session to run.
         stop
             Stop request of the operator, which ends the session.
-        watcher, listens
+        watcher, can_receive_stop
             See :class:`rigd.runner.session.SessionRun`.
 
         Raises

@@ -161,7 +161,7 @@ class Series:
             Receiver of the progress.
         live
             Show each session in a live view.
-        listens
+        can_receive_stop
             See :class:`rigd.runner.session.SessionRun`.
         quick_looks
             Program that makes a quick look at each session. The next session waits some seconds for

@@ -211,13 +211,13 @@ class SessionRun:
         Session to run.
     group
         Processes of the rig. The control process must be connected to the devices and idle.
-    connected
+    connection
         Message that the control process sent after it had connected to the devices.
     live
         Live view that shows the session, or None.
     watcher
         Called about fifty times a second with the progress and the events since the last call.
-    listens
+    can_receive_stop
         Returns whether this process can receive a stop request. If not, this process stops its
         heartbeat, so that the control process treats it as hung.
 

@@ -19,7 +19,7 @@ def open_plain_file(path: Path, max_bytes: int, *, newline: str | None = None) -
     ----------
     path
         Path of the file.
-    most_bytes
+    max_bytes
         Maximum size of the file in bytes.
     newline
         Treatment of line ends, as for `open`.
@@ -40,7 +40,7 @@ def read_plain_file(path: Path, max_bytes: int) -> bytes:
     ----------
     path
         Path of the file.
-    most_bytes
+    max_bytes
         Maximum size of the file in bytes.
 
     Raises

@@ -147,7 +147,7 @@ def decompressed_chunk(
         Compressed content of the chunk.
     size
         Length of the decompressed content in bytes, as the chunk states it.
-    where
+    location_text
         Position of the chunk, for error messages.
 
     Raises

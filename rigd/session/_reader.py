@@ -248,7 +248,7 @@ class TopicBuffer:
     path : path of the file, for its size and for error messages
     layout : layout of the messages
     fields : names of the fields to store; None for all
-    most : maximum number of messages; more of them raise an error
+    max_messages : maximum number of messages; more of them raise an error
     on_messages : called with each block of messages, with all fields
     """
 
