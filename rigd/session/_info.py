@@ -278,8 +278,8 @@ def readable_texts(values: Mapping[str, str], what: str) -> tuple[dict[str, str]
 class _EntryLimiter:
     """Cuts one kind of a file's entries, such as its events, to a total number of characters.
 
-    `what` is a plural noun for the entries. `max_characters` is the maximum number of characters in text or
-    JSON form. A line on omitted entries is appended to `omission_texts`.
+    `what` is a plural noun for the entries. `max_characters` is the maximum number of characters in
+    text or JSON form. A line on omitted entries is appended to `omission_texts`.
     """
 
     def __init__(self, what: str, max_characters: int, omission_texts: list[str]) -> None:
