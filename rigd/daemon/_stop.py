@@ -245,7 +245,7 @@ class _StopOfAll:
             if self._uid not in (0, process.uid):
                 self._supervisors_of_others.append(_SupervisorStop(process, controls))
                 continue
-            supervisor = self._own_supervisors.get((process.pid, process.born or 0))
+            supervisor = self._own_supervisors.get((process.pid, process.start_ticks or 0))
             if supervisor is None:
                 supervisor = _SupervisorStop(process, controls)
                 if self._rig is not None and not supervisor.may_run_rig(self._rig):
@@ -381,7 +381,7 @@ class _SupervisorStop:
         self.process = process
         self.controls = controls
         self._rigd_command = _rigd_arguments(process.command)
-        self._start_time = process.born or 0
+        self._start_time = process.start_ticks or 0
         self._rig = held_rig(process.pid) or self._rig_of_command_line
         self._had_session = self.has_session
         self.suspended = False
@@ -437,11 +437,13 @@ class _SupervisorStop:
     @property
     def is_over(self) -> bool:
         """Whether no session is running, and none can begin any more."""
-        if self.process.suspended and self.process.awaits(STOP_SIGNAL):
+        if self.process.suspended and self.process.has_pending(STOP_SIGNAL):
             self.suspended = True
             return all(control.name == IDLE_NAME for control in self.controls)
         has_reacted = time.monotonic() - self._last_signal_s > _SIGNAL_REACTION_TIME_S
-        has_obeyed = self._is_signal_sent and has_reacted and not self.process.awaits(STOP_SIGNAL)
+        has_obeyed = (
+            self._is_signal_sent and has_reacted and not self.process.has_pending(STOP_SIGNAL)
+        )
         if self._is_foreground_command and self.process.handles(STOP_SIGNAL):
             # Its control process ends after the file was closed. A process without a session may
             # still be planning, but will not begin the session.
@@ -486,9 +488,9 @@ class _SupervisorStop:
 
     def _send_unless_ended(self, process: RunningProcess, number: int) -> None:
         """Send a signal to a process, unless it has ended."""
-        born = process.born
-        if born is not None:
-            send_signal(process, born, number)
+        start_ticks = process.start_ticks
+        if start_ticks is not None:
+            send_signal(process, start_ticks, number)
 
     def report_to(self, report: StopReport, *, ended: bool, waited: bool) -> None:
         """Add the result for this process to a report."""

@@ -516,7 +516,7 @@ def _signal_stop(pid: int) -> bool:
     process = read_process(pid)
     if process is None or not process.handles(STOP_SIGNAL):
         return False
-    start_time = process.born
+    start_time = process.start_ticks
     return start_time is not None and send_signal(process, start_time, STOP_SIGNAL)
 
 

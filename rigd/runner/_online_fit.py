@@ -80,13 +80,15 @@ class FitSupervisor:
         except ChildError as error:
             self._continue_without_process(str(error))
 
-    def await_ready(self, meanwhile: Callable[[], bool]) -> str:
+    def await_ready(self, call_while_waiting: Callable[[], bool]) -> str:
         """Wait until the fit process is ready; return why it is not, or an empty text.
 
-        The wait ends early if `meanwhile`, which is called repeatedly, returns False.
+        The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
         """
         delay_text = await_ready(
-            lambda: self._is_ready or bool(self._failure), self._process_messages, meanwhile
+            lambda: self._is_ready or bool(self._failure),
+            self._process_messages,
+            call_while_waiting,
         )
         if delay_text:
             self._continue_without_process(f"The fit process was {delay_text}.")
@@ -122,10 +124,10 @@ class FitSupervisor:
         estimates, self._new_estimates = self._new_estimates, []
         return estimates
 
-    def finish(self, ticks: int, meanwhile: Callable[[], None]) -> dict[str, Any]:
+    def finish(self, ticks: int, call_while_waiting: Callable[[], None]) -> dict[str, Any]:
         """Wait for the fit of the whole record; return the last estimate as a JSON dictionary.
 
-        `ticks` is the length of the record. `meanwhile` is called repeatedly during the wait.
+        `ticks` is the length of the record. `call_while_waiting` is called repeatedly meanwhile.
         """
         self._send(RecordEnded(ticks))
         begun_s = time.monotonic()
@@ -133,7 +135,7 @@ class FitSupervisor:
             self._failure or (self._last_report is not None and self._last_report.final)
         ):
             self._process_messages(_POLL_S)
-            meanwhile()
+            call_while_waiting()
             if (
                 self._shared_state[StateField.STOP] != Stop.NO
                 and time.monotonic() > begun_s + _STOPPED_FIT_TIMEOUT_S
@@ -147,7 +149,7 @@ class FitSupervisor:
         if self._search is not None:
             targets = self._search.targets
             estimates = target_estimates(document, targets) if "modes" in document else []
-            reached, self.unmet_reason = self._assess(estimates)
+            reached, self.unmet_reason = self._assess_precision(estimates)
             document["search"] = {
                 "asked": [str(target) for target in targets],
                 "targets": targets_json(estimates),
@@ -169,7 +171,7 @@ class FitSupervisor:
             return self._search_end.reason
         return "Reached by the fit of the whole record."
 
-    def _assess(self, estimates: Sequence[TargetEstimate]) -> tuple[bool | None, str]:
+    def _assess_precision(self, estimates: Sequence[TargetEstimate]) -> tuple[bool | None, str]:
         """Return whether the whole record has the requested precision, and text if it has not.
 
         The first value is None if the whole record was not fitted, whatever earlier estimates

@@ -28,15 +28,16 @@ _POLL_S = 0.05
 def await_ready(
     is_settled: Callable[[], bool],
     process_messages_for: Callable[[float], None],
-    meanwhile: Callable[[], bool],
+    call_while_waiting: Callable[[], bool],
 ) -> str:
     """Wait until a process is ready or has failed; return text if it takes too long, else "".
 
     `is_settled` returns whether the process is ready or has failed. `process_messages_for`
-    processes its messages for a time in seconds. The wait ends early if `meanwhile` returns False.
+    processes its messages for a time in seconds. `call_while_waiting` is called repeatedly, and the
+    wait ends early if it returns False.
     """
     deadline_s = time.monotonic() + _READY_TIMEOUT_S
-    while not is_settled() and meanwhile():
+    while not is_settled() and call_while_waiting():
         process_messages_for(_POLL_S)
         if not is_settled() and time.monotonic() > deadline_s:
             return f"not ready within {_READY_TIMEOUT_S:g} s"

@@ -139,8 +139,10 @@ class Rig:
             If the connection fails, or a value of the profile is unknown. All processes and devices
             are closed then.
         """
-        if unknown := describe_unknown_values(self._profile.rig):
-            raise RigError(f"{unknown}\nThen start the daemon again, which reads the profile once.")
+        if unknown_values_text := describe_unknown_values(self._profile.rig):
+            raise RigError(
+                f"{unknown_values_text}\nThen start the daemon again, which reads the profile once."
+            )
         if self.connected:
             self.disconnect()
         try:

@@ -206,7 +206,7 @@ class Series:
                 self.plan.ending,
                 self._touch,
                 self._watch_fit,
-                self._seed(number),
+                self._session_seed(number),
                 self.plan.clearance.accepted,
             )
             with contextlib.nullcontext() if quick_looks is None else quick_looks.suspended():
@@ -224,7 +224,7 @@ class Series:
             if not result.went_well:
                 return
 
-    def _seed(self, number: int) -> int | None:
+    def _session_seed(self, number: int) -> int | None:
         """Return the seed of a simulated rig's noise in a session, or None for a random seed."""
         simulation = self._profile.rig.simulation
         if simulation is None or simulation.seed is None:

@@ -63,8 +63,10 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
     else:
         model = TouchModel.assumed(rig.beam, rig.damping, **stated_values)
     beam = watched_beam(model, rig.rate_hz, _reading_noise(profile))
-    shear = sensor.shear_projection if any(sensor.shear_projection) else None
-    return TouchSearch(TouchOrder(beam, DetectorSettings(), excitation.approach, shear), model)
+    shear_projection = sensor.shear_projection if any(sensor.shear_projection) else None
+    return TouchSearch(
+        TouchOrder(beam, DetectorSettings(), excitation.approach, shear_projection), model
+    )
 
 
 def _sensor_filter(rig: RigParameters) -> "SensorFilter":
@@ -72,11 +74,13 @@ def _sensor_filter(rig: RigParameters) -> "SensorFilter":
     from rigd.touch import SensorFilter
 
     low_pass = rig.sensor.filter_hz, rig.sensor.filter_order
-    serial = rig.ati_serial
-    if serial is None:
+    serial_settings = rig.ati_serial
+    if serial_settings is None:
         return SensorFilter(*low_pass)
-    records = serial.records_per_tick(rig.rate_hz)
-    return SensorFilter.of_records(*low_pass, serial.filter, records, 1 / serial.stream_hz)
+    records = serial_settings.records_per_tick(rig.rate_hz)
+    return SensorFilter.of_records(
+        *low_pass, serial_settings.filter, records, 1 / serial_settings.stream_hz
+    )
 
 
 def _reading_noise(profile: Profile) -> "ChannelNoise":
@@ -129,13 +133,15 @@ class TouchEstimates:
         except ChildError as error:
             self._continue_without_process(str(error))
 
-    def await_ready(self, meanwhile: Callable[[], bool]) -> None:
+    def await_ready(self, call_while_waiting: Callable[[], bool]) -> None:
         """Wait until the touch process is ready or has failed.
 
-        The wait ends early if `meanwhile`, which is called repeatedly, returns False.
+        The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
         """
         delay_text = await_ready(
-            lambda: self._is_ready or bool(self._failure), self._process_messages, meanwhile
+            lambda: self._is_ready or bool(self._failure),
+            self._process_messages,
+            call_while_waiting,
         )
         if delay_text:
             self._continue_without_process(f"The touch process was {delay_text}.")
@@ -151,7 +157,7 @@ class TouchEstimates:
         events, self._events = self._events, []
         return events
 
-    def finish(self, touches: int, meanwhile: Callable[[], None]) -> list[dict[str, Any]]:
+    def finish(self, touches: int, call_while_waiting: Callable[[], None]) -> list[dict[str, Any]]:
         """Wait for the final estimates of all detected touches; return a JSON dictionary for each.
 
         `touches` is the number of detected touches. A touch without an estimate has its number
@@ -167,7 +173,7 @@ class TouchEstimates:
 
         while is_estimate_missing():
             self._process_messages(_POLL_S)
-            meanwhile()
+            call_while_waiting()
         return [
             _touch_document(number, self._reports.get(number)) for number in range(1, touches + 1)
         ]

@@ -168,7 +168,7 @@ class _SessionFit:
                 return
             match message:
                 case FileHeader():
-                    self._begin(message)
+                    self._start_fits(message)
                 case RecordEnded(ticks):
                     self._record_ticks = ticks
                     if self._search is not None and self._search.due_tick is not None:
@@ -180,7 +180,7 @@ class _SessionFit:
                             self._search.end_of_record(ticks, held_ticks_before, begun)
                         )
 
-    def _begin(self, header: FileHeader) -> None:
+    def _start_fits(self, header: FileHeader) -> None:
         """Send the header of the session file to the fit program, and prepare the planning."""
         job = self._job
         if job.search is not None:
@@ -210,7 +210,7 @@ class _SessionFit:
         search = self._search
         if self._record_ticks is not None:
             if is_drained:
-                self._request(self._record_ticks, whole=True)
+                self._request_estimate(self._record_ticks, whole=True)
         elif (
             search is not None
             and search.due_tick is not None
@@ -220,9 +220,9 @@ class _SessionFit:
             # before it publishes the sample.
             tick = search.due_tick + self._shared_state[StateField.HELD]
             if self._passed_ticks >= tick:
-                self._request(tick, whole=search.may_be_last, from_last=True)
+                self._request_estimate(tick, whole=search.may_be_last, from_last=True)
 
-    def _request(self, tick: int, *, whole: bool, from_last: bool = False) -> None:
+    def _request_estimate(self, tick: int, *, whole: bool, from_last: bool = False) -> None:
         """Request an estimate from the samples before a tick; see `EstimateRequest`."""
         self._request_count += 1
         self._pending = EstimateRequest(
@@ -269,7 +269,7 @@ class _SessionFit:
             self._parent.send(message)
         if search.needs_early_fit:
             # This fit of all structures provides start values for the check of the whole record.
-            self._request(request.tick, whole=True, from_last=True)
+            self._request_estimate(request.tick, whole=True, from_last=True)
             self._is_early_fit_pending = True
 
 

@@ -130,7 +130,7 @@ class RigPreview:
         return BeamEstimate.stated(rig.beam, rig.damping, density_nm2_per_hz, tip_mass_kg)
 
     @cached_property
-    def _loop(self) -> ClosedLoop:
+    def _closed_loop(self) -> ClosedLoop:
         """Stable closed loop with the beam of the profile."""
         return stable_loop(self._profile.loop_model())[0]
 
@@ -139,7 +139,7 @@ class RigPreview:
 
         The result has the shape of `frequency_hz`.
         """
-        return self._loop.response(frequency_hz)
+        return self._closed_loop.response(frequency_hz)
 
     def fraction_of_limits(self, reference_rad: Real) -> float:
         """Return the largest ratio of a predicted peak to its limit for a reference angle (n,).
@@ -149,7 +149,7 @@ class RigPreview:
         ControlDesignError
             If the loop is unstable and the predicted response overflows.
         """
-        response = self._loop.simulate(reference_rad)
+        response = self._closed_loop.simulate(reference_rad)
         always_limited, clippable = _limited_peaks(self._profile, _peaks(reference_rad, response))
         return _largest_fraction(always_limited + clippable)
 
@@ -179,7 +179,7 @@ class RigPreview:
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
         """Return the predicted peak slope of the beam's free end for a reference angle (n,)."""
-        angle_rad = self._loop.simulate(reference_rad).angle_rad
+        angle_rad = self._closed_loop.simulate(reference_rad).angle_rad
         rig = self._profile.rig
         return tip_motion(rig.beam, rig.damping, angle_rad, rig.rate_hz).slope_rad
 
@@ -293,12 +293,12 @@ def predict_session(
     loop, instability_warning = stable_loop(loop_model_with(profile, excitation.model))
     prediction = predict(loop, excitation)
     violations, torque_violations = (
-        [violation_text for peak in peaks if (violation_text := peak.violation())]
+        [violation_text for peak in peaks if (violation_text := peak.violation_text())]
         for peaks in _limited_peaks(profile, prediction)
     )
     refusals = list(clearance.refusals)
     tip_slope = _limited_tip_slope(profile, prediction) if has_slope_limit(excitation) else None
-    slope_violation = tip_slope is not None and tip_slope.violation()
+    slope_violation = tip_slope is not None and tip_slope.violation_text()
     if violations or slope_violation or (torque_violations and not force):
         advice = _amplitude_advice(profile, excitation, force=force)
         refusals += [f"{violation_text}; {advice}." for violation_text in violations]
@@ -628,7 +628,7 @@ class _LimitedPeak:
     unit: str
     key: str
 
-    def violation(self) -> str | None:
+    def violation_text(self) -> str | None:
         """Return text that states how the peak exceeds the limit, or None if it does not."""
         if self.value <= self.limit:
             return None

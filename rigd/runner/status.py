@@ -261,8 +261,8 @@ class StatusReader:
                 continue
             if process not in group:
                 continue
-            child = group[process]
-            if not child.running:
+            child_process = group[process]
+            if not child_process.running:
                 state = "ended"
             elif not group.has_job(process):
                 state = "waiting"
@@ -270,4 +270,4 @@ class StatusReader:
                 state = "hung"
             else:
                 state = "running"
-            yield ProcessStatus(process.name, child.pid, state, still_s)
+            yield ProcessStatus(process.name, child_process.pid, state, still_s)

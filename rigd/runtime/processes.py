@@ -34,31 +34,31 @@ class RunningProcess:
     """Short name, which `name_this_process` sets."""
     command: tuple[str, ...]
     """Command line: program and arguments."""
-    caught: int
+    handled_signals: int
     """Bit mask of the signals that have a handler; bit n-1 represents signal n."""
-    ignored: int
+    ignored_signals: int
     """Bit mask of the ignored signals; bit n-1 represents signal n."""
-    pending: int
+    pending_signals: int
     """Bit mask of the signals that were sent but not received yet; bit n-1 represents signal n."""
     suspended: bool
     """Whether the process is suspended by a signal or a debugger."""
 
     @property
-    def born(self) -> int | None:
+    def start_ticks(self) -> int | None:
         """Start time in clock ticks since the computer was started, or None if it has ended."""
         return started_at(self.pid)
 
     def handles(self, number: int) -> bool:
         """Return whether the process has a handler for a signal."""
-        return bool(self.caught >> (number - 1) & 1)
+        return bool(self.handled_signals >> (number - 1) & 1)
 
     def ignores(self, number: int) -> bool:
         """Return whether the process ignores a signal."""
-        return bool(self.ignored >> (number - 1) & 1)
+        return bool(self.ignored_signals >> (number - 1) & 1)
 
-    def awaits(self, number: int) -> bool:
+    def has_pending(self, number: int) -> bool:
         """Return whether a signal was sent to the process but not received yet."""
-        return bool(self.pending >> (number - 1) & 1)
+        return bool(self.pending_signals >> (number - 1) & 1)
 
 
 def read_processes() -> list[RunningProcess]:
@@ -108,26 +108,26 @@ def _parsed_process(pid: int, status: str, command: bytes) -> RunningProcess | N
         uid=users.pop() if len(users) == 1 else -1,
         name=fields["Name"],
         command=tuple(os.fsdecode(command).split("\0")[:-1]),
-        caught=int(fields["SigCgt"], 16),
-        ignored=int(fields["SigIgn"], 16),
-        pending=int(fields["SigPnd"], 16) | int(fields["ShdPnd"], 16),
+        handled_signals=int(fields["SigCgt"], 16),
+        ignored_signals=int(fields["SigIgn"], 16),
+        pending_signals=int(fields["SigPnd"], 16) | int(fields["ShdPnd"], 16),
         suspended=state in "Tt",
     )
 
 
-def send_signal(process: RunningProcess, born: int, number: int) -> bool:
+def send_signal(process: RunningProcess, start_ticks: int, number: int) -> bool:
     """Send a signal to a process unless it has ended, and return whether the signal was sent.
 
     Parameters
     ----------
     process
         Process that gets the signal.
-    born
+    start_ticks
         Start time of the process, which shows whether its process id was reused meanwhile.
     number
         Number of the signal.
     """
-    if process.born != born:
+    if process.start_ticks != start_ticks:
         return False
     with suppress(OSError):
         os.kill(process.pid, number)

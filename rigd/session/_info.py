@@ -235,8 +235,8 @@ def _missing_samples_sentence(session: Session) -> str:
     first, end = (int(ticks[0]), int(ticks[-1]) + 1) if len(ticks) else (0, 0)
     incomplete_segments = [
         name
-        for name, (begins, ends) in session.segments.items()
-        if ends > begins and (begins < first or ends > end)
+        for name, (first_tick, end_tick) in session.segments.items()
+        if end_tick > first_tick and (first_tick < first or end_tick > end)
     ]
     if incomplete_segments and (session.outcome or {}).get("outcome") == "complete":
         return (

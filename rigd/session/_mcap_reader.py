@@ -327,9 +327,9 @@ class _ContainerReader:
 
     def _release_pages(self) -> None:
         """Release the pages of the mapped file, which would count as memory of the process."""
-        mapped = self._data.obj
-        if len(self._data) > _RELEASE_INTERVAL_BYTES and isinstance(mapped, mmap.mmap):
-            mapped.madvise(mmap.MADV_DONTNEED)
+        mapped_file = self._data.obj
+        if len(self._data) > _RELEASE_INTERVAL_BYTES and isinstance(mapped_file, mmap.mmap):
+            mapped_file.madvise(mmap.MADV_DONTNEED)
 
     def _read_unchunked_messages(self, start: int, first_end: int) -> int:
         """Read consecutive messages outside of chunks, and return the offset where they end.
@@ -454,12 +454,12 @@ class _ContainerReader:
         if remainder or bytes_to_skip:
             raise _truncated_record_error(remainder_offset, location_text)
 
-    def _skippable_bytes(self, records: bytes, base: int, location_text: str) -> int:
+    def _skippable_bytes(self, records: bytes, buffer_offset: int, location_text: str) -> int:
         """Return the length of the first record in bytes if it can be skipped, else 0."""
         opcode, length, channel = _RUN_HEAD_FORMAT.unpack_from(records)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             if length > limits.MAX_TEXT_BYTES:
-                raise _truncated_record_error(base, location_text)
+                raise _truncated_record_error(buffer_offset, location_text)
             return 0
         if opcode == Opcode.MESSAGE:
             if self._is_wanted.get(channel, True) and self._is_accepted_length(
@@ -486,11 +486,11 @@ class _ContainerReader:
         return False
 
     def _read_records(
-        self, records: bytes, base: int, chunk_position: int, location_text: str
+        self, records: bytes, buffer_offset: int, chunk_position: int, location_text: str
     ) -> int:
         """Read the complete records of a buffer, and return the offset where the rest begins.
 
-        `base` is the offset of the buffer in its chunk.
+        `buffer_offset` is the offset of the buffer in its chunk.
         """
         end = 0
         while end < len(records):
@@ -504,7 +504,7 @@ class _ContainerReader:
                 return start
             opcode, length = RECORD_HEAD_FORMAT.unpack_from(records, start)
             if opcode == 0:
-                raise _missing_record_error(base + start, location_text)
+                raise _missing_record_error(buffer_offset + start, location_text)
             content = start + RECORD_HEAD_FORMAT.size
             end = content + length
             if end > len(records):
@@ -671,14 +671,14 @@ def _run_length(records: Buffer, start: int, size: int, limit: int) -> int:
         records[start : start + _RUN_HEAD_DTYPE.itemsize], _RUN_HEAD_DTYPE
     )[0]
     max_count = (limit - start) // size
-    equal_count, step = 1, _FIRST_COMPARISON_MESSAGES
+    equal_count, messages_to_compare = 1, _FIRST_COMPARISON_MESSAGES
     while equal_count < max_count:
-        count = min(step, max_count - equal_count)
+        count = min(messages_to_compare, max_count - equal_count)
         run_heads = np.ndarray(count, _RUN_HEAD_DTYPE, records, start + equal_count * size, (size,))
         is_equal = (run_heads["head"] == head) & (run_heads["tail"] == tail)
         first_different = int(is_equal.argmin())
         if not is_equal[first_different]:
             return equal_count + first_different
         equal_count += count
-        step *= 8
+        messages_to_compare *= 8
     return equal_count

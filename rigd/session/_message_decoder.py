@@ -158,7 +158,7 @@ class _FieldOffsets:
     fields: tuple[tuple[str, int, int, str], ...]
     """For each field: name, offset of its first byte, length in bytes, and NumPy type or "varint"
     or "varint32"."""
-    absent: tuple[str, ...]
+    absent_fields: tuple[str, ...]
     """Names of the fields that such messages lack, which are decoded as 0."""
 
 
@@ -407,14 +407,16 @@ class MessageDecoder:
                     conversion,
                 )
         names = self.dtype.names or ()
-        absent = {name: getattr(empty_message, name, 0) for name in names if name not in fields}
-        if any(absent.values()):  # not zero by default, and possibly out of range
+        absent_fields = {
+            name: getattr(empty_message, name, 0) for name in names if name not in fields
+        }
+        if any(absent_fields.values()):  # not zero by default, and possibly out of range
             return None
         return _FieldOffsets(
             mask,
             np.frombuffer(message, np.uint8) & mask,
             tuple(entry for name, entry in fields.items() if name in names),
-            tuple(absent),
+            tuple(absent_fields),
         )
 
     def _array_conversion(
@@ -605,7 +607,7 @@ def _decode_at_offsets(
             out[name][indices] = value.astype(out.dtype[name])
         else:
             out[name][indices] = np.ndarray(count, conversion, rows, first, (size,))
-    for name in layout.absent:
+    for name in layout.absent_fields:
         out[name][indices] = 0
 
 

@@ -491,9 +491,9 @@ def merged_metadata(contents: McapContents, name: str) -> dict[str, str] | None:
 def _check_ticks(path: Path, samples: npt.NDArray[np.void]) -> None:
     """Raise if the ticks do not increase from each sample to the next."""
     ticks = samples["tick"]
-    backward = np.flatnonzero(ticks[1:] <= ticks[:-1])
-    if len(backward):
-        first = int(backward[0])
+    backward_indices = np.flatnonzero(ticks[1:] <= ticks[:-1])
+    if len(backward_indices):
+        first = int(backward_indices[0])
         raise SessionError(
             f"{path}: tick {ticks[first + 1]} follows tick {ticks[first]} in {SAMPLE_TOPIC}, but "
             "ticks must increase from sample to sample. Those that do are saved with `rigd recover "

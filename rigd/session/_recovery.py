@@ -368,7 +368,7 @@ def _copy_sound_file(path: Path, target: Path) -> Recovery:
     is_part = path.name.endswith(PART_SUFFIX)
     if is_part:
         _require_target_absent(path, target)
-        with _temporary_target(path, target, like=path):
+        with _temporary_target(path, target, copied_file=path):
             pass
     return Recovery(
         source=path,
@@ -391,15 +391,15 @@ def _require_target_absent(path: Path, target: Path) -> None:
 
 
 @contextlib.contextmanager
-def _temporary_target(path: Path, target: Path, like: Path | None = None) -> Iterator[Path]:
+def _temporary_target(path: Path, target: Path, copied_file: Path | None = None) -> Iterator[Path]:
     """Yield a temporary path in the folder of `target`, and rename it to `target` on success.
 
-    The temporary file starts as a copy of the file `like`, if one is given.
+    The temporary file starts as a copy of the file `copied_file`, if one is given.
     """
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     try:
-        if like is not None:
-            with like.open("rb") as source:
+        if copied_file is not None:
+            with copied_file.open("rb") as source:
                 copy_new(source.fileno(), temporary)
         yield temporary
         rename_new(temporary, target)
@@ -484,14 +484,14 @@ def _tick_counts(samples: npt.NDArray[np.void], unrecovered_samples: int) -> dic
     missing_before = np.diff(samples["tick"].astype(np.int64), prepend=-1) - 1
     was_lost = (status & Status.AFTER_LOST) != 0
     was_missed = ~was_lost & ((status & Status.AFTER_MISSED) != 0)
-    missed = int(missing_before[was_missed].sum())
+    missed_ticks = int(missing_before[was_missed].sum())
     unexplained = int(missing_before[~was_lost & ~was_missed].sum())
-    lost = int(missing_before[was_lost].sum()) + max(unexplained, unrecovered_samples)
+    lost_ticks = int(missing_before[was_lost].sum()) + max(unexplained, unrecovered_samples)
     return {
-        "scheduled": str(len(samples) + missed + lost),
+        "scheduled": str(len(samples) + missed_ticks + lost_ticks),
         "recorded": str(len(samples)),
-        "missed": str(missed),
-        "lost": str(lost),
+        "missed": str(missed_ticks),
+        "lost": str(lost_ticks),
         "late": str(int(np.count_nonzero(status & Status.LATE))),
         "stale_angles": str(int(np.count_nonzero(status & Status.ANGLE_STALE))),
         "stale_wrenches": str(int(np.count_nonzero(status & Status.WRENCH_STALE))),
