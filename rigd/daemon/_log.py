@@ -1,6 +1,6 @@
-"""The daemon's log: on standard error, written by a separate thread.
+"""The daemon's log on standard error, which a separate thread writes.
 
-A stopped terminal or a hanging journal must not prevent the daemon from receiving a stop.
+A suspended terminal or a hanging journal must not prevent the daemon from receiving a stop.
 """
 
 import contextlib
@@ -12,66 +12,70 @@ import threading
 import time
 from typing import Final
 
-NAME: Final = "rigd.serve"
-_MOST_WAITING: Final = 1000
-_STANDARD_ERROR: Final = 2
-_FLUSH_S: Final = 1.0
+LOGGER_NAME: Final = "rigd.serve"
+"""Name of the daemon's logger."""
+_MAX_WAITING_RECORDS: Final = 1000
+"""Maximum number of log records that wait to be written."""
+_STANDARD_ERROR_FD: Final = 2
+"""File descriptor of standard error."""
+_FLUSH_TIMEOUT_S: Final = 1.0
+"""Maximum time in seconds to wait at the end until all records are written."""
 
 
-class _Dropping(logging.handlers.QueueHandler):
-    """Queue of log records; when it is full, further records are dropped and counted."""
+class _DroppingQueueHandler(logging.handlers.QueueHandler):
+    """Log handler that queues records, and drops and counts records if the queue is full."""
 
     def __init__(self, waiting: "queue.Queue[logging.LogRecord]") -> None:
         super().__init__(waiting)
-        self._waiting = waiting
+        self._queue = waiting
         self._dropped = 0
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Queue a record without waiting."""
-        if self._dropped and not self._waiting.full():
+        """Add a record to the queue without waiting; drop it if the queue is full."""
+        if self._dropped and not self._queue.full():
             text = f"{self._dropped} lines before this one were dropped (log not read)"
-            self._waiting.put_nowait(
-                logging.LogRecord(NAME, logging.WARNING, "", 0, text, None, None)
+            self._queue.put_nowait(
+                logging.LogRecord(LOGGER_NAME, logging.WARNING, "", 0, text, None, None)
             )
             self._dropped = 0
         try:
-            self._waiting.put_nowait(record)
+            self._queue.put_nowait(record)
         except queue.Full:
             self._dropped += 1
 
 
-class Log:
-    """Log of the daemon, active inside its context."""
+class DaemonLog:
+    """Context in which the records of the daemon's logger are written to standard error."""
 
     def __init__(self) -> None:
-        self._waiting: queue.Queue[logging.LogRecord] = queue.Queue(_MOST_WAITING)
-        self._handler = _Dropping(self._waiting)
+        self._queue: queue.Queue[logging.LogRecord] = queue.Queue(_MAX_WAITING_RECORDS)
+        self._handler = _DroppingQueueHandler(self._queue)
 
     def __enter__(self) -> None:
         logging.raiseExceptions = False  # a closed terminal must not end the daemon
-        logger = logging.getLogger(NAME)
+        logger = logging.getLogger(LOGGER_NAME)
         logger.setLevel(logging.INFO)
         logger.addHandler(self._handler)
         # A daemon thread: it may hang when the program ends.
-        threading.Thread(target=self._write, daemon=True).start()
+        threading.Thread(target=self._write_records, daemon=True).start()
 
     def __exit__(self, *_: object) -> None:
-        logging.getLogger(NAME).removeHandler(self._handler)
-        deadline_s = time.monotonic() + _FLUSH_S
-        while self._waiting.unfinished_tasks and time.monotonic() < deadline_s:
+        logging.getLogger(LOGGER_NAME).removeHandler(self._handler)
+        deadline_s = time.monotonic() + _FLUSH_TIMEOUT_S
+        while self._queue.unfinished_tasks and time.monotonic() < deadline_s:
             time.sleep(0.01)
 
-    def _write(self) -> None:
-        """Write the log line by line, however long that takes.
+    def _write_records(self) -> None:
+        """Write the queued records line by line; run in a thread, because writing may block.
 
-        It bypasses the interpreter's buffer and the handlers of `logging`: a hanging write would
-        hold their locks, and the end of the program would wait for these.
+        The lines are not written through Python's buffered stream or the handlers of `logging`.
+        Otherwise a blocked write would hold their locks, and the program could not end.
         """
         formatter = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
         while True:
-            line = formatter.format(self._waiting.get()) + "\n"
+            line = formatter.format(self._queue.get()) + "\n"
             data = line.encode(errors="backslashreplace")
             with contextlib.suppress(OSError):
                 while data:
-                    data = data[os.write(_STANDARD_ERROR, data) :]
-            self._waiting.task_done()
+                    data = data[os.write(_STANDARD_ERROR_FD, data) :]
+            self._queue.task_done()

@@ -9,11 +9,11 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-from rigd.daemon._log import NAME, Log
+from rigd.daemon._log import LOGGER_NAME, DaemonLog
 from rigd.daemon._server import Server
 from rigd.daemon._service import Service
 from rigd.daemon._states import resolve_user
-from rigd.daemon.address import COMMON, bind, socket_path
+from rigd.daemon.address import GROUP_FOLDER, bind, socket_path
 from rigd.devices import (
     ActuationTarget,
     actuation_target,
@@ -24,9 +24,9 @@ from rigd.profile import Profile
 from rigd.runner import Rig
 from rigd.runtime import STOP_SIGNAL, RigLock
 
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
+_END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 
-_log = logging.getLogger(NAME)
+_log = logging.getLogger(LOGGER_NAME)
 
 
 def run_daemon(
@@ -40,24 +40,24 @@ def run_daemon(
     page: bool = False,
     page_port: int | None = None,
 ) -> signal.Signals:
-    """Run the rig daemon until a signal ends it.
+    """Run the daemon of a rig until a signal ends it.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     folder
-        Folder for session files.
+        Folder of the session files.
     group
-        Group whose members may command the daemon, in addition to this user.
+        Group of users who may operate the rig through the daemon, in addition to this user.
     live, fast
         See :class:`rigd.runner._rig.Rig`.
     quick_looks
-        Whether to make a quick look of each session.
+        Whether to make a quick look at each session.
     page
         Whether to serve the operator's page.
     page_port
-        Port of the page on loopback; None: 8720, or another one if that is taken.
+        Port of the page on the loopback interface, or None for 8720 or, if used, another port.
 
     Returns
     -------
@@ -67,21 +67,21 @@ def run_daemon(
     Raises
     ------
     RigBusyError
-        If another program runs the rig.
+        If another program uses the rig.
     AddressError
         If the socket cannot be created.
     """
-    moving = actuation_target(profile.rig)
-    with ExitStack() as ending:
-        ending.enter_context(Log())
+    target = actuation_target(profile.rig)
+    with ExitStack() as resources:
+        resources.enter_context(DaemonLog())
         resolve_user(os.getuid())
-        ending.enter_context(
-            RigLock(profile.name, "rigd serve", hardware=moving is ActuationTarget.HARDWARE)
+        resources.enter_context(
+            RigLock(profile.name, "rigd serve", hardware=target is ActuationTarget.HARDWARE)
         )
-        path = socket_path(profile.name, None if group is None else COMMON)
-        listener = ending.enter_context(bind(path, group))
-        ending.callback(path.unlink, missing_ok=True)
-        worker = ending.enter_context(ThreadPoolExecutor(1, "rig"))
+        path = socket_path(profile.name, None if group is None else GROUP_FOLDER)
+        listener = resources.enter_context(bind(path, group))
+        resources.callback(path.unlink, missing_ok=True)
+        worker = resources.enter_context(ThreadPoolExecutor(1, "rig"))
         server = Server(listener)
         service = Service(
             Rig(profile, fast=fast, live=live),
@@ -94,55 +94,57 @@ def run_daemon(
             live=live,
             quick_looks=quick_looks,
         )
-        _log.info("%s Listening on %s", describe_actuation_target(profile.rig, moving), path)
+        _log.info("%s Listening on %s", describe_actuation_target(profile.rig, target), path)
         for difference in simulated_differently(profile.rig):
             _log.warning("the simulated rig has %s", difference)
         if page:
             from rigd.daemon._page import PageProcess
 
-            serving = PageProcess(profile, folder, path, page_port, service.set_page)
-            ending.callback(serving.close)
-        return asyncio.run(_run(server, service))
+            page_process = PageProcess(profile, folder, path, page_port, service.set_page_address)
+            resources.callback(page_process.close)
+        return asyncio.run(_run_until_signal(server, service))
 
 
-async def _run(server: Server, service: Service) -> signal.Signals:
+async def _run_until_signal(server: Server, service: Service) -> signal.Signals:
+    """Run server and service until a signal ends the daemon, and return that signal."""
     loop = asyncio.get_running_loop()
     ending_signal: asyncio.Future[signal.Signals] = loop.create_future()
 
-    def end(number: signal.Signals) -> None:
+    def end_by_signal(number: signal.Signals) -> None:
         if not ending_signal.done():
             ending_signal.set_result(number)
 
-    for number in _ENDING:
+    for number in _END_SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup
-            loop.add_signal_handler(number, end, number)
-    # A stop by signal works even if other clients block the socket. Register it before the socket
-    # accepts clients.
-    loop.add_signal_handler(STOP_SIGNAL, _stop, service)
+            loop.add_signal_handler(number, end_by_signal, number)
+    # A stop by signal works even if other clients block the socket. The handler is installed before
+    # the socket accepts clients.
+    loop.add_signal_handler(STOP_SIGNAL, _stop_session, service)
     server.serve(service)
-    opening = asyncio.create_task(service.open())
-    polling = asyncio.create_task(service.run())
-    streaming = asyncio.create_task(service.stream_signals())
-    streaming.add_done_callback(_log_stream_failure)
-    # Polling ends only by a bug, which must not leave the rig unsupervised.
-    polling.add_done_callback(lambda _: end(signal.SIGABRT))
+    connecting_task = asyncio.create_task(service.open())
+    polling_task = asyncio.create_task(service.run())
+    streaming_task = asyncio.create_task(service.stream_signals())
+    streaming_task.add_done_callback(_log_stream_failure)
+    # Polling ends only because of a bug, which must not leave the rig unsupervised.
+    polling_task.add_done_callback(lambda _: end_by_signal(signal.SIGABRT))
     await ending_signal
-    why = f"the daemon got {ending_signal.result().name}"
-    _log.info("%s and ends", why)
-    await service.close(why)
-    polling.cancel()
-    streaming.cancel()
-    await asyncio.gather(opening, polling, streaming, return_exceptions=True)
+    reason = f"the daemon got {ending_signal.result().name}"
+    _log.info("%s and ends", reason)
+    await service.close(reason)
+    polling_task.cancel()
+    streaming_task.cancel()
+    await asyncio.gather(connecting_task, polling_task, streaming_task, return_exceptions=True)
     await server.close()
     return ending_signal.result()
 
 
 def _log_stream_failure(streaming: "asyncio.Task[None]") -> None:
-    """Log the failure of the signal stream, on which the rig does not depend."""
+    """Log that the publishing of signals has failed, on which the rig does not depend."""
     if not streaming.cancelled():
         _log.error("the signals are no longer published", exc_info=streaming.exception())
 
 
-def _stop(service: Service) -> None:
+def _stop_session(service: Service) -> None:
+    """Stop the running session; called when the daemon gets the stop signal."""
     _log.info("stop: requested by %s", STOP_SIGNAL.name)
     service.stop(f"the daemon got {STOP_SIGNAL.name}")

@@ -1,6 +1,7 @@
-"""Requests to the daemon: a line of bytes is parsed into a checked request, or refused.
+"""Requests to the daemon, which are parsed from lines of untrusted bytes and checked.
 
-The input is untrusted. A refusal names the error; docs/control_socket.md has the rules.
+An invalid line raises an error whose text states the reason. docs/control_socket.md states the
+rules.
 """
 
 import inspect
@@ -15,22 +16,28 @@ from rigd.excitation import FROM_THE_RIG, KINDS, Value
 from rigd.session.user_metadata import NOTES, MetadataError, metadata_keys
 from rigd.units import finite_number
 
-LONGEST_LINE = 65_536
-"""Limit in bytes of a request with its newline."""
-MOST_SESSIONS = 1000
-_LONGEST_PATH = 4096
-_LONGEST_TEXT = 1000
-_SHOWN = 60
+MAX_LINE_BYTES = 65_536
+"""Maximum length of a request in bytes, including its newline."""
+MAX_SESSIONS = 1000
+"""Maximum number of sessions in a series."""
+_MAX_PATH_CHARACTERS = 4096
+"""Maximum number of characters of a path among the parameters."""
+_MAX_TEXT_CHARACTERS = 1000
+"""Maximum number of characters of a text among the parameters."""
+_MAX_SHOWN_CHARACTERS = 60
+"""Maximum number of characters of a value in an error message."""
 
-_LONGEST_ID = 64
-_MOST_ROWS = 32
+_MAX_ID_CHARACTERS = 64
+"""Maximum number of characters of a request's id or of a row's name."""
+_MAX_ACCEPTED_ROWS = 32
+"""Maximum number of checks that a request may accept as failed."""
 Note = Annotated[str, Field(max_length=1000)]
-RowName = Annotated[str, Field(max_length=_LONGEST_ID)]
-Id = int | Annotated[str, Field(max_length=_LONGEST_ID)]
+RowName = Annotated[str, Field(max_length=_MAX_ID_CHARACTERS)]
+Id = int | Annotated[str, Field(max_length=_MAX_ID_CHARACTERS)]
 
 
 class RequestError(Exception):
-    """A request is invalid; the message says why, and `request_id` identifies the request."""
+    """Raised if a request is invalid; it states why, and `request_id` identifies the request."""
 
     def __init__(self, message: str, request_id: Id | None = None) -> None:
         super().__init__(message)
@@ -38,68 +45,68 @@ class RequestError(Exception):
 
 
 class CommandError(RigdError):
-    """A request is refused or failed; the message is for the operator."""
+    """Raised if a request is refused or has failed; the message is for the operator."""
 
     def __init__(self, message: str, *, wrong_use: bool = False) -> None:
         super().__init__(message)
         self.wrong_use = wrong_use
-        """Whether the request itself must change."""
+        """Whether the request can succeed only if it is changed."""
 
 
 class Request(BaseModel):
-    """Base of all requests, with their common fields."""
+    """Base class of all requests, with their common fields."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     controlling: ClassVar[bool] = False
-    """Whether only the client that holds control may send it."""
+    """Whether only the client that controls the rig may send the request."""
 
     command: str
     id: Id | None = None
 
 
 class StatusRequest(Request):
-    """Report the status of daemon, rig and session."""
+    """Request for the status of daemon, rig and session."""
 
     command: Literal["status"]
 
 
 class WatchRequest(Request):
-    """Subscribe to the events."""
+    """Request to subscribe to the daemon's events, and to signals if `signals` is True."""
 
     command: Literal["watch"]
     signals: bool = False
 
 
 class StopSessionRequest(Request):
-    """End the running session safely."""
+    """Request to end the running session safely."""
 
     command: Literal["stop"]
 
 
 class TareRequest(Request):
-    """Average the sensor at rest."""
+    """Request to tare the force-torque sensor: to average its readings at rest."""
 
     controlling = True
     command: Literal["tare"]
 
 
 class ZeroRequest(Request):
-    """Make the present angle the zero."""
+    """Request to set the present motor angle as the rig's zero."""
 
     controlling = True
     command: Literal["zero"]
 
 
 class ResetRequest(Request):
-    """Leave the fault."""
+    """Request to leave the state of fault."""
 
     controlling = True
     command: Literal["reset"]
 
 
 class Notes(BaseModel):
-    """Notes of the operator for the session files."""
+    """Operator, specimen, note and other metadata of the user for the session files."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -109,46 +116,46 @@ class Notes(BaseModel):
     meta: dict[str, Any] = {}
 
     def as_metadata(self) -> dict[str, str]:
-        """Return the notes that are set, by their keys in the session file.
+        """Return the notes that are not empty: key in the session file → text.
 
         Raises
         ------
         MetadataError
-            If added metadata breaks a rule.
+            If a name or value of `meta` breaks a rule.
         """
         texts = {name: getattr(self, name) for name in NOTES}
         return {name: text for name, text in texts.items() if text} | metadata_keys(self.meta)
 
 
 class CheckRequest(Request):
-    """Check profile, control loop, computer, and the data that the connected devices reported."""
+    """Request to check profile, control loop, computer and the data that devices reported."""
 
     controlling = True
     command: Literal["check"]
 
 
 class SessionRequest(Request):
-    """A session or a series of sessions."""
+    """Base class of requests that describe a session or a series of sessions."""
 
     excitation: str
     parameters: dict[str, Any] = {}
-    repeat: int = Field(default=1, ge=1, le=MOST_SESSIONS)
+    repeat: int = Field(default=1, ge=1, le=MAX_SESSIONS)
     notes: Notes = Notes()
     force: bool = False
     watch_fit: bool = False
-    accept: list[RowName] = Field(default=[], max_length=_MOST_ROWS)
+    accept: list[RowName] = Field(default=[], max_length=_MAX_ACCEPTED_ROWS)
     tip_slope_rad: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
 
 
 class StartRequest(SessionRequest):
-    """Run the sessions."""
+    """Request to run a session or a series of sessions."""
 
     controlling = True
     command: Literal["start"]
 
 
 class PredictRequest(SessionRequest):
-    """Predict the sessions without running them."""
+    """Request to predict a session without running it."""
 
     command: Literal["predict"]
 
@@ -167,71 +174,81 @@ AnyRequest = (
 _REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(
     Annotated[AnyRequest, Field(discriminator="command")]
 )
-_COMMANDS = "status", "watch", "stop", "tare", "zero", "reset", "check", "start", "predict"
+_COMMAND_NAMES = "status", "watch", "stop", "tare", "zero", "reset", "check", "start", "predict"
 
 
 def parse_request(line: bytes) -> AnyRequest:
-    """Return the request in a line.
+    """Return the request that a line of bytes contains.
 
     Raises
     ------
     RequestError
-        If it is invalid; the message names the error.
+        If the line is not a valid request; the message states the reason.
     """
-    given = _parse_object(line)
-    request_id = given.get("id")
+    document = _parse_object(line)
+    request_id = document.get("id")
     if not isinstance(request_id, int | str) or isinstance(request_id, bool):
         request_id = None
-    command = given.get("command")
-    if command not in _COMMANDS:
+    command = document.get("command")
+    if command not in _COMMAND_NAMES:
         raise RequestError(
-            f"command = {_shown(command)} is unknown; choose {', '.join(_COMMANDS)}.",
+            f"command = {_shown_value(command)} is unknown; choose {', '.join(_COMMAND_NAMES)}.",
             request_id,
         )
     try:
-        request = _REQUESTS.validate_python(given)
+        request = _REQUESTS.validate_python(document)
     except ValidationError as error:
-        raise RequestError(_first_complaint(error), request_id) from None
+        raise RequestError(_first_error_sentence(error), request_id) from None
     try:
-        return _checked(request) if isinstance(request, SessionRequest) else request
+        return _checked_session_request(request) if isinstance(request, SessionRequest) else request
     except RequestError as error:
         raise RequestError(str(error), request_id) from None
 
 
 def _parse_object(line: bytes) -> dict[str, Any]:
+    """Return the JSON object in a line; raise RequestError if there is none."""
     try:
-        given = json.loads(line.decode(), parse_constant=_no_constant)
+        document = json.loads(line.decode(), parse_constant=_refuse_json_constant)
     except UnicodeDecodeError:
         raise RequestError("The line is not UTF-8.") from None
     except RecursionError:
         raise RequestError("The line is nested too deeply.") from None
     except ValueError as error:
         raise RequestError(f"The line is not JSON ({error}).") from None
-    if not isinstance(given, dict):
+    if not isinstance(document, dict):
         raise RequestError("A request is a JSON object.")
-    return given
+    return document
 
 
-def _no_constant(name: str) -> NoReturn:
+def _refuse_json_constant(name: str) -> NoReturn:
+    """Raise ValueError for ``NaN`` or ``Infinity`` in a line of JSON."""
     raise ValueError(f"{name} is not a number")
 
 
-def _first_complaint(error: ValidationError) -> str:
-    first = error.errors(include_url=False, include_context=False)[0]
-    if first["loc"][1:2] == ("id",):  # pydantic reports each of its two types separately
-        return f"id is a whole number or a text of at most {_LONGEST_ID} characters."
-    where = ".".join(str(part)[:_SHOWN] for part in first["loc"][1:]) or "The request"
-    return f"{where}: {first['msg']}."
+def _first_error_sentence(error: ValidationError) -> str:
+    """Return the first error of a request's fields as a sentence."""
+    first_error = error.errors(include_url=False, include_context=False)[0]
+    if first_error["loc"][1:2] == ("id",):  # pydantic reports each of its two types separately
+        return f"id is a whole number or a text of at most {_MAX_ID_CHARACTERS} characters."
+    field_name = (
+        ".".join(str(part)[:_MAX_SHOWN_CHARACTERS] for part in first_error["loc"][1:])
+        or "The request"
+    )
+    return f"{field_name}: {first_error['msg']}."
 
 
 AnySessionRequest = TypeVar("AnySessionRequest", bound=SessionRequest)
 
 
-def _checked(request: AnySessionRequest) -> AnySessionRequest:
-    """Return a session request whose parameters fit the excitation's function."""
+def _checked_session_request(request: AnySessionRequest) -> AnySessionRequest:
+    """Return a session request with checked and converted parameters of the excitation.
+
+    Raises RequestError if the excitation, a note or a parameter is invalid.
+    """
     if request.excitation not in KINDS:
         raise RequestError(
-            f"excitation = {_shown(request.excitation)} is unknown; choose {', '.join(KINDS)}."
+            f"excitation = {_shown_value(request.excitation)} is unknown; choose "
+            f"{', '.join(KINDS)}."
         )
     for note in NOTES:
         if not getattr(request.notes, note).isprintable():
@@ -244,68 +261,70 @@ def _checked(request: AnySessionRequest) -> AnySessionRequest:
     given_parameters = dict(request.parameters)
     # Older clients send it among the parameters of `until`.
     if request.tip_slope_rad is None and "tip_slope_rad" in given_parameters:
-        slope_rad = _number("tip_slope_rad", given_parameters.pop("tip_slope_rad"))
+        slope_rad = _finite_number("tip_slope_rad", given_parameters.pop("tip_slope_rad"))
         if slope_rad <= 0.0:
             raise RequestError(f"tip_slope_rad = {slope_rad:g} rad must be more than 0 rad.")
         update["tip_slope_rad"] = slope_rad
     function = KINDS[request.excitation]
-    known = {
+    function_parameters = {
         name: parameter
         for name, parameter in inspect.signature(function).parameters.items()
         if name not in FROM_THE_RIG
     }
     values: dict[str, Value] = {}
     for name, given in given_parameters.items():
-        if name not in known:
+        if name not in function_parameters:
             raise RequestError(
-                f"parameters: {_shown(name)} is not a parameter of {request.excitation}; there are "
-                f"{', '.join(known)}."
+                f"parameters: {_shown_value(name)} is not a parameter of {request.excitation}; "
+                f"there are {', '.join(function_parameters)}."
             )
-        values[name] = _value(name, given, known[name].annotation)
-    for name, parameter in known.items():
+        values[name] = _converted_parameter(name, given, function_parameters[name].annotation)
+    for name, parameter in function_parameters.items():
         if parameter.default is inspect.Parameter.empty and name not in values:
             raise RequestError(f"parameters.{name} is missing.")
     return request.model_copy(update={**update, "parameters": values})
 
 
-def _value(name: str, given: object, wanted: object) -> Value:
-    if wanted in (float, float | None):
-        return _number(name, given)
-    if wanted is int:
+def _converted_parameter(name: str, given: object, wanted_type: object) -> Value:
+    """Return a parameter converted to the type `wanted_type`; raise RequestError if impossible."""
+    if wanted_type in (float, float | None):
+        return _finite_number(name, given)
+    if wanted_type is int:
         if isinstance(given, int) and not isinstance(given, bool) and abs(given) < 2**63:
             return given
-        raise RequestError(f"parameters.{name} = {_shown(given)} is not a whole number.")
-    if wanted is str:
-        if isinstance(given, str) and given.isprintable() and len(given) <= _LONGEST_TEXT:
+        raise RequestError(f"parameters.{name} = {_shown_value(given)} is not a whole number.")
+    if wanted_type is str:
+        if isinstance(given, str) and given.isprintable() and len(given) <= _MAX_TEXT_CHARACTERS:
             return given
         raise RequestError(
-            f"parameters.{name} = {_shown(given)} is not plain text of one line and at most "
-            f"{_LONGEST_TEXT} characters."
+            f"parameters.{name} = {_shown_value(given)} is not plain text of one line and at most "
+            f"{_MAX_TEXT_CHARACTERS} characters."
         )
     if (
         isinstance(given, str)
         and given.isprintable()
-        and len(given) < _LONGEST_PATH
+        and len(given) < _MAX_PATH_CHARACTERS
         and Path(given).is_absolute()
     ):
         return Path(given)
     raise RequestError(
-        f"parameters.{name} = {_shown(given)} is not the absolute path of a file; give one that "
-        "the daemon can read."
+        f"parameters.{name} = {_shown_value(given)} is not the absolute path of a file; give one "
+        "that the daemon can read."
     )
 
 
-def _number(name: str, given: object) -> float:
+def _finite_number(name: str, given: object) -> float:
+    """Return a parameter as a finite number; raise RequestError if it is not one."""
     number = finite_number(given)
     if number is None:
-        raise RequestError(f"parameters.{name} = {_shown(given)} is not a finite number.")
+        raise RequestError(f"parameters.{name} = {_shown_value(given)} is not a finite number.")
     return number
 
 
-def _shown(value: object) -> str:
-    """Return a value as JSON, shortened for a message."""
+def _shown_value(value: object) -> str:
+    """Return a value as JSON for an error message, cut to 60 characters."""
     try:
         text = json.dumps(value)
     except (ValueError, RecursionError):
         text = "..."
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return text if len(text) <= _MAX_SHOWN_CHARACTERS else f"{text[:_MAX_SHOWN_CHARACTERS]}..."

@@ -1,4 +1,4 @@
-"""Series of sessions that the daemon runs: its progress, and the reports on it."""
+"""Series of sessions that the daemon runs: progress, and reports to log and clients."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -7,54 +7,61 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.daemon import _protocol as protocol
-from rigd.daemon._log import NAME
+from rigd.daemon._log import LOGGER_NAME
 from rigd.daemon._states import DaemonState, Document, fit_document
 from rigd.engine.shared_state import LogEvent
 from rigd.runner import RigError, Series, result_line
 from rigd.runner.session import RunResult, SessionProgress
 from rigd.runtime import StopRequest
 
-_LOGGED = {
+_LOGGING_LEVELS = {
     "info": logging.INFO,
     "warning": logging.WARNING,
     "error": logging.ERROR,
     "fatal": logging.CRITICAL,
 }
-"""Log level of each level of reported events."""
+"""Level of an event → level with which the event is logged."""
 
-Publish = Callable[[Document], None]
+PublishEvent = Callable[[Document], None]
+"""Function that sends an event to the clients that have subscribed."""
 
-_log = logging.getLogger(NAME)
+_log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(slots=True)
 class ServedSeries:
-    """Sessions of one request, and their progress."""
+    """Series of sessions that a client requested, and its progress."""
 
     number: int
+    """Number of the series since the daemon was started."""
     request: protocol.StartRequest
+    """Request of the client."""
     stop: StopRequest = field(default_factory=StopRequest)
+    """Flag that states whether a stop of the series was requested."""
     planned: Series | None = None
+    """Planned series, or None before the planning is complete."""
     session: int = 0
     """Number of the present session, from 1."""
     path: Path | None = None
+    """Path of the present session's file."""
     fit: Document | None = None
-    """Last fit of that session's record."""
+    """Last fit of the present session's record."""
     results: list[RunResult] = field(default_factory=list)
-    """Results of the sessions so far, including a failed one."""
+    """Results of the sessions so far, including a failed session."""
     reason: str = ""
-    """Reason for an early end."""
+    """Sentence that states why the series ended early; empty if it did not."""
     running: bool = False
+    """Whether the series is planned or run now."""
     failed: bool = False
-    """Whether something failed, so that sessions are missing or incomplete."""
+    """Whether the series failed, so that sessions are missing or incomplete."""
 
     @property
-    def words(self) -> str:
-        """Description for the operator."""
-        return _WORDS.get(self.request.excitation, self.request.excitation)
+    def description(self) -> str:
+        """Description of the series' sessions for the operator, such as "chirp"."""
+        return _EXCITATION_DESCRIPTIONS.get(self.request.excitation, self.request.excitation)
 
     def as_document(self) -> Document:
-        """Return the series and its progress as a JSON document."""
+        """Return the series and its progress as a dictionary for JSON."""
         return {
             "series": self.number,
             "excitation": self.request.excitation,
@@ -68,74 +75,79 @@ class ServedSeries:
             "failed": self.failed,
             "reason": self.reason,
             "fit": self.fit,
-            # Without their fits, which would double the size of the document.
+            # The fits are left out, because they would double the size of the document.
             "sessions": [replace(result, fit=None).as_dict() for result in self.results],
         }
 
     def state_after(self, fault: str) -> tuple[DaemonState, str]:
-        """Return the state of the daemon after this series, and the reason.
+        """Return the state of the daemon after the end of this series, and the reason.
 
         Parameters
         ----------
         fault
-            Fault of the rig; empty if the rig is ready.
+            Sentence on the rig's fault, or empty if the rig is ready.
         """
         if fault:
             return DaemonState.FAULT, fault
         if self.stop.requested:
-            return DaemonState.READY, f"{self.words} was stopped"
+            return DaemonState.READY, f"{self.description} was stopped"
         if self.reason:
             return DaemonState.READY, self.reason
-        return DaemonState.READY, f"{self.words} is complete"
+        return DaemonState.READY, f"{self.description} is complete"
 
 
-_WORDS: Final = {
+_EXCITATION_DESCRIPTIONS: Final = {
     "file": "session from a file",
     "modes": "session of narrow sweeps",
     "touch": "search for an obstacle",
     "until": "search for a precision",
 }
-"""Descriptions of excitations whose names do not explain themselves."""
+"""Kind of excitation → description for the operator, if the name alone is unclear."""
 
-_LEVELS: Final = {"complete": "info", "stopped": "warning"}
-"""Event levels of the outcomes; ``error`` for all others."""
+_OUTCOME_LEVELS: Final = {"complete": "info", "stopped": "warning"}
+"""Outcome of a session → level of the event that reports it; ``error`` for other outcomes."""
 
 
 class SeriesReporter:
-    """Reporter that stores, logs and publishes the events of a series, in the worker thread."""
+    """Receiver of the progress of a series, which it stores, logs and publishes to clients.
 
-    def __init__(self, series: ServedSeries, publish: Publish, listens: Callable[[], bool]) -> None:
+    It is called in the worker thread.
+    """
+
+    def __init__(
+        self, series: ServedSeries, publish: PublishEvent, can_receive_stop: Callable[[], bool]
+    ) -> None:
         self._series = series
         self._publish = publish
-        self._listens = listens
+        self._can_receive_stop = can_receive_stop
 
-    def begins(self, number: int, path: Path) -> None:
-        if not self._listens():
+    def on_start(self, number: int, path: Path) -> None:
+        if not self._can_receive_stop():
             raise RigError(
                 "The daemon does not respond to requests: no further session is started."
             )
         self._series.session, self._series.path = number, path
         self._series.fit = None
 
-    def says(self, level: str, text: str) -> None:
+    def on_message(self, level: str, text: str) -> None:
         self._report(level, text, notable=True)
 
-    def shown(self, where: str) -> None:
-        self._report("info", where)
+    def on_live_view(self, view_text: str) -> None:
+        self._report("info", view_text)
 
-    def update(self, progress: SessionProgress, events: list[LogEvent]) -> None:
+    def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         for event in events:
-            if event.level in _LOGGED:
+            if event.level in _LOGGING_LEVELS:
                 self._report(event.level, event.message, notable=event.notable)
         for fit in progress.fits:
             self._report_fit(fit)
 
-    def ended(self, result: RunResult, *, look_follows: bool) -> None:
+    def on_result(self, result: RunResult, *, look_follows: bool) -> None:
         series = self._series
         series.results.append(result)
         fit = {}
         if result.fit is not None:
-            # The result lacks temporary data, such as the text for the operator.
+            # The result's fit lacks temporary data, such as the text for the operator.
             series.fit = (series.fit or {}) | fit_document(result.fit)
             fit = {"fit": series.fit}
         line = result_line(result.as_dict())
@@ -148,18 +160,20 @@ class SeriesReporter:
             result.path or result.part or "no file",
             line,
         )
-        # For event lists, with the text of the terminal.
-        level = _LEVELS.get(result.outcome, "error")
+        # This event has the text of the terminal, for clients that list events.
+        level = _OUTCOME_LEVELS.get(result.outcome, "error")
         message = {"level": level, "text": line, "session": series.session}
         self._publish({"event": "message", **message})
         document = result.as_dict() | fit | {"look_follows": look_follows}
         self._publish({"event": "session", "number": series.session, **document})
 
     def _report(self, level: str, text: str, *, notable: bool = False) -> None:
-        _log.log(_LOGGED[level], "series %d: %s", self._series.number, text)
+        """Log a message on the series, and publish it as an event."""
+        _log.log(_LOGGING_LEVELS[level], "series %d: %s", self._series.number, text)
         message = {"level": level, "text": text, "notable": notable}
         self._publish({"event": "message", **message})
 
     def _report_fit(self, fit: Mapping[str, Any]) -> None:
+        """Store a fit of the present record, and publish it as an event."""
         document = self._series.fit = fit_document(fit)
         self._publish({"event": "fit", "session": self._series.session, **document})

@@ -1,9 +1,11 @@
-"""Server of the daemon's socket, which exchanges lines with many, even slow or hostile, clients.
+"""Server of the daemon's socket, which serves many clients, even slow or hostile ones.
 
-No client can delay the supervisor of a running session noticeably. Lines are short and are handled
-one at a time at a bounded rate. Unread output is buffered up to a limit, beyond which the client is
-dropped. A connection counts as a client after its first complete line. A `stop` is always obeyed,
-with any number of clients.
+Clients send requests as lines of JSON, and get lines of JSON with replies and events.
+
+No client can delay the supervisor of a running session noticeably. Lines are short, and are
+processed one at a time at a limited rate. Unread output is buffered up to a limit, beyond which the
+client is disconnected. A connection counts as a client after its first complete line. The request
+`stop` is always executed, with any number of clients.
 """
 
 import asyncio
@@ -19,9 +21,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final, cast
 
-from rigd.daemon._log import NAME
+from rigd.daemon._log import LOGGER_NAME
 from rigd.daemon._protocol import (
-    LONGEST_LINE,
+    MAX_LINE_BYTES,
     AnyRequest,
     CommandError,
     Id,
@@ -34,96 +36,106 @@ from rigd.daemon._service import Service
 from rigd.daemon._states import Document, Peer, resolve_user
 from rigd.daemon.address import peer_of
 
-MOST_CLIENTS = 32
-MOST_WATCHERS = 24
-"""Limit below `MOST_CLIENTS`, so that short requests always find room."""
-MOST_SILENT = 64
-"""Limit of the connections that have not sent a complete line yet."""
+MAX_CLIENTS = 32
+"""Maximum number of clients."""
+MAX_SUBSCRIBERS = 24
+"""Maximum number of clients that subscribe to events. It is below `MAX_CLIENTS`, so that clients
+with short requests can always connect."""
+MAX_PENDING_CONNECTIONS = 64
+"""Maximum number of connections that have not sent a complete line yet."""
 _BACKLOG = 128
-_ACCEPTS_AT_ONCE = 64
+"""Maximum number of connections that wait to be accepted."""
+_ACCEPTS_PER_ROUND = 64
+"""Number of connections that are accepted before a pause."""
 _ACCEPT_PAUSE_S = 0.001
-"""Pause after so many accepts, so that a flood of connections leaves time for other work."""
-_PACE_S = 0.005
-"""Least time between two requests of a client."""
-_MOST_UNREAD = 262_144
-_MOST_WAITING_LINES = 64
-_FAREWELL_S = 1.0
+"""Pause in seconds after `_ACCEPTS_PER_ROUND` connections, which leaves time for other work."""
+_MIN_REQUEST_INTERVAL_S = 0.005
+"""Minimum time in seconds between two requests of a client."""
+_MAX_UNREAD_BYTES = 262_144
+"""Number of bytes of unread output beyond which a client is disconnected."""
+_MAX_WAITING_LINES = 64
+"""Number of unprocessed lines beyond which no more are read from a client."""
+_CLOSE_TIMEOUT_S = 1.0
+"""Maximum time in seconds in which a client's last output is sent before it is disconnected."""
 
-_log = logging.getLogger(NAME)
+_log = logging.getLogger(LOGGER_NAME)
 
 
 class Server:
-    """Server through which clients command a service.
+    """Server through which clients send requests to the daemon's service.
 
     Parameters
     ----------
     listener
-        A bound socket, not yet listening.
+        Bound socket that does not listen yet.
     """
 
     def __init__(self, listener: socket.socket) -> None:
         self._listener = listener
         self._service: Service | None = None
         self._clients: set[_ClientConnection] = set()
-        self._leaving: set[_ClientConnection] = set()
-        self._silent: dict[socket.socket, _PendingConnection] = {}
+        self._is_leaving: set[_ClientConnection] = set()
+        self._pending_connections: dict[socket.socket, _PendingConnection] = {}
         """Connections without a complete line, oldest first."""
-        self._answering: set[asyncio.Task[None]] = set()
+        self._stop_tasks: set[asyncio.Task[None]] = set()
         self._resolved_uids: set[int] = set()
-        self._count = 0
+        self._connection_count = 0
         self._closed = False
         self._spare_fd: int | None = None
-        self._reserve_fd()
+        self._reserve_spare_fd()
 
     def serve(self, service: Service) -> None:
-        """Start to accept clients in the running event loop."""
+        """Start to accept the clients of a service in the running event loop."""
         self._service = service
         self._listener.listen(_BACKLOG)
-        self._accept_again()
+        self._await_connections()
 
     def publish(self, event: Document) -> None:
-        """Send an event to all clients that watch."""
-        watching = [client for client in self._clients if client.wants(event)]
-        data = _line(event) if watching else b""
-        for client in watching:
+        """Send an event to all clients that have subscribed to it."""
+        is_subscribed = [client for client in self._clients if client.is_subscribed_to(event)]
+        data = _json_line(event) if is_subscribed else b""
+        for client in is_subscribed:
             client.write(data)
 
     async def close(self) -> None:
-        """Send the pending output and close all connections."""
+        """Stop accepting clients, send the pending output, and close all connections."""
         self._closed = True
         asyncio.get_running_loop().remove_reader(self._listener)
         self._listener.close()
-        for silent in list(self._silent.values()):
-            self._forget_pending(silent)
-            silent.link.close()
+        for pending in list(self._pending_connections.values()):
+            self._forget_pending(pending)
+            pending.link.close()
         for client in list(self._clients):
-            self._dismiss(client)
-        while self._leaving:  # takes at most `_FAREWELL_S`
+            self._disconnect_when_sent(client)
+        while self._is_leaving:  # takes at most `_CLOSE_TIMEOUT_S`
             await asyncio.sleep(0.01)
-        self._release_fd()
+        self._release_spare_fd()
 
-    def forget(self, client: "_ClientConnection") -> None:
-        """Remove a client that is gone."""
+    def remove(self, client: "_ClientConnection") -> None:
+        """Remove a client whose connection was lost."""
         self._clients.discard(client)
-        self._leaving.discard(client)
+        self._is_leaving.discard(client)
 
-    def _dismiss(self, client: "_ClientConnection") -> None:
+    def _disconnect_when_sent(self, client: "_ClientConnection") -> None:
+        """Remove a client, and disconnect it after its last output was sent."""
         self._clients.discard(client)
-        self._leaving.add(client)
-        client.leave()
+        self._is_leaving.add(client)
+        client.close_when_sent()
 
-    def may_watch(self) -> bool:
-        """Return whether another client may watch."""
-        return sum(client.watching for client in self._clients) < MOST_WATCHERS
+    def can_subscribe(self) -> bool:
+        """Return whether another client may subscribe to events."""
+        return sum(client.is_subscribed for client in self._clients) < MAX_SUBSCRIBERS
 
     # Connections without a complete line
 
-    def _accept_again(self) -> None:
+    def _await_connections(self) -> None:
+        """Let the event loop call `_accept_connections` when a connection waits to be accepted."""
         if not self._closed:
-            asyncio.get_running_loop().add_reader(self._listener, self._accept_some)
+            asyncio.get_running_loop().add_reader(self._listener, self._accept_connections)
 
-    def _accept_some(self) -> None:
-        for _ in range(_ACCEPTS_AT_ONCE):
+    def _accept_connections(self) -> None:
+        """Accept waiting connections up to a number, and pause after that."""
+        for _ in range(_ACCEPTS_PER_ROUND):
             try:
                 link, _ = self._listener.accept()
             except BlockingIOError:
@@ -133,138 +145,152 @@ class Server:
                     return
                 self._refuse_without_fd()
                 break
-            self._welcome(link)
+            self._read_new_connection(link)
         loop = asyncio.get_running_loop()
         loop.remove_reader(self._listener)
-        loop.call_later(_ACCEPT_PAUSE_S, self._accept_again)
+        loop.call_later(_ACCEPT_PAUSE_S, self._await_connections)
 
-    def _welcome(self, link: socket.socket) -> None:
-        """Accept a new connection and read at once: most have sent their line already."""
+    def _read_new_connection(self, link: socket.socket) -> None:
+        """Read from a new connection at once, because most have sent their line already."""
         try:
-            silent = self._introduced(link)
+            pending = self._identified_connection(link)
         except OSError:
             link.close()
         else:
-            self._receive(silent)
+            self._receive(pending)
 
-    def _introduced(self, link: socket.socket) -> "_PendingConnection":
+    def _identified_connection(self, link: socket.socket) -> "_PendingConnection":
+        """Return an accepted connection with its number, process id and user id."""
         link.setblocking(False)
         pid, uid = peer_of(link)
-        self._count += 1
-        return _PendingConnection(link, Peer(self._count, pid, uid))
+        self._connection_count += 1
+        return _PendingConnection(link, Peer(self._connection_count, pid, uid))
 
-    def _receive(self, silent: "_PendingConnection") -> None:
-        """Read from a connection, and make it a client once its first line is complete."""
+    def _receive(self, pending: "_PendingConnection") -> None:
+        """Read from a connection, and make it a client when its first line is complete."""
         try:
-            data = silent.link.recv(LONGEST_LINE)
+            data = pending.link.recv(MAX_LINE_BYTES)
         except BlockingIOError:
-            self._await_line(silent)
+            self._await_line(pending)
             return
         except OSError:
             data = b""
-        silent.received += data
-        if data and b"\n" not in silent.received and len(silent.received) < LONGEST_LINE:
-            self._await_line(silent)
+        pending.received += data
+        if data and b"\n" not in pending.received and len(pending.received) < MAX_LINE_BYTES:
+            self._await_line(pending)
             return
-        self._forget_pending(silent)
+        self._forget_pending(pending)
         if data:
-            self._admit(silent)
+            self._make_client(pending)
         else:
-            silent.link.close()
+            pending.link.close()
 
-    def _await_line(self, silent: "_PendingConnection") -> None:
-        """Wait for more data; if too many connections wait, drop one."""
-        if silent.link in self._silent:
+    def _await_line(self, pending: "_PendingConnection") -> None:
+        """Wait for more data of a connection; if too many connections wait, close one of them."""
+        if pending.link in self._pending_connections:
             return
-        if len(self._silent) >= MOST_SILENT:
+        if len(self._pending_connections) >= MAX_PENDING_CONNECTIONS:
             self._drop_oldest_pending()
-        self._silent[silent.link] = silent
-        asyncio.get_running_loop().add_reader(silent.link, self._receive, silent)
+        self._pending_connections[pending.link] = pending
+        asyncio.get_running_loop().add_reader(pending.link, self._receive, pending)
 
     def _drop_oldest_pending(self) -> bool:
-        """Drop the oldest waiting connection of the process that has most of them.
+        """Close the oldest waiting connection of the process that has most of them.
 
-        Thus many connections of one process never displace a new connection of another.
+        Many connections of one process therefore never displace a new connection of another
+        process. Returns False if no connection waits.
         """
-        if not self._silent:
+        if not self._pending_connections:
             return False
-        (pid, _), *_ = Counter(silent.peer.pid for silent in self._silent.values()).most_common(1)
-        oldest = next(silent for silent in self._silent.values() if silent.peer.pid == pid)
+        (pid, _), *_ = Counter(
+            pending.peer.pid for pending in self._pending_connections.values()
+        ).most_common(1)
+        oldest = next(
+            pending for pending in self._pending_connections.values() if pending.peer.pid == pid
+        )
         self._forget_pending(oldest)
-        _send_full(oldest.link)
+        _refuse_connection(oldest.link)
         return True
 
-    def _forget_pending(self, silent: "_PendingConnection") -> None:
-        if self._silent.pop(silent.link, None) is not None:
-            asyncio.get_running_loop().remove_reader(silent.link)
+    def _forget_pending(self, pending: "_PendingConnection") -> None:
+        """Stop waiting for the data of a connection."""
+        if self._pending_connections.pop(pending.link, None) is not None:
+            asyncio.get_running_loop().remove_reader(pending.link)
 
     # Clients
 
-    def _admit(self, silent: "_PendingConnection") -> None:
-        """Make a connection that has sent its first line a client."""
+    def _make_client(self, pending: "_PendingConnection") -> None:
+        """Make a connection that has sent its first line a client, if there is room for one."""
         assert self._service is not None
-        if len(self._clients) >= MOST_CLIENTS and not self._make_room():
-            self._answer_if_stop(silent)
+        if len(self._clients) >= MAX_CLIENTS and not self._disconnect_idle_client():
+            self._refuse_unless_stop(pending)
             return
-        uid = silent.peer.uid
+        uid = pending.peer.uid
         if uid not in self._resolved_uids:
             self._resolved_uids.add(uid)
-            # In a thread, because the user database may be on a network.
+            # This runs in a thread, because the user database may be on a network.
             threading.Thread(target=resolve_user, args=(uid,), daemon=True).start()
-        client = _ClientConnection(self, self._service, silent.peer, bytes(silent.received))
+        client = _ClientConnection(self, self._service, pending.peer, bytes(pending.received))
         self._clients.add(client)
-        client.connecting = asyncio.create_task(_connect(silent.link, client))
+        client.connecting = asyncio.create_task(_connect(pending.link, client))
 
-    def _make_room(self) -> bool:
-        """Dismiss an idle client, of the process that has most of them; return whether one was."""
+    def _disconnect_idle_client(self) -> bool:
+        """Disconnect an idle client of the process that has most idle clients.
+
+        Returns False if no client is idle.
+        """
         idle = [client for client in self._clients if client.is_idle]
         if not idle:
             return False
         count = Counter(client.pid for client in idle)
         longest = min(idle, key=lambda client: (-count[client.pid], client.last_received_s))
-        longest.write(_FULL)
-        self._dismiss(longest)
+        longest.write(_TOO_MANY_CLIENTS_LINE)
+        self._disconnect_when_sent(longest)
         return True
 
-    def _answer_if_stop(self, silent: "_PendingConnection") -> None:
-        """Refuse a client for which there is no room, but obey its `stop`."""
-        line = bytes(silent.received).partition(b"\n")[0]
+    def _refuse_unless_stop(self, pending: "_PendingConnection") -> None:
+        """Refuse a connection for which there is no room, unless it requests a `stop`."""
+        line = bytes(pending.received).partition(b"\n")[0]
         with suppress(RequestError):
             request = parse_request(line)
             if isinstance(request, StopSessionRequest):
-                task = asyncio.create_task(self._stop_and_close(request, silent))
-                self._answering.add(task)
-                task.add_done_callback(self._answering.discard)
+                task = asyncio.create_task(self._stop_and_close(request, pending))
+                self._stop_tasks.add(task)
+                task.add_done_callback(self._stop_tasks.discard)
                 return
-        _send_full(silent.link)
+        _refuse_connection(pending.link)
 
     async def _stop_and_close(
-        self, request: StopSessionRequest, silent: "_PendingConnection"
+        self, request: StopSessionRequest, pending: "_PendingConnection"
     ) -> None:
+        """Execute the `stop` of a connection, send the reply, and close the connection."""
         assert self._service is not None
-        _send_last(silent.link, _line(await _reply(self._service, request, silent.peer)))
+        _send_last_line(
+            pending.link, _json_line(await _reply(self._service, request, pending.peer))
+        )
 
     def _refuse_without_fd(self) -> None:
-        """Accept and refuse a client although no descriptor is free."""
+        """Accept and refuse a connection although the process has no free file descriptor."""
         if self._drop_oldest_pending():
-            return  # its descriptor is free now
+            return  # the descriptor of the closed connection is free now
         if self._spare_fd is None:
-            self._reserve_fd()
-        self._release_fd()
+            self._reserve_spare_fd()
+        self._release_spare_fd()
         with suppress(OSError):
             link, _ = self._listener.accept()
-            silent = self._introduced(link)
+            pending = self._identified_connection(link)
             with suppress(BlockingIOError):
-                silent.received += link.recv(LONGEST_LINE)
-            self._answer_if_stop(silent)
-        self._reserve_fd()
+                pending.received += link.recv(MAX_LINE_BYTES)
+            self._refuse_unless_stop(pending)
+        self._reserve_spare_fd()
 
-    def _reserve_fd(self) -> None:
-        """Reserve a descriptor, with which a client can be accepted when no other is free."""
+    def _reserve_spare_fd(self) -> None:
+        """Reserve a file descriptor, with which a connection can be accepted if none is free."""
         with suppress(OSError):
             self._spare_fd = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
 
-    def _release_fd(self) -> None:
+    def _release_spare_fd(self) -> None:
+        """Release the reserved file descriptor."""
         spare, self._spare_fd = self._spare_fd, None
         if spare is not None:
             os.close(spare)
@@ -272,7 +298,7 @@ class Server:
 
 @dataclass(slots=True)
 class _PendingConnection:
-    """A connection that has not sent a complete line yet."""
+    """Connection that has not sent a complete line yet."""
 
     link: socket.socket
     peer: Peer
@@ -280,34 +306,34 @@ class _PendingConnection:
 
 
 class _ClientConnection(asyncio.Protocol):
-    """Connection of one client."""
+    """Connection of a client: reads its requests, and sends replies and events."""
 
     def __init__(self, server: Server, service: Service, peer: Peer, received: bytes) -> None:
         self._server = server
         self._service = service
         self._peer = peer
         self._received = received
-        """Bytes received before the connection became a client."""
+        """Bytes that were received before the connection became a client."""
         self._transport: asyncio.Transport | None = None
         self._pending = bytearray()
-        self._lines: deque[bytes] = deque()
-        self._pump: asyncio.TimerHandle | None = None
+        self._waiting_lines: deque[bytes] = deque()
+        self._next_line_timer: asyncio.TimerHandle | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-        self._ended = False
-        self._leaving = False
+        self._has_ended = False
+        self._is_leaving = False
         self.connecting: asyncio.Task[None] | None = None
-        self.watching = False
-        self._wants_signals = False
+        self.is_subscribed = False
+        self._is_subscribed_to_signals = False
         self.last_received_s = time.monotonic()
 
     @property
     def is_idle(self) -> bool:
-        """Whether the client neither watches nor controls nor waits for a reply."""
+        """Whether the client neither subscribes to events, controls the rig nor awaits a reply."""
         return not (
             self._received
-            or self.watching
+            or self.is_subscribed
             or self._tasks
-            or self._lines
+            or self._waiting_lines
             or self._service.controller == self._peer
         )
 
@@ -316,131 +342,148 @@ class _ClientConnection(asyncio.Protocol):
         """Process id of the client."""
         return self._peer.pid
 
-    def wants(self, event: Document) -> bool:
-        """Return whether the client subscribed to an event."""
-        return self.watching and (self._wants_signals or event["event"] != "signals")
+    def is_subscribed_to(self, event: Document) -> bool:
+        """Return whether the client has subscribed to an event."""
+        return self.is_subscribed and (
+            self._is_subscribed_to_signals or event["event"] != "signals"
+        )
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Handle the lines received so far."""
+        """Process the lines that were received before the connection became a client."""
         self._transport = cast("asyncio.Transport", transport)
-        # Beyond this limit the client is dropped; pausing the writer would not help.
-        self._transport.set_write_buffer_limits(high=_MOST_UNREAD)
-        if self._leaving:  # it was dismissed before it began
-            self.drop()
+        # Beyond this limit the client is disconnected, because pausing the writer would not help.
+        self._transport.set_write_buffer_limits(high=_MAX_UNREAD_BYTES)
+        if self._is_leaving:  # the client was dismissed before its connection was made
+            self.disconnect()
             return
         received, self._received = self._received, b""
         self.data_received(received)
 
     def data_received(self, data: bytes) -> None:
-        """Handle received bytes, split at any position."""
+        """Split received bytes, which may end within a line, into lines to be processed."""
         self._pending += data
         *lines, rest = self._pending.split(b"\n")
         self._pending = rest
-        self._lines.extend(bytes(line) for line in lines)
-        if len(rest) >= LONGEST_LINE or any(len(line) >= LONGEST_LINE for line in lines):
-            self.write(_line(_refusal(None, f"A line has at most {LONGEST_LINE} bytes.")))
-            self.leave()
-        elif self._pump is None and self._lines:
-            self._handle_next()
-        if len(self._lines) > _MOST_WAITING_LINES and self._transport is not None:
+        self._waiting_lines.extend(bytes(line) for line in lines)
+        if len(rest) >= MAX_LINE_BYTES or any(len(line) >= MAX_LINE_BYTES for line in lines):
+            self.write(
+                _json_line(_refusal_document(None, f"A line has at most {MAX_LINE_BYTES} bytes."))
+            )
+            self.close_when_sent()
+        elif self._next_line_timer is None and self._waiting_lines:
+            self._process_next_line()
+        if len(self._waiting_lines) > _MAX_WAITING_LINES and self._transport is not None:
             self._transport.pause_reading()
 
     def eof_received(self) -> bool:
-        """Answer the pending requests and close; a disconnected client is the same."""
-        self._ended = True
-        self._leave_if_done()
+        """Reply to the pending requests and close, because the client sends no more requests."""
+        self._has_ended = True
+        self._close_if_done()
         return True
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - asyncio's
-        """Forget the client; its sessions continue."""
-        if self._pump is not None:
-            self._pump.cancel()
-        self._lines.clear()
+        """Remove the client after its connection was lost; its sessions continue."""
+        if self._next_line_timer is not None:
+            self._next_line_timer.cancel()
+        self._waiting_lines.clear()
         self._transport = None
         self._service.release(self._peer)
-        self._server.forget(self)
+        self._server.remove(self)
 
     def write(self, data: bytes) -> None:
-        """Send data; drop the client if too much output is unread."""
+        """Send bytes to the client; disconnect it if too much output is unread."""
         if self._transport is None or self._transport.is_closing():
             return
         self._transport.write(data)
-        if self._transport.get_write_buffer_size() > _MOST_UNREAD:
-            self.drop()
+        if self._transport.get_write_buffer_size() > _MAX_UNREAD_BYTES:
+            self.disconnect()
 
-    def leave(self) -> None:
-        """Close once all output is sent, or after a short time."""
-        self._leaving = True
-        self._lines.clear()
+    def close_when_sent(self) -> None:
+        """Close the connection when all output is sent, or after a second."""
+        self._is_leaving = True
+        self._waiting_lines.clear()
         if self._transport is not None and not self._transport.is_closing():
             self._transport.close()
-            asyncio.get_running_loop().call_later(_FAREWELL_S, self.drop)
+            asyncio.get_running_loop().call_later(_CLOSE_TIMEOUT_S, self.disconnect)
 
-    def drop(self) -> None:
+    def disconnect(self) -> None:
         """Close the connection at once."""
         if self._transport is not None:
             self._transport.abort()
 
-    def _handle_next(self) -> None:
-        """Handle one request, and schedule the next one."""
-        self._pump = None
-        if not self._lines:
-            self._leave_if_done()
+    def _process_next_line(self) -> None:
+        """Process one waiting line, and schedule the next."""
+        self._next_line_timer = None
+        if not self._waiting_lines:
+            self._close_if_done()
             return
-        line = self._lines.popleft()
+        line = self._waiting_lines.popleft()
         self.last_received_s = time.monotonic()
-        self._handle(line)
+        self._process_line(line)
         if self._transport is None or self._transport.is_closing():
             return
-        self._pump = asyncio.get_running_loop().call_later(_PACE_S, self._handle_next)
-        if not self._lines:
+        self._next_line_timer = asyncio.get_running_loop().call_later(
+            _MIN_REQUEST_INTERVAL_S, self._process_next_line
+        )
+        if not self._waiting_lines:
             self._transport.resume_reading()
 
-    def _handle(self, line: bytes) -> None:
+    def _process_line(self, line: bytes) -> None:
+        """Parse a line, and start to execute the request; refuse an invalid line."""
         try:
             request = parse_request(line)
         except RequestError as error:
-            self.write(_line(_refusal(error.request_id, str(error))))
+            self.write(_json_line(_refusal_document(error.request_id, str(error))))
             return
-        if request.command == "watch" and not self.watching:
-            if not self._server.may_watch():
-                text = f"{MOST_WATCHERS} clients are watching already; use status instead."
-                self.write(_line(_refusal(request.id, text, command="watch", wrong_use=False)))
+        if request.command == "watch" and not self.is_subscribed:
+            if not self._server.can_subscribe():
+                text = f"{MAX_SUBSCRIBERS} clients are watching already; use status instead."
+                self.write(
+                    _json_line(
+                        _refusal_document(request.id, text, command="watch", wrong_use=False)
+                    )
+                )
                 return
-            self.watching = True
+            self.is_subscribed = True
         if isinstance(request, WatchRequest):
-            self._wants_signals |= request.signals
-        task = asyncio.create_task(self._answer(request))
+            self._is_subscribed_to_signals |= request.signals
+        task = asyncio.create_task(self._execute_and_reply(request))
         self._tasks.add(task)
-        task.add_done_callback(self._answered)
+        task.add_done_callback(self._remove_task)
 
-    async def _answer(self, request: AnyRequest) -> None:
-        self.write(_line(await _reply(self._service, request, self._peer)))
+    async def _execute_and_reply(self, request: AnyRequest) -> None:
+        """Execute a request, and send the reply."""
+        self.write(_json_line(await _reply(self._service, request, self._peer)))
 
-    def _answered(self, task: "asyncio.Task[None]") -> None:
+    def _remove_task(self, task: "asyncio.Task[None]") -> None:
+        """Remove the task of a request after the reply was sent."""
         self._tasks.discard(task)
-        self._leave_if_done()
+        self._close_if_done()
 
-    def _leave_if_done(self) -> None:
-        if self._ended and not (self._tasks or self._lines):
-            self.leave()
+    def _close_if_done(self) -> None:
+        """Close the connection if the client sends no more requests and all are replied to."""
+        if self._has_ended and not (self._tasks or self._waiting_lines):
+            self.close_when_sent()
 
 
 async def _reply(service: Service, request: AnyRequest, peer: Peer) -> Document:
-    """Execute a request and return the reply."""
+    """Execute a request, and return the reply, or a refusal if that raises an error."""
     try:
-        reply = await service.handle(request, peer)
+        reply = await service.execute(request, peer)
     except CommandError as error:
-        return _refusal(request.id, str(error), command=request.command, wrong_use=error.wrong_use)
+        return _refusal_document(
+            request.id, str(error), command=request.command, wrong_use=error.wrong_use
+        )
     except Exception as error:
         _log.exception("unexpected error in a request")
         text = f"Unexpected error in the daemon ({error!r}); its log says more."
-        return _refusal(request.id, text, command=request.command, wrong_use=False)
+        return _refusal_document(request.id, text, command=request.command, wrong_use=False)
     reply = {"reply": request.command, "ok": True, **reply}
     return reply if request.id is None else reply | {"id": request.id}
 
 
 async def _connect(link: socket.socket, client: _ClientConnection) -> None:
+    """Pass an accepted socket to the event loop as the connection of a client."""
     try:
         await asyncio.get_running_loop().connect_accepted_socket(lambda: client, link)
     except OSError:
@@ -448,32 +491,34 @@ async def _connect(link: socket.socket, client: _ClientConnection) -> None:
         client.connection_lost(None)
 
 
-_text: Final = json.JSONEncoder(allow_nan=False).encode
+_encode_json: Final = json.JSONEncoder(allow_nan=False).encode
 
 
-def _line(document: Document) -> bytes:
-    return _text(document).encode() + b"\n"
+def _json_line(document: Document) -> bytes:
+    """Return a reply or an event as a line of JSON."""
+    return _encode_json(document).encode() + b"\n"
 
 
-def _refusal(
+def _refusal_document(
     request_id: Id | None, text: str, *, command: str | None = None, wrong_use: bool = True
 ) -> Document:
+    """Return the reply that refuses a request, with the reason."""
     reply = {"reply": command, "ok": False, "error": text, "wrong_use": wrong_use}
     return reply if request_id is None else reply | {"id": request_id}
 
 
-_FULL = _line(
-    _refusal(None, "There are too many clients; try again later.", wrong_use=False)
+_TOO_MANY_CLIENTS_LINE = _json_line(
+    _refusal_document(None, "There are too many clients; try again later.", wrong_use=False)
     | {"crowded": True}
 )
 
 
-def _send_last(link: socket.socket, line: bytes) -> None:
-    """Send a last line without waiting, and close."""
+def _send_last_line(link: socket.socket, line: bytes) -> None:
+    """Send a last line without waiting, and close the connection."""
     with link, suppress(OSError):
         link.send(line)
 
 
-def _send_full(link: socket.socket) -> None:
-    """Refuse a connection because there are too many."""
-    _send_last(link, _FULL)
+def _refuse_connection(link: socket.socket) -> None:
+    """Refuse and close a connection because there are too many clients."""
+    _send_last_line(link, _TOO_MANY_CLIENTS_LINE)

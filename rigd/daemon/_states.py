@@ -1,4 +1,4 @@
-"""States of the daemon, their transitions, and the daemon's status as JSON documents."""
+"""States of the daemon and their transitions, and JSON documents of the daemon's status."""
 
 import base64
 import os
@@ -18,57 +18,62 @@ from rigd.live.address import LiveAddress
 from rigd.runner.signal_blocks import SignalBlock
 from rigd.runner.status import ProcessStatus, RigStatus
 
-_REMEMBERED = 50
+_MAX_HISTORY = 50
+"""Number of transitions that the daemon's status lists."""
 
 
 class DaemonState(StrEnum):
-    """States of the daemon."""
+    """State of the daemon."""
 
     IDLE = "idle"
-    """The devices are closed."""
+    """The devices are not connected."""
     READY = "ready"
-    """The devices are connected, the torque is off."""
+    """The devices are connected, and the torque is off."""
     RUNNING = "running"
-    """A session runs, or a pause between two sessions of a series."""
+    """A series of sessions is running, including the pauses between its sessions."""
     STOPPING = "stopping"
     """A stop was requested, and the session has not ended yet."""
     FAULT = "fault"
-    """No torque is commanded until an operator resets the rig; the reason has the drive report."""
+    """Something failed, and no torque is commanded until an operator resets the rig."""
 
 
-_LEADS_TO: Mapping[DaemonState, frozenset[DaemonState]] = {
+_NEXT_STATES: Mapping[DaemonState, frozenset[DaemonState]] = {
     DaemonState.IDLE: frozenset({DaemonState.READY, DaemonState.FAULT}),
     DaemonState.READY: frozenset({DaemonState.RUNNING, DaemonState.IDLE, DaemonState.FAULT}),
     DaemonState.RUNNING: frozenset({DaemonState.STOPPING, DaemonState.READY, DaemonState.FAULT}),
     DaemonState.STOPPING: frozenset({DaemonState.READY, DaemonState.FAULT}),
     DaemonState.FAULT: frozenset({DaemonState.IDLE, DaemonState.READY}),
 }
+"""State → states that may follow it."""
 
-_REMEDIES: Mapping[DaemonState, str] = {
+_STATE_ADVICE: Mapping[DaemonState, str] = {
     DaemonState.IDLE: "its devices are being connected; try again in a moment",
     DaemonState.READY: "there is nothing to reset",
     DaemonState.RUNNING: "wait for the session to end, or end it with rigd stop",
     DaemonState.STOPPING: "the session is being stopped; wait for its end",
     DaemonState.FAULT: "remove the cause, then run rigd reset",
 }
-_ADJECTIVES: Mapping[DaemonState, str] = {state: state.value for state in DaemonState} | {
+"""State in which a command is refused → advice for the operator."""
+_STATE_DESCRIPTIONS: Mapping[DaemonState, str] = {state: state.value for state in DaemonState} | {
     DaemonState.FAULT: "in fault"
 }
-_COMES_FROM: Mapping[str, DaemonState] = {
+"""State → description for a sentence on the rig."""
+_REQUIRED_STATES: Mapping[str, DaemonState] = {
     "start": DaemonState.READY,
     "tare": DaemonState.READY,
     "zero": DaemonState.READY,
     "reset": DaemonState.FAULT,
 }
+"""Command → state that it requires."""
 
 
 class IllegalTransitionError(Exception):
-    """A transition is not in the table, which is a bug."""
+    """Raised if the daemon's state must not change in this way, which is a bug."""
 
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """One change of state."""
+    """Change of the daemon's state, with time (ns since the Unix epoch) and reason."""
 
     utc_ns: int
     before: DaemonState
@@ -77,19 +82,19 @@ class Transition:
 
 
 class DaemonStateMachine:
-    """State machine of the daemon, with its last transitions.
+    """State machine of the daemon, which also stores its last transitions.
 
     Parameters
     ----------
     on_change
-        Called with each transition, after it.
+        Called with each transition after the state has changed.
     utc_ns
-        Wall clock, which tests replace.
+        Function that returns the wall-clock time in nanoseconds since the Unix epoch.
 
     Attributes
     ----------
     state
-        Present state.
+        Present state of the daemon.
     history
         Last transitions, oldest first.
     """
@@ -103,42 +108,42 @@ class DaemonStateMachine:
         self._utc_ns = utc_ns
         self._began_utc_ns = utc_ns()
         self.state = DaemonState.IDLE
-        self.history: deque[Transition] = deque(maxlen=_REMEMBERED)
+        self.history: deque[Transition] = deque(maxlen=_MAX_HISTORY)
 
     @property
     def since_utc_ns(self) -> int:
-        """Time at which the present state began."""
+        """Time at which the present state began, in nanoseconds since the Unix epoch."""
         return self.history[-1].utc_ns if self.history else self._began_utc_ns
 
     @property
     def reason(self) -> str:
-        """Reason of the present state."""
+        """Reason for which the present state was entered."""
         return self.history[-1].reason if self.history else "the daemon was started"
 
-    def move(self, after: DaemonState, reason: str) -> None:
-        """Change to another state.
+    def change_to(self, next_state: DaemonState, reason: str) -> None:
+        """Change the daemon's state for a reason.
 
         Raises
         ------
         IllegalTransitionError
-            If there is no such transition.
+            If this state must not follow the present state.
         """
-        if after not in _LEADS_TO[self.state]:
-            raise IllegalTransitionError(f"{self.state} does not lead to {after} ({reason}).")
-        transition = Transition(self._utc_ns(), self.state, after, reason)
-        self.state = after
+        if next_state not in _NEXT_STATES[self.state]:
+            raise IllegalTransitionError(f"{self.state} does not lead to {next_state} ({reason}).")
+        transition = Transition(self._utc_ns(), self.state, next_state, reason)
+        self.state = next_state
         self.history.append(transition)
         self._on_change(transition)
 
     def refusal(self, command: str) -> str:
-        """Return why a command is refused in the present state; empty if it is not."""
-        wanted = _COMES_FROM.get(command, self.state)
-        if wanted is self.state:
+        """Return a sentence that refuses a command in the present state, or "" if it is allowed."""
+        required_state = _REQUIRED_STATES.get(command, self.state)
+        if required_state is self.state:
             return ""
-        why = f" ({self.reason.rstrip('.')})" if self.state is DaemonState.FAULT else ""
+        fault_text = f" ({self.reason.rstrip('.')})" if self.state is DaemonState.FAULT else ""
         return (
-            f"{command} needs a rig that is {_ADJECTIVES[wanted]}; this one is "
-            f"{_ADJECTIVES[self.state]}{why}: {_REMEDIES[self.state]}."
+            f"{command} needs a rig that is {_STATE_DESCRIPTIONS[required_state]}; this one is "
+            f"{_STATE_DESCRIPTIONS[self.state]}{fault_text}: {_STATE_ADVICE[self.state]}."
         )
 
 
@@ -147,42 +152,44 @@ class DaemonStateMachine:
 Document = dict[str, Any]
 
 
-_USERS: dict[int, str] = {}
-"""Names of users by their numbers."""
+_USER_NAMES: dict[int, str] = {}
+"""User id → user name, for the users resolved so far."""
 
 
 def resolve_user(uid: int) -> None:
-    """Find the name of a user for :class:`Peer`, which may take long."""
-    if uid not in _USERS:
+    """Store the name of a user for :class:`Peer`; finding it may take a long time."""
+    if uid not in _USER_NAMES:
         with suppress(KeyError):
-            _USERS[uid] = pwd.getpwuid(uid).pw_name
+            _USER_NAMES[uid] = pwd.getpwuid(uid).pw_name
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """A client, as the kernel identifies it."""
+    """Client of the daemon, identified by the kernel."""
 
     number: int
-    """Number of its connection."""
+    """Number of the client's connection."""
     pid: int
+    """Process id of the client."""
     uid: int
+    """User id of the client."""
 
     @property
     def user(self) -> str:
-        """Name of its user, or the number while the name is unknown."""
-        return _USERS.get(self.uid, str(self.uid))
+        """Name of the client's user, or the user id while the name is unknown."""
+        return _USER_NAMES.get(self.uid, str(self.uid))
 
     def __str__(self) -> str:
         return f"process {self.pid} of {self.user}"
 
 
 def peer_document(peer: Peer | None) -> Document | None:
-    """Return the client that holds control as a JSON document."""
+    """Return process and user of a client as a dictionary for JSON, or None without client."""
     return None if peer is None else {"pid": peer.pid, "uid": peer.uid, "user": peer.user}
 
 
 def transition_document(transition: Transition) -> Document:
-    """Return a transition as a JSON document."""
+    """Return a transition of the daemon's state as a dictionary for JSON."""
     return {
         "utc_ns": transition.utc_ns,
         "from": transition.before.value,
@@ -192,21 +199,16 @@ def transition_document(transition: Transition) -> Document:
 
 
 def rig_document(status: RigStatus, rates: Mapping[str, float | None]) -> Document:
-    """Return the status of the rig and its processes as a JSON document.
+    """Return the status of the rig and of its processes as a dictionary for JSON.
 
-    Parameters
-    ----------
-    status
-        Status of the rig.
-    rates
-        Measured records per second, by topic.
+    `rates` are the measured numbers of messages per second, by topic.
     """
     return {
         "phase": status.phase.name.lower(),
         "angle_rad": status.angle_rad,
         "coupling_torque_nm": status.coupling_torque_nm,
         "torque_command_nm": status.torque_command_nm,
-        "signals": None if status.signals is None else _finite(asdict(status.signals())),
+        "signals": None if status.signals is None else _finite_or_none(asdict(status.signals())),
         "health": {
             "missed": status.missed,
             "late": status.late,
@@ -219,7 +221,7 @@ def rig_document(status: RigStatus, rates: Mapping[str, float | None]) -> Docume
         },
         "live_view": _view_document(status.live_view),
         "processes": [
-            asdict(process) | {"state": _state(process, status.phase)}
+            asdict(process) | {"state": _process_state(process, status.phase)}
             for process in status.processes
         ],
         "topics": [
@@ -236,16 +238,10 @@ def rig_document(status: RigStatus, rates: Mapping[str, float | None]) -> Docume
 
 
 def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | None) -> Document:
-    """Return a block of signals as a JSON document.
+    """Return the event with a block of signals as a dictionary for JSON.
 
-    Parameters
-    ----------
-    block
-        Signals and gauges.
-    rate_hz
-        Ticks per second.
-    frequency_hz
-        Frequency of the excitation at the last tick.
+    `rate_hz` is the sample rate, and `frequency_hz` the frequency of the excitation at the block's
+    last tick, or None.
     """
     return {
         "event": "signals",
@@ -272,76 +268,78 @@ def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | N
     }
 
 
-def _finite(values: Mapping[str, float]) -> Document:
-    """Return numbers for JSON, with null for values that are not finite."""
+def _finite_or_none(values: Mapping[str, float]) -> Document:
+    """Return a copy of a mapping with None in place of numbers that are not finite, for JSON."""
     return {name: value if isfinite(value) else None for name, value in values.items()}
 
 
 def _view_document(view: LiveAddress | None) -> Document | None:
-    """Return the address of the live view as a JSON document."""
+    """Return the address of the live view as a dictionary for JSON, or None without live view."""
     return None if view is None else {"url": view.page_url, **asdict(view)}
 
 
-def _state(process: ProcessStatus, phase: Phase) -> str:
-    """Return the state of a process; one that lasts for one session ends as ``done``."""
-    passing = any(p.for_one_session and p.name == process.name for p in PROCESSES)
-    return "done" if process.state == "ended" and passing and phase is Phase.OFF else process.state
+def _process_state(process: ProcessStatus, phase: Phase) -> str:
+    """Return the state of a process for clients.
+
+    A process that runs for one session only has the state ``done``, not ``ended``, after it.
+    """
+    is_for_one_session = any(p.for_one_session and p.name == process.name for p in PROCESSES)
+    return (
+        "done"
+        if process.state == "ended" and is_for_one_session and phase is Phase.OFF
+        else process.state
+    )
 
 
-_OF_A_FIT = (
+_PUBLISHED_FIT_KEYS = (
     *("tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings"),
     *("type", "validity", "modes", "parameters", "search", "text"),
 )
-"""Members of a fit that clients receive; others, such as the covariance, are too long."""
-_MOST_ITEMS, _LONGEST_TEXT = 16, 400
-_LONG = frozenset({"pieces", "constants"})
-"""Omitted members of these: segments of a search (they are in the file), and the modal constants of
-the test of uniformity."""
+"""Keys of a fit that clients receive; other values, such as the covariance, are too long."""
+_MAX_LIST_ITEMS, _MAX_TEXT_CHARACTERS = 16, 400
+_OMITTED_KEYS = frozenset({"pieces", "constants"})
+"""Keys that are left out of a fit because their values are too long: the segments of a search, and
+the modal constants of the test of a uniform beam."""
 
 
 def fit_document(fit: Mapping[str, Any]) -> Document:
-    """Return a fit of the record as a JSON document of bounded size.
+    """Return a fit of the record as a dictionary for JSON that has a limited size.
 
-    Parameters
-    ----------
-    fit
-        The fit, as in `RunResult.fit`.
+    `fit` has the format of `RunResult.fit`.
     """
-    return {name: _bounded(fit[name]) for name in _OF_A_FIT if name in fit}
+    return {name: _shortened_value(fit[name]) for name in _PUBLISHED_FIT_KEYS if name in fit}
 
 
-def _bounded(value: Any) -> Any:  # noqa: ANN401 - what JSON has
-    """Return lists and texts shortened to a bounded size."""
+def _shortened_value(value: Any) -> Any:  # noqa: ANN401 - what JSON has
+    """Return a JSON value in which lists are cut to 16 items, and texts to 400 characters."""
     if isinstance(value, str):
-        return value[:_LONGEST_TEXT]
+        return value[:_MAX_TEXT_CHARACTERS]
     if isinstance(value, Mapping):
-        return {key: _bounded(member) for key, member in value.items() if key not in _LONG}
+        return {
+            key: _shortened_value(member)
+            for key, member in value.items()
+            if key not in _OMITTED_KEYS
+        }
     if isinstance(value, list | tuple):
-        return [_bounded(item) for item in value[:_MOST_ITEMS]]
+        return [_shortened_value(item) for item in value[:_MAX_LIST_ITEMS]]
     return value
 
 
 def progress_document(status: RigStatus, total: int, rate_hz: float | None) -> Document:
-    """Return the progress of a session as a JSON document.
+    """Return the progress of a session as a dictionary for JSON.
 
-    Parameters
-    ----------
-    status
-        Status of the rig.
-    total
-        Ticks of the record.
-    rate_hz
-        Ticks per second of real time; None with the virtual clock.
+    `total` is the number of ticks of the record. `rate_hz` is the sample rate, or None under the
+    virtual clock, for which no remaining time is stated.
     """
-    # Until tick 0 the shared state may have the counts of the session before.
-    left = max(0, total - status.tick)
+    # Before tick 0 the status may have the counts of the previous session.
+    remaining_ticks = max(0, total - status.tick)
     return {
         "phase": status.phase.name.lower(),
         "activity": status.activity.value,
         "tick": status.tick,
         "total": total,
         "percent": round(100.0 * status.tick / total, 1) if total else 100.0,
-        "time_left_s": None if rate_hz is None else round(left / rate_hz, 1),
+        "time_left_s": None if rate_hz is None else round(remaining_ticks / rate_hz, 1),
         "missed": status.missed,
         "late": status.late,
         "lost": status.lost,
@@ -363,7 +361,7 @@ def daemon_document(
     failed_checks: list[Document],
     began_utc_ns: int,
 ) -> Document:
-    """Return the description of the daemon as a JSON document."""
+    """Return the description of the daemon, such as its profile, as a dictionary for JSON."""
     from rigd import __version__
 
     return {
@@ -389,6 +387,6 @@ def daemon_document(
     }
 
 
-def histories(transitions: Iterable[Transition]) -> list[Document]:
-    """Return the last transitions as JSON documents."""
+def transition_documents(transitions: Iterable[Transition]) -> list[Document]:
+    """Return transitions of the daemon's state as a list of dictionaries for JSON."""
     return [transition_document(transition) for transition in transitions]

@@ -1,4 +1,4 @@
-"""Address of a rig's daemon: creation of its socket, and search for it."""
+"""Socket of a rig's daemon: its path, its creation, and the search for running daemons."""
 
 import errno
 import grp
@@ -13,19 +13,19 @@ from rigd.errors import FailureError, UserError
 from rigd.runtime.addresses import address_files, answers, file_name, folder_fault, runtime_folder
 from rigd.runtime.processes import listening_sockets
 
-COMMON = Path("/run/rigd")
-"""Folder of daemons for a group: a user's own runtime folder is closed to others."""
-SUFFIX = ".daemon"
-"""Suffix of the name of each daemon's socket."""
-_CREDENTIALS = struct.Struct("3i")
+GROUP_FOLDER = Path("/run/rigd")
+"""Folder for sockets of daemons that a group may use, since others cannot enter a user's folder."""
+SOCKET_SUFFIX = ".daemon"
+"""Suffix of the file name of a daemon's socket."""
+_CREDENTIALS_FORMAT = struct.Struct("3i")
 
 
 class AddressError(FailureError):
-    """A socket cannot be created, or no daemon is found; the message is for the operator."""
+    """Raised if a socket cannot be created or no daemon is found; the message states why."""
 
 
 class UnknownGroupError(UserError):
-    """A group does not exist."""
+    """Raised if the group that may use the daemon does not exist."""
 
 
 def socket_path(rig: str, folder: Path | None = None) -> Path:
@@ -36,45 +36,45 @@ def socket_path(rig: str, folder: Path | None = None) -> Path:
     rig
         Name of the rig's profile.
     folder
-        Folder of the socket; None: the user's runtime folder.
+        Folder of the socket, or None for the user's runtime folder.
     """
-    return (folder or runtime_folder()) / f"{file_name(rig)}{SUFFIX}"
+    return (folder or runtime_folder()) / f"{file_name(rig)}{SOCKET_SUFFIX}"
 
 
 def peer_of(link: socket.socket) -> tuple[int, int]:
-    """Return process id and user id of a connection's peer, from the kernel.
+    """Return process id and user id of the process at the other end of a Unix socket connection.
 
     Raises
     ------
     OSError
         If the kernel does not report them.
     """
-    credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    pid, uid, _ = _CREDENTIALS.unpack(credentials)
+    credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS_FORMAT.size)
+    pid, uid, _ = _CREDENTIALS_FORMAT.unpack(credentials)
     return pid, uid
 
 
 def bind(path: Path, group: str | None) -> socket.socket:
-    """Create the socket, which only its users can connect to, once it listens.
+    """Return a new bound socket for the daemon, to which only this user or a group can connect.
 
-    Call it only while holding the lock of the rig: it replaces the socket of a dead daemon.
+    The caller must hold the lock of the rig, because the socket of a dead daemon is replaced.
 
     Parameters
     ----------
     path
-        Path of the socket. The user's own folder is created; a group's folder has to exist.
+        Path of the socket. This user's own folder is created, but the folder of a group must exist.
     group
-        Group whose members may also connect.
+        Group whose members may also connect, or None.
 
     Raises
     ------
     UnknownGroupError
-        If there is no such group.
+        If the group does not exist.
     AddressError
         If the socket cannot be created, its folder is closed to the group or writable by others,
         or a running daemon uses it.
     """
-    number = None if group is None else _group_number(group)
+    group_id = None if group is None else _group_number(group)
     fault = folder_fault(path.parent, shared=group is not None)
     if fault:
         raise AddressError(fault)
@@ -82,41 +82,41 @@ def bind(path: Path, group: str | None) -> socket.socket:
         raise AddressError(f"Another daemon answers on {path}; see rigd status.")
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:
-        if number is None:
+        if group_id is None:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        elif not _open_to(number, path.parent):
+        elif not _can_group_enter(group_id, path.parent):
             raise PermissionError(errno.EACCES, f"{path.parent} is closed to the group {group}")
         path.unlink(missing_ok=True)
-        before = os.umask(0o177)
+        previous_umask = os.umask(0o177)
         try:
             listener.bind(os.fspath(path))
         finally:
-            os.umask(before)
-        if number is not None:
-            os.chown(path, -1, number, follow_symlinks=False)
+            os.umask(previous_umask)
+        if group_id is not None:
+            os.chown(path, -1, group_id, follow_symlinks=False)
             path.chmod(0o660)
     except OSError as error:
         listener.close()
-        raise AddressError(_refused(path, group, error)) from None
+        raise AddressError(_creation_error_text(path, group, error)) from None
     return listener
 
 
 def running() -> list[Path]:
-    """Return the sockets of all daemons that this user can reach."""
-    sockets = address_files(f"*{SUFFIX}", *_folders())
+    """Return the paths of the sockets of all daemons that this user can connect to."""
+    sockets = address_files(f"*{SOCKET_SUFFIX}", *_searched_folders())
     return [path for path in sockets if answers(path)]
 
 
 def find(rig: str | None) -> Path:
-    """Return the socket of a rig's daemon, or of the only daemon.
+    """Return the path of the socket of a rig's daemon, or of the only daemon if `rig` is None.
 
     Raises
     ------
     AddressError
-        If there is none, or several; the message names the remedy.
+        If there is no such daemon, or several daemons; the message states the remedy.
     """
     if rig is not None:
-        for folder in _folders():
+        for folder in _searched_folders():
             path = socket_path(rig, folder)
             if answers(path):
                 return path
@@ -124,61 +124,72 @@ def find(rig: str | None) -> Path:
             f"No daemon of the rig {rig} {_not_found_reason(file_name(rig))}"
             f"rigd serve --profile {rig}."
         )
-    found = running()
-    if not found:
+    sockets = running()
+    if not sockets:
         raise AddressError(f"No daemon {_not_found_reason(None)}rigd serve --profile NAME.")
-    if len(found) > 1:
-        rigs = ", ".join(path.name.removesuffix(SUFFIX) for path in found)
+    if len(sockets) > 1:
+        rigs = ", ".join(path.name.removesuffix(SOCKET_SUFFIX) for path in sockets)
         raise AddressError(f"Several daemons are running ({rigs}); name one with --profile.")
-    return found[0]
+    return sockets[0]
 
 
-def _folders() -> list[Path]:
-    """Return the folders to search for daemons, without that of groups if it is unsafe."""
-    return [runtime_folder()] if folder_fault(COMMON, shared=True) else [runtime_folder(), COMMON]
+def _searched_folders() -> list[Path]:
+    """Return the folders to search for sockets of daemons, except for an unsafe group folder."""
+    return (
+        [runtime_folder()]
+        if folder_fault(GROUP_FOLDER, shared=True)
+        else [runtime_folder(), GROUP_FOLDER]
+    )
 
 
 def _not_found_reason(rig: str | None) -> str:
-    """Return part of a sentence: why no daemon of `rig` (as in file names; None: any) is found."""
-    fault = folder_fault(COMMON, shared=True)
-    unsafe = address_files(f"*{SUFFIX}", COMMON) if fault else []
-    others = []
+    """Return the words after "No daemon" that state why no daemon is found, with the remedy.
+
+    `rig` is the rig's name as in file names, or None for any rig.
+    """
+    fault = folder_fault(GROUP_FOLDER, shared=True)
+    sockets_in_unsafe_folder = address_files(f"*{SOCKET_SUFFIX}", GROUP_FOLDER) if fault else []
+    sockets_elsewhere = []
     with suppress(OSError):
-        others = [path for path in own_sockets() if rig in (None, path.name.removesuffix(SUFFIX))]
-    folders = " or ".join(map(str, _folders()))
-    if unsafe:
+        sockets_elsewhere = [
+            path for path in own_sockets() if rig in (None, path.name.removesuffix(SOCKET_SUFFIX))
+        ]
+    folders = " or ".join(map(str, _searched_folders()))
+    if sockets_in_unsafe_folder:
         return f"answers in {folders}. {fault} Without one there, start it with "
-    if others:
+    if sockets_elsewhere:
         return (
-            f"answers in {folders}, but one listens on {others[0]}: set XDG_RUNTIME_DIR as it was "
-            "set for that one, or start another with "
+            f"answers in {folders}, but one listens on {sockets_elsewhere[0]}: set XDG_RUNTIME_DIR "
+            "as it was set for that one, or start another with "
         )
     return "is running; start it with "
 
 
 def own_sockets() -> list[Path]:
-    """Return the listening sockets of this user's daemons from the kernel's list.
+    """Return the paths of the sockets on which this user's daemons listen, from the kernel's list.
 
-    For root these are the sockets of all users.
+    For root the result includes the sockets of all users.
 
     Raises
     ------
     OSError
-        If the system has no such list.
+        If the system has no list of sockets.
     """
-    found = []
+    sockets = []
     for path in listening_sockets():
         folder = path.parent.name
-        if path.name.endswith(SUFFIX) and (folder == "rigd" or folder.startswith("rigd-")):
-            with suppress(OSError, ValueError):  # it is gone, or in a folder of another user
+        if path.name.endswith(SOCKET_SUFFIX) and (folder == "rigd" or folder.startswith("rigd-")):
+            with suppress(OSError, ValueError):  # it was removed, or is in another user's folder
                 status = path.lstat()
                 if stat.S_ISSOCK(status.st_mode) and os.getuid() in (0, status.st_uid):
-                    found.append(path)
-    return found
+                    sockets.append(path)
+    return sockets
 
 
 def peer_at(path: Path) -> tuple[int, int] | None:
-    """Return process id and user id that listen on a socket; None if its queue is full.
+    """Return process id and user id of the process that listens on a socket.
+
+    The result is None if the queue of the socket is full.
 
     Parameters
     ----------
@@ -199,6 +210,7 @@ def peer_at(path: Path) -> tuple[int, int] | None:
 
 
 def _group_number(group: str) -> int:
+    """Return the group id of a group; raise UnknownGroupError if it does not exist."""
     try:
         return grp.getgrnam(group).gr_gid
     except KeyError:
@@ -208,7 +220,7 @@ def _group_number(group: str) -> int:
         ) from None
 
 
-def _open_to(group: int, folder: Path) -> bool:
+def _can_group_enter(group: int, folder: Path) -> bool:
     """Return whether the members of a group can enter a folder."""
     status = folder.stat()
     return bool(
@@ -216,7 +228,8 @@ def _open_to(group: int, folder: Path) -> bool:
     )
 
 
-def _refused(path: Path, group: str | None, error: OSError) -> str:
+def _creation_error_text(path: Path, group: str | None, error: OSError) -> str:
+    """Return the error message for a socket that cannot be created, with the remedy."""
     remedy = (
         "set XDG_RUNTIME_DIR to a folder with a short name that is yours."
         if group is None

@@ -1,8 +1,8 @@
-"""Background jobs of the daemon: predictions, checks and heavy plans, each in its own process.
+"""Background jobs of the daemon (predictions, checks, heavy plans), each in a process of its own.
 
-They take processor time and memory, and any client may request a prediction while a session runs.
-In the daemon's own process they would block the interpreter that supervises the session. Their own
-process has the lowest priority of an ordinary program, and a limited fraction of the free memory.
+Any client may request a prediction while a session is running. In the daemon's own process such a
+job would block the interpreter that supervises the session. The job's own process has the lowest
+priority of an ordinary program, and is limited to a fraction of the free memory.
 """
 
 import asyncio
@@ -27,56 +27,60 @@ from rigd.runner.planning import excitation_for, largest_amplitude, plan_documen
 from rigd.runner.request import NoRoomError
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, prefer_oom_kill
 
-_PATIENCE_S: Final = 50.0
-"""Less than the client's timeout, so that the client gets a reply."""
-_MOST_BYTES: Final = 4 << 30
-_LEAST_BYTES: Final = 256 << 20
-"""A session of two minutes needs 180 MiB, of which 120 MiB are the program."""
+_JOB_TIMEOUT_S: Final = 50.0
+"""Maximum time in seconds for a job, below the client's timeout so that the client gets a reply."""
+_MAX_MEMORY_BYTES: Final = 4 << 30
+"""Maximum memory of a job in bytes."""
+_MIN_MEMORY_BYTES: Final = 256 << 20
+"""Memory in bytes that a job may use in any case. A session of two minutes needs 180 MiB, of which
+120 MiB are the program."""
 _MEMORY_FRACTION: Final = 0.25
-"""Fraction of the available memory: only the control process of a session locks its memory."""
+"""Fraction of the available memory that a job may use. It is limited because, apart from the
+control process of a session, the memory of no process is locked."""
 _LOWEST_PRIORITY: Final = 19
-_LIGHT_S: Final = 300.0
-"""Longest record that is planned in half a second and 100 MB."""
+"""Niceness with the lowest priority."""
+_LIGHT_RECORD_S: Final = 300.0
+"""Longest duration of a record in seconds whose planning takes half a second and 100 MB."""
 
-Done = TypeVar("Done")
-Done_co = TypeVar("Done_co", covariant=True)
+Result = TypeVar("Result")
+Result_co = TypeVar("Result_co", covariant=True)
 
 
-class BackgroundJob(Protocol[Done_co]):
-    """A job that runs in its own process."""
+class BackgroundJob(Protocol[Result_co]):
+    """Job of the daemon that is performed in a process of its own."""
 
     during_sessions: ClassVar[bool]
-    """Whether it may run during a session, with lower priority."""
+    """Whether the job may run during a session, with the lowest priority."""
 
-    def perform(self) -> Done_co:
-        """Return the result; an error of the rig goes to the client."""
+    def perform(self) -> Result_co:
+        """Perform the job and return its result; a RigdError is reported to the client."""
 
 
 @dataclass(frozen=True, slots=True)
 class PredictionJob:
-    """Prediction of a session, by `rigd.runner.planning.predict_session`."""
+    """Job that predicts a session by `rigd.runner.planning.predict_session`."""
 
     during_sessions: ClassVar[bool] = True
 
     profile: Profile
-    """Rig of the session."""
+    """Profile of the rig."""
     excitation: str
-    """Name of the excitation."""
+    """Kind of the excitation, such as "chirp"."""
     parameters: Mapping[str, Value]
-    """Its options."""
+    """Parameters of the excitation by their names."""
     force: bool
-    """Whether torques may be clipped."""
+    """Whether the torques of motor and sensor may be clipped."""
     specimen: str
-    """Name of the specimen; empty: the profile's."""
+    """Name of the specimen, or empty for the beam of the profile."""
     start_rad: float = 0.0
-    """Angle of the motor from the rig's zero."""
+    """Motor angle at the start, relative to the rig's zero."""
     accept: tuple[str, ...] = ()
     """Names of rows of `rigd check` that may fail."""
     tip_slope_rad: float | None = None
-    """Largest slope of the tip in an identification; None: the profile's."""
+    """Maximum tip slope of an identification, or None for the limit of the profile."""
 
     def perform(self) -> dict[str, Any]:
-        """Return the prediction for the reply."""
+        """Return the plan and the largest possible amplitude as a dictionary for JSON."""
         profile = with_specimen(self.profile, self.specimen)
         profile = with_tip_slope(profile, self.tip_slope_rad)
         excitation = excitation_for(profile, self.excitation, self.parameters, self.start_rad)
@@ -89,16 +93,16 @@ class PredictionJob:
 
 @dataclass(frozen=True, slots=True)
 class CheckJob:
-    """Check of a rig whose devices the daemon owns, by `rigd.checks.check_without_devices`."""
+    """Job that checks a rig by `rigd.checks.check_without_devices`, while the daemon uses it."""
 
     during_sessions: ClassVar[bool] = True
     profile: Profile
-    """Rig to check."""
+    """Profile of the rig."""
     calibration: Mapping[str, Any] | None
-    """Calibration that the connected sensor reported; None: the devices are not connected."""
+    """Calibration that the connected sensor reported, or None if it is not connected."""
 
     def perform(self) -> dict[str, Any]:
-        """Return the rows and the verdict for the reply."""
+        """Return the results of all checks and the verdict as a dictionary for JSON."""
         from rigd.checks import check_without_devices
         from rigd.checks.rows import overall
 
@@ -119,28 +123,33 @@ class CheckJob:
 
 @dataclass(frozen=True, slots=True)
 class PlanJob:
-    """Plan of sessions, a `rigd.runner.Series`."""
+    """Job that plans a series of sessions, a `rigd.runner.Series`."""
 
     during_sessions: ClassVar[bool] = False
 
     profile: Profile
-    """Rig of the sessions."""
+    """Profile of the rig."""
     request: StartRequest
     """Request of the client."""
     folder: Path
-    """Folder for the files."""
+    """Folder of the session files."""
     start_rad: float
-    """Angle of the motor from the rig's zero."""
+    """Motor angle at the start, relative to the rig's zero."""
 
     @property
     def is_heavy(self) -> bool:
-        """Whether it may need over a second or much memory, as for a file or a long record."""
+        """Whether the planning may take more than a second or much memory.
+
+        This is assumed for an excitation from a file, and for a long record.
+        """
         values = self.request.parameters.items()
-        long_s = sum(value for name, value in values if name.endswith("_s"))
-        return long_s > _LIGHT_S or any(isinstance(value, Path) for _, value in values)
+        total_duration_s = sum(value for name, value in values if name.endswith("_s"))
+        return total_duration_s > _LIGHT_RECORD_S or any(
+            isinstance(value, Path) for _, value in values
+        )
 
     def perform(self) -> Series:
-        """Return the series, after checking that it may run."""
+        """Return the planned series; raise CommandError if it is refused."""
         request = self.request
         notes = request.notes.as_metadata()
         try:
@@ -165,18 +174,20 @@ class PlanJob:
             raise CommandError("There is not enough memory to plan such a session.") from None
 
 
-async def perform(job: BackgroundJob[Done]) -> Done:
-    """Run a job in its own process and return its result, without blocking the event loop.
+async def perform(job: BackgroundJob[Result]) -> Result:
+    """Perform a job in a process of its own, and return its result.
+
+    The event loop is not blocked meanwhile.
 
     Parameters
     ----------
     job
-        Job to run.
+        Job to perform.
 
     Raises
     ------
     CommandError
-        If it is refused, fails, or takes longer than 50 s.
+        If the job is refused, fails, or takes longer than 50 s.
     """
     try:
         process = await asyncio.create_subprocess_exec(
@@ -189,10 +200,10 @@ async def perform(job: BackgroundJob[Done]) -> Done:
     except OSError as error:
         raise CommandError(f"No process can be started for it ({error.strerror}).") from None
     try:
-        output, _ = await asyncio.wait_for(process.communicate(pickle.dumps(job)), _PATIENCE_S)
+        output, _ = await asyncio.wait_for(process.communicate(pickle.dumps(job)), _JOB_TIMEOUT_S)
         answer = pickle.loads(output)
     except TimeoutError:
-        raise CommandError(f"It takes longer than {_PATIENCE_S:g} s; check CPU load.") from None
+        raise CommandError(f"It takes longer than {_JOB_TIMEOUT_S:g} s; check CPU load.") from None
     except (EOFError, pickle.UnpicklingError):
         raise CommandError(f"Its process ended with exit code {process.returncode}.") from None
     finally:
@@ -201,41 +212,42 @@ async def perform(job: BackgroundJob[Done]) -> Done:
             await process.wait()
     if isinstance(answer, CommandError):
         raise answer
-    done: Done = answer
+    done: Result = answer
     return done
 
 
 def main() -> None:
-    """Run the job from standard input, and write the result or the error to standard output.
+    """Perform the pickled job from standard input, and write the pickled result to standard output.
 
-    Unpickling is safe, because this program writes both ends.
+    An error is written in place of the result. Unpickling is safe, because this program has written
+    the data itself.
     """
     prefer_oom_kill()
-    most_bytes = _memory_limit()
-    resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
+    max_bytes = _memory_limit()
+    resource.setrlimit(resource.RLIMIT_AS, (max_bytes, max_bytes))
     job = pickle.load(sys.stdin.buffer)
     if job.during_sessions:
         os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_PRIORITY)
     try:
-        answer = job.perform()
+        result = job.perform()
     except RigdError as error:
-        answer = CommandError(str(error), wrong_use=error.wrong_use)
+        result = CommandError(str(error), wrong_use=error.wrong_use)
     except MemoryError:
-        answer = CommandError(
+        result = CommandError(
             "There is not enough free memory to predict such a session; shorten it, or close other "
             "programs.",
             wrong_use=True,
         )
-    if isinstance(answer, dict):
-        json.dumps(answer, allow_nan=False)  # raises if the reply is not JSON
-    pickle.dump(answer, sys.stdout.buffer)
+    if isinstance(result, dict):
+        json.dumps(result, allow_nan=False)  # raises if the reply is not JSON
+    pickle.dump(result, sys.stdout.buffer)
 
 
 def _memory_limit(meminfo: Path = Path("/proc/meminfo")) -> int:
-    """Return the limit of a job's address space in bytes."""
+    """Return the maximum address space of a job in bytes, from the memory available now."""
     text = meminfo.read_text()
     available = int(text.partition("MemAvailable:")[2].split()[0]) * 1024
-    return int(min(max(_MEMORY_FRACTION * available, _LEAST_BYTES), _MOST_BYTES))
+    return int(min(max(_MEMORY_FRACTION * available, _MIN_MEMORY_BYTES), _MAX_MEMORY_BYTES))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Client of the daemon: a blocking connection, and a persistent stop."""
+"""Client of the daemon: a blocking connection, and a stop that is repeated until confirmed."""
 
 import json
 import os
@@ -22,19 +22,26 @@ from rigd.runtime.processes import read_process, read_processes, send_signal
 
 Document = dict[str, Any]
 
-_ANSWER_PATIENCE_S = 60.0
-"""Timeout of a reply; reconnecting the devices takes up to half of it."""
-_CONNECT_PATIENCE_S = 5.0
-_CROWD_PATIENCE_S = 10.0
-"""Time of repeated attempts to reach a daemon that has too many clients."""
-_STOP_PATIENCE_S = 10.0
-_STOP_ANSWER_S = 0.5
-_SIGNAL_AFTER_S = 0.3
-_END_PATIENCE_S = 3.0
-"""Time in which the other processes of a dead daemon end by themselves."""
-_PAUSE_S = 0.02
-_POLL_S = 0.1
-_TIME = struct.Struct("@ll")
+_REPLY_TIMEOUT_S = 60.0
+"""Maximum time in seconds for a reply; connecting the devices again takes up to half of it."""
+_CONNECT_TIMEOUT_S = 5.0
+"""Maximum time in seconds to connect to the daemon."""
+_TOO_MANY_CLIENTS_TIMEOUT_S = 10.0
+"""Time in seconds for which a request is repeated if the daemon has too many clients."""
+_STOP_TIMEOUT_S = 10.0
+"""Maximum time in seconds until a daemon must have confirmed a stop."""
+_FIRST_STOP_REPLY_TIMEOUT_S = 0.5
+"""Time in seconds for the reply to the first attempt to stop; it is doubled at each attempt."""
+_STOP_SIGNAL_DELAY_S = 0.3
+"""Time in seconds without confirmation after which the daemon is also stopped by a signal."""
+_PROCESS_END_TIMEOUT_S = 3.0
+"""Time in seconds in which the other processes of a dead daemon end by themselves."""
+_RETRY_PAUSE_S = 0.02
+"""Pause in seconds between two attempts."""
+_STOP_POLL_INTERVAL_S = 0.1
+"""Time in seconds between two checks whether a stop was requested."""
+_TIMEVAL_FORMAT = struct.Struct("@ll")
+"""Format of the kernel's time value: seconds and microseconds."""
 UNKNOWN_STATE = (
     "A session may still be running: check the rig, and press the wired stop (STO) if "
     "anything moves."
@@ -45,34 +52,38 @@ UNKNOWN_STATE = (
 
 
 class DaemonGoneError(FailureError):
-    """The daemon cannot be reached, or is gone; the message is for the operator.
+    """Raised if the daemon cannot be reached, or the connection to it was lost.
 
     Parameters
     ----------
     message
-        Message that needs no further examination.
-    lost
-        Process and user of a daemon whose connection was lost; None: the message is complete.
+        Text for the operator.
+    lost_process
+        Process id and user id of a daemon whose connection was lost, or None if the message is
+        complete without further examination.
     """
 
-    def __init__(self, message: str, lost: tuple[int, int] | None = None) -> None:
+    def __init__(self, message: str, lost_process: tuple[int, int] | None = None) -> None:
         super().__init__(message)
-        self._lost = lost
+        self._lost_process = lost_process
 
     def full_message(self) -> str:
-        """Return the message; for a lost daemon, after up to 3 s, with what still runs."""
-        return str(self) if self._lost is None else describe_remains(*self._lost)
+        """Return the text for the operator.
+
+        If the connection was lost, it states which processes still run, after up to 3 s.
+        """
+        return str(self) if self._lost_process is None else describe_remains(*self._lost_process)
 
 
 class RefusedByDaemonError(RigdError):
-    """The daemon refused a request, or the request failed; the message is the daemon's.
+    """Raised if the daemon refused a request, or the request failed.
 
     Parameters
     ----------
     message
-        Reason that the daemon gives, for the operator.
+        Reason that the daemon states, for the operator.
     wrong_use
-        Whether the request itself must change (exit code 2); otherwise it may succeed later.
+        Whether the request can succeed only if it is changed (exit code 2).
     """
 
     def __init__(self, message: str, *, wrong_use: bool) -> None:
@@ -81,54 +92,56 @@ class RefusedByDaemonError(RigdError):
 
 
 class Client:
-    """A connection to a daemon; leaving its context closes it.
+    """Connection to a daemon, which is closed at the end of its context.
 
     Parameters
     ----------
     path
-        Path of the socket.
+        Path of the daemon's socket.
     connect_s
-        Time to connect: the daemon may be suspended, or overloaded by other clients.
+        Maximum time to connect. The daemon may be suspended, or overloaded by other clients.
     answer_s
-        Time to receive a reply.
+        Maximum time to receive a reply.
 
     Attributes
     ----------
     pid, uid
-        Process and user that listen there, as the kernel reports them.
+        Process id and user id of the daemon, as the kernel reports them.
 
     Raises
     ------
     DaemonGoneError
-        If no process listens there, or the connection is not accepted in time.
+        If no process listens on the socket, or the connection is not accepted in time.
     """
 
     def __init__(
         self,
         path: Path,
-        connect_s: float = _CONNECT_PATIENCE_S,
-        answer_s: float = _ANSWER_PATIENCE_S,
+        connect_s: float = _CONNECT_TIMEOUT_S,
+        answer_s: float = _REPLY_TIMEOUT_S,
     ) -> None:
         self._path = path
-        self._connect_s = connect_s
-        self._answer_s = answer_s
+        self._connect_timeout_s = connect_s
+        self._reply_timeout_s = answer_s
         self._events: deque[Document] = deque()
         self._connect()
 
     def _connect(self) -> None:
-        self._pending = b""
-        self._link = link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        """Connect to the daemon; raise DaemonGoneError if that fails or takes too long."""
+        self._received = b""
+        self._socket = link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            # The kernel's own time-out: with Python's, a full queue is a failure at once.
-            patience = _TIME.pack(*divmod(round(self._connect_s * 1e6), 1_000_000))
-            link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, patience)
+            # The timeout of the kernel is used, because with Python's a full queue fails at once.
+            timeout = _TIMEVAL_FORMAT.pack(*divmod(round(self._connect_timeout_s * 1e6), 1_000_000))
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, timeout)
             link.connect(str(self._path))
             self.pid, self.uid = peer_of(link)
         except BlockingIOError:
             link.close()
             raise DaemonGoneError(
-                f"The daemon on {self._path} takes no connection within {self._connect_s:g} s: "
-                f"it is suspended, or overloaded by other clients. {UNKNOWN_STATE}"
+                f"The daemon on {self._path} takes no connection within "
+                f"{self._connect_timeout_s:g} s: it is suspended, or overloaded by other clients. "
+                f"{UNKNOWN_STATE}"
             ) from None
         except OSError as error:
             link.close()
@@ -148,94 +161,96 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Close the connection; sessions continue."""
-        self._link.close()
+        """Close the connection; a running session continues."""
+        self._socket.close()
 
     def ask(self, command: str, **fields: object) -> Document:
-        """Send a request and return its reply; events that arrive meanwhile are stored.
+        """Send a request to the daemon, and return its reply.
 
-        If the daemon refuses the client because there are too many, the request was not executed,
-        and is repeated.
+        Events that arrive meanwhile are stored for :meth:`event`. If the daemon has too many
+        clients, the request is repeated.
 
         Parameters
         ----------
         command
-            A request of docs/control_socket.md.
+            Name of a request in docs/control_socket.md.
         **fields
-            Its further fields.
+            Further fields of the request.
 
         Returns
         -------
         dict
-            The reply.
+            Reply of the daemon.
 
         Raises
         ------
         RefusedByDaemonError
-            If the reply is a refusal.
+            If the daemon refuses the request.
         DaemonGoneError
-            If there is no reply.
+            If the daemon does not reply.
         """
         return self.ask_unless(lambda: False, command, **fields)
 
     def ask_unless(self, stopped: Callable[[], bool], command: str, **fields: object) -> Document:
-        """Send a request as :meth:`ask` does, and cancel it if a stop is requested.
+        """Send a request like :meth:`ask`, but cancel it if a stop is requested meanwhile.
 
         Parameters
         ----------
         stopped
-            Returns whether a stop is requested; polled until there is a reply.
+            Function that returns whether a stop is requested; called until the reply arrives.
         command
-            A request of docs/control_socket.md that a `stop` cancels.
+            Name of a request in docs/control_socket.md that the request `stop` cancels.
         **fields
-            Its further fields.
+            Further fields of the request.
 
         Returns
         -------
         dict
-            Reply to the request, or to the `stop` that cancelled it (``reply`` says which).
+            Reply to the request, or to the `stop` that cancelled it; ``reply`` states which.
 
         Raises
         ------
         RefusedByDaemonError
-            If the reply is a refusal.
+            If the daemon refuses the request.
         DaemonGoneError
-            If there is none.
+            If the daemon does not reply.
         """
-        deadline_s = time.monotonic() + min(_CROWD_PATIENCE_S, self._answer_s)
+        deadline_s = time.monotonic() + min(_TOO_MANY_CLIENTS_TIMEOUT_S, self._reply_timeout_s)
         while True:
             try:
                 return self._ask_once(command, fields, stopped)
-            except _CrowdedError:
+            except _TooManyClientsError:
                 if time.monotonic() > deadline_s:
                     raise
-                time.sleep(_PAUSE_S)
+                time.sleep(_RETRY_PAUSE_S)
                 self.close()
                 self._connect()
 
     def _ask_once(
         self, command: str, fields: dict[str, object], stopped: Callable[[], bool]
     ) -> Document:
+        """Send a request once, and return its reply, or that to a stop sent after it."""
         self.send(command, **fields)
-        stopping = False
-        deadline_s = time.monotonic() + self._answer_s
-        while (left_s := deadline_s - time.monotonic()) > 0.0:
-            if stopped() and not stopping:
-                # On this connection: on another one the stop might be executed before the request.
+        is_stop_sent = False
+        deadline_s = time.monotonic() + self._reply_timeout_s
+        while (remaining_s := deadline_s - time.monotonic()) > 0.0:
+            if stopped() and not is_stop_sent:
+                # It is sent on the same connection, because on another connection the stop might be
+                # executed before the request.
                 self.send("stop")
-                stopping = True
-                deadline_s = min(deadline_s, time.monotonic() + _STOP_PATIENCE_S)
-            message = self._next(min(left_s, _POLL_S))
+                is_stop_sent = True
+                deadline_s = min(deadline_s, time.monotonic() + _STOP_TIMEOUT_S)
+            message = self._next_message(min(remaining_s, _STOP_POLL_INTERVAL_S))
             if message is None:
                 continue
             if "event" in message:
                 self._events.append(message)
             elif not message.get("ok"):
-                raise _refusal(message)
+                raise _refusal_error(message)
             else:
                 return message
         raise DaemonGoneError(
-            f"The daemon (process {self.pid}) does not answer within {self._answer_s:g} s. "
+            f"The daemon (process {self.pid}) does not answer within {self._reply_timeout_s:g} s. "
             f"{UNKNOWN_STATE}"
         )
 
@@ -245,48 +260,49 @@ class Client:
         Parameters
         ----------
         command
-            A request of docs/control_socket.md.
+            Name of a request in docs/control_socket.md.
         **fields
-            Its further fields.
+            Further fields of the request.
 
         Raises
         ------
         DaemonGoneError
-            If it cannot be sent.
+            If the request cannot be sent.
         """
         line = json.dumps({"command": command, **fields}).encode() + b"\n"
         try:
-            self._link.settimeout(_ANSWER_PATIENCE_S)
-            self._link.sendall(line)
+            self._socket.settimeout(_REPLY_TIMEOUT_S)
+            self._socket.sendall(line)
         except OSError:
-            # The daemon may have sent the reason before it closed.
+            # The daemon may have sent the reason before it closed the connection.
             self._raise_refusal()
-            raise self._gone() from None
+            raise self._connection_lost_error() from None
 
     def event(self, timeout_s: float) -> Document | None:
-        """Return the next event (or reply), or None if none comes in time.
+        """Return the next event or reply of the daemon, or None if none arrives in time.
 
         Raises
         ------
         DaemonGoneError
-            If the daemon is gone.
+            If the connection was lost.
         """
-        return self._events.popleft() if self._events else self._next(timeout_s)
+        return self._events.popleft() if self._events else self._next_message(timeout_s)
 
-    def _next(self, timeout_s: float) -> Document | None:
+    def _next_message(self, timeout_s: float) -> Document | None:
+        """Return the next message from the socket, or None if none arrives in time."""
         deadline_s = time.monotonic() + timeout_s
-        while b"\n" not in self._pending:
-            self._link.settimeout(max(1e-3, deadline_s - time.monotonic()))
+        while b"\n" not in self._received:
+            self._socket.settimeout(max(1e-3, deadline_s - time.monotonic()))
             try:
-                data = self._link.recv(65_536)
+                data = self._socket.recv(65_536)
             except TimeoutError:
                 return None
             except OSError:
                 data = b""
             if not data:
-                raise self._gone()
-            self._pending += data
-        line, self._pending = self._pending.split(b"\n", 1)
+                raise self._connection_lost_error()
+            self._received += data
+        line, self._received = self._received.split(b"\n", 1)
         try:
             message = json.loads(line)
         except ValueError:
@@ -296,77 +312,81 @@ class Client:
         return message
 
     def _raise_refusal(self) -> None:
+        """Raise the daemon's refusal if it has sent one before it closed the connection."""
         try:
-            while (message := self._next(0.1)) is not None:
+            while (message := self._next_message(0.1)) is not None:
                 if "error" in message:
-                    raise _refusal(message)
+                    raise _refusal_error(message)
         except DaemonGoneError:
             return
 
-    def _gone(self) -> DaemonGoneError:
+    def _connection_lost_error(self) -> DaemonGoneError:
+        """Return the error for a lost connection."""
         return DaemonGoneError(
             f"The connection to the daemon (process {self.pid}) is lost.", (self.pid, self.uid)
         )
 
 
-class _CrowdedError(RefusedByDaemonError):
-    """The daemon did not execute the request, because there were too many clients."""
+class _TooManyClientsError(RefusedByDaemonError):
+    """Raised if the daemon did not execute a request because it has too many clients."""
 
 
-def _refusal(message: Document) -> RefusedByDaemonError:
-    kind = _CrowdedError if message.get("crowded") else RefusedByDaemonError
-    return kind(str(message.get("error", message)), wrong_use=bool(message.get("wrong_use")))
+def _refusal_error(message: Document) -> RefusedByDaemonError:
+    """Return the error that a reply of the daemon reports."""
+    error_class = _TooManyClientsError if message.get("crowded") else RefusedByDaemonError
+    return error_class(str(message.get("error", message)), wrong_use=bool(message.get("wrong_use")))
 
 
 # Stop
 
 
 def stop_session(path: Path) -> Document:
-    """Stop the session of a daemon: repeat the request, then send its process a signal.
+    """Request a daemon to stop its session until it confirms, and also by a signal if it is slow.
 
     Parameters
     ----------
     path
-        Path of its socket.
+        Path of the daemon's socket.
 
     Returns
     -------
     dict
-        The reply, with ``signalled``: whether the signal was sent before, so that the session may
-        have ended before the reply; and ``peer``: process and user that replied.
+        Reply of the daemon with two more keys. ``signalled`` states whether the signal was sent, so
+        that the session may have ended before the reply. ``peer`` is the process id and the user id
+        of the process that replied.
 
     Raises
     ------
     RefusedByDaemonError
-        If it refuses.
+        If the daemon refuses the request.
     DaemonGoneError
-        If it has not confirmed the stop for 10 s; the message states what was done and found.
+        If the daemon does not confirm the stop within 10 s. The message states what was done.
     """
     began_s = time.monotonic()
-    seen: tuple[int, int] | None = None
+    peer: tuple[int, int] | None = None
     signalled = False
-    answer_s = _STOP_ANSWER_S
+    reply_timeout_s = _FIRST_STOP_REPLY_TIMEOUT_S
     while True:
         try:
-            with Client(path, answer_s, answer_s) as client:
-                seen = client.pid, client.uid
-                return client.ask("stop") | {"signalled": signalled, "peer": seen}
-        except (DaemonGoneError, _CrowdedError) as error:
+            with Client(path, reply_timeout_s, reply_timeout_s) as client:
+                peer = client.pid, client.uid
+                return client.ask("stop") | {"signalled": signalled, "peer": peer}
+        except (DaemonGoneError, _TooManyClientsError) as error:
             failure = str(error)
         waited_s = time.monotonic() - began_s
-        if seen is not None and not signalled and waited_s > _SIGNAL_AFTER_S:
-            signalled = _signal_stop(seen[0])
-        if waited_s > _STOP_PATIENCE_S or not path.exists():
+        if peer is not None and not signalled and waited_s > _STOP_SIGNAL_DELAY_S:
+            signalled = _signal_stop(peer[0])
+        if waited_s > _STOP_TIMEOUT_S or not path.exists():
             break
-        # A daemon that is starved of processor time obeys, and answers late.
-        answer_s = min(2.0 * answer_s, _STOP_PATIENCE_S)
-        time.sleep(_PAUSE_S)
-    if seen is None:
+        # A daemon that lacks processor time stops its session, but replies late.
+        reply_timeout_s = min(2.0 * reply_timeout_s, _STOP_TIMEOUT_S)
+        time.sleep(_RETRY_PAUSE_S)
+    if peer is None:
         raise DaemonGoneError(failure)
     if not signalled:
-        raise DaemonGoneError(failure, seen)
+        raise DaemonGoneError(failure, peer)
     raise DaemonGoneError(
-        f"The daemon (process {seen[0]}) was sent {STOP_SIGNAL.name}, which asks it to stop, and "
+        f"The daemon (process {peer[0]}) was sent {STOP_SIGNAL.name}, which asks it to stop, and "
         f"has not replied for {waited_s:.0f} s. {UNKNOWN_STATE}"
     )
 
@@ -374,21 +394,22 @@ def stop_session(path: Path) -> Document:
 def await_end(
     path: Path, patience_s: float, peer: tuple[int, int] | None = None
 ) -> Document | None:
-    """Wait until a daemon reports that no session runs.
+    """Wait until a daemon reports that no session is running, and return its status.
 
     Parameters
     ----------
     path
-        Socket of the daemon.
+        Path of the daemon's socket.
     patience_s
-        Longest wait.
+        Maximum time to wait.
     peer
-        Process and user that must reply; None: any.
+        Process id and user id of the daemon that must reply, or None for any.
 
     Returns
     -------
     dict or None
-        Final status; None if the session has not ended in time, or too many clients block this one.
+        Status of the daemon, or None if the session has not ended in time, or the daemon has too
+        many clients.
 
     Raises
     ------
@@ -402,10 +423,10 @@ def await_end(
         while True:
             try:
                 status = client.ask("status")
-            except _CrowdedError:
+            except _TooManyClientsError:
                 return None
             series = status["series"]
-            # A stop during planning takes effect after it, before the session begins.
+            # A stop during planning takes effect after the planning, before the session begins.
             if status["state"] not in ("running", "stopping") and (
                 series is None
                 or not series["running"]
@@ -414,45 +435,47 @@ def await_end(
                 return status
             if time.monotonic() > deadline_s:
                 return None
-            time.sleep(_PAUSE_S)
+            time.sleep(_RETRY_PAUSE_S)
 
 
 def describe_remains(pid: int, uid: int) -> str:
-    """Return which processes of an unresponsive daemon still run, after some seconds.
+    """Return text that states which processes of a lost daemon still run, with the remedy.
+
+    The processes have some seconds to end before the text is made.
 
     Parameters
     ----------
     pid, uid
         Process id and user id of the daemon.
     """
-    deadline_s = time.monotonic() + _END_PATIENCE_S
+    deadline_s = time.monotonic() + _PROCESS_END_TIMEOUT_S
     while True:
-        daemon, control = _is_there(pid), _control_processes(pid)
-        if not (daemon or control) or time.monotonic() > deadline_s:
+        is_daemon_running, control_processes = _is_process_running(pid), _control_processes(pid)
+        if not (is_daemon_running or control_processes) or time.monotonic() > deadline_s:
             break
-        time.sleep(_PAUSE_S)
-    if daemon:
+        time.sleep(_RETRY_PAUSE_S)
+    if is_daemon_running:
         return (
             f"The connection to the daemon (process {pid}) is lost, though it runs; see rigd "
             f"status. {UNKNOWN_STATE}"
         )
-    begin_again = "see the daemon's log for the cause, and start it again with rigd serve."
-    if control:
+    restart_advice = "see the daemon's log for the cause, and start it again with rigd serve."
+    if control_processes:
         return (
-            f"The daemon is gone (process {pid}), and its control process {control[0]} still runs "
-            "and may move the motor: press the wired stop (STO). Then " + begin_again
+            f"The daemon is gone (process {pid}), and its control process {control_processes[0]} "
+            "still runs and may move the motor: press the wired stop (STO). Then " + restart_advice
         )
     if uid != os.getuid() and not _sees_other_users():
-        return f"The daemon is gone (process {pid}). {UNKNOWN_STATE} Then {begin_again}"
+        return f"The daemon is gone (process {pid}). {UNKNOWN_STATE} Then {restart_advice}"
     return (
         "The daemon is gone. Its control process, which alone moves the motor, has ended too: "
         "check that the rig is at rest. What was recorded of a session is in the daemon's output "
-        f"folder; {begin_again}"
+        f"folder; {restart_advice}"
     )
 
 
-def _is_there(pid: int) -> bool:
-    """Return whether a process with that id runs, of any user."""
+def _is_process_running(pid: int) -> bool:
+    """Return whether a process of any user with this id is running."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -465,7 +488,7 @@ def _is_there(pid: int) -> bool:
 
 
 def _sees_other_users() -> bool:
-    """Return whether /proc shows the processes of other users (mount option hidepid)."""
+    """Return whether this user sees processes of other users (mount option hidepid of /proc)."""
     try:
         return bool(Path("/proc/1/cmdline").read_bytes())
     except OSError:
@@ -473,7 +496,7 @@ def _sees_other_users() -> bool:
 
 
 def _control_processes(pid: int) -> list[int]:
-    """Return the control processes of a supervisor, whose only argument is its process id."""
+    """Return the process ids of the control processes that a supervisor has started."""
     from rigd.engine import supervisor_of_control
 
     with suppress(OSError):
@@ -486,53 +509,58 @@ def _control_processes(pid: int) -> list[int]:
 
 
 def _signal_stop(pid: int) -> bool:
-    """Send the stop signal to a process that handles it; it would kill others."""
+    """Send the stop signal to a process if it has a handler; return whether it was sent.
+
+    The signal would kill a process without a handler.
+    """
     process = read_process(pid)
     if process is None or not process.handles(STOP_SIGNAL):
         return False
-    born = process.born
-    return born is not None and send_signal(process, born, STOP_SIGNAL)
+    start_time = process.start_ticks
+    return start_time is not None and send_signal(process, start_time, STOP_SIGNAL)
 
 
 # Running daemons
 
 
 def find_views(rig: str | None) -> list[LiveAddress]:
-    """Return the live views of a rig, or of all.
+    """Return the addresses of the live views of a rig, or of all rigs.
 
     Parameters
     ----------
     rig
-        The profile's name; None: of any.
+        Name of the rig's profile, or None for all rigs.
     """
-    own = running_views()
-    views = [view for view in own if rig in (None, view.rig)]
+    own_views = running_views()
+    views = [view for view in own_views if rig in (None, view.rig)]
     if not views:
         # The runtime folder of another user's daemon is not readable.
-        found = (_of_daemon(path) for path in running())
-        views = [view for view in found if view is not None and rig in (None, view.rig)]
+        daemon_views = (_view_of_daemon(path) for path in running())
+        views = [view for view in daemon_views if view is not None and rig in (None, view.rig)]
     return views
 
 
 def daemons() -> dict[str, bool]:
-    """Return the rigs with a daemon, and for each whether the daemon has a live view."""
-    found = (_status(path) for path in running())
+    """Return the rigs with a running daemon: profile name → whether it has a live view."""
+    statuses = (_status_of_daemon(path) for path in running())
     return {
         status["daemon"]["profile"]: status["daemon"]["live"]
-        for status in found
+        for status in statuses
         if status is not None
     }
 
 
-def _of_daemon(path: Path) -> LiveAddress | None:
-    status = _status(path)
+def _view_of_daemon(path: Path) -> LiveAddress | None:
+    """Return the address of a daemon's live view, or None if it has none."""
+    status = _status_of_daemon(path)
     view = None if status is None or status["rig"] is None else status["rig"]["live_view"]
     if view is None:
         return None
     return LiveAddress(**{field.name: view[field.name] for field in fields(LiveAddress)})
 
 
-def _status(path: Path) -> dict[str, Any] | None:
+def _status_of_daemon(path: Path) -> dict[str, Any] | None:
+    """Return the status of the daemon on a socket, or None if it does not reply."""
     try:
         with Client(path) as client:
             return client.ask("status")

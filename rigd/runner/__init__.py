@@ -1,12 +1,12 @@
-"""The supervisor: plans sessions and starts, watches and ends the processes of a rig.
+"""The supervisor, which plans sessions, and starts, monitors and ends the processes of a rig.
 
 The package offers the process group (`ProcessGroup`), the rig (`Rig`), series of sessions
-(`Series`), sessions in the foreground (`run_in_foreground`) and their text on a terminal
+(`Series`), the sessions of `rigd run` (`run_in_foreground`) and their text on a terminal
 (`plan_lines`, `ProgressLine`, `result_line`). The public modules are the prediction of a session
-(`planning`), its request and its file (`request`), one session and its result (`session`), the
-quick looks after a session (`quick_looks`), and the status and signals of a running session
-(`status`, `signal_blocks`). The supervisor moves nothing itself. `session` detects a dead or hung
-process and requests a stop from the control process, which switches the torque off
+(`planning`), the preparation of a session and its file (`request`), the supervision of one session
+(`session`), the quick looks after a session (`quick_looks`), and the status and signals of a
+running session (`status`, `signal_blocks`). The supervisor moves nothing itself. `session` detects
+a dead or hung process and requests a stop from the control process, which switches the torque off
 (`rigd.engine.control_process`).
 """
 

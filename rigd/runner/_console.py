@@ -1,4 +1,4 @@
-"""Text of sessions on a terminal: plan, progress and result.
+"""Text on a terminal for a session: plan, progress and result.
 
 `rigd run` and `rigd start` show the same text. Plans and results are JSON documents, because
 `rigd start` receives them from the daemon.
@@ -14,20 +14,20 @@ from rigd.engine.shared_state import Phase
 from rigd.printable import counts_text, progress_bar
 from rigd.session.touches import touch_line
 
-_REDRAWN_S: Final = 0.05
-"""Shortest time between two updates of the line; each costs 2 ms of processor time."""
-_PATIENCE_S: Final = 2.0
-"""Longest wait for a suspended terminal at the end of a session."""
+_MIN_REDRAW_INTERVAL_S: Final = 0.05
+"""Minimum time in seconds between two updates of the line, which take 2 ms of processor time."""
+_CLOSE_TIMEOUT_S: Final = 2.0
+"""Maximum time in seconds to wait for a suspended terminal at the end of a session."""
 
 
 def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
-    """Return the lines that describe the predicted session.
+    """Yield the lines of text that describe the plan of a session.
 
     Parameters
     ----------
     plan
-        The plan as in the reply to ``start``. An older daemon omits some keys; an error here would
-        leave its session without Ctrl-C.
+        Plan as in the daemon's reply to ``start``. An older daemon omits some keys. They must not
+        raise an error here, because then Ctrl-C would no longer stop the session.
     """
     limits = plan.get("limits", {})
 
@@ -35,17 +35,17 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
         limit = f" (limit {limits[name]:g})" if name in limits else ""
         return f"{plan[f'peak_{name}']:.3g} {unit}{limit}"
 
-    what = f"{plan['excitation']} on {plan['profile']}, " if "profile" in plan else ""
+    subject = f"{plan['excitation']} on {plan['profile']}, " if "profile" in plan else ""
     sweep = f"{plan['sweep']}, " if plan.get("sweep") else ""
     at_most = "at most " if plan.get("ends_itself") else ""
-    yield f"{what}{sweep}record of {at_most}{plan['record_s']:g} s."
+    yield f"{subject}{sweep}record of {at_most}{plan['record_s']:g} s."
     yield (
         f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
         f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
     )
-    for words in ("specimen_in_words", "tip_in_words"):
-        if plan.get(words):
-            yield plan[words]
+    for key in ("specimen_in_words", "tip_in_words"):
+        if plan.get(key):
+            yield plan[key]
     for warning in plan["warnings"]:
         yield f"Warning: {warning}"
 
@@ -56,7 +56,7 @@ def result_line(session: Mapping[str, Any]) -> str:
     Parameters
     ----------
     session
-        The result as :meth:`rigd.runner.session.RunResult.as_dict` returns it.
+        Result of the session, from :meth:`rigd.runner.session.RunResult.as_dict`.
     """
     outcome = session["outcome"].capitalize()
     reason = f" {session['reason']}" if session["reason"] else ""
@@ -69,10 +69,10 @@ def result_line(session: Mapping[str, Any]) -> str:
 
 
 class ProgressLine:
-    """Progress line on standard error, with messages above it.
+    """Progress line of a session on standard error, with messages above it.
 
-    A separate thread writes the line: a suspended terminal (Ctrl-S) or a pipe without a reader must
-    not block the supervisor.
+    A separate thread writes the line, because a suspended terminal (Ctrl-S) or a pipe without a
+    reader must not block the supervisor.
     """
 
     def __init__(self) -> None:
@@ -83,69 +83,72 @@ class ProgressLine:
         self._lock = threading.Lock()
         self._state: dict[str, Any] = {}
         self._messages: list[str] = []
-        self._closed = False
-        self._recorded = False
-        self._changed = threading.Event()
-        self._due_s = 0.0
-        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._is_closed = False
+        self._has_record_begun = False
+        self._has_changed = threading.Event()
+        self._next_redraw_s = 0.0
+        self._thread = threading.Thread(target=self._write_until_closed, daemon=True)
         self._thread.start()
 
     def update(
         self, phase: Phase, tick: int, total: int, *, missed: int, late: int, number: str = ""
     ) -> None:
-        """Update the progress of the session.
+        """Show the present progress of the session.
 
         Parameters
         ----------
         phase
             Phase of the control process.
         tick, total
-            Number of ticks scheduled so far, and total number of ticks of the record.
+            Number of ticks that were due so far, and total number of ticks of the record.
         missed, late
-            Number of missed ticks and of late ticks so far. Both are shown once a tick is missed.
+            Number of missed ticks and of late ticks so far. They are shown only if a tick was
+            missed.
         number
             Number of the session in its series, such as ``2/5``; empty for a single session.
         """
-        # Before tick 0 the count is that of the previous session.
-        self._recorded |= phase is Phase.RUNNING
+        # Before tick 0 the counter still has the value of the previous session.
+        self._has_record_begun |= phase is Phase.RUNNING
         self._state = {
             "description": f"{phase.words} {number}".rstrip(),
-            "completed": tick if self._recorded else 0,
+            "completed": tick if self._has_record_begun else 0,
             "total": total,
             "counts": f"{missed} missed, {late} late" if missed else "",
         }
         now_s = time.monotonic()
-        if now_s >= self._due_s:
-            self._due_s = now_s + _REDRAWN_S
-            self._changed.set()
+        if now_s >= self._next_redraw_s:
+            self._next_redraw_s = now_s + _MIN_REDRAW_INTERVAL_S
+            self._has_changed.set()
 
     def say(self, message: str) -> None:
-        """Write a message above the line."""
+        """Write a message for the operator above the progress line."""
         with self._lock:
             self._messages.append(message)
-        self._changed.set()
+        self._has_changed.set()
 
     def close(self) -> None:
-        """Remove the line after all messages are written, or after a timeout."""
-        self._closed = True
-        self._changed.set()
-        self._thread.join(_PATIENCE_S)
+        """Remove the progress line after all messages are written, or after a timeout."""
+        self._is_closed = True
+        self._has_changed.set()
+        self._thread.join(_CLOSE_TIMEOUT_S)
 
-    def _work(self) -> None:
+    def _write_until_closed(self) -> None:
+        """Write the line and the messages until the line is closed; run in a thread."""
         closed = False
         while not closed:
-            self._changed.wait()
-            self._changed.clear()
-            closed = self._closed  # read first, so that all earlier messages are still written
+            self._has_changed.wait()
+            self._has_changed.clear()
+            closed = self._is_closed  # read first, so that all earlier messages are still written
             with self._lock:
                 messages, self._messages = self._messages, []
-            with contextlib.suppress(OSError):  # the terminal is gone; the session is not
-                self._show(messages)
+            with contextlib.suppress(OSError):  # the session continues without a terminal
+                self._write_messages(messages)
         if self._progress.live.is_started:  # otherwise stopping only prints an empty line
             with contextlib.suppress(OSError):
                 self._progress.stop()
 
-    def _show(self, messages: list[str]) -> None:
+    def _write_messages(self, messages: list[str]) -> None:
+        """Write messages, and redraw the progress line below them."""
         for message in messages:
             self._progress.console.print(message, markup=False, highlight=False, soft_wrap=True)
         if self._state:

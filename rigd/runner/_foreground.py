@@ -1,4 +1,4 @@
-"""Sessions in the foreground: plan them, show their progress, and print their results."""
+"""Sessions of `rigd run`: plan them, show their progress, and print their results."""
 
 import contextlib
 import time
@@ -25,30 +25,31 @@ from rigd.runner.request import load_rig, remaining_file_text
 from rigd.runner.session import RunResult, SessionFailedError, SessionProgress
 from rigd.runtime import RigLock, StopRequest
 
-_QUICK_LOOK_PATIENCE_S: Final = 10.0
-"""Longest run time of the last quick look after the end, without the time in which other programs
-use the processor."""
-_LONGEST_QUICK_LOOK_S: Final = 120.0
-"""Longest total wait for it."""
+_QUICK_LOOK_MAX_RUN_TIME_S: Final = 10.0
+"""Maximum run time in seconds of the last quick look after the sessions. Time in which it waits for
+the processor does not count."""
+_QUICK_LOOK_MAX_WAIT_S: Final = 120.0
+"""Maximum time in seconds to wait for the last quick look, with waits for the processor."""
 _POLL_S: Final = 0.05
 
-_Print = Callable[[str], None]
+_PrintLine = Callable[[str], None]
+"""Function that prints a line for the operator."""
 
 
 class SeriesFailedError(FailureError):
-    """A session of a series could not be run, or failed.
+    """Raised if a session of a series could not be run, or failed.
 
     Parameters
     ----------
     message
-        Reason, for the operator.
+        Reason for the operator.
     results
         Results of the earlier sessions, and of the failed session if it had begun.
 
     Attributes
     ----------
     results
-        The same results as a list.
+        List of these results.
     """
 
     def __init__(self, message: str, results: Sequence[RunResult] = ()) -> None:
@@ -80,14 +81,14 @@ def run_in_foreground(
     identifies_motor: bool = False,
     tip_slope_rad: float | None = None,
 ) -> list[RunResult]:
-    """Run `repeat` sessions; end at a stop or at the first incomplete session.
+    """Run a series of sessions until a stop or the first incomplete session; return the results.
 
     Parameters
     ----------
     build
-        Returns the excitation for a profile.
+        Function that returns the excitation for a profile.
     group
-        The started processes. They are ended when this function returns.
+        Started processes of the rig. They are ended when this function returns.
     stop
         Stop request of the operator.
     profile_name
@@ -95,34 +96,34 @@ def run_in_foreground(
     folder
         Folder of the session files; created if it does not exist.
     repeat, seed, notes, fast, live, force, accept, hardware
-        As on the command line. The sessions of a series use one connection. Each session waits
+        Options of the command line. The sessions of a series use one connection. Each session waits
         until the beam is at rest.
     quiet_stdout
-        Print all text on standard error, because standard output is reserved for a document.
+        Print all text to standard error, because standard output is reserved for a JSON document.
     quick_look
         Make a quick look at each session, and wait some seconds for the last one.
     from_angle
-        The excitation depends on the motor angle. The rig is connected first, and `build` receives
-        the angle as ``start_rad``.
+        Whether the excitation depends on the motor angle. The rig is then connected first, and
+        `build` receives the angle as ``start_rad``.
     prepare
-        Returns a modified profile, applied before planning.
+        Function that returns a modified profile before the sessions are planned.
     obstacles
         Obstacles of a simulated beam, as on the command line.
     watch_fit
-        Fit each record while it is recorded, and print the fits.
+        Fit each record repeatedly during the session, and print the estimates.
     identifies_motor
         See :class:`rigd.runner._series.Series`.
     tip_slope_rad
-        Largest tip slope of an identification; None: the limit of the profile.
+        Maximum tip slope of an identification, or None for the limit of the profile.
 
     Raises
     ------
     UserError
-        If a session is refused before the first one is run.
+        If a session is refused before the first session is run.
     SeriesFailedError
         If a session cannot be run, or failed.
     """
-    write: _Print = partial(_print, err=quiet_stdout)
+    write: _PrintLine = partial(_print, err=quiet_stdout)
     results: list[RunResult] = []
 
     def report(quick_look: QuickLook) -> None:
@@ -132,9 +133,9 @@ def run_in_foreground(
 
     quick_looks = QuickLooks(report) if quick_look else None
     try:
-        # The rig is released last, when no process uses the devices any more.
-        with contextlib.ExitStack() as reserved, group:
-            profile, moving = load_rig(
+        # The lock of the rig is released last, when no process uses the devices any more.
+        with contextlib.ExitStack() as locks, group:
+            profile, target = load_rig(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
             )
             specimen = notes.get("specimen", "")
@@ -142,20 +143,22 @@ def run_in_foreground(
             if prepare is not None:
                 profile = prepare(profile)
             profile = with_tip_slope(profile, tip_slope_rad)
-            mounted = with_specimen(profile, specimen)
-            _print(describe_actuation_target(profile.rig, moving), err=True)
+            specimen_profile = with_specimen(profile, specimen)
+            _print(describe_actuation_target(profile.rig, target), err=True)
             for difference in simulated_differently(profile.rig):
                 write(f"Warning: the simulated rig has {difference}.")
-            alone = not (fast and moving is ActuationTarget.SIMULATED)
-            shared = moving is ActuationTarget.HARDWARE
-            reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
+            is_exclusive = not (fast and target is ActuationTarget.SIMULATED)
+            is_hardware = target is ActuationTarget.HARDWARE
+            locks.enter_context(
+                RigLock(profile.name, "rigd run", hardware=is_hardware, alone=is_exclusive)
+            )
             rig = Rig(profile, fast=fast, group=group)
             if from_angle and not stop.requested:
-                rig.connect(moving)
+                rig.connect(target)
                 build = partial(build, start_rad=rig.angle_rad)
             series = Series(
-                mounted,
-                build(mounted),
+                specimen_profile,
+                build(specimen_profile),
                 folder,
                 repeat=repeat,
                 notes=notes,
@@ -168,8 +171,8 @@ def run_in_foreground(
             for line in plan_lines(series.plan_document()):
                 write(line)
             if not (stop.requested or rig.connected):
-                rig.connect(moving)
-            with _Operator(series.ticks, repeat, write) as operator:
+                rig.connect(target)
+            with _TerminalProgress(series.ticks, repeat, write) as operator:
                 series.run(rig, stop, operator, live=live, quick_looks=quick_looks)
         if stop.requested:
             _print_stop(results, repeat)
@@ -189,16 +192,16 @@ def run_in_foreground(
     return results
 
 
-class _Operator:
-    """Print the progress and the results of a series of sessions."""
+class _TerminalProgress:
+    """Prints the progress and the results of a series of sessions to the terminal."""
 
-    def __init__(self, ticks: int, repeat: int, write: _Print) -> None:
+    def __init__(self, ticks: int, repeat: int, write: _PrintLine) -> None:
         self._ticks = ticks
         self._repeat = repeat
         self._print = write
-        self._line: ProgressLine | None = None
+        self._progress_line: ProgressLine | None = None
         self._number = ""
-        self._where = ""
+        self._last_view_text = ""
 
     def __enter__(self) -> Self:
         return self
@@ -206,26 +209,26 @@ class _Operator:
     def __exit__(self, *_: object) -> None:
         self._close()
 
-    def begins(self, number: int, path: Path) -> None:  # noqa: ARG002 - printed when it exists
+    def on_start(self, number: int, path: Path) -> None:  # noqa: ARG002 - printed when it exists
         self._number = f"{number}/{self._repeat}" if self._repeat > 1 else ""
-        self._line = ProgressLine()
+        self._progress_line = ProgressLine()
 
-    def says(self, level: str, text: str) -> None:
+    def on_message(self, level: str, text: str) -> None:
         self._print(f"Warning: {text}" if level == "warning" else text)
 
-    def shown(self, where: str) -> None:
-        if where != self._where:
-            self._print(where)
-            self._where = where
+    def on_live_view(self, view_text: str) -> None:
+        if view_text != self._last_view_text:
+            self._print(view_text)
+            self._last_view_text = view_text
 
-    def update(self, progress: SessionProgress, events: list[LogEvent]) -> None:
-        assert self._line is not None
+    def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
+        assert self._progress_line is not None
         for event in events:
             if event.level in ("warning", "error", "fatal"):
-                self._line.say(f"{event.level.capitalize()}: {event.message}")
+                self._progress_line.say(f"{event.level.capitalize()}: {event.message}")
             elif event.notable:
-                self._line.say(event.message)
-        self._line.update(
+                self._progress_line.say(event.message)
+        self._progress_line.update(
             progress.phase,
             progress.tick,
             self._ticks,
@@ -234,7 +237,7 @@ class _Operator:
             number=self._number,
         )
 
-    def ended(self, result: RunResult, *, look_follows: bool) -> None:  # noqa: ARG002
+    def on_result(self, result: RunResult, *, look_follows: bool) -> None:  # noqa: ARG002
         self._close()
         self._print(result_line(result.as_dict()))
         if result.path is not None:
@@ -243,56 +246,62 @@ class _Operator:
             self._print(str(result.path))
 
     def _close(self) -> None:
-        if self._line is not None:
-            self._line.close()
-            self._line = None
+        if self._progress_line is not None:
+            self._progress_line.close()
+            self._progress_line = None
 
 
 def _print(text: str, *, err: bool) -> None:
-    with contextlib.suppress(OSError):  # the terminal is gone; the session is not
+    """Print a line to standard output or, if `err` is True, to standard error."""
+    with contextlib.suppress(OSError):  # the session continues without a terminal
         typer.echo(text, err=err)
 
 
 def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
-    """Wait for the last quick looks; another Ctrl-C skips them."""
-    stop.sessions_are_over()
-    before, skipped = stop.requested, False
+    """Wait for the last quick looks to be completed, up to a time limit or another Ctrl-C."""
+    stop.ignore_stop_signal()
+    was_stopped, is_skipped = stop.requested, False
 
     def skip() -> None:
-        nonlocal skipped
-        skipped = True
+        nonlocal is_skipped
+        is_skipped = True
 
     stop.on_request = skip
     quick_looks.poll()
     if quick_looks.busy:
         _print("Quick look at the session; Ctrl-C skips it.", err=True)
-    deadline_s = time.monotonic() + _LONGEST_QUICK_LOOK_S
+    deadline_s = time.monotonic() + _QUICK_LOOK_MAX_WAIT_S
     while (
         quick_looks.busy
-        and not skipped
-        and quick_looks.spent_s < _QUICK_LOOK_PATIENCE_S
+        and not is_skipped
+        and quick_looks.run_time_s < _QUICK_LOOK_MAX_RUN_TIME_S
         and time.monotonic() < deadline_s
     ):
         time.sleep(_POLL_S)
         quick_looks.poll()
-    if quick_looks.busy and not skipped:
-        why = (
+    if quick_looks.busy and not is_skipped:
+        reason = (
             "took too long"
-            if quick_looks.spent_s >= _QUICK_LOOK_PATIENCE_S
+            if quick_looks.run_time_s >= _QUICK_LOOK_MAX_RUN_TIME_S
             else "got no processor time"
         )
         _print(
-            f"The quick look {why} and was skipped: python -m analysis.quick_look FILE makes it.",
+            f"The quick look {reason} and was skipped: python -m analysis.quick_look FILE makes "
+            "it.",
             err=True,
         )
-    stop.requested = before  # this Ctrl-C skipped the quick look only
+    stop.requested = was_stopped  # this Ctrl-C skipped the quick look only
 
 
 def _print_stop(results: Sequence[RunResult], repeat: int) -> None:
-    """Report a stop between two sessions or before the first one; a session reports its own."""
+    """Print that a stop was requested before the first session or between two sessions.
+
+    Nothing is printed if a session itself was stopped, because its result states the stop.
+    """
     if len(results) == repeat or any(not result.went_well for result in results):
         return
-    after = f" after {len(results)} of {repeat} sessions" if results else ""
+    count_text = f" after {len(results)} of {repeat} sessions" if results else ""
     _print(
-        f"Stopped: no record{after}. Stopped by the operator before the session began.", err=True
+        f"Stopped: no record{count_text}. Stopped by the operator before the session began.",
+        err=True,
     )

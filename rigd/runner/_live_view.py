@@ -1,4 +1,4 @@
-"""Live view of a rig: starts the publisher process, watches it, and restarts it if it is lost."""
+"""Live view of a rig: start, supervision and restart of the publisher process."""
 
 import math
 import time
@@ -21,21 +21,22 @@ from rigd.runtime import StopRequest
 from rigd.view import Subject, band_of, sweep_of
 from rigd.view.plots import OF_A_BUS, OF_REAL_TIME
 
-_PATIENCE_S = 10.0
-"""Longest time for which a session waits for the start of the live view."""
-_START_PATIENCE_S = 60.0
-"""Time after which a starting publisher counts as hung, also on a busy computer."""
-_BEGIN_PATIENCE_S = 1.0
-_FIT_BAND_HZ = 50.0
-"""Upper end of the band assumed for an excitation without a band."""
-_MOST_FIT_MODES = 4
-"""Largest number of modes whose fits are plotted; more plots would be too small to read."""
-_MOST_RESTARTS = 3
-"""Largest number of restarts in one session."""
+_ADDRESS_TIMEOUT_S = 10.0
+"""Maximum time in seconds for which a session waits for the start of the live view."""
+_START_TIMEOUT_S = 60.0
+"""Time in seconds without a heartbeat after which a starting publisher counts as hung."""
+_SHOW_TIMEOUT_S = 1.0
+"""Maximum time in seconds for which a session waits until the live view shows it."""
+_DEFAULT_FIT_BAND_HZ = 50.0
+"""Upper frequency in Hz that is assumed for an excitation without start and stop frequencies."""
+_MAX_FIT_MODES = 4
+"""Maximum number of modes whose fits are plotted; more plots would be too small to read."""
+_MAX_RESTARTS = 3
+"""Maximum number of restarts of the publisher in one session."""
 
 
 class LiveView:
-    """Publisher process of a rig; a session continues without it if it is lost."""
+    """Supervisor of the publisher process, without which a session continues if it fails."""
 
     def __init__(self, group: ProcessGroup, rig: str, *, fast: bool = False) -> None:
         self._fast = fast
@@ -45,141 +46,160 @@ class LiveView:
         self._session: LiveSession | None = None
         self._unreported: list[LogEvent] = []
         self._restarts = 0
-        self._lost = ""
-        self._shown = False
+        self._failure = ""
+        self._is_session_shown = False
         self._start()
 
     def show(self, order: Order, stop: StopRequest) -> str:
-        """Show the next session; return the address of the view, or why there is none."""
+        """Prepare the view for the next session; return text with its address, or why none."""
         self._restarts = 0
-        if self._lost:  # a new attempt for the new session
+        if self._failure:  # a new attempt for the new session
             self._start()
-        self._await(lambda: self._answered, _PATIENCE_S, stop)
-        begins = tuple(ring.written for ring in self._group.channels.rings)
+        self._process_messages_until(lambda: self._has_address, _ADDRESS_TIMEOUT_S, stop)
+        start_positions = tuple(ring.written for ring in self._group.channels.rings)
         self._session = LiveSession(
-            subject_of(order, fast=self._fast), str(uuid.uuid4()), begins, order.path.parent
+            subject_of(order, fast=self._fast),
+            str(uuid.uuid4()),
+            start_positions,
+            order.path.parent,
         )
-        self._shown = False
+        self._is_session_shown = False
         self._send(self._session)
         # The view then has all samples from the first one; the session does not depend on it.
-        self._await(lambda: self._shown, _BEGIN_PATIENCE_S, stop)
-        if self._lost:
-            return f"No live view: {self._lost} The session continues without it."
+        self._process_messages_until(lambda: self._is_session_shown, _SHOW_TIMEOUT_S, stop)
+        if self._failure:
+            return f"No live view: {self._failure} The session continues without it."
         if self.address is None:
             return "The live view is still starting; open it with rigd live."
         return f"Live view: {self.address.viewer_url}"
 
     def check(self) -> None:
-        """Check whether the publisher is running; restart it if it died or hangs."""
-        if not self._lost:
-            self._listen(0.0)
-        if not self._lost:
-            self._feel_pulse()
+        """Restart the publisher if it has ended or hangs."""
+        if not self._failure:
+            self._process_message_for(0.0)
+        if not self._failure:
+            self._check_heartbeat()
 
     def poll(self) -> list[LogEvent]:
-        """Check the publisher, and return the events for the operator."""
+        """Restart the publisher if necessary, and return new events for the operator."""
         self.check()
         events, self._unreported = self._unreported, []
         return events
 
-    def touched(self, touches: Sequence[Mapping[str, Any]]) -> None:
-        """Show touches of the session, as in JSON documents."""
+    def show_touches(self, touches: Sequence[Mapping[str, Any]]) -> None:
+        """Show estimated touches of the session, given as in JSON documents."""
         if touches and self._session is not None:
             self._send(LiveTouches(tuple(touches)))
 
-    def fitted(self, fits: Sequence[Mapping[str, Any]]) -> None:
-        """Show the latest fit of the record, as in JSON documents."""
+    def show_fits(self, fits: Sequence[Mapping[str, Any]]) -> None:
+        """Show the latest fit of the record, given as in JSON documents."""
         if fits and self._session is not None:
             self._send(LiveFit(fits[-1]))
 
     def finish(self, outcome: str, reason: str) -> None:
-        """Show the end of the current session; its outcome may be unknown."""
+        """Show the end of the current session; an unknown outcome and reason are empty."""
         if self._session is not None:
             self._session = None
-            ends = tuple(ring.written for ring in self._group.channels.rings)
-            self._send(LiveEnd(ends, outcome, reason))
+            end_positions = tuple(ring.written for ring in self._group.channels.rings)
+            self._send(LiveEnd(end_positions, outcome, reason))
 
-    def _await(self, met: Callable[[], bool], patience_s: float, stop: StopRequest) -> None:
-        """Listen until a condition is met, the publisher is lost, or the time is over."""
-        deadline = time.monotonic() + patience_s
-        while not (met() or self._lost or stop.requested) and time.monotonic() < deadline:
-            self._listen(0.1)
+    def _process_messages_until(
+        self, is_condition_met: Callable[[], bool], timeout_s: float, stop: StopRequest
+    ) -> None:
+        """Process messages until a condition is met, the publisher fails, or time has run out."""
+        deadline = time.monotonic() + timeout_s
+        while (
+            not (is_condition_met() or self._failure or stop.requested)
+            and time.monotonic() < deadline
+        ):
+            self._process_message_for(0.1)
 
     def _start(self) -> None:
-        """Start a new process."""
-        self._answered = False
-        self._lost = ""
-        self._pulse = Heartbeat()
+        """Start a publisher process, and send it the rig and the current session."""
+        self._has_address = False
+        self._failure = ""
+        self._heartbeat = Heartbeat()
         try:
-            self._group.fresh(LIVE)
+            self._group.idle_process(LIVE)
         except ChildError as error:
-            self._lost, self.address = str(error), None
+            self._failure, self.address = str(error), None
             return
         self._send(self._job)
         if self._session is not None:
             self._send(self._session)
 
     def _send(self, message: object) -> None:
-        if self._lost:
+        """Send a message to the publisher, which is restarted if it has ended."""
+        if self._failure:
             return
         try:
             self._group[LIVE].send(message)
         except ChildError as error:
             self._restart(str(error))
 
-    def _listen(self, patience_s: float) -> None:
+    def _process_message_for(self, timeout_s: float) -> None:
+        """Process a message of the publisher, waiting up to `timeout_s` seconds for it."""
         try:
-            answer = self._group[LIVE].poll(patience_s)
+            message = self._group[LIVE].poll(timeout_s)
         except ChildError as error:
             self._restart(str(error))
         else:
-            if answer is not None:
-                self._understand(answer)
+            if message is not None:
+                self._process_message(message)
 
-    def _understand(self, answer: object) -> None:
-        match answer:
+    def _process_message(self, message: object) -> None:
+        """Process a message of the publisher: its address, its readiness, or its failure."""
+        match message:
             case LiveShown():
-                self._shown = True
+                self._is_session_shown = True
             case LiveAddress():
-                before, self.address = self.address, answer
-                self._answered = True
-                if before is not None and before.viewer_url != answer.viewer_url:
-                    self._note("info", f"Live view: {answer.viewer_url}")
+                previous_address, self.address = self.address, message
+                self._has_address = True
+                if (
+                    previous_address is not None
+                    and previous_address.viewer_url != message.viewer_url
+                ):
+                    self._add_event("info", f"Live view: {message.viewer_url}")
             case _:
-                self._lost = answer.reason if isinstance(answer, Failed) else str(answer)
+                self._failure = message.reason if isinstance(message, Failed) else str(message)
                 self.address = None
                 if self._session is not None:
-                    self._note("warning", f"No live view: {self._lost} The session continues.")
+                    self._add_event(
+                        "warning", f"No live view: {self._failure} The session continues."
+                    )
 
-    def _feel_pulse(self) -> None:
+    def _check_heartbeat(self) -> None:
+        """Restart the publisher if its last heartbeat is too long ago."""
         assert LIVE.hung_after_s is not None
-        patience_s = LIVE.hung_after_s if self._answered else _START_PATIENCE_S
+        timeout_s = LIVE.hung_after_s if self._has_address else _START_TIMEOUT_S
         beat = self._group.channels.shared_state[StateField.LIVE_BEAT]
-        if self._pulse.stalled_for(beat, time.monotonic()) > patience_s:
-            self._restart(f"The live process was killed: no response for {patience_s:g} s.")
+        if self._heartbeat.stalled_for(beat, time.monotonic()) > timeout_s:
+            self._restart(f"The live process was killed: no response for {timeout_s:g} s.")
 
-    def _restart(self, why: str) -> None:
+    def _restart(self, reason: str) -> None:
+        """Replace the publisher by a new one, up to the maximum number of restarts."""
         self._restarts += 1
-        if self._restarts > _MOST_RESTARTS:
-            self._lost, self.address = why, None
-            self._note("warning", f"{why} It is not restarted; the session continues.")
+        if self._restarts > _MAX_RESTARTS:
+            self._failure, self.address = reason, None
+            self._add_event("warning", f"{reason} It is not restarted; the session continues.")
             return
-        self._note("warning", f"{why} It is restarted; the session continues.")
+        self._add_event("warning", f"{reason} It is restarted; the session continues.")
         self._group[LIVE].kill()
         self._start()
 
-    def _note(self, level: Level, message: str) -> None:
+    def _add_event(self, level: Level, message: str) -> None:
+        """Add an event for the operator."""
         self._unreported.append(LogEvent(0, level, message))
 
 
 def subject_of(order: Order, *, fast: bool = False) -> Subject:
-    """Return the data of a session that the live view needs."""
+    """Return the data of a session that the live view shows, such as beam, sweep and limits."""
     rig, excitation = order.profile.rig, order.excitation
-    absent: set[str] = set()
+    absent_plots: set[str] = set()
     if rig.devices.drive == rig.devices.sensor == "sim":
-        absent |= OF_A_BUS
+        absent_plots |= OF_A_BUS
     if fast:
-        absent |= OF_REAL_TIME
+        absent_plots |= OF_REAL_TIME
     return Subject(
         name=order.path.stem,
         rate_hz=rig.rate_hz,
@@ -196,24 +216,32 @@ def subject_of(order: Order, *, fast: bool = False) -> Subject:
         specimen=dict(order.notes).get("specimen", ""),
         limits=gauge_limits(order.profile),
         thermal_time_constant_s=rig.motor.thermal_time_constant_s,
-        absent=frozenset(absent),
+        absent=frozenset(absent_plots),
         fit_modes=_fit_modes(order),
     )
 
 
 def _fit_modes(order: Order) -> int | None:
-    """Return the number of modes whose fits are plotted: those expected in the excited band."""
+    """Return the number of modes whose fits are plotted: those expected in the excited band.
+
+    Returns None if the session makes no fits.
+    """
     excitation = order.excitation
     if excitation.search is None and not order.watch_fit:
         return None
-    ends = (excitation.parameters.get(name, _FIT_BAND_HZ) for name in ("start_hz", "stop_hz"))
-    highest_hz = max(float(end) for end in ends)
-    expected_hz = undamped_frequencies_rad_s(order.profile.rig.beam, _MOST_FIT_MODES) / math.tau
+    sweep_limits = (
+        excitation.parameters.get(name, _DEFAULT_FIT_BAND_HZ) for name in ("start_hz", "stop_hz")
+    )
+    highest_hz = max(float(end) for end in sweep_limits)
+    expected_hz = undamped_frequencies_rad_s(order.profile.rig.beam, _MAX_FIT_MODES) / math.tau
     return max(1, int(np.count_nonzero(expected_hz < highest_hz)))
 
 
 def gauge_limits(profile: Profile) -> dict[str, float]:
-    """Return the limits of the gauges by name; the limit of missed ticks is in percent."""
+    """Return the limit of each gauge of the live view: gauge name → limit in SI units.
+
+    The limit of missed ticks is in percent.
+    """
     limits, motor, sensor = profile.limits, profile.rig.motor, profile.rig.sensor
     axes = ("fx", "fy", "fz", "tx", "ty", "tz")
     return {

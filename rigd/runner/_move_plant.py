@@ -1,4 +1,4 @@
-"""Rig model for the planning of moves: its closed loop, optionally with an identified beam."""
+"""Model of motor, beam and closed loop with which moves are planned."""
 
 import math
 from dataclasses import replace
@@ -22,36 +22,41 @@ from rigd.profile import Profile
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-_MOST_MODES = 6
-"""Number of modes that a move leaves at rest; higher modes are too weak to be observed."""
-_UNSURE = 0.01
-"""Assumed relative uncertainty of the mode frequencies of a profile's beam."""
-_FILTERS = 1.2
-"""Largest reference acceleration over the acceleration of the free motor at peak torque. It exceeds
-1 because the filters of the loop smooth the reference."""
-_SETTLED = 5.0
-"""Settling time of the loop, in time constants."""
-_DRAWS = 4
-"""Number of noise realisations for the predicted vibration after a move."""
+_MAX_MODES = 6
+"""Maximum number of modes whose vibration a move suppresses; higher modes are too weak to show."""
+_DEFAULT_FREQUENCY_UNCERTAINTY = 0.01
+"""Assumed relative uncertainty of the mode frequencies of the profile's beam."""
+_MAX_REFERENCE_ACCELERATION_RATIO = 1.2
+"""Ratio of the largest reference acceleration to the motor's acceleration at peak torque without
+load. It exceeds 1 because the filters of the loop smooth the reference."""
+_SETTLING_TIME_CONSTANTS = 5.0
+"""Settling time of the closed loop as a multiple of its time constant."""
+_NOISE_REALISATIONS = 4
+"""Number of noise realisations from which the vibration after a move is predicted."""
 
 
-def loop_model_with(profile: Profile, found: IdentifiedBeam | None) -> LoopModel:
-    """Return the loop model of a rig with an identified beam and its channel parameters."""
+def loop_model_with(profile: Profile, identified_beam: IdentifiedBeam | None) -> LoopModel:
+    """Return the loop model of a rig with an identified beam, tool inertia and delays.
+
+    If `identified_beam` is None, the model has the values of the profile.
+    """
     model = profile.loop_model()
-    if found is None:
+    if identified_beam is None:
         return model
-    model = with_beam(model, found.loaded_beam)
-    if found.tool_inertia_kg_m2 is not None:
-        model = replace(model, tool_inertia_kg_m2=found.tool_inertia_kg_m2)
-    if found.delay_s is not None:
+    model = with_beam(model, identified_beam.loaded_beam)
+    if identified_beam.tool_inertia_kg_m2 is not None:
+        model = replace(model, tool_inertia_kg_m2=identified_beam.tool_inertia_kg_m2)
+    if identified_beam.delay_s is not None:
         # Only the difference of the two delays is identified, and neither can be negative.
-        angle_s = max(model.angle_delay_s, -found.delay_s)
-        model = replace(model, angle_delay_s=angle_s, torque_delay_s=angle_s + found.delay_s)
+        angle_s = max(model.angle_delay_s, -identified_beam.delay_s)
+        model = replace(
+            model, angle_delay_s=angle_s, torque_delay_s=angle_s + identified_beam.delay_s
+        )
     return model
 
 
 def with_beam(model: LoopModel, loaded: LoadedBeam) -> LoopModel:
-    """Return a loop model with another loaded beam."""
+    """Return a copy of a loop model with another beam, tip mass and root compliance."""
     return replace(
         model,
         beam=loaded.beam,
@@ -66,53 +71,63 @@ def move_plant_of(
     profile: Profile,
     model: LoopModel,
     coupling_limit_nm: float,
-    found: IdentifiedBeam | None = None,
+    identified_beam: IdentifiedBeam | None = None,
 ) -> MovePlant:
-    """Return the rig model for the planning of a move; `found` is None without an analysis."""
-    # The friction compensation (tanh of the speed) is not linear: its maximum is subtracted.
+    """Return the model of motor, beam and closed loop with which a move is planned.
+
+    `identified_beam` is the identified beam, or None for the beam of the profile.
+    """
+    # The friction compensation (tanh of the speed) is not linear, and its maximum is subtracted
+    # from the available torque.
     settings = replace(model.settings, friction_compensation_nm=0.0)
     loop = close_loop(replace(model, settings=settings))
     check_stability(loop)
-    locked, ringing = mode_poles(loop)
+    locked_hub_poles, closed_loop_poles = mode_poles(loop)
     # Torque of a mode for the angle's acceleration: 2 Re(r exp(p t)), r its residue in G(s)/s².
-    per_angle = 2.0 * np.abs(model.loaded_beam.residues(locked))
-    uncertainty = (_UNSURE,) * ringing.size
-    if found is not None:
-        uncertainty = found.pole_uncertainty(ringing.size)
+    torque_per_angle = 2.0 * np.abs(model.loaded_beam.residues(locked_hub_poles))
+    uncertainty = (_DEFAULT_FREQUENCY_UNCERTAINTY,) * closed_loop_poles.size
+    if identified_beam is not None:
+        uncertainty = identified_beam.pole_uncertainty(closed_loop_poles.size)
     motor, rig = profile.control_motor, profile.rig
     disturbances = Disturbances(
         motor.coulomb_nm, rig.encoder.resolution_rad, torque_noise_nm(profile)
     )
-    compensated = replace(loop, model=model)
+    compensated_loop = replace(loop, model=model)
 
-    def disturbed(reference_rad: Real, modes: int) -> tuple[Real, Real]:
+    def respond_disturbed(reference_rad: Real, modes: int) -> tuple[Real, Real]:
         response = simulate_disturbed(
-            compensated, reference_rad, disturbances, modes=modes, draws=_DRAWS
+            compensated_loop, reference_rad, disturbances, modes=modes, draws=_NOISE_REALISATIONS
         )
         return response.angle_rad, response.mode_torque_nm
 
     return MovePlant(
         rate_hz=model.rate_hz,
         respond=loop.simulate,
-        disturbed=disturbed,
-        poles_rad_s=ringing,
-        torque_per_state_nm_s=per_angle * np.abs(loop.response(np.abs(ringing) / (2.0 * math.pi))),
+        disturbed=respond_disturbed,
+        poles_rad_s=closed_loop_poles,
+        torque_per_state_nm_s=torque_per_angle
+        * np.abs(loop.response(np.abs(closed_loop_poles) / (2.0 * math.pi))),
         frequency_uncertainty=np.array(uncertainty),
         torque_noise_nm=disturbances.torque_noise_nm,
-        settling_s=_SETTLED / settings.pole_rad_s,
+        settling_s=_SETTLING_TIME_CONSTANTS / settings.pole_rad_s,
         peak_torque_nm=motor.peak_torque_nm,
         friction_nm=profile.control.friction_compensation_nm,
-        largest_acceleration_rad_s2=_FILTERS * motor.peak_torque_nm / motor.inertia_kg_m2,
+        largest_acceleration_rad_s2=_MAX_REFERENCE_ACCELERATION_RATIO
+        * motor.peak_torque_nm
+        / motor.inertia_kg_m2,
         velocity_rad_s=profile.limits.velocity_rad_s,
         tracking_error_rad=profile.limits.tracking_error_rad,
         coupling_torque_nm=coupling_limit_nm,
         angle_rad=profile.limits.angle_rad,
-        model=found,
+        model=identified_beam,
     )
 
 
 def torque_noise_nm(profile: Profile) -> float:
-    """Return the noise of one torque reading: simulated noise, or the resolution of the sensor."""
+    """Return the standard deviation of the noise of a coupling torque reading, in N·m.
+
+    It is computed from the simulated noise, or from the resolution of a real sensor.
+    """
     rig = profile.rig
     axes = np.array(rig.sensor.resolution)
     if rig.simulation is not None:
@@ -121,14 +136,19 @@ def torque_noise_nm(profile: Profile) -> float:
 
 
 def mode_poles(loop: ClosedLoop) -> tuple[Complex, Complex]:
-    """Return the poles of the beam with locked hub and of the closed loop, in rad/s, (m,) each.
+    """Return the poles of the beam with locked hub, and the closed loop's poles, in rad/s.
 
-    One pole of each pair is returned, for the lowest modes that oscillate below half the Nyquist
-    frequency. While the motor is held, the closed loop vibrates: its poles are near those of the
-    beam with locked hub, and differ from them where the loop damps a mode.
+    The arrays (m,) contain one pole of each conjugate pair, for the lowest modes that oscillate
+    below half the Nyquist frequency. While the motor holds its angle, the beam vibrates with the
+    poles of the closed loop. They are near those of the beam with locked hub, and differ if the
+    loop damps a mode.
     """
     model = loop.model
-    locked = model.loaded_beam.poles(clamped_free_eigenvalues(_MOST_MODES))[:, 0]
-    locked = locked[(locked.imag > 0.0) & (np.abs(locked) < 0.5 * math.pi * model.rate_hz)]
-    closed = [loop.poles_rad_s[np.argmin(np.abs(loop.poles_rad_s - s))] for s in locked]
-    return locked, np.array(closed)
+    locked_hub_poles = model.loaded_beam.poles(clamped_free_eigenvalues(_MAX_MODES))[:, 0]
+    locked_hub_poles = locked_hub_poles[
+        (locked_hub_poles.imag > 0.0) & (np.abs(locked_hub_poles) < 0.5 * math.pi * model.rate_hz)
+    ]
+    closed_loop_poles = [
+        loop.poles_rad_s[np.argmin(np.abs(loop.poles_rad_s - s))] for s in locked_hub_poles
+    ]
+    return locked_hub_poles, np.array(closed_loop_poles)

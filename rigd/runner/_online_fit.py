@@ -1,4 +1,4 @@
-"""Fits of a running session: supervision of the fit process and use of its estimates."""
+"""Fits during a session: supervision of the fit process, and use of its estimates."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +16,12 @@ from rigd.engine.messages import (
 )
 from rigd.engine.processes import FIT, ChildError, Heartbeat
 from rigd.engine.shared_state import LogEvent, StateField, Stop
-from rigd.runner._precision_search import TargetEstimate, in_words, target_estimates, targets_json
+from rigd.runner._precision_search import (
+    TargetEstimate,
+    estimates_text,
+    target_estimates,
+    targets_json,
+)
 from rigd.runner._process_group import await_ready
 
 if TYPE_CHECKING:
@@ -25,24 +30,25 @@ if TYPE_CHECKING:
     from rigd.profile import Profile, RealtimeSettings
     from rigd.runner._process_group import ProcessGroup
 
-_LAST_PATIENCE_S: Final = 60.0
-"""Time for the fit of the whole record, with the torque off; a stop skips it."""
-_STOP_PATIENCE_S: Final = 5.0
+_FINAL_FIT_TIMEOUT_S: Final = 60.0
+"""Maximum time in seconds for the fit of the whole record, while the torque is off."""
+_STOPPED_FIT_TIMEOUT_S: Final = 5.0
+"""Maximum time in seconds for the fit of the whole record after the operator has stopped."""
 _POLL_S: Final = 0.05
 _STORED_KEYS: Final = (
     "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "validity",
     "modes", "parameters",
 )  # fmt: skip
-"""Keys of the last estimate that are stored in the file."""
+"""Keys of the last estimate that are stored in the session file."""
 
 
 class FitSupervisor:
-    """Supervise the fit process of one session and collect its estimates.
+    """Supervisor of the fit process of one session, which collects the estimates.
 
-    A session with a precision search ends with its last segment, when the process reports the end
-    of the search or when the process is lost. `segments` holds the planned segments after the end
-    of the search. `shortcoming` states why the whole record does not have the requested precision,
-    or why this is not known; it is empty if the record has the precision.
+    If the session lasts until a precision is reached, it ends with its last planned segment after
+    the process has reported the end of the search or has failed. `segments` contains the planned
+    segments after that. `unmet_reason` states why the whole record does not have the requested
+    precision, or why this is unknown. It is empty if the record has the precision.
     """
 
     def __init__(
@@ -57,173 +63,193 @@ class FitSupervisor:
         self._shared_state = group.channels.shared_state
         self._search = search
         self._events: list[LogEvent] = []
-        self._news: list[Mapping[str, Any]] = []
-        self._planned: list[Mapping[str, Any]] = []
+        self._new_estimates: list[Mapping[str, Any]] = []
+        self._planned_segments: list[Mapping[str, Any]] = []
         self._last_report: FitReport | None = None
-        self._ended: SearchEnded | None = None
-        self._ready = self._begun = False
-        self._lost = ""
-        self._skipped = ""
-        self._pulse = Heartbeat()
+        self._search_end: SearchEnded | None = None
+        self._is_ready = self._has_begun = False
+        self._failure = ""
+        self._skip_reason = ""
+        self._heartbeat = Heartbeat()
         self.segments: Mapping[str, tuple[int, int]] = {}
-        self.shortcoming = ""
-        first = group.channels.samples.written
-        job = FitJob(group.channels.specs, first, profile, reference, search, realtime)
+        self.unmet_reason = ""
+        first_position = group.channels.samples.written
+        job = FitJob(group.channels.specs, first_position, profile, reference, search, realtime)
         try:
-            group.fresh(FIT).start(job)
+            group.idle_process(FIT).start(job)
         except ChildError as error:
-            self._lose(str(error))
+            self._continue_without_process(str(error))
 
-    def await_ready(self, meanwhile: Callable[[], bool]) -> str:
-        """Wait until the process is ready; return why it is not, else an empty text."""
-        late = await_ready(lambda: self._ready or bool(self._lost), self._listen, meanwhile)
-        if late:
-            self._lose(f"The fit process was {late}.")
-        return self._lost
+    def await_ready(self, call_while_waiting: Callable[[], bool]) -> str:
+        """Wait until the fit process is ready; return why it is not, or an empty text.
+
+        The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
+        """
+        delay_text = await_ready(
+            lambda: self._is_ready or bool(self._failure),
+            self._process_messages,
+            call_while_waiting,
+        )
+        if delay_text:
+            self._continue_without_process(f"The fit process was {delay_text}.")
+        return self._failure
 
     def begin(self, header: FileHeader) -> None:
-        """Send the header of the session file to the process, before the record begins."""
-        self._begun = True
+        """Send the header of the session file to the fit process before the record begins."""
+        self._has_begun = True
         self._send(header)
 
     def poll(self) -> list[LogEvent]:
-        """Read the received messages, and return the events for the operator."""
-        self._listen(0.0)
-        if self._ready and not self._lost:
-            self._feel_pulse()
+        """Process the received messages, and return the new events for the operator."""
+        self._process_messages(0.0)
+        if self._is_ready and not self._failure:
+            self._check_heartbeat()
         events, self._events = self._events, []
         return events
 
-    def _feel_pulse(self) -> None:
-        """End the process if it hangs."""
+    def _check_heartbeat(self) -> None:
+        """Kill the fit process if its last heartbeat is too long ago."""
         assert FIT.hung_after_s is not None
-        still_s = self._pulse.stalled_for(self._shared_state[StateField.FIT_BEAT], time.monotonic())
-        if still_s > FIT.hung_after_s:
+        stalled_s = self._heartbeat.stalled_for(
+            self._shared_state[StateField.FIT_BEAT], time.monotonic()
+        )
+        if stalled_s > FIT.hung_after_s:
             self._group[FIT].kill()
-            self._lose(f"The fit process hung for {FIT.hung_after_s:g} s and was ended.")
+            self._continue_without_process(
+                f"The fit process hung for {FIT.hung_after_s:g} s and was ended."
+            )
 
-    def news(self) -> list[Mapping[str, Any]]:
-        """Return the estimates received since the last call, for the live view."""
-        news, self._news = self._news, []
-        return news
+    def take_new_estimates(self) -> list[Mapping[str, Any]]:
+        """Return the estimates that were received since the last call."""
+        estimates, self._new_estimates = self._new_estimates, []
+        return estimates
 
-    def finish(self, ticks: int, meanwhile: Callable[[], None]) -> dict[str, Any]:
-        """Wait for the fit of the whole record of `ticks` ticks; return the result for JSON."""
+    def finish(self, ticks: int, call_while_waiting: Callable[[], None]) -> dict[str, Any]:
+        """Wait for the fit of the whole record; return the last estimate as a JSON dictionary.
+
+        `ticks` is the length of the record. `call_while_waiting` is called repeatedly meanwhile.
+        """
         self._send(RecordEnded(ticks))
         begun_s = time.monotonic()
-        while self._begun and not (
-            self._lost or (self._last_report is not None and self._last_report.final)
+        while self._has_begun and not (
+            self._failure or (self._last_report is not None and self._last_report.final)
         ):
-            self._listen(_POLL_S)
-            meanwhile()
+            self._process_messages(_POLL_S)
+            call_while_waiting()
             if (
                 self._shared_state[StateField.STOP] != Stop.NO
-                and time.monotonic() > begun_s + _STOP_PATIENCE_S
+                and time.monotonic() > begun_s + _STOPPED_FIT_TIMEOUT_S
             ):
-                self._skipped = "A stop skipped the fit of the whole record."
+                self._skip_reason = "A stop skipped the fit of the whole record."
                 break
-            if time.monotonic() > begun_s + _LAST_PATIENCE_S:
-                self._lose("The fit of the whole record took too long.")
+            if time.monotonic() > begun_s + _FINAL_FIT_TIMEOUT_S:
+                self._continue_without_process("The fit of the whole record took too long.")
         estimate = {} if self._last_report is None else self._last_report.document
         document = {key: estimate[key] for key in _STORED_KEYS if key in estimate}
         if self._search is not None:
             targets = self._search.targets
-            found = target_estimates(document, targets) if "modes" in document else []
-            reached, self.shortcoming = self._assess(found)
+            estimates = target_estimates(document, targets) if "modes" in document else []
+            reached, self.unmet_reason = self._assess_precision(estimates)
             document["search"] = {
                 "asked": [str(target) for target in targets],
-                "targets": targets_json(found),
+                "targets": targets_json(estimates),
                 "reached": reached,
-                "reason": self.shortcoming or self._success,
-                "pieces": self._planned,
+                "reason": self.unmet_reason or self._success_sentence,
+                "pieces": self._planned_segments,
             }
         return document
 
     @property
-    def _reason(self) -> str:
-        """Reason for the end of the search as a sentence; empty if it was stopped."""
-        return self._ended.reason if self._ended is not None else self._lost
+    def _end_reason(self) -> str:
+        """Sentence that states why the search ended; empty if the operator stopped the session."""
+        return self._search_end.reason if self._search_end is not None else self._failure
 
     @property
-    def _success(self) -> str:
-        """Statement that the requested precision was reached, as a sentence."""
-        if self._ended is not None and self._ended.reached:
-            return self._ended.reason
+    def _success_sentence(self) -> str:
+        """Sentence that states that the requested precision was reached."""
+        if self._search_end is not None and self._search_end.reached:
+            return self._search_end.reason
         return "Reached by the fit of the whole record."
 
-    def _assess(self, found: Sequence[TargetEstimate]) -> tuple[bool | None, str]:
-        """Return whether the whole record has the requested precision, and the shortcoming.
+    def _assess_precision(self, estimates: Sequence[TargetEstimate]) -> tuple[bool | None, str]:
+        """Return whether the whole record has the requested precision, and text if it has not.
 
-        Without a fit of the whole record this is not known, whatever earlier estimates stated.
+        The first value is None if the whole record was not fitted, whatever earlier estimates
+        stated. The text is empty if the precision was reached.
         """
-        report, ended = self._last_report, self._ended
-        on_the_way = ended is not None and ended.reached
-        unknown = "" if report is None else str(report.document.get("problem") or "")
+        report, search_end = self._last_report, self._search_end
+        was_reached_before = search_end is not None and search_end.reached
+        unknown_reason = "" if report is None else str(report.document.get("problem") or "")
         if report is None or not report.final:
-            unknown = self._lost or self._skipped or "The whole record was not fitted."
-        elif not unknown and not found:
-            unknown = "Its fit has no modes."
-        if unknown:
-            way = "Reached on the way." if on_the_way else self._reason
-            parts = ["" if way == unknown else way]
-            parts.append(f"Not known whether the whole record has the precision: {unknown}")
-            parts.append(f"Last estimate: {in_words(found)}." if found else "")
+            unknown_reason = (
+                self._failure or self._skip_reason or "The whole record was not fitted."
+            )
+        elif not unknown_reason and not estimates:
+            unknown_reason = "Its fit has no modes."
+        if unknown_reason:
+            search_text = "Reached on the way." if was_reached_before else self._end_reason
+            parts = ["" if search_text == unknown_reason else search_text]
+            parts.append(f"Not known whether the whole record has the precision: {unknown_reason}")
+            parts.append(f"Last estimate: {estimates_text(estimates)}." if estimates else "")
             return None, " ".join(filter(None, parts))
-        short = [each for each in found if not each.ratio <= 1.0]
-        if not short:
+        imprecise_estimates = [each for each in estimates if not each.ratio <= 1.0]
+        if not imprecise_estimates:
             return True, ""
-        reason = self._reason
-        if on_the_way:
-            reason = self._lost or "Reached on the way, but not by the whole record."
-        return False, f"{reason} So far: {in_words(short)}.".strip()
+        reason = self._end_reason
+        if was_reached_before:
+            reason = self._failure or "Reached on the way, but not by the whole record."
+        return False, f"{reason} So far: {estimates_text(imprecise_estimates)}.".strip()
 
     @property
     def failure(self) -> str:
-        """Reason for a loss of the process before the end of its search; else empty."""
-        return self._lost if self._search is not None and self._ended is None else ""
+        """Sentence that states why the process failed during its search; empty if it did not."""
+        return self._failure if self._search is not None and self._search_end is None else ""
 
     def _send(self, message: object) -> None:
-        if self._lost:
+        """Send a message to the fit process, unless it has failed."""
+        if self._failure:
             return
         try:
             self._group[FIT].send(message)
         except ChildError as error:
-            self._lose(str(error))
+            self._continue_without_process(str(error))
 
-    def _listen(self, patience_s: float) -> None:
-        if self._lost:
+    def _process_messages(self, timeout_s: float) -> None:
+        """Process messages of the fit process, waiting up to `timeout_s` seconds for them."""
+        if self._failure:
             return
         try:
-            for message in self._group[FIT].messages(patience_s):
-                self._take(message)
+            for message in self._group[FIT].messages(timeout_s):
+                self._process_message(message)
         except ChildError as error:
-            self._lose(str(error))
+            self._continue_without_process(str(error))
 
-    def _take(self, message: object) -> None:
+    def _process_message(self, message: object) -> None:
+        """Process one message of the fit process."""
         match message:
             case FitReady():
-                self._ready = True
+                self._is_ready = True
             case FitReport(document):
                 self._last_report = message
-                self._news.append(document)
+                self._new_estimates.append(document)
                 self._events += [
                     LogEvent(0, "info", line, notable=True) for line in document["text"]
                 ]
             case PlannedSegment(name, document):
-                self._planned.append({"name": name, **document})
+                self._planned_segments.append({"name": name, **document})
                 self._events.append(LogEvent(0, "info", f"Next: {name}."))
             case SearchEnded(_, reason, segments):
-                self._ended, self.segments = message, segments
+                self._search_end, self.segments = message, segments
                 self._shared_state[StateField.LAST_SEGMENT] = 1
                 self._events.append(LogEvent(0, "info", reason, notable=True))
             case Failed(reason):
-                self._lose(reason)
+                self._continue_without_process(reason)
 
-    def _lose(self, why: str) -> None:
-        """Continue without the process; a planned reference ends with its last segment."""
-        self._lost = why
-        follows = "The session continues without fits."
-        if self._search is not None and self._ended is None:
+    def _continue_without_process(self, reason: str) -> None:
+        """Continue the session without the fit process, or end it with the last planned segment."""
+        self._failure = reason
+        consequence = "The session continues without fits."
+        if self._search is not None and self._search_end is None:
             self._shared_state[StateField.LAST_SEGMENT] = 1
-            follows = "The session ends with what is planned."
-        self._events.append(LogEvent(0, "warning", f"{why} {follows}"))
+            consequence = "The session ends with what is planned."
+        self._events.append(LogEvent(0, "warning", f"{reason} {consequence}"))

@@ -1,9 +1,9 @@
-"""Search for a requested precision: choice of the next excitation, and end of the session.
+"""Planning of a session that lasts until estimates reach a requested precision.
 
-Each decision uses a fit of the samples before the last planned segment. It is therefore made during
-that segment, in real time and under the virtual clock alike. If the planned segments are expected
-to suffice, a pause follows instead of another segment. After the pause all damping structures are
-fitted, as `analyze` does, and only this fit can state that the precision is reached.
+During each segment of the excitation, the next segment is chosen from a fit of the samples before
+it. If the planned segments are expected to suffice, a pause follows instead of another segment.
+After the pause all damping structures are fitted, as by `analyze`. Only this fit can show that the
+precision is reached.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,25 +27,28 @@ from rigd.units import with_half_width, with_percentage
 
 Real = NDArray[np.float64]
 
-_ENOUGH: Final = 0.98
-"""Largest ratio of expected to target deviation at which a pause follows instead of a segment."""
-_FORECAST_FROM: Final = 4
-"""Number of estimates after which the remaining time is forecast."""
-_HOPELESS: Final = 2.0
-"""Ratio of forecast to available time above which the target is out of reach."""
-_HOPELESS_IN_A_ROW: Final = 3
-"""Number of such decisions in a row after which the search is given up."""
-_NOT_SEEN: Final = "not visible yet"
-_DOUBTFUL_IN_A_ROW: Final = 4
-"""Number of doubtful fits of all structures in a row after which the search is given up."""
-_WIDTH: Final = 22
-_SCANS: Final = 2
-"""Largest number of repeated scans after failed fits."""
-_TIGHTER: Final = 0.7
-"""Factor on the target deviations after a flagged estimate: twice the information."""
-_FACTORS: Final = (0.5, 4.0)
-"""Range of the correction factor: reported over expected standard deviation."""
-_OF_MODES: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
+_SUFFICIENT_RATIO: Final = 0.98
+"""Ratio of expected to requested standard deviation up to which a pause is appended."""
+_MIN_FORECAST_ESTIMATES: Final = 4
+"""Minimum number of estimates from which the remaining time is forecast."""
+_UNREACHABLE_TIME_RATIO: Final = 2.0
+"""Ratio of forecast to available time above which the requested precision is unreachable."""
+_MAX_UNREACHABLE_FORECASTS: Final = 3
+"""Number of consecutive forecasts of an unreachable precision that end the session."""
+_NOT_VISIBLE: Final = "not visible yet"
+"""Doubt of an estimate whose mode the record does not show."""
+_MAX_DOUBTFUL_FITS: Final = 4
+"""Number of consecutive doubtful fits of all damping structures that end the session."""
+_COLUMN_WIDTH: Final = 22
+"""Width in characters of a column of the printed table."""
+_MAX_REPEATED_SCANS: Final = 2
+"""Maximum number of times that the scan is repeated after failed fits."""
+_TIGHTENING_FACTOR: Final = 0.7
+"""Factor on the requested deviations after a flagged estimate, for twice the information."""
+_CORRECTION_FACTOR_RANGE: Final = (0.5, 4.0)
+"""Range of the ratio of reported to expected standard deviation that corrects the design."""
+_MODAL_QUANTITY_KEYS: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
+"""Requested modal quantity → its key in the estimates of a mode."""
 
 
 # Estimates of the requested quantities
@@ -53,66 +56,68 @@ _OF_MODES: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
 
 @dataclass(frozen=True, slots=True)
 class TargetEstimate:
-    """Estimate of one requested quantity."""
+    """Estimate of a quantity whose precision the operator requested."""
 
     quantity: str
-    """One of `rigd.excitation.QUANTITIES`."""
+    """Name of the quantity, one of `rigd.excitation.QUANTITIES`."""
     mode: int | None
-    """Number of the mode, from 1; None: not a modal quantity, or no such mode was found."""
+    """Number of the mode, from 1; None if the quantity is not modal or no such mode was found."""
     value: float | None
-    """Estimated value; None: not estimated."""
+    """Estimated value, or None if the quantity was not estimated."""
     std: float
-    """Standard deviation; infinite if the value is doubtful."""
+    """Standard deviation of the estimate, infinite if the estimate is doubtful."""
     target_std: float
-    """Requested standard deviation, in the same unit."""
+    """Requested standard deviation, in the unit of the value."""
     doubt: str = ""
-    """Why the value is doubtful; else empty."""
+    """Text that states why the estimate is doubtful; empty if it is not."""
 
     @property
     def name(self) -> str:
-        """Name of the quantity for the operator."""
-        if self.quantity not in _OF_MODES:
+        """Name of the quantity for the operator, with its mode."""
+        if self.quantity not in _MODAL_QUANTITY_KEYS:
             return self.quantity
         return f"{self.quantity} of {'any mode' if self.mode is None else f'mode {self.mode}'}"
 
     @property
     def ratio(self) -> float:
-        """Ratio of the standard deviation to the requested one."""
+        """Ratio of the standard deviation to the requested standard deviation."""
         return self.std / self.target_std if self.target_std > 0.0 else inf
 
 
 def target_estimates(
     document: Mapping[str, Any], targets: Sequence[Target]
 ) -> list[TargetEstimate]:
-    """Return the estimates of all requested quantities from an answer of the fit program.
+    """Return the estimates of all requested quantities from a document of the fit program.
 
-    The answer is described in docs/online_fit.md. A modal target without a number applies to each
-    mode in the band.
+    docs/online_fit.md describes the document. A modal target without a mode number applies to each
+    mode in the excited frequency band.
     """
     return [each for target in targets for each in _estimates_of(document, target)]
 
 
 def _estimates_of(document: Mapping[str, Any], target: Target) -> Iterator[TargetEstimate]:
-    key = _OF_MODES.get(target.quantity)
+    """Yield the estimates of one requested quantity, one for each mode to which it applies."""
+    key = _MODAL_QUANTITY_KEYS.get(target.quantity)
     if key is None:
-        yield _read(target, document.get("parameters", {}).get(target.quantity))
+        yield _estimate_of_entry(target, document.get("parameters", {}).get(target.quantity))
         return
     # The fit also reports modes above the band, which no segment excites.
-    inside = [m for m in document["modes"] if (m["frequency_hz"]["value"] or 0.0) < BAND_HZ]
-    modes = [m for m in inside if target.mode in (None, m["mode"])]
+    modes_in_band = [m for m in document["modes"] if (m["frequency_hz"]["value"] or 0.0) < BAND_HZ]
+    modes = [m for m in modes_in_band if target.mode in (None, m["mode"])]
     for mode in modes:
-        found = _read(replace(target, mode=int(mode["mode"])), mode[key])
-        yield found if mode["shown"] else replace(found, std=inf, doubt=_NOT_SEEN)
+        estimate = _estimate_of_entry(replace(target, mode=int(mode["mode"])), mode[key])
+        yield estimate if mode["shown"] else replace(estimate, std=inf, doubt=_NOT_VISIBLE)
     if not modes:
         why = "no such mode was found in the band"
         yield TargetEstimate(target.quantity, target.mode, None, inf, target.std, why)
 
 
-def _read(target: Target, found: Mapping[str, Any] | None) -> TargetEstimate:
+def _estimate_of_entry(target: Target, entry: Mapping[str, Any] | None) -> TargetEstimate:
+    """Return the estimate of a requested quantity from its entry in the fit's document."""
     of = target.quantity, target.mode
-    if found is None or found["value"] is None:
+    if entry is None or entry["value"] is None:
         return TargetEstimate(*of, None, inf, target.std, "it is not part of what was found")
-    value, std, doubt = float(found["value"]), found["std"], found["flag"] or ""
+    value, std, doubt = float(entry["value"]), entry["std"], entry["flag"] or ""
     target_std = target.std * (abs(value) if target.relative else 1.0)
     return TargetEstimate(
         *of, value, inf if doubt or std is None else float(std), target_std, doubt
@@ -122,44 +127,48 @@ def _read(target: Target, found: Mapping[str, Any] | None) -> TargetEstimate:
 def beam_estimate(
     document: Mapping[str, Any], targets: Sequence[Target], uniformity: float
 ) -> BeamEstimate:
-    """Return the beam estimate of an answer of the fit program, for the design of excitation.
+    """Return the beam estimate, for the design of excitation, from the fit program's document.
 
-    `uniformity` is the relative standard deviation of each mode's frequency from that of a uniform
-    beam. If all targets are modal, the estimate is that of the modal model.
+    `uniformity` is the relative standard deviation of each mode's frequency from the frequency of a
+    uniform beam. If all targets are modal, the parameters are those of the modal model.
     """
     names, noise = document["covariance"]["names"], document["noise"]
-    found = BeamEstimate.from_dict({**document["plant"], "names": names, "noise": noise})
-    if uniformity and all(target.quantity in _OF_MODES for target in targets):
-        return found.modal()
+    estimate = BeamEstimate.from_dict({**document["plant"], "names": names, "noise": noise})
+    if uniformity and all(target.quantity in _MODAL_QUANTITY_KEYS for target in targets):
+        return estimate.modal()
     # The tolerance is wider if the modes deviate by more than the stated uniformity.
-    return found.with_tolerance(max(uniformity, (document["uniformity_percent"] or 0.0) / 100.0))
+    return estimate.with_tolerance(max(uniformity, (document["uniformity_percent"] or 0.0) / 100.0))
 
 
 # The search
 
 
 @dataclass(slots=True)
-class _Interval:
-    """Interval of the reference and of the record."""
+class _PlannedInterval:
+    """Planned segment of the reference, and its position in the record.
+
+    The record has more ticks than the reference if the angle had to be held for lack of a segment.
+    """
 
     name: str
     reference_rad: Real
     reference_tick: int
-    """First tick in the reference."""
+    """First tick of the segment in the reference."""
     record_tick: int
-    """First tick in the record."""
+    """First tick of the segment in the record."""
 
     @property
     def size(self) -> int:
+        """Number of ticks of the segment."""
         return int(self.reference_rad.size)
 
 
 class ExcitationPlanner:
-    """Choose the segments of the reference of one session.
+    """Chooses the segments of the reference until the requested precision is reached.
 
-    `due` is the tick of the reference up to which the next decision needs samples; None: no further
-    decision. If `may_be_last` is set, the next estimate may be the last one, and all structures are
-    to be fitted.
+    `due_tick` is the tick of the reference up to which the next decision needs samples, or None
+    after the last decision. If `may_be_last` is True, the next estimate may end the session, and
+    must be a fit of all damping structures.
     """
 
     def __init__(
@@ -172,249 +181,288 @@ class ExcitationPlanner:
     ) -> None:
         self._targets = search.targets
         self._tip_slope_rad = search.tip_slope_rad
-        self._rig = RigPreview(profile, start_rad)
+        self._preview = RigPreview(profile, start_rad)
         self._writer = writer
         self._rate_hz = profile.rig.rate_hz
-        self._most_ticks = writer.ticks + writer.room
-        first, scan_rad = search.scan
-        self._intervals = [_Interval("scan", scan_rad, first, first)]
-        self._segment_count = self._scans = 0
-        self._shows_modes = self._judged = False
-        self._hopeless = self._doubtful = 0
+        self._max_ticks = writer.ticks + writer.room
+        scan_tick, scan_rad = search.scan
+        self._intervals = [_PlannedInterval("scan", scan_rad, scan_tick, scan_tick)]
+        self._segment_count = self._repeated_scans = 0
+        self._excites_unseen_modes = self._has_full_fit = False
+        self._unreachable_count = self._doubtful_count = 0
         self._tightening = 1.0
-        self._course = _Course()
-        self._factors: dict[str, float] = {}
-        percent = search.uniformity_percent
-        of_profile = profile.uncertainty.uniformity_percent
-        self._uniformity = (of_profile if percent is None else percent) / 100.0
-        self._columns: list[str] = []
-        self.due: int | None = first + scan_rad.size
+        self._forecast = _TimeForecast()
+        self._correction_factors: dict[str, float] = {}
+        stated_percent = search.uniformity_percent
+        profile_percent = profile.uncertainty.uniformity_percent
+        self._uniformity = (profile_percent if stated_percent is None else stated_percent) / 100.0
+        self._column_names: list[str] = []
+        self.due_tick: int | None = scan_tick + scan_rad.size
         self.may_be_last = False
 
-    def decide(self, document: Mapping[str, Any], held: int, held_before: int) -> Iterator[object]:
-        """Plan the next segment from an answer to the samples before `due`; yield the messages.
+    def plan_next(
+        self, document: Mapping[str, Any], held_ticks: int, held_ticks_before: int
+    ) -> Iterator[object]:
+        """Plan the next segment from a fit of the samples before `due_tick`.
 
-        The angle was held for `held` ticks of the record because no segment was available, for
-        `held_before` of them before the last segment that has begun.
+        Yields the messages for the supervisor. The angle was held for `held_ticks` ticks because no
+        segment was available in time. `held_ticks_before` of these precede the segment that began
+        last.
         """
         last = self._intervals[-1]
-        last.record_tick = last.reference_tick + held_before
-        self._judged |= self.may_be_last
+        last.record_tick = last.reference_tick + held_ticks_before
+        self._has_full_fit |= self.may_be_last
         if document["problem"] or "plant" not in document:
             problem = document["problem"] or "Nothing could be fitted."
-            if self._columns:
+            if self._column_names:
                 # Earlier fits succeeded: the record now has a gap, or the sensor is stuck.
-                yield self._end(f"Given up: {problem}", reached=False)
+                yield self._end_message(f"Given up: {problem}", reached=False)
             else:
-                yield from self._scan_again(problem, held)
+                yield from self._repeat_scan(problem, held_ticks)
             return
-        found = target_estimates(document, self._targets)
+        estimates = target_estimates(document, self._targets)
         time_s = document["tick"] / self._rate_hz
-        self._course.note(time_s, max(each.ratio for each in found))
+        self._forecast.add(time_s, max(each.ratio for each in estimates))
         doubt = document["doubt"] or ""
-        # A doubt from the freest structure alone is first checked with all structures.
-        yield self._report(document, found, time_s, quietly=bool(doubt) and not self.may_be_last)
-        if self.may_be_last and all(each.ratio <= 1.0 for each in found):
-            yield self._end(f"Reached: {in_words(found)}.", reached=True)
+        # A doubt from the structure with most parameters is first checked with all structures.
+        yield self._report_message(
+            document, estimates, time_s, quietly=bool(doubt) and not self.may_be_last
+        )
+        if self.may_be_last and all(each.ratio <= 1.0 for each in estimates):
+            yield self._end_message(f"Reached: {estimates_text(estimates)}.", reached=True)
             return
         if self.may_be_last:
-            flagged = [each for each in found if each.doubt not in ("", _NOT_SEEN)]
-            if flagged and last.name == "pause" and not doubt:
-                # Precise enough according to the plan, but flagged as no property of the antenna.
-                doubt = f"{flagged[0].name}: {flagged[0].doubt}"
-                self._tightening *= _TIGHTER
-            self._doubtful = self._doubtful + 1 if doubt else 0
-        if self._doubtful >= _DOUBTFUL_IN_A_ROW:
+            flagged_estimates = [each for each in estimates if each.doubt not in ("", _NOT_VISIBLE)]
+            if flagged_estimates and last.name == "pause" and not doubt:
+                # The plan is fulfilled, but the estimate is flagged as no property of the antenna.
+                doubt = f"{flagged_estimates[0].name}: {flagged_estimates[0].doubt}"
+                self._tightening *= _TIGHTENING_FACTOR
+            self._doubtful_count = self._doubtful_count + 1 if doubt else 0
+        if self._doubtful_count >= _MAX_DOUBTFUL_FITS:
             findings = " ".join(document["findings"])
             reason = f"The record is doubtful: {doubt}. {findings} Take a chirp."
-            yield self._end(reason.replace("  ", " "), reached=False)
+            yield self._end_message(reason.replace("  ", " "), reached=False)
             return
         try:
             estimate = beam_estimate(document, self._targets, self._uniformity)
-            yield from self._go_on(estimate, document["tick"], found, held, doubt)
+            yield from self._plan_segment_or_pause(
+                estimate, document["tick"], estimates, held_ticks, doubt
+            )
         except (RigdError, ArithmeticError, ValueError) as error:
-            # The estimate is too wrong to plan with.
-            yield from self._scan_again(str(error), held)
+            # The estimate is too inaccurate for planning.
+            yield from self._repeat_scan(str(error), held_ticks)
 
     @property
     def needs_early_fit(self) -> bool:
-        """Whether all structures are to be fitted now, while the last segment is played.
+        """Whether all damping structures are to be fitted already during the last segment.
 
-        The first fit of all structures after a pause then has start values.
+        This provides start values for the fit of all structures after the pause.
         """
-        return self._intervals[-1].name == "pause" and not self._judged and self.due is not None
+        return (
+            self._intervals[-1].name == "pause"
+            and not self._has_full_fit
+            and self.due_tick is not None
+        )
 
-    def is_begun(self, begun: int) -> bool:
-        """Whether the last segment has begun, so that its tick in the record is known."""
+    def has_last_segment_begun(self, begun: int) -> bool:
+        """Return whether the last planned segment has begun, so that its record tick is known.
+
+        `begun` is the tick of the reference at which the segment that began last ends, or 0 if none
+        has begun.
+        """
         return len(self._intervals) == 1 or begun > self._intervals[-1].reference_tick
 
-    def ended(self, ticks: int, held_before: int, begun: int) -> SearchEnded:
-        """Return the end of the search after the end of a record of `ticks` ticks."""
-        if self.is_begun(begun):
+    def end_of_record(self, ticks: int, held_ticks_before: int, begun: int) -> SearchEnded:
+        """Return the message that ends the search after a record of `ticks` ticks has ended."""
+        if self.has_last_segment_begun(begun):
             last = self._intervals[-1]
-            last.record_tick = last.reference_tick + held_before
+            last.record_tick = last.reference_tick + held_ticks_before
         else:
             self._intervals.pop()
-        return self._end(self._too_long if ticks >= self._most_ticks else "", reached=False)
+        return self._end_message(
+            self._too_long_text if ticks >= self._max_ticks else "", reached=False
+        )
 
     @property
-    def _too_long(self) -> str:
-        return f"Not reached within {self._most_ticks / self._rate_hz:g} s (--at-most)."
+    def _too_long_text(self) -> str:
+        """Text that states that the precision was not reached in the maximum duration."""
+        return f"Not reached within {self._max_ticks / self._rate_hz:g} s (--at-most)."
 
-    def _go_on(
+    def _plan_segment_or_pause(
         self,
         estimate: BeamEstimate,
         tick: int,
-        found: Sequence[TargetEstimate],
-        held: int,
+        estimates: Sequence[TargetEstimate],
+        held_ticks: int,
         doubt: str,
     ) -> Iterator[object]:
-        """Append a segment, or a pause if the planned segments are expected to suffice."""
-        reference_rad = self._reference_rad(held)
-        # Negative if the angle was held for long before the last segment.
-        left_ticks = self._most_ticks - reference_rad.size
-        left_s = left_ticks / self._rate_hz
-        if left_s < SHORTEST_S + PAUSE_S:
-            if self.may_be_last or left_ticks <= 0:
-                yield self._end(self._too_long, reached=False)
+        """Append the next segment, or a pause if the planned segments are expected to suffice."""
+        reference_rad = self._reference_rad(held_ticks)
+        # Negative if the angle was held for a long time before the last segment.
+        remaining_ticks = self._max_ticks - reference_rad.size
+        remaining_s = remaining_ticks / self._rate_hz
+        if remaining_s < SHORTEST_S + PAUSE_S:
+            if self.may_be_last or remaining_ticks <= 0:
+                yield self._end_message(self._too_long_text, reached=False)
             else:
-                self._pause(min(PAUSE_S, left_s))
+                self._append_pause(min(PAUSE_S, remaining_s))
             return
-        plant = self._rig.plant_with(estimate.loaded_beam)
+        plant = self._preview.plant_with(estimate.loaded_beam)
         angle_rad = plant.respond(reference_rad).angle_rad
         segment = next_segment(
             estimate,
             angle_rad,
-            self._aims(estimate, angle_rad[:tick], found),
-            self._rig,
-            left_s - PAUSE_S,
+            self._corrected_targets(estimate, angle_rad[:tick], estimates),
+            self._preview,
+            remaining_s - PAUSE_S,
             tip_slope_rad=self._tip_slope_rad,
-            through=self._through(found),
+            through=self._modes_to_excite(estimates),
         )
-        if not self.may_be_last and all(each.ratio <= _ENOUGH for each in segment.now):
-            self._pause(PAUSE_S)
+        if not self.may_be_last and all(each.ratio <= _SUFFICIENT_RATIO for each in segment.now):
+            self._append_pause(PAUSE_S)
             return
-        never = [f"{each.impossible}." for each in segment.now if each.impossible]
-        # Two forecasts: from the information of possible segments, and from the course so far.
-        slow = segment.forecast.seconds > _HOPELESS * left_s
-        hopeless = never[0] if never else slow and self._course.hopeless(left_s)
-        self._hopeless = self._hopeless + 1 if hopeless else 0
-        if self._hopeless >= _HOPELESS_IN_A_ROW:
-            yield self._end(f"Out of reach: {hopeless}", reached=False)
+        impossible_reasons = [f"{each.impossible}." for each in segment.now if each.impossible]
+        # Two forecasts: from the information of possible segments, and from the progress so far.
+        is_too_slow = segment.forecast.seconds > _UNREACHABLE_TIME_RATIO * remaining_s
+        reason = (
+            impossible_reasons[0]
+            if impossible_reasons
+            else is_too_slow and self._forecast.unreachable_reason(remaining_s)
+        )
+        self._unreachable_count = self._unreachable_count + 1 if reason else 0
+        if self._unreachable_count >= _MAX_UNREACHABLE_FORECASTS:
+            yield self._end_message(f"Out of reach: {reason}", reached=False)
             return
         self._segment_count += 1
         self._append(f"piece_{self._segment_count}", segment.reference_rad)
-        self.due = self._intervals[-1].reference_tick
-        # Another structure, such as a compliant clamp, may explain what a uniform beam does not.
+        self.due_tick = self._intervals[-1].reference_tick
+        # Another structure, such as a compliant clamp, may fit where a uniform beam does not.
         self.may_be_last = bool(doubt) and not self.may_be_last
-        yield PlannedSegment(segment.name, self._document(segment, found))
+        yield PlannedSegment(segment.name, self._expectation_document(segment, estimates))
 
-    def _aims(
-        self, estimate: BeamEstimate, angle_rad: Real, found: Sequence[TargetEstimate]
+    def _corrected_targets(
+        self, estimate: BeamEstimate, angle_rad: Real, estimates: Sequence[TargetEstimate]
     ) -> list[Target]:
-        """Return the targets of the design, corrected for its bias.
+        """Return the requested deviations with which the next segment is designed.
 
-        The design predicts standard deviations of a beam model, and a fit reports those of the
-        modal model. Each target is divided by the ratio of reported to predicted deviation for the
-        present record.
+        The design predicts standard deviations of the beam model, but a fit reports those of the
+        modal model. Each requested deviation is therefore divided by the ratio of reported to
+        predicted deviation for the record so far.
         """
-        by_name = {each.name: each.std for each in found}
-        aims = []
+        std_by_name = {each.name: each.std for each in estimates}
+        corrected = []
         for each in expected_precisions(angle_rad, estimate, self._targets, self._rate_hz):
-            factor = by_name.get(each.target.name, inf) / max(each.std, 1e-300)
-            factor = float(np.clip(factor, *_FACTORS)) if isfinite(factor) else 1.0
-            self._factors[each.target.name] = factor
-            aims.append(replace(each.target, std=self._tightening * each.target.std / factor))
-        return aims
+            factor = std_by_name.get(each.target.name, inf) / max(each.std, 1e-300)
+            factor = float(np.clip(factor, *_CORRECTION_FACTOR_RANGE)) if isfinite(factor) else 1.0
+            self._correction_factors[each.target.name] = factor
+            corrected.append(replace(each.target, std=self._tightening * each.target.std / factor))
+        return corrected
 
-    def _through(self, found: Sequence[TargetEstimate]) -> list[int]:
-        """Return the modes that the next segment must excite because the record does not show them.
+    def _modes_to_excite(self, estimates: Sequence[TargetEstimate]) -> list[int]:
+        """Return the numbers of modes that the next segment must excite, since none shows so far.
 
-        A model may determine such a mode from the others, and the design expects this, but the
-        check of the record does not accept it. Every other segment is free for the design.
+        The design expects that the model determines such a mode from the others, but the check of
+        the record requires that the mode itself is visible. Only every second segment is bound to
+        excite such modes.
         """
-        unseen = [each.mode for each in found if each.doubt == _NOT_SEEN and each.mode]
-        self._shows_modes = bool(unseen) and self._segment_count > 0 and not self._shows_modes
-        return unseen if self._shows_modes else []
+        unseen_modes = [each.mode for each in estimates if each.doubt == _NOT_VISIBLE and each.mode]
+        self._excites_unseen_modes = (
+            bool(unseen_modes) and self._segment_count > 0 and not self._excites_unseen_modes
+        )
+        return unseen_modes if self._excites_unseen_modes else []
 
-    def _scan_again(self, why: str, held: int) -> Iterator[object]:
-        """Repeat the scan after an unusable estimate."""
-        if self._scans >= _SCANS or not self._scan(f"scan_{self._scans + 2}", held):
-            yield self._end(f"Given up: {why}", reached=False)
+    def _repeat_scan(self, reason: str, held_ticks: int) -> Iterator[object]:
+        """Append the scan again after an unusable estimate, or end the search.
+
+        Yields the message for the supervisor. `reason` states why the estimate is unusable.
+        """
+        if self._repeated_scans >= _MAX_REPEATED_SCANS or not self._append_scan(
+            f"scan_{self._repeated_scans + 2}", held_ticks
+        ):
+            yield self._end_message(f"Given up: {reason}", reached=False)
             return
-        self._scans += 1
+        self._repeated_scans += 1
         self.may_be_last = False
-        yield PlannedSegment("the scan once more", {"why": why})
+        yield PlannedSegment("the scan once more", {"why": reason})
 
-    def _scan(self, name: str, held: int) -> bool:
-        """Append the scan under another name; return whether there was time for it."""
+    def _append_scan(self, name: str, held_ticks: int) -> bool:
+        """Append the first scan under another name; return whether enough time was left."""
         scan_rad = self._intervals[0].reference_rad
-        if self._most_ticks - self._writer.ticks - held < scan_rad.size:
+        if self._max_ticks - self._writer.ticks - held_ticks < scan_rad.size:
             return False
         self._append(name, scan_rad)
-        self.due = self._writer.ticks
+        self.due_tick = self._writer.ticks
         return True
 
-    def _pause(self, duration_s: float) -> None:
-        """Append a pause, after which all structures are fitted to the whole record."""
+    def _append_pause(self, duration_s: float) -> None:
+        """Append a pause, after which all damping structures are fitted to the whole record."""
         self._append("pause", np.zeros(round(duration_s * self._rate_hz)))
-        self.due, self.may_be_last = self._writer.ticks, True
+        self.due_tick, self.may_be_last = self._writer.ticks, True
 
     def _append(self, name: str, reference_rad: Real) -> None:
+        """Append a named segment to the reference that the control loop reads."""
         tick = self._writer.ticks
-        self._intervals.append(_Interval(name, reference_rad, tick, tick))
+        self._intervals.append(_PlannedInterval(name, reference_rad, tick, tick))
         self._writer.append(reference_rad)
 
-    def _reference_rad(self, held: int) -> Real:
-        """Return the reference of the record up to the end of the last segment, shape (n,)."""
-        whole = np.zeros(self._writer.ticks + held)
+    def _reference_rad(self, held_ticks: int) -> Real:
+        """Return the reference angle (n,) in the record up to the end of the last segment."""
+        reference_rad = np.zeros(self._writer.ticks + held_ticks)
         for each in self._intervals:
-            whole[each.record_tick : each.record_tick + each.size] = each.reference_rad
-        return whole
+            reference_rad[each.record_tick : each.record_tick + each.size] = each.reference_rad
+        return reference_rad
 
-    def _report(
+    def _report_message(
         self,
         document: Mapping[str, Any],
-        found: Sequence[TargetEstimate],
+        estimates: Sequence[TargetEstimate],
         time_s: float,
         *,
         quietly: bool,
     ) -> FitReport:
-        """Return a report of an estimate, with a row of the table of requested quantities."""
-        state = {"left_s": self._course.left_s, "targets": targets_json(found)}
+        """Return the message that reports an estimate, with a row of the printed table.
+
+        The row is left out if `quietly` is True.
+        """
+        search_document = {"left_s": self._forecast.remaining_s, "targets": targets_json(estimates)}
         validity = Validity.of_document(document.get("validity"))
-        text = [] if quietly else self._rows(found, time_s, validity)
-        return FitReport({**document, "search": state, "text": text})
+        text = [] if quietly else self._table_rows(estimates, time_s, validity)
+        return FitReport({**document, "search": search_document, "text": text})
 
-    def _rows(
-        self, found: Sequence[TargetEstimate], time_s: float, validity: Validity
+    def _table_rows(
+        self, estimates: Sequence[TargetEstimate], time_s: float, validity: Validity
     ) -> list[str]:
-        """Return the next row of the table, after a header row if the columns changed."""
+        """Return the next row of the printed table, after a heading if its columns changed."""
         rows = []
-        columns = [each.name for each in found]
-        if columns != self._columns:
-            self._columns = columns
-            heads = "".join(f"{name:<{_WIDTH}}" for name in columns)
-            about = f"± one standard deviation; tip slope {validity.short}"
-            rows.append(f"  time  {heads}left   ({about})")
-        left_s = self._course.left_s
-        cells = "".join(f"{_cell(each):<{_WIDTH}}" for each in found)
-        return [*rows, f"{time_s:5.1f} s {cells}{'' if left_s is None else f'{left_s:.0f} s'}"]
+        column_names = [each.name for each in estimates]
+        if column_names != self._column_names:
+            self._column_names = column_names
+            headings = "".join(f"{name:<{_COLUMN_WIDTH}}" for name in column_names)
+            note = f"± one standard deviation; tip slope {validity.short}"
+            rows.append(f"  time  {headings}left   ({note})")
+        remaining_s = self._forecast.remaining_s
+        cells = "".join(f"{_cell_text(each):<{_COLUMN_WIDTH}}" for each in estimates)
+        return [
+            *rows,
+            f"{time_s:5.1f} s {cells}{'' if remaining_s is None else f'{remaining_s:.0f} s'}",
+        ]
 
-    def state(self, document: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the estimates of the requested quantities for JSON."""
+    def targets_document(self, document: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the estimates of all requested quantities as a dictionary for JSON."""
         return {"targets": targets_json(target_estimates(document, self._targets))}
 
-    def _document(self, segment: Segment, found: Sequence[TargetEstimate]) -> dict[str, Any]:
-        """Return the expected result of a segment and the estimate from which it was planned."""
+    def _expectation_document(
+        self, segment: Segment, estimates: Sequence[TargetEstimate]
+    ) -> dict[str, Any]:
+        """Return the expected precision after a segment, and the present one, for JSON."""
         return {
             "duration_s": segment.reference_rad.size / self._rate_hz,
-            "stated": {each.name: each.std for each in found if isfinite(each.std)},
+            "stated": {each.name: each.std for each in estimates if isfinite(each.std)},
             "expected": [
                 {
                     "name": each.target.name,
-                    "std": self._factors[each.target.name] * each.std,
-                    "asked_std": self._factors[each.target.name]
+                    "std": self._correction_factors[each.target.name] * each.std,
+                    "asked_std": self._correction_factors[each.target.name]
                     * each.target_std
                     / self._tightening,
                 }
@@ -422,71 +470,89 @@ class ExcitationPlanner:
                 if isfinite(each.std)
             ],
             "share_of_limits": segment.fraction_of_limits,
-            "left_s": self._course.left_s,
+            "left_s": self._forecast.remaining_s,
         }
 
-    def _end(self, reason: str, *, reached: bool) -> SearchEnded:
-        """End the search; the record ends with the planned segments."""
-        self.due = None
+    def _end_message(self, reason: str, *, reached: bool) -> SearchEnded:
+        """Return the message that ends the search with the planned segments."""
+        self.due_tick = None
         segments = {
             each.name: (each.record_tick, each.record_tick + each.size)
             for each in self._intervals
             if each.name != "pause"
         }
-        segments["sweep"] = (self._intervals[0].record_tick, self._most_ticks)
+        segments["sweep"] = (self._intervals[0].record_tick, self._max_ticks)
         return SearchEnded(reached, reason, segments)
 
 
-class _Course:
-    """Course of the largest ratio of reported to requested deviation, and its extrapolation.
+class _TimeForecast:
+    """Forecast of the time until the requested precision is reached.
 
-    The inverse square of the ratio is proportional to the information, which grows linearly with
-    time under the most informative excitation.
+    It extrapolates the largest ratio of reported to requested deviation. The inverse square of this
+    ratio is proportional to the information, which grows linearly with time under the most
+    informative excitation.
     """
 
     def __init__(self) -> None:
-        self._known: list[tuple[float, float]] = []
+        self._information_at_times: list[tuple[float, float]] = []
 
-    def note(self, time_s: float, ratio: float) -> None:
-        """Add the ratio at a time of the record."""
+    def add(self, time_s: float, ratio: float) -> None:
+        """Add the ratio of reported to requested deviation at a time of the record."""
         if isfinite(ratio):
-            self._known.append((time_s, ratio**-2))
+            self._information_at_times.append((time_s, ratio**-2))
 
     @property
-    def left_s(self) -> float | None:
-        """Forecast time until the ratio is 1, from the latest half of the course; None: unknown."""
-        if len(self._known) < _FORECAST_FROM:
-            return None
-        (now_s, now), (then_s, then) = self._known[-1], self._known[len(self._known) // 2 - 1]
-        if now >= 1.0:
-            return 0.0
-        return (1.0 - now) * (now_s - then_s) / (now - then) if now > then else None
+    def remaining_s(self) -> float | None:
+        """Forecast time in seconds until the ratio is 1, from the last half of the estimates.
 
-    def hopeless(self, time_left_s: float) -> str:
-        """Return why the available time is too short, and the remedy; else an empty text."""
-        left_s = self.left_s
-        if left_s is None or left_s <= _HOPELESS * time_left_s:
-            return ""
-        now_s, now = self._known[-1]
-        ratio = (now + (1.0 - now) * time_left_s / left_s) ** -0.5
+        It is None if there are too few estimates, or if the information does not grow.
+        """
+        if len(self._information_at_times) < _MIN_FORECAST_ESTIMATES:
+            return None
+        (now_s, present_information), (earlier_s, earlier_information) = (
+            self._information_at_times[-1],
+            self._information_at_times[len(self._information_at_times) // 2 - 1],
+        )
+        if present_information >= 1.0:
+            return 0.0
         return (
-            f"it would take about {left_s:.0f} s more, and the {time_left_s:.0f} s that are left "
-            f"will do for {ratio:.2g} times the deviation asked for. Ask for that, or give "
-            f"--at-most {1.2 * (now_s + left_s):.0f}."
+            (1.0 - present_information)
+            * (now_s - earlier_s)
+            / (present_information - earlier_information)
+            if present_information > earlier_information
+            else None
+        )
+
+    def unreachable_reason(self, available_s: float) -> str:
+        """Return text that states why the available time is too short, with the remedy.
+
+        It is empty if the time may suffice.
+        """
+        required_s = self.remaining_s
+        if required_s is None or required_s <= _UNREACHABLE_TIME_RATIO * available_s:
+            return ""
+        now_s, present_information = self._information_at_times[-1]
+        ratio = (
+            present_information + (1.0 - present_information) * available_s / required_s
+        ) ** -0.5
+        return (
+            f"it would take about {required_s:.0f} s more, and the {available_s:.0f} s that are "
+            f"left will do for {ratio:.2g} times the deviation asked for. Ask for that, or give "
+            f"--at-most {1.2 * (now_s + required_s):.0f}."
         )
 
 
-def _cell(each: TargetEstimate) -> str:
-    """Return the cell of a quantity in the table, damping ratios in percent."""
+def _cell_text(each: TargetEstimate) -> str:
+    """Return the text of a table cell with an estimate; damping ratios are in percent."""
     if each.value is None or each.doubt:
-        return each.doubt if each.doubt == _NOT_SEEN else "doubtful"
+        return each.doubt if each.doubt == _NOT_VISIBLE else "doubtful"
     scale, unit = (100.0, " %") if each.name.startswith("damping") else (1.0, "")
     half = scale * each.std
     return f"{with_half_width(scale * each.value, (-half, half))}{unit}"
 
 
-def targets_json(found: Sequence[TargetEstimate]) -> list[dict[str, Any]]:
-    """Return the estimates of the requested quantities for JSON."""
+def targets_json(estimates: Sequence[TargetEstimate]) -> list[dict[str, Any]]:
+    """Return the estimates of requested quantities as a list of dictionaries for JSON."""
     return [
         {
             "name": each.name,
@@ -497,16 +563,17 @@ def targets_json(found: Sequence[TargetEstimate]) -> list[dict[str, Any]]:
             "asked_std": each.target_std if isfinite(each.target_std) else None,
             "doubt": each.doubt,
         }
-        for each in found
+        for each in estimates
     ]
 
 
-def in_words(found: Sequence[TargetEstimate]) -> str:
-    """Return the estimates and their standard deviations as text."""
-    return ", ".join(_one_in_words(each) for each in found)
+def estimates_text(estimates: Sequence[TargetEstimate]) -> str:
+    """Return one line of text with the estimates and their standard deviations."""
+    return ", ".join(_estimate_text(each) for each in estimates)
 
 
-def _one_in_words(each: TargetEstimate) -> str:
+def _estimate_text(each: TargetEstimate) -> str:
+    """Return text with one estimate and its standard deviation, or with its doubt."""
     if each.value is None or each.doubt:
         return f"{each.name}: {each.doubt}"
     return (

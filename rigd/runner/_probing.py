@@ -1,7 +1,7 @@
-"""Probing move before the first session: decision, execution and stored result.
+"""Probing move before the first session, which verifies the scales of motor and sensors.
 
-A result is valid until the computer is restarted, as long as the verified values, the drive, the
-sensor and a simulated rig do not change. It is stored in the user's runtime folder.
+The result is stored in the user's runtime folder. It is valid until the computer is restarted, as
+long as the verified values, the drive, the sensor and a simulated rig do not change.
 """
 
 import contextlib
@@ -25,15 +25,15 @@ from rigd.runtime.addresses import runtime_folder
 from rigd.safety.probe_estimate import ProbeEstimate, contradiction, doubts
 from rigd.safety.probing_move import MEASURED, ProbeEnd, plan_probe
 
-_VERIFIED: Final = (
+_VERIFIED_KEY_PREFIXES: Final = (
     "rate_hz", "beam.", "damping.", "motor.", "encoder.", "actuation.", "sensor.projection",
     "sensor.tool_inertia_kg_m2", "sensor.delay_s", "cia402.direction", "cia402.gear_ratio",
 )  # fmt: skip
-"""Prefixes of the profile keys that a result depends on."""
+"""Prefixes of the profile keys whose values a probing move verifies."""
 
 
 class ProbeFailedError(FailureError):
-    """The rig contradicts its profile; the message states the contradiction."""
+    """Raised if a probing move shows that the rig contradicts its profile; it states how."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,21 +41,24 @@ class ProbeResult:
     """Result of a probing move."""
 
     end: ProbeEnd
-    """Reason for the end of the move."""
+    """Reason for which the move ended."""
     estimate: ProbeEstimate
-    """Estimated scales and friction."""
+    """Estimated friction, and ratios of measured to expected values."""
 
     def contradiction(self, profile: Profile, *, motor: bool = True) -> str:
-        """Return the contradiction to the profile, with or without the motor data; else empty."""
+        """Return text that states how the result contradicts the profile, or "" if it does not.
+
+        If `motor` is False, torque and inertia of the motor are not compared.
+        """
         return contradiction(probed_rig(profile), self.end, self.estimate, motor=motor)
 
     def as_metadata(self) -> dict[str, str]:
-        """Return the result as metadata of a session file."""
+        """Return the probing move's result as metadata of a session file."""
         numbers = self.estimate.as_dict()
         return {f"probe_{key}": repr(numbers[key]) for key in numbers if numbers[key] is not None}
 
     def lines(self, profile: Profile) -> list[str]:
-        """Return the result as lines of text."""
+        """Return lines of text that report the probing move's result to the operator."""
         estimate = self.estimate
         rows = (
             ("coupling torque over the beam's at the measured angle", estimate.coupling_ratio,
@@ -66,64 +69,65 @@ class ProbeResult:
              estimate.inertia_std),
         )  # fmt: skip
         lines = [
-            f"{what}: not known" if ratio is None else f"{what}: {ratio:.2f} ± {std:.2f}"
-            for what, ratio, std in rows
+            f"{title}: not known" if ratio is None else f"{title}: {ratio:.2f} ± {std:.2f}"
+            for title, ratio, std in rows
         ]
         if estimate.coulomb_nm is not None:
-            stated = profile.rig.motor.coulomb_nm
+            stated_nm = profile.rig.motor.coulomb_nm
             lines.append(
-                f"Coulomb friction: {estimate.coulomb_nm:.3f} N·m (motor.coulomb_nm: {stated:g})"
+                f"Coulomb friction: {estimate.coulomb_nm:.3f} N·m (motor.coulomb_nm: {stated_nm:g})"
             )
         travel = f"{estimate.travel_rad:.2g} rad, {estimate.speed_rad_s:.2g} rad/s"
         return [*lines, f"travel and speed, as measured: {travel}"]
 
 
-def verify(
+def verify_by_probing(
     profile: Profile,
     rig: Rig,
     stop: StopRequest,
-    says: Callable[[Literal["info", "warning"], str], None],
+    report: Callable[[Literal["info", "warning"], str], None],
     *,
     motor: bool = True,
 ) -> ProbeResult | None:
-    """Make a probing move if it is needed; return its result, or None if none is needed.
+    """Make a probing move if motor and encoder were not measured, and return its result.
 
-    The move is needed if motor and encoder were not measured and no stored result is valid. With
-    `motor`, torque and inertia of the motor are checked too.
+    A valid stored result is used instead of a new move. Returns None if no probing is needed, and
+    raises ProbeFailedError if the result contradicts the profile. If `motor` is False, torque and
+    inertia of the motor are not compared.
     """
-    if _is_identified(profile) or _is_simulated_alike(profile):
+    if _is_identified(profile) or _is_simulated_with_profile(profile):
         return None
-    result = stored_result(profile, rig)
+    result = read_stored_result(profile, rig)
     if result is None or result.contradiction(profile, motor=motor):
-        says("info", announcement(profile))
-        result = probe(profile, rig, stop)
-        found = result.contradiction(profile, motor=motor)
-        if found:
-            raise ProbeFailedError(found)
-        says("info", f"Probing move passed: {'; '.join(result.lines(profile))}.")
+        report("info", probing_announcement(profile))
+        result = run_probing_move(profile, rig, stop)
+        contradiction_text = result.contradiction(profile, motor=motor)
+        if contradiction_text:
+            raise ProbeFailedError(contradiction_text)
+        report("info", f"Probing move passed: {'; '.join(result.lines(profile))}.")
     for warning in doubts(result.estimate):
-        says("warning", warning)
+        report("warning", warning)
     return result
 
 
 def _is_identified(profile: Profile) -> bool:
-    """Whether a profile states that motor and encoder were measured."""
+    """Return whether a profile states that motor and encoder were measured."""
     return all(profile.sources.get(key) == "measured" for key in MEASURED)
 
 
-def _is_simulated_alike(profile: Profile) -> bool:
-    """Whether the rig is simulated with the values of its profile, so that a probe is useless."""
+def _is_simulated_with_profile(profile: Profile) -> bool:
+    """Return whether the rig is simulated with its profile's values, so that probing is useless."""
     if profile.rig.devices.drive == "sim":
         return True
     simulator = find_simulator(profile.rig.name)
     if simulator is None:
         return False
-    ours = _verified(described(profile.rig))
-    return all(simulator.rig.get(key) == value for key, value in ours.items())
+    profile_values = _verified_values(described(profile.rig))
+    return all(simulator.rig.get(key) == value for key, value in profile_values.items())
 
 
-def announcement(profile: Profile) -> str:
-    """Return a sentence that announces the motion of the shaft."""
+def probing_announcement(profile: Profile) -> str:
+    """Return a sentence for the operator that announces the motion of a probing move."""
     plan = plan_probe(probed_rig(profile))
     return (
         "Probing move, which verifies the scales of motor, encoder and sensor: strokes of up to "
@@ -132,16 +136,16 @@ def announcement(profile: Profile) -> str:
     )
 
 
-def probe(profile: Profile, rig: Rig, stop: StopRequest) -> ProbeResult:
+def run_probing_move(profile: Profile, rig: Rig, stop: StopRequest) -> ProbeResult:
     """Make a probing move on a connected rig, and store its result."""
-    result = _result(rig.probe(profile, stop))
-    document = {"key": _key(profile, rig), "boot": _boot(), "end": result.end.name}
-    path = _file(profile)
+    result = _result_of_document(rig.probe(profile, stop))
+    document = {"key": _validity_key(profile, rig), "boot": _boot_id(), "end": result.end.name}
+    path = _result_path(profile)
     with contextlib.suppress(OSError):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        fresh = path.with_suffix(".new")
-        fresh.write_text(json.dumps(document | result.estimate.as_dict()), encoding="utf-8")
-        fresh.replace(path)
+        new_path = path.with_suffix(".new")
+        new_path.write_text(json.dumps(document | result.estimate.as_dict()), encoding="utf-8")
+        new_path.replace(path)
     return result
 
 
@@ -154,20 +158,20 @@ def probe_in_foreground(
     hardware: bool,
     says: Callable[[str], None],
 ) -> tuple[Profile, ProbeResult]:
-    """Make a single probing move, whatever the profile states.
+    """Make a probing move for `rigd probe`, even if motor and encoder were measured.
 
     Parameters
     ----------
     group
-        The started processes. They are ended when this function returns.
+        Started processes of the rig. They are ended when this function returns.
     stop
         Stop request of the operator.
     profile_name
         Name or path of the profile.
     fast, hardware
-        As on the command line.
+        Options of the command line.
     says
-        Receives messages for the operator before the move begins.
+        Function that gets messages for the operator before the move begins.
 
     Returns
     -------
@@ -181,60 +185,70 @@ def probe_in_foreground(
     RigError
         If the rig cannot be connected, or the move is stopped or ended by an interlock.
     """
-    with contextlib.ExitStack() as reserved, group:
-        profile, moving = load_rig(profile_name, fast=fast, hardware=hardware)
-        says(describe_actuation_target(profile.rig, moving))
-        alone = not (fast and moving is ActuationTarget.SIMULATED)
-        shared = moving is ActuationTarget.HARDWARE
-        reserved.enter_context(RigLock(profile.name, "rigd probe", hardware=shared, alone=alone))
+    with contextlib.ExitStack() as locks, group:
+        profile, target = load_rig(profile_name, fast=fast, hardware=hardware)
+        says(describe_actuation_target(profile.rig, target))
+        is_exclusive = not (fast and target is ActuationTarget.SIMULATED)
+        is_hardware = target is ActuationTarget.HARDWARE
+        locks.enter_context(
+            RigLock(profile.name, "rigd probe", hardware=is_hardware, alone=is_exclusive)
+        )
         rig = Rig(profile, fast=fast, group=group)
-        rig.connect(moving)
-        says(announcement(profile))
-        return profile, probe(profile, rig, stop)
+        rig.connect(target)
+        says(probing_announcement(profile))
+        return profile, run_probing_move(profile, rig, stop)
 
 
-def stored_result(profile: Profile, rig: Rig) -> ProbeResult | None:
-    """Return the valid stored result of the last probing move, or None."""
+def read_stored_result(profile: Profile, rig: Rig) -> ProbeResult | None:
+    """Return the stored result of the last probing move, or None if there is no valid one."""
     try:
-        document = json.loads(_file(profile).read_text("utf-8"))
-        if document.pop("key") != _key(profile, rig) or document.pop("boot") != _boot():
+        document = json.loads(_result_path(profile).read_text("utf-8"))
+        if document.pop("key") != _validity_key(profile, rig) or document.pop("boot") != _boot_id():
             return None
-        return _result(document)
+        return _result_of_document(document)
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
 
 
-def _result(document: Mapping[str, Any]) -> ProbeResult:
-    numbers = {key: value for key, value in document.items() if key != "end"}
-    return ProbeResult(ProbeEnd[document["end"]], ProbeEstimate(**numbers))
+def _result_of_document(document: Mapping[str, Any]) -> ProbeResult:
+    """Return the result of a probing move from its document."""
+    estimate_fields = {key: value for key, value in document.items() if key != "end"}
+    return ProbeResult(ProbeEnd[document["end"]], ProbeEstimate(**estimate_fields))
 
 
-def _verified(values: Mapping[str, object]) -> dict[str, object]:
-    return {key: value for key, value in values.items() if key.startswith(_VERIFIED)}
+def _verified_values(values: Mapping[str, object]) -> dict[str, object]:
+    """Return those values of a profile that a probing move verifies."""
+    return {key: value for key, value in values.items() if key.startswith(_VERIFIED_KEY_PREFIXES)}
 
 
-def _key(profile: Profile, rig: Rig) -> str:
-    """Return the key of a result: hash of values, drive, sensor and process of a simulated rig."""
+def _validity_key(profile: Profile, rig: Rig) -> str:
+    """Return a hash of everything that a stored result depends on.
+
+    This is the verified values, the drive, the sensor, and the process of a simulated rig.
+    """
     simulator = find_simulator(profile.rig.name)
     limits = profile.limits
-    belongs = (
-        _verified(described(profile.rig)),
+    dependencies = (
+        _verified_values(described(profile.rig)),
         (limits.angle_rad, limits.velocity_rad_s),
         dict(rig.drive_statement),
         dict(rig.calibration or {}),
         None if simulator is None else simulator.pid,
     )
-    return hashlib.sha256(json.dumps(belongs, sort_keys=True, default=str).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(dependencies, sort_keys=True, default=str).encode()
+    ).hexdigest()
 
 
-def _boot() -> str:
-    """Return the boot id of the computer; empty if there is none."""
+def _boot_id() -> str:
+    """Return an identifier that changes when the computer is restarted, or "" if unavailable."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text("utf-8").strip()
     except OSError:
         return ""
 
 
-def _file(profile: Profile) -> Path:
-    plain = "".join(c if c.isalnum() else "-" for c in profile.name).strip("-")
-    return runtime_folder() / f"probed-{plain}.json"
+def _result_path(profile: Profile) -> Path:
+    """Return the path of the file with the stored result for a profile."""
+    file_name_part = "".join(c if c.isalnum() else "-" for c in profile.name).strip("-")
+    return runtime_folder() / f"probed-{file_name_part}.json"

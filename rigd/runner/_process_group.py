@@ -1,7 +1,7 @@
-"""Process group of a rig: control, recorder and live publisher, and their shared memory.
+"""Processes of a rig (control process, recorder and others), and their shared memory.
 
-This module is quick to import, so that the processes are started first: they import their modules
-while the supervisor reads the profile and plans.
+This module is quick to import, so that the processes are started early. They import their modules
+while the supervisor reads the profile and plans the session.
 """
 
 import contextlib
@@ -17,39 +17,44 @@ from rigd.engine.processes import CONTROL, LIVE, PROCESSES, RECORDER, Child, Chi
 if TYPE_CHECKING:
     from rigd.engine.channels import Channels
 
-_DESCRIPTORS = 6
-_PREPARING_S = 20.0
-"""Time for a process of one session to get ready on a busy computer; nothing moves yet."""
+_SHARED_MEMORY_FILES = 6
+"""Number of shared memory files."""
+_READY_TIMEOUT_S = 20.0
+"""Maximum time in seconds for a process to become ready on a busy computer, before any motion."""
 _POLL_S = 0.05
+"""Time in seconds to wait for a message at once."""
 
 
 def await_ready(
-    settled: Callable[[], bool], listen: Callable[[float], None], meanwhile: Callable[[], bool]
+    is_settled: Callable[[], bool],
+    process_messages_for: Callable[[float], None],
+    call_while_waiting: Callable[[], bool],
 ) -> str:
-    """Wait until a process is `settled`: ready or lost; return how late it is, or an empty text.
+    """Wait until a process is ready or has failed; return text if it takes too long, else "".
 
-    `listen` receives its messages for at most the given time in s. The wait ends early if
-    `meanwhile` returns False.
+    `is_settled` returns whether the process is ready or has failed. `process_messages_for`
+    processes its messages for a time in seconds. `call_while_waiting` is called repeatedly, and the
+    wait ends early if it returns False.
     """
-    deadline_s = time.monotonic() + _PREPARING_S
-    while not settled() and meanwhile():
-        listen(_POLL_S)
-        if not settled() and time.monotonic() > deadline_s:
-            return f"not ready within {_PREPARING_S:g} s"
+    deadline_s = time.monotonic() + _READY_TIMEOUT_S
+    while not is_settled() and call_while_waiting():
+        process_messages_for(_POLL_S)
+        if not is_settled() and time.monotonic() > deadline_s:
+            return f"not ready within {_READY_TIMEOUT_S:g} s"
     return ""
 
 
 class ProcessGroup:
-    """Control process, recorder and optional live publisher of a rig.
+    """Control process, recorder and further processes of a rig, with their shared memory.
 
-    Leaving the context ends all processes, the control process first.
+    All processes are ended when the context is left, the control process first.
 
     Parameters
     ----------
     live
-        Start the live publisher too.
+        Start the publisher of the live view too.
     also
-        Further processes to start now; others are started when they are needed.
+        Further processes to start at once. Others are started when they are needed.
 
     Raises
     ------
@@ -61,9 +66,9 @@ class ProcessGroup:
     Attributes
     ----------
     live
-        Whether the live publisher is started too.
+        Whether the publisher of the live view is started too.
     cores
-        Cores of the processes that are started later; empty: those of this process.
+        Processor cores for processes that are started later, or empty for those of this process.
     """
 
     def __init__(self, *, live: bool, also: Collection[Process] = ()) -> None:
@@ -72,10 +77,10 @@ class ProcessGroup:
         self.cores: frozenset[int] = frozenset()
         self._fds: list[int] = []
         self._channels: Channels | None = None
-        self._used: set[Process] = set()
+        self._processes_with_job: set[Process] = set()
         self._children: dict[Process, Child] = {}
         try:
-            while len(self._fds) < _DESCRIPTORS:
+            while len(self._fds) < _SHARED_MEMORY_FILES:
                 self._fds.append(shared_memory_fd())
             wanted = {CONTROL, RECORDER, *self._also} | ({LIVE} if live else set())
             for process in (process for process in PROCESSES if process in wanted):
@@ -92,55 +97,57 @@ class ProcessGroup:
 
     @property
     def control(self) -> Child:
-        """The process that communicates with the devices."""
+        """Control process, which communicates with the devices."""
         return self._children[CONTROL]
 
     @property
     def recorder(self) -> Child:
-        """The process that writes the file."""
+        """Recorder process, which writes the session file."""
         return self._children[RECORDER]
 
-    def fresh(self, process: Process) -> Child:
-        """Return a new process that replaces one with a job.
+    def idle_process(self, process: Process) -> Child:
+        """Return a started process without a job; replace it if it already received one.
 
         Raises
         ------
         ChildError
             If the process cannot be started.
         """
-        if process in self._used or process not in self._children:
+        if process in self._processes_with_job or process not in self._children:
             if process in self._children:  # the previous one may not have been started
                 self._children.pop(process).stop(process.grace_s)
             self._start(process)
-        self._used.add(process)
+        self._processes_with_job.add(process)
         return self._children[process]
 
     def has_job(self, process: Process) -> bool:
-        """Return whether a process has received its job."""
-        return process in self._used
+        """Return whether a process has already received a job."""
+        return process in self._processes_with_job
 
     @property
-    def laid_out(self) -> bool:
-        """Whether the shared memory has its size."""
+    def has_memory(self) -> bool:
+        """Whether the shared memory has been allocated."""
         return self._channels is not None
 
     @property
     def channels(self) -> "Channels":
-        """The channels in shared memory."""
+        """Ring buffers and shared state, through which the processes exchange data."""
         assert self._channels is not None
         return self._channels
 
-    def lay_out(self, rate_hz: float, *, fast: bool = False, watched: bool = False) -> None:
-        """Set the size of the shared memory for sessions at a rate.
+    def allocate_memory(
+        self, rate_hz: float, *, fast: bool = False, may_be_observed: bool = False
+    ) -> None:
+        """Allocate the shared memory for sessions at a sample rate.
 
         Parameters
         ----------
         rate_hz
-            Ticks a second.
+            Sample rate, in ticks per second.
         fast
-            The sessions run under the virtual clock.
-        watched
-            Observers of samples may be started later.
+            Whether the sessions run under the virtual clock.
+        may_be_observed
+            Whether processes that read samples, such as a fit, may be started later.
 
         Raises
         ------
@@ -150,14 +157,15 @@ class ProcessGroup:
         from rigd.engine.channels import VIRTUAL_BUFFERED_S, create_channels
         from rigd.safety.limits import BUFFERED_S
 
-        # Observers of samples, such as a live view or a fit, are slower than the virtual clock.
-        hurried = fast and (self.live or self._also or watched)
-        buffered_s = VIRTUAL_BUFFERED_S if hurried else BUFFERED_S
+        # Readers of samples, such as a live view or a fit, are slower than the virtual clock.
+        is_faster_than_observers = fast and (self.live or self._also or may_be_observed)
+        buffered_s = VIRTUAL_BUFFERED_S if is_faster_than_observers else BUFFERED_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
 
     def _start(self, process: Process) -> None:
+        """Start a process, which waits for its job."""
         self._children[process] = Child(process.name, process.module, self._fds, self.cores)
-        self._used.discard(process)
+        self._processes_with_job.discard(process)
 
     def __enter__(self) -> Self:
         return self
@@ -171,10 +179,10 @@ class ProcessGroup:
         self.end()
 
     def end(self) -> None:
-        """End all processes and release the memory; repeated calls do nothing."""
+        """End all processes and release the shared memory; may be called repeatedly."""
         if self._channels is not None:
             self._channels.ask_to_stop()
-        with contextlib.ExitStack() as ending:  # continues after an error of one of them
+        with contextlib.ExitStack() as ending:  # continues after an error of one process
             for process in reversed(PROCESSES):
                 if process in self._children:
                     ending.callback(self._children.pop(process).stop, process.grace_s)

@@ -1,4 +1,4 @@
-"""The rig: connect, run sessions, tare, zero, status, disconnect."""
+"""Control of a rig: connect its devices, run sessions, tare, set the zero, report its status."""
 
 import contextlib
 import gc
@@ -19,48 +19,57 @@ from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner.request import Order
-from rigd.runner.session import RunResult, SessionFailedError, SessionRun, Watcher, always
+from rigd.runner.session import (
+    ProgressCallback,
+    RunResult,
+    SessionFailedError,
+    SessionRun,
+    can_always_receive_stop,
+)
 from rigd.runner.signal_blocks import SignalBlock, SignalReader
-from rigd.runner.status import RigStatus, StatusWatch
+from rigd.runner.status import RigStatus, StatusReader
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.05
-_CONNECT_PATIENCE_S = 30.0
-_SLOW_PATIENCE_S = 30.0
-"""Longest time between heartbeats under the virtual clock, whose ticks may wait for replies."""
-_ENABLE_PATIENCE_S = 5.0
-"""Time for enabling a drive, during which there is no heartbeat."""
-_PROBE_PATIENCE_S = 60.0
-_ANSWER_PATIENCE_S = 10.0
-"""Time to wait for an answer, in addition to the measuring time."""
+"""Time in seconds between two checks for a message of the control process."""
+_CONNECT_TIMEOUT_S = 30.0
+"""Maximum time in seconds for connecting the devices."""
+_VIRTUAL_CLOCK_HEARTBEAT_TIMEOUT_S = 30.0
+"""Maximum time between heartbeats under the virtual clock, whose ticks may wait for replies."""
+_ENABLE_TIMEOUT_S = 5.0
+"""Maximum time in seconds for enabling a drive, during which there is no heartbeat."""
+_PROBE_TIMEOUT_S = 60.0
+"""Maximum time in seconds for a probing move, in addition to the wait for rest before it."""
+_MEASUREMENT_TIMEOUT_S = 10.0
+"""Maximum time in seconds for a reply to a tare or zero, in addition to the measuring time."""
 
 
 class RigError(FailureError):
-    """The rig cannot carry out a request, or is lost; the message is for the operator."""
+    """Raised if the rig cannot execute a request or its connection is lost; it states why."""
 
 
 class Rig:
-    """The devices of one profile, in separate processes.
+    """The devices of one profile, operated by separate processes.
 
-    All methods except :meth:`status` and :meth:`signals` are called from one thread.
+    All methods except :meth:`status` and :meth:`signals` must be called from one thread.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     fast
-        Run under the virtual clock.
+        Run sessions under the virtual clock, faster than real time.
     live
         Show each session in a live view.
     group
-        Processes that are already started, for the first connection.
+        Processes that are already started and are used for the first connection.
 
     Attributes
     ----------
     connected
-        Whether the control process owns the devices.
+        Whether the control process is connected to the devices.
     zero_lost
-        Whether a zero set by the operator was lost with its connection.
+        Whether a zero that the operator had set was lost with the connection to the devices.
     """
 
     def __init__(
@@ -77,12 +86,12 @@ class Rig:
         self._group = group
         self._connection: Connected | None = None
         self._view: LiveView | None = None
-        self._zero_set = False
-        self._pulse = Heartbeat()
+        self._is_zero_set = False
+        self._heartbeat = Heartbeat()
         self._precedence: Precedence | None = None
         self._status_lock = threading.Lock()
-        self._statuses = StatusWatch(profile.rig.rate_hz)
-        self._signals = SignalReader(profile)
+        self._status_reader = StatusReader(profile.rig.rate_hz)
+        self._signal_reader = SignalReader(profile)
         self.connected = False
         self.zero_lost = False
 
@@ -93,77 +102,83 @@ class Rig:
 
     @property
     def angle_rad(self) -> float:
-        """Motor angle from the rig's zero.
+        """Motor angle relative to the rig's zero.
 
         Raises
         ------
         RigError
             If the rig is not connected.
         """
-        return self._require().channels.shared_state[StateField.ANGLE_NRAD] * 1e-9
+        return self._connected_group().channels.shared_state[StateField.ANGLE_NRAD] * 1e-9
 
     @property
     def calibration(self) -> Mapping[str, Any] | None:
-        """Identity and calibration of the connected sensor; None while not connected."""
+        """Identity and calibration of the connected sensor, or None while not connected."""
         return (
             None if self._connection is None or not self.connected else self._connection.calibration
         )
 
     @property
     def drive_statement(self) -> Mapping[str, str]:
-        """Metadata that the connected drive states; empty while not connected."""
+        """Metadata on its settings that the connected drive reports, empty while not connected."""
         return {} if self._connection is None or not self.connected else self._connection.drive
 
-    def connect(self, moving: ActuationTarget | None = None, *, reset_fault: bool = False) -> None:
-        """Start the processes and connect the devices; the torque stays off.
+    def connect(self, target: ActuationTarget | None = None, *, reset_fault: bool = False) -> None:
+        """Start the processes and connect the devices, while the torque stays off.
 
         Parameters
         ----------
-        moving
-            Actuation target that was announced to the operator; any other is refused.
+        target
+            Actuation target that was announced to the operator; any other target is refused.
         reset_fault
-            Reset a fault of the drive first, by decision of the operator.
+            Reset a fault of the drive first, as the operator has decided.
 
         Raises
         ------
         RigError
-            If the connection fails, or a value of the profile is unknown. Everything is closed
-            then.
+            If the connection fails, or a value of the profile is unknown. All processes and devices
+            are closed then.
         """
-        if unknown := describe_unknown_values(self._profile.rig):
-            raise RigError(f"{unknown}\nThen start the daemon again, which reads the profile once.")
+        if unknown_values_text := describe_unknown_values(self._profile.rig):
+            raise RigError(
+                f"{unknown_values_text}\nThen start the daemon again, which reads the profile once."
+            )
         if self.connected:
             self.disconnect()
         try:
-            # The sessions of the processes started here are not yet known.
-            any_session = self._group is None
+            # For processes that are started here, it is not yet known which sessions follow.
+            may_be_observed = self._group is None
             group = self._group = self._group or ProcessGroup(live=self._live)
-            granted = self._take_precedence(group)
+            granted_settings = self._raise_priority(group)
             if reset_fault:
-                self._reset_fault(moving)
-            _lay_out(group, self._profile.rig.rate_hz, fast=self._fast, watched=any_session)
-            job = ControlJob(self._profile, moving, group.channels.specs, self._fast)
-            group.fresh(CONTROL).start(job)
-            connection = self._ask(_CONNECT_PATIENCE_S)
+                self._reset_fault(target)
+            _allocate_shared_memory(
+                group, self._profile.rig.rate_hz, fast=self._fast, may_be_observed=may_be_observed
+            )
+            job = ControlJob(self._profile, target, group.channels.specs, self._fast)
+            group.idle_process(CONTROL).start(job)
+            connection = self._await_message(_CONNECT_TIMEOUT_S)
             assert isinstance(connection, Connected)
-            self._connection = replace(connection, realtime={**connection.realtime, **granted})
+            self._connection = replace(
+                connection, realtime={**connection.realtime, **granted_settings}
+            )
         except (RigError, ChildError, OSError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
         if LIVE in group:
             self._view = LiveView(group, self._profile.name, fast=self._fast)
         self.connected = True
-        self.zero_lost |= self._zero_set
-        self._zero_set = False
+        self.zero_lost |= self._is_zero_set
+        self._is_zero_set = False
 
     def run(
         self,
         order: Order,
         stop: StopRequest,
-        watcher: Watcher,
-        listens: Callable[[], bool] = always,
+        watcher: ProgressCallback,
+        can_receive_stop: Callable[[], bool] = can_always_receive_stop,
     ) -> RunResult:
-        """Run one session.
+        """Run one session to its end, and return its result.
 
         Parameters
         ----------
@@ -171,17 +186,17 @@ class Rig:
             Session to run.
         stop
             Stop request of the operator, which ends the session.
-        watcher, listens
+        watcher, can_receive_stop
             See :class:`rigd.runner.session.SessionRun`.
 
         Raises
         ------
         RigError
-            If the rig is not connected, or its zero is lost.
+            If the rig is not connected, or its zero was lost.
         SessionFailedError
-            If the file cannot be written, or the recorder died.
+            If the file cannot be written, or the recorder ended.
         """
-        group = self._require()
+        group = self._connected_group()
         assert self._connection is not None
         if self.zero_lost:
             raise RigError(
@@ -190,9 +205,9 @@ class Rig:
             )
         if self._precedence is not None:
             self._precedence.cover()
-        _wipe(group.channels.shared_state)
+        _reset_session_fields(group.channels.shared_state)
         group.channels.clear()
-        session = SessionRun(order, group, self._connection, self._view, watcher, listens)
+        session = SessionRun(order, group, self._connection, self._view, watcher, can_receive_stop)
         outcome = reason = ""
         try:
             result = replace(session.run(stop), hardware=not self.simulated)
@@ -206,13 +221,13 @@ class Rig:
             if self._view is not None:
                 self._view.finish(outcome, reason)
             if session.device_failed:
-                self._await_end()
-            # Between sessions: objects of a session would fragment the memory, and a long series
-            # would take 4 kB more for each session.
+                self._await_closed_devices()
+            # Collected between sessions: remaining objects of a session would fragment the memory,
+            # and a long series would take 4 kB more for each session.
             gc.collect()
 
     def show(self, order: Order, stop: StopRequest) -> str:
-        """Show the next session in the live view.
+        """Prepare the live view for the next session, and return its address.
 
         Parameters
         ----------
@@ -222,48 +237,48 @@ class Rig:
         Returns
         -------
         str
-            Address of the view, or why there is none, for the operator.
+            Text for the operator: address of the live view, or why there is none.
         """
-        group = self._require()
+        group = self._connected_group()
         if self._view is None:
             return "No live view was requested."
-        _wipe(group.channels.shared_state)
+        _reset_session_fields(group.channels.shared_state)
         return self._view.show(order, stop)
 
     def tare(self) -> dict[str, Any]:
-        """Average the sensor at rest.
+        """Tare the force-torque sensor: average its readings at rest.
 
         Returns
         -------
         dict
-            ``mean`` and ``std`` by axis (N, N·m), and ``torque_std_nm``.
+            ``mean`` and ``std`` of each axis (N, N·m), and ``torque_std_nm``.
 
         Raises
         ------
         RigError
             If the tare fails.
         """
-        return self._order(Tare(), self._profile.session.tare_s)
+        return self._measure(Tare(), self._profile.session.tare_s)
 
     def zero(self) -> dict[str, Any]:
-        """Set the present motor angle as zero; the limits are relative to it.
+        """Set the present motor angle as the rig's zero, to which the limits are relative.
 
         Returns
         -------
         dict
-            ``moved_rad``: the angle before the reset to zero.
+            ``moved_rad``: the angle relative to the previous zero.
 
         Raises
         ------
         RigError
             If the motor moves.
         """
-        answer = self._order(Zero(), 0.0)
-        self._zero_set, self.zero_lost = True, False
-        return answer
+        reply = self._measure(Zero(), 0.0)
+        self._is_zero_set, self.zero_lost = True, False
+        return reply
 
     def probe(self, profile: Profile, stop: StopRequest) -> dict[str, Any]:
-        """Make the probing move of a profile.
+        """Make the probing move, which estimates friction and the scales of motor and sensors.
 
         Parameters
         ----------
@@ -275,19 +290,19 @@ class Rig:
         Returns
         -------
         dict
-            ``end``, the name of a `rigd.safety.probing_move.ProbeEnd`, and the fields of a
-            `rigd.safety.probe_estimate.ProbeEstimate`.
+            ``end``, the name of a `rigd.safety.probing_move.ProbeEnd` that states why the move
+            ended, and the fields of a `rigd.safety.probe_estimate.ProbeEstimate`.
 
         Raises
         ------
         RigError
-            If the move is stopped, an interlock ends it, or the rig is lost.
+            If the move is stopped, an interlock ends it, or the connection is lost.
         """
-        group = self._require()
+        group = self._connected_group()
         shared_state = group.channels.shared_state
         if self._precedence is not None:
             self._precedence.cover()
-        _wipe(shared_state)
+        _reset_session_fields(shared_state)
 
         def request_stop() -> None:
             shared_state[StateField.STOP] = Stop.OPERATOR
@@ -297,34 +312,41 @@ class Rig:
             request_stop()
         try:
             group.control.send(Probe(profile))
-            answer = self._await_probe(group, profile)
+            reply = self._await_probe(group, profile)
         except (ChildError, RigError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
         finally:
-            stop.on_request = _nothing
-            _wipe(shared_state)
-        if isinstance(answer, Refused):
-            raise RigError(answer.reason)
-        assert isinstance(answer, Measured)
-        return answer.values
+            stop.on_request = _ignore_stop_request
+            _reset_session_fields(shared_state)
+        if isinstance(reply, Refused):
+            raise RigError(reply.reason)
+        assert isinstance(reply, Measured)
+        return reply.values
 
     def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
-        """Wait for the result of a probing move while monitoring the control process."""
-        shared_state, pulse = group.channels.shared_state, Heartbeat()
+        """Monitor the control process until it sends the result of a probing move, return that.
+
+        A hung control process is killed.
+        """
+        shared_state, heartbeat = group.channels.shared_state, Heartbeat()
         assert CONTROL.hung_after_s is not None
-        hung_after_s = _SLOW_PATIENCE_S if self._fast else CONTROL.hung_after_s + _ENABLE_PATIENCE_S
-        until_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_PATIENCE_S
+        hung_after_s = (
+            _VIRTUAL_CLOCK_HEARTBEAT_TIMEOUT_S
+            if self._fast
+            else CONTROL.hung_after_s + _ENABLE_TIMEOUT_S
+        )
+        until_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_TIMEOUT_S
         while True:
-            answer = group.control.poll(_POLL_S)
+            reply = group.control.poll(_POLL_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
-            if isinstance(answer, Ended):
-                raise RigError(answer.reason or "It was stopped.")
-            if answer is not None:
-                return answer
+            if isinstance(reply, Ended):
+                raise RigError(reply.reason or "It was stopped.")
+            if reply is not None:
+                return reply
             now_s = time.monotonic()
-            still_s = pulse.stalled_for(shared_state[StateField.CONTROL_BEAT], now_s)
-            if still_s > hung_after_s or now_s > until_s:
+            stalled_s = heartbeat.stalled_for(shared_state[StateField.CONTROL_BEAT], now_s)
+            if stalled_s > hung_after_s or now_s > until_s:
                 group.control.kill()
                 raise RigError(
                     "The control process did not end the probing move and was killed: without its "
@@ -332,14 +354,15 @@ class Rig:
                 )
 
     def watch(self) -> None:
-        """Check the control process; call this several times a second between sessions.
+        """Check that the control process is running; call this several times a second when idle.
 
         Raises
         ------
         RigError
-            If the process reported a fault, died or hangs. Everything is closed then.
+            If the control process reported a fault, ended or hangs. All processes and devices are
+            closed then.
         """
-        group = self._require()
+        group = self._connected_group()
         if self._view is not None:
             self._view.check()
         try:
@@ -349,11 +372,13 @@ class Rig:
         shared_state = group.channels.shared_state
         shared_state.beat(StateField.SUPERVISOR_BEAT)
         assert CONTROL.hung_after_s is not None
-        still_s = self._pulse.stalled_for(shared_state[StateField.CONTROL_BEAT], time.monotonic())
-        if message is None and still_s > CONTROL.hung_after_s:
+        stalled_s = self._heartbeat.stalled_for(
+            shared_state[StateField.CONTROL_BEAT], time.monotonic()
+        )
+        if message is None and stalled_s > CONTROL.hung_after_s:
             group.control.kill()
             message = Ended(
-                f"The control process has not responded for {still_s:.1f} s. Check CPU load."
+                f"The control process has not responded for {stalled_s:.1f} s. Check CPU load."
             )
         if message is not None:
             self.disconnect()
@@ -361,27 +386,28 @@ class Rig:
             raise RigError(reason or "The control process was asked to end.")
 
     def status(self) -> RigStatus | None:
-        """Return the status from shared memory, from any thread; None while there is none."""
+        """Return the rig's present status, or None without connection; any thread may call this."""
         with self._status_lock:
             group, view = self._group, self._view
-            if group is None or not group.laid_out:
+            if group is None or not group.has_memory:
                 return None
             address = None if view is None else view.address
-            return replace(self._statuses.read(group), live_view=address)
+            return replace(self._status_reader.read(group), live_view=address)
 
     def signals(self) -> list[SignalBlock]:
-        """Return the signals of the record since the last call, from any thread.
+        """Return the signals that were recorded since the last call; any thread may call this.
 
-        Reading starts with the first call, and again if the last call was more than 1 s ago.
+        The first call starts the reading and returns no earlier signals. So does a call more than
+        1 s after the previous one.
         """
         with self._status_lock:
             group = self._group
-            if group is None or not group.laid_out:
+            if group is None or not group.has_memory:
                 return []
-            return self._signals.take(group.channels)
+            return self._signal_reader.take(group.channels)
 
     def disconnect(self) -> None:
-        """Disable the drive, close the devices, end the processes; repeated calls do nothing."""
+        """Disable the drive, close the devices and end the processes; may be called repeatedly."""
         with self._status_lock:
             group, self._group = self._group, None
             self._view = None
@@ -392,8 +418,8 @@ class Rig:
             self._precedence.release()
             self._precedence = None
 
-    def _take_precedence(self, group: ProcessGroup) -> dict[str, str]:
-        """Raise the priority of this process; return what the system granted."""
+    def _raise_priority(self, group: ProcessGroup) -> dict[str, str]:
+        """Raise the priority of this process, and return the granted settings as metadata."""
         if self._fast:
             return {}
         realtime = self._profile.realtime
@@ -401,68 +427,69 @@ class Rig:
         group.cores = self._precedence.cores_before
         return {f"supervisor_{name}": text for name, text in self._precedence.take().items()}
 
-    def _reset_fault(self, moving: ActuationTarget | None) -> None:
+    def _reset_fault(self, target: ActuationTarget | None) -> None:
+        """Reset the fault of the drive; raise RigError if that fails."""
         try:
             from rigd.devices import reset_drive  # late: loads the drivers, needed only here
 
-            reset_drive(self._profile.rig, moving)
+            reset_drive(self._profile.rig, target)
         except (DeviceError, OSError) as error:
             raise RigError(str(error)) from None
 
-    def _require(self) -> ProcessGroup:
+    def _connected_group(self) -> ProcessGroup:
+        """Return the processes of the rig; raise RigError if it is not connected."""
         if self._group is None or not self.connected:
             raise RigError("The rig is not connected.")
         return self._group
 
-    def _order(self, order: Tare | Zero, duration_s: float) -> dict[str, Any]:
-        """Send a measuring order to the control process between sessions, and return the result."""
-        group = self._require()
+    def _measure(self, order: Tare | Zero, duration_s: float) -> dict[str, Any]:
+        """Make the control process measure a tare or zero between sessions; return the result.
+
+        `duration_s` is the measuring time.
+        """
+        group = self._connected_group()
         try:
             group.control.send(order)
-            answer = self._ask(_ANSWER_PATIENCE_S + duration_s)
+            reply = self._await_message(_MEASUREMENT_TIMEOUT_S + duration_s)
         except (ChildError, RigError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
-        if isinstance(answer, Refused):
-            raise RigError(answer.reason)
-        assert isinstance(answer, Measured)
-        return answer.values
+        if isinstance(reply, Refused):
+            raise RigError(reply.reason)
+        assert isinstance(reply, Measured)
+        return reply.values
 
-    def _ask(self, patience_s: float) -> object:
-        """Wait for an answer of the control process.
+    def _await_message(self, timeout_s: float) -> object:
+        """Wait for a message of the control process, and return it.
 
-        Raises
-        ------
-        RigError
-            If it ends instead, or does not answer in time.
-        ChildError
-            If it died.
+        Raises RigError if the process ends regularly or sends nothing in time, and ChildError if it
+        died.
         """
         assert self._group is not None
-        answer = self._group.control.poll(patience_s)
-        if answer is None:
+        message = self._group.control.poll(timeout_s)
+        if message is None:
             raise RigError(
-                f"The control process does not answer within {patience_s:g} s; check that the "
+                f"The control process does not answer within {timeout_s:g} s; check that the "
                 "devices are on, and check CPU load."
             )
-        if isinstance(answer, Ended):
-            raise RigError(answer.reason or "It was stopped.")
-        return answer
+        if isinstance(message, Ended):
+            raise RigError(message.reason or "It was stopped.")
+        return message
 
-    def _await_end(self) -> None:
-        """Wait until a control process with a failed device has closed the others."""
+    def _await_closed_devices(self) -> None:
+        """Wait until the control process has closed all devices after one failed; disconnect."""
         assert self._group is not None
         with contextlib.suppress(ChildError):
-            self._group.control.poll(_ANSWER_PATIENCE_S)
+            self._group.control.poll(_MEASUREMENT_TIMEOUT_S)
         self.disconnect()
 
 
-def _nothing() -> None:
-    """Do nothing: the stop request is polled."""
+def _ignore_stop_request() -> None:
+    """Do nothing when a stop is requested, because its flag is read later."""
 
 
-def _wipe(shared_state: SharedState) -> None:
-    """Clear the fields of the shared state that belong to one session."""
+def _reset_session_fields(shared_state: SharedState) -> None:
+    """Reset the fields of the shared state that belong to a single session."""
     shared_state[StateField.STOP] = Stop.NO
     shared_state[StateField.GO] = 0
     shared_state[StateField.LIVE_DROPPED] = 0
@@ -470,9 +497,12 @@ def _wipe(shared_state: SharedState) -> None:
     shared_state[StateField.LAST_SEGMENT] = 0
 
 
-def _lay_out(group: ProcessGroup, rate_hz: float, *, fast: bool, watched: bool) -> None:
+def _allocate_shared_memory(
+    group: ProcessGroup, rate_hz: float, *, fast: bool, may_be_observed: bool
+) -> None:
+    """Allocate the shared memory of the processes; raise RigError if that fails."""
     try:
-        group.lay_out(rate_hz, fast=fast, watched=watched)
+        group.allocate_memory(rate_hz, fast=fast, may_be_observed=may_be_observed)
     except OSError as error:
         raise RigError(
             f"No shared memory for the session processes ({error.strerror}); check the "

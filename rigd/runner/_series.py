@@ -1,6 +1,6 @@
-"""Series: the sessions of one request, planned once and run in sequence.
+"""Series of sessions of one request, which are planned once and run one after another.
 
-`rigd run` and the daemon use it, each with its own observer (`SeriesWatcher`).
+`rigd run` and the daemon use it, each with its own implementation of `SeriesWatcher`.
 """
 
 import contextlib
@@ -17,75 +17,80 @@ from rigd.runner._rig import Rig, RigError
 from rigd.runner._touch_search import touch_search
 from rigd.runner.planning import RefusedError, plan_document, plan_session, predicted_metadata
 from rigd.runner.quick_looks import QuickLooks
-from rigd.runner.request import Order, check_required, choose_path, make_room
-from rigd.runner.session import RunResult, SessionProgress, always
+from rigd.runner.request import Order, check_required, choose_path, require_disk_space
+from rigd.runner.session import RunResult, SessionProgress, can_always_receive_stop
 from rigd.runtime import StopRequest
 
-_QUICK_LOOK_PATIENCE_S: Final = 8.0
-"""Longest pause between two sessions for the quick look at the first one, which mostly takes two or
-three seconds. If it is unfinished, it is suspended."""
+_QUICK_LOOK_MAX_PAUSE_S: Final = 8.0
+"""Maximum pause in seconds before the next session for the quick look at the last one, which mostly
+takes two or three seconds. An unfinished quick look is then suspended."""
 _POLL_S: Final = 0.05
 
 
 class SeriesWatcher(Protocol):
-    """Observer of a series; these methods are called in this order for each of its sessions."""
+    """Receiver of the progress of a series of sessions."""
 
-    def begins(self, number: int, path: Path) -> None:
-        """Receive number and file of the next session, from 1; an error ends the series."""
+    def on_start(self, number: int, path: Path) -> None:
+        """Process the start of a session, with its number from 1 and the path of its file.
 
-    def says(self, level: Literal["info", "warning"], text: str) -> None:
-        """Receive a message before the first session."""
+        An exception ends the series.
+        """
 
-    def shown(self, where: str) -> None:
-        """Receive the address of the live view, or why there is none."""
+    def on_message(self, level: Literal["info", "warning"], text: str) -> None:
+        """Process a message for the operator before the first session."""
 
-    def update(self, progress: SessionProgress, events: list[LogEvent]) -> None:
-        """Receive progress and events, about fifty times a second."""
+    def on_live_view(self, view_text: str) -> None:
+        """Process the text with the address of the live view, or with the reason for none."""
 
-    def ended(self, result: RunResult, *, look_follows: bool) -> None:
-        """Receive the result, and whether a quick look follows."""
+    def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
+        """Process progress and new events of a session, about fifty times a second."""
+
+    def on_result(self, result: RunResult, *, look_follows: bool) -> None:
+        """Process the result of a session; `look_follows` states whether a quick look follows."""
 
 
 class Series:
-    """Sessions of one excitation on one connection, checked against limits and disk.
+    """Series of sessions with one excitation on one connection to the rig.
+
+    The constructor plans the sessions, and checks limits, metadata and disk space.
 
     Parameters
     ----------
     profile, excitation
-        Rig and excitation of each session.
+        Profile of the rig, and excitation of each session.
     folder
         Folder of the session files; created if it does not exist.
     repeat
         Number of sessions.
     notes
-        Operator, specimen, note and added metadata; empty texts are omitted. The profile already
-        has the beam of a specimen with a file.
+        Metadata of the user: operator, specimen, note and others. Empty texts are omitted. If the
+        specimen has a file, the profile must already contain its beam.
     force
         See :func:`rigd.runner.planning.plan_session`.
     accept
-        Names of rows of `rigd check` that may fail; the failed ones are recorded in the files.
+        Names of rows of `rigd check` that may fail. The failed rows are recorded in the files.
     watch_fit
-        Fit each record while it is recorded.
+        Fit each record repeatedly during the session.
     identifies_motor
-        The sessions measure the motor. A probing move then verifies only the values that the limits
-        of travel and speed depend on.
+        Whether the sessions measure the motor. A probing move then verifies only the values on
+        which the limits of travel and speed depend.
 
     Attributes
     ----------
     plan
-        Predicted behaviour of each session.
+        Prediction of each session.
     results
         Results of the sessions so far.
 
     Raises
     ------
     CheckFailedError, UnknownRowError
-        If a check on paper fails and is not accepted, or `accept` has an unknown name.
+        If a check of the profile fails and is not accepted, or `accept` contains an unknown name.
     RefusedError, ControlDesignError, RealisationError
-        If the sessions would leave the limits, cannot be predicted, or lack metadata that the
-        profile requires.
+        If the sessions would exceed limits, cannot be predicted, or lack metadata that the profile
+        requires.
     NoRoomError
-        If the disk has no room for the first session.
+        If the disk has no space for the first session.
     """
 
     def __init__(
@@ -117,19 +122,19 @@ class Series:
         self.plan = plan_session(profile, excitation, force=force, accept=accept)
         self._touch = touch_search(profile, excitation)
         self.results: list[RunResult] = []
-        self._make_room()
+        self._require_disk_space()
 
     @property
     def ticks(self) -> int:
-        """Ticks of each session's record."""
+        """Number of ticks in the record of each session."""
         return int(self._excitation.reference_rad.size)
 
     def frequency_hz(self, tick: int) -> float | None:
-        """Return the frequency of the excitation at a tick; None if it has none."""
+        """Return the present frequency of the excitation at a tick, or None if it has none."""
         return present_frequency_hz(self._excitation, tick)
 
     def plan_document(self) -> dict[str, Any]:
-        """Return the plan for JSON."""
+        """Return the plan of each session as a dictionary for JSON."""
         return plan_document(self._profile, self._excitation, self.plan)
 
     def run(
@@ -139,12 +144,12 @@ class Series:
         watcher: SeriesWatcher,
         *,
         live: bool,
-        listens: Callable[[], bool] = always,
+        can_receive_stop: Callable[[], bool] = can_always_receive_stop,
         quick_looks: QuickLooks | None = None,
     ) -> None:
-        """Run the sessions; end at a stop or at the first incomplete session.
+        """Run the sessions until a stop or the first incomplete session.
 
-        Each session waits until the beam is at rest.
+        The results are appended to `results`. Each session waits until the beam is at rest.
 
         Parameters
         ----------
@@ -153,39 +158,40 @@ class Series:
         stop
             Stop request of the operator.
         watcher
-            Observer of the series.
+            Receiver of the progress.
         live
             Show each session in a live view.
-        listens
-            See :class:`rigd.runner.session.Session`.
+        can_receive_stop
+            See :class:`rigd.runner.session.SessionRun`.
         quick_looks
-            Makes a quick look at each session; the next session waits some seconds for it.
+            Program that makes a quick look at each session. The next session waits some seconds for
+            it.
 
         Raises
         ------
         NoRoomError
-            If the disk has no room for a further session.
+            If the disk has no space for a further session.
         RigError, SessionFailedError
-            If a session cannot be run, or failed; its result is not stored.
+            If a session cannot be run, or failed. Its result is not appended.
         ProbeFailedError
             If a probing move before the first session shows that the rig contradicts its profile.
         """
         try:
-            probed = {} if stop.requested else self._probe(rig, stop, watcher)
+            probe_metadata = {} if stop.requested else self._probe_if_needed(rig, stop, watcher)
         except RigError:
             if stop.requested and rig.connected:
-                return  # the move was stopped, and nothing else happened
+                return  # the probing move was stopped, and nothing failed
             raise
         for number in range(1, self._repeat + 1):
             if quick_looks is not None and number > 1:
                 _await_quick_look(quick_looks, rig, stop)
             if stop.requested:
                 return
-            self._make_room()
-            counted = self._repeat > 1
-            path = choose_path(self._folder, self._excitation.kind, number if counted else None)
-            notes = self._notes | ({"series": f"{number} of {self._repeat}"} if counted else {})
-            watcher.begins(number, path)
+            self._require_disk_space()
+            is_numbered = self._repeat > 1
+            path = choose_path(self._folder, self._excitation.kind, number if is_numbered else None)
+            notes = self._notes | ({"series": f"{number} of {self._repeat}"} if is_numbered else {})
+            watcher.on_start(number, path)
             order = Order(
                 self._profile,
                 self._excitation,
@@ -194,53 +200,61 @@ class Series:
                 tuple(
                     (
                         predicted_metadata(self._profile, self.plan.prediction, self._excitation)
-                        | probed
+                        | probe_metadata
                     ).items()
                 ),
                 self.plan.ending,
                 self._touch,
                 self._watch_fit,
-                self._seed(number),
+                self._session_seed(number),
                 self.plan.clearance.accepted,
             )
-            with contextlib.nullcontext() if quick_looks is None else quick_looks.held():
+            with contextlib.nullcontext() if quick_looks is None else quick_looks.suspended():
                 if live:
-                    watcher.shown(rig.show(order, stop))
-                result = rig.run(order, stop, watcher.update, listens)
+                    watcher.on_live_view(rig.show(order, stop))
+                result = rig.run(order, stop, watcher.on_progress, can_receive_stop)
             self.results.append(result)
             # The record of a vibration-free move contains no information on the modes.
-            seen = result.path if self._excitation.shows_modes else None
-            watcher.ended(result, look_follows=quick_looks is not None and seen is not None)
-            if quick_looks is not None and seen is not None:
-                quick_looks.begin(seen)
+            analysed_path = result.path if self._excitation.shows_modes else None
+            watcher.on_result(
+                result, look_follows=quick_looks is not None and analysed_path is not None
+            )
+            if quick_looks is not None and analysed_path is not None:
+                quick_looks.begin(analysed_path)
             if not result.went_well:
                 return
 
-    def _seed(self, number: int) -> int | None:
-        """Return the seed of a simulated rig's noise in a session; None: a fresh one."""
+    def _session_seed(self, number: int) -> int | None:
+        """Return the seed of a simulated rig's noise in a session, or None for a random seed."""
         simulation = self._profile.rig.simulation
         if simulation is None or simulation.seed is None:
             return None
         return session_seed(simulation.seed, number)
 
-    def _probe(self, rig: Rig, stop: StopRequest, watcher: SeriesWatcher) -> dict[str, str]:
-        """Make a probing move if motor and encoder are not known; return its metadata."""
+    def _probe_if_needed(
+        self, rig: Rig, stop: StopRequest, watcher: SeriesWatcher
+    ) -> dict[str, str]:
+        """Make a probing move if motor and encoder were not measured; return its metadata.
+
+        The metadata are empty if no move is needed.
+        """
         if self._profile.rig.devices.drive == "sim":
             return {}
         from rigd.runner import _probing  # late: a simulation in this process needs none
 
-        result = _probing.verify(
-            self._profile, rig, stop, watcher.says, motor=not self._identifies_motor
+        result = _probing.verify_by_probing(
+            self._profile, rig, stop, watcher.on_message, motor=not self._identifies_motor
         )
         return {} if result is None else result.as_metadata()
 
-    def _make_room(self) -> None:
-        make_room(self._folder, self._excitation, self._profile.limits)
+    def _require_disk_space(self) -> None:
+        """Raise NoRoomError if the disk lacks space for the next session."""
+        require_disk_space(self._folder, self._excitation, self._profile.limits)
 
 
 def _await_quick_look(quick_looks: QuickLooks, rig: Rig, stop: StopRequest) -> None:
-    """Wait for the quick look at the last session before the next session suspends it."""
-    deadline_s = time.monotonic() + _QUICK_LOOK_PATIENCE_S
+    """Wait some seconds for the quick look at the last session before the next session begins."""
+    deadline_s = time.monotonic() + _QUICK_LOOK_MAX_PAUSE_S
     while quick_looks.busy and not stop.requested and time.monotonic() < deadline_s:
         rig.watch()
         quick_looks.poll()

@@ -1,7 +1,7 @@
-"""Slope of the antenna's tip: its limit in identifications, and its description in plans.
+"""Slope of the antenna's tip: its limit in identifications, and text on it in plans.
 
-The exact model (`rigd.beam`) is valid for small slopes. `limits.tip_slope_rad` of the profile or
-`--tip-slope` of the session limits the slope.
+The exact beam model (`rigd.beam`) is valid for small slopes only. The profile limits the slope by
+`limits.tip_slope_rad`, and a session by `--tip-slope`.
 """
 
 import math
@@ -17,33 +17,34 @@ from rigd.profile import Profile
 PAPER_AMPLITUDE_RAD: Final = 0.025
 """Amplitude of the reference paper's chirp, up to which chirps are exempt from the limit."""
 
-NOT_IDENTIFYING: Final = ("move", "touch")
-"""Excitations with a target angle: they depend on the start angle and have no amplitude."""
+KINDS_WITH_TARGET_ANGLE: Final = ("move", "touch")
+"""Kinds of excitation with a target angle, which do not identify the antenna and have no amplitude.
+"""
 
-_MEANING: Final = {
+_STEEP_SLOPE_EFFECTS: Final = {
     "move": ", so that more vibration may be left than predicted",
     "touch": ", so that position and force of a touch are less accurate",
 }
 
 
 class TipSlopeError(UserError):
-    """The operator's limit of the tip slope cannot be used."""
+    """Raised if the limit of the tip slope that the operator states is invalid."""
 
 
 def with_tip_slope(profile: Profile, tip_slope_rad: float | None) -> Profile:
-    """Return a profile with the operator's limit of the tip's slope.
+    """Return a copy of a profile with another limit of the tip slope.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     tip_slope_rad
-        Limit for one session; None: that of the profile.
+        Limit that the operator states, or None to retain the limit of the profile.
 
     Raises
     ------
     TipSlopeError
-        If it is not a finite number above 0.
+        If the limit is not a finite number above 0.
     """
     if tip_slope_rad is None:
         return profile
@@ -54,15 +55,18 @@ def with_tip_slope(profile: Profile, tip_slope_rad: float | None) -> Profile:
     return replace(profile, limits=replace(profile.limits, tip_slope_rad=tip_slope_rad))
 
 
-def is_limited(excitation: Excitation) -> bool:
-    """Return whether the slope limit applies: the session identifies the antenna."""
+def has_slope_limit(excitation: Excitation) -> bool:
+    """Return whether the limit of the tip slope applies to an excitation.
+
+    It applies to excitations that identify the antenna, except for chirps of small amplitude.
+    """
     if excitation.kind == "chirp":
-        return not is_exempt(excitation)
-    # Sessions that identify the motor have other kinds: they do not depend on a beam model.
-    return excitation.kind in KINDS and excitation.kind not in NOT_IDENTIFYING
+        return not is_exempt_chirp(excitation)
+    # Sessions that identify the motor have other kinds, since they do not depend on a beam model.
+    return excitation.kind in KINDS and excitation.kind not in KINDS_WITH_TARGET_ANGLE
 
 
-def is_exempt(excitation: Excitation) -> bool:
+def is_exempt_chirp(excitation: Excitation) -> bool:
     """Return whether the excitation is a chirp of at most the reference paper's amplitude."""
     return (
         excitation.kind == "chirp"
@@ -71,12 +75,16 @@ def is_exempt(excitation: Excitation) -> bool:
 
 
 def is_physical(tip: TipMotion, beam: Beam) -> bool:
-    """Return whether the motion is possible: deflection up to the length, error below 100 %."""
+    """Return whether a predicted tip motion is physically possible.
+
+    It is possible if the deflection is at most the beam's length, and the linear model's error is
+    below 100 %.
+    """
     return tip.deflection_m <= beam.length_m and linear_model_error(tip.slope_rad) < 1.0
 
 
 def tip_document(tip: TipMotion | None, beam: Beam) -> dict[str, Any] | None:
-    """Return the predicted motion of the tip for JSON."""
+    """Return the predicted motion of the tip as a dictionary for JSON, or None if unknown."""
     if tip is None:
         return None
     return {
@@ -87,59 +95,61 @@ def tip_document(tip: TipMotion | None, beam: Beam) -> dict[str, Any] | None:
 
 
 def slope_remedy(excitation: Excitation, slope_rad: float, limit_rad: float) -> str:
-    """Return how a session beyond the limit can be changed or allowed."""
-    lower = ""
+    """Return advice on how to change or allow a session beyond the limit of the tip slope."""
+    factor_text = ""
     if excitation.kind == "file":
         factor = _rounded_down(limit_rad / slope_rad)
-        lower = f" to {factor:g} of it" if factor > 0 else ""
-    exempt = (
+        factor_text = f" to {factor:g} of it" if factor > 0 else ""
+    exemption_text = (
         f" (chirps of up to {PAPER_AMPLITUDE_RAD:g} rad, as in the reference paper, are exempt)"
         if excitation.kind == "chirp"
         else ""
     )
     allowed_rad = math.ceil(100 * slope_rad) / 100
-    return f"{lower}{exempt}, or allow it with --tip-slope {allowed_rad:g} (rad)"
+    return f"{factor_text}{exemption_text}, or allow it with --tip-slope {allowed_rad:g} (rad)"
 
 
 def tip_in_words(tip: TipMotion | None, beam: Beam, excitation: Excitation) -> str:
-    """Describe the tip motion and the error of the linear model; empty without a beam."""
+    """Return text on the predicted tip motion and the linear model's error; "" without beam."""
     if tip is None:
         return ""
     error = linear_model_error(tip.slope_rad)
     if not is_physical(tip, beam):
-        size = f"up to {100 * error:.2g}" if error < 1.0 else "above 100"
-        motion = (
+        error_text = f"up to {100 * error:.2g}" if error < 1.0 else "above 100"
+        motion_text = (
             f"Predicted tip slope: {tip.slope_rad:.2g} rad. The linear model does not hold there "
-            f"(error {size} %): the predicted deflection is larger than the beam allows, and "
+            f"(error {error_text} %): the predicted deflection is larger than the beam allows, and "
             "deflection and speed of the tip are not known"
         )
     else:
         fraction = tip.deflection_m / beam.length_m
-        motion = (
+        motion_text = (
             f"Predicted tip deflection: {tip.deflection_m:.3g} m ({100 * fraction:.2g} % of the "
             f"length), tip speed {tip.speed_m_s:.3g} m/s, slope {tip.slope_rad:.2g} rad."
         )
         if not tip.slope_rad > SMALL_SLOPE_RAD:
-            return motion
-        motion += (
+            return motion_text
+        motion_text += (
             f" At slopes above {SMALL_SLOPE_RAD:g} rad the linear model is not exact (error at "
             f"most {100 * error:.2g} %), and air drag may limit the motion"
         )
-    if excitation.kind in NOT_IDENTIFYING:
-        return f"{motion}{_MEANING[excitation.kind]}."
+    if excitation.kind in KINDS_WITH_TARGET_ANGLE:
+        return f"{motion_text}{_STEEP_SLOPE_EFFECTS[excitation.kind]}."
     if excitation.kind not in KINDS:
-        return f"{motion}; the identification of the motor does not rest on it."
-    lower = _rounded_down(SMALL_SLOPE_RAD / tip.slope_rad)
-    within = f"; {lower:g} times the amplitude stays within" if lower > 0 else ""
-    exempt = (
+        return f"{motion_text}; the identification of the motor does not rest on it."
+    amplitude_factor = _rounded_down(SMALL_SLOPE_RAD / tip.slope_rad)
+    advice = (
+        f"; {amplitude_factor:g} times the amplitude stays within" if amplitude_factor > 0 else ""
+    )
+    exemption_text = (
         f" A chirp of up to {PAPER_AMPLITUDE_RAD:g} rad, as in the reference paper, is not refused "
         "for it."
-        if is_exempt(excitation)
+        if is_exempt_chirp(excitation)
         else ""
     )
-    return f"{motion}{within}.{exempt}"
+    return f"{motion_text}{advice}.{exemption_text}"
 
 
 def _rounded_down(factor: float) -> float:
-    """Round a factor down to two decimals."""
+    """Return a factor rounded down to two decimals."""
     return math.floor(100.0 * factor) / 100.0

@@ -1,7 +1,7 @@
-"""Search for an obstacle: settings of detector and estimator, and the estimates of the touches.
+"""Search for an obstacle: settings of the touch detector, and supervision of the touch process.
 
-The control loop detects a touch and reacts by itself. The touch process estimates position and
-force at the same time. A session continues without the touch process if it is lost.
+The control loop detects a touch and reacts to it. Meanwhile the touch process estimates position
+and force. A session continues without the touch process if that fails.
 """
 
 import time
@@ -26,32 +26,32 @@ if TYPE_CHECKING:
     from rigd.runner._process_group import ProcessGroup
     from rigd.touch import ChannelNoise, SensorFilter, TouchModel
 
-_STEP_STD: Final = 1 / sqrt(12)
-"""Standard deviation of the rounding error for steps of 1."""
-_LAST_PATIENCE_S: Final = 30.0
-"""Time for the last estimate after the end of a record; a later estimate is not reported."""
+_ROUNDING_STD_PER_STEP: Final = 1 / sqrt(12)
+"""Standard deviation of the rounding error, as a fraction of the quantisation step."""
+_FINAL_ESTIMATES_TIMEOUT_S: Final = 30.0
+"""Maximum time in seconds for the last estimates after the end of a record."""
 _POLL_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class TouchSearch:
-    """Settings of the search for an obstacle."""
+    """Settings of the search for an obstacle in a session."""
 
     order: TouchOrder
-    """Settings of the control loop."""
+    """Settings with which the control loop detects a touch and reacts to it."""
     model: "TouchModel"
-    """Model of the estimator."""
+    """Model of beam and sensor with which the touch process estimates touches."""
 
 
 def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None:
-    """Return the touch search of an excitation; None for an excitation without an approach."""
+    """Return the settings of the search for an obstacle, or None if there is no search."""
     if excitation.approach is None:
         return None
     from rigd.touch import DetectorSettings, TouchModel, watched_beam
 
     rig = profile.rig
     sensor = rig.sensor
-    stated: dict[str, Any] = {
+    stated_values: dict[str, Any] = {
         "angle_delay_s": rig.encoder.delay_s,
         "torque_delay_s": sensor.delay_s,
         "tool_inertia_kg_m2": sensor.tool_inertia_kg_m2,
@@ -59,28 +59,35 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
     }
     path = str(excitation.parameters["file"])
     if path:
-        model = TouchModel.from_analysis(path, length_m=rig.beam.length_m, **stated)
+        model = TouchModel.from_analysis(path, length_m=rig.beam.length_m, **stated_values)
     else:
-        model = TouchModel.assumed(rig.beam, rig.damping, **stated)
-    beam = watched_beam(model, rig.rate_hz, _noise(profile))
-    shear = sensor.shear_projection if any(sensor.shear_projection) else None
-    return TouchSearch(TouchOrder(beam, DetectorSettings(), excitation.approach, shear), model)
+        model = TouchModel.assumed(rig.beam, rig.damping, **stated_values)
+    beam = watched_beam(model, rig.rate_hz, _reading_noise(profile))
+    shear_projection = sensor.shear_projection if any(sensor.shear_projection) else None
+    return TouchSearch(
+        TouchOrder(beam, DetectorSettings(), excitation.approach, shear_projection), model
+    )
 
 
 def _sensor_filter(rig: RigParameters) -> "SensorFilter":
-    """Return the sensor filters that a profile states."""
+    """Return the low-pass filters in the sensor's signal path that a profile states."""
     from rigd.touch import SensorFilter
 
     low_pass = rig.sensor.filter_hz, rig.sensor.filter_order
-    serial = rig.ati_serial
-    if serial is None:
+    serial_settings = rig.ati_serial
+    if serial_settings is None:
         return SensorFilter(*low_pass)
-    records = serial.records_per_tick(rig.rate_hz)
-    return SensorFilter.of_records(*low_pass, serial.filter, records, 1 / serial.stream_hz)
+    records = serial_settings.records_per_tick(rig.rate_hz)
+    return SensorFilter.of_records(
+        *low_pass, serial_settings.filter, records, 1 / serial_settings.stream_hz
+    )
 
 
-def _noise(profile: Profile) -> "ChannelNoise":
-    """Return the noise of the readings; only the ratio matters, its size is measured at rest."""
+def _reading_noise(profile: Profile) -> "ChannelNoise":
+    """Return the noise of torque, shear force and angle readings.
+
+    Only the ratios are used, since the size of the noise is measured at rest.
+    """
     from rigd.touch import ChannelNoise
 
     rig = profile.rig
@@ -91,11 +98,13 @@ def _noise(profile: Profile) -> "ChannelNoise":
         float(np.linalg.norm(np.array(projection) * axes))
         for projection in (rig.sensor.projection, rig.sensor.shear_projection)
     )
-    return ChannelNoise(torque_nm, shear_n or None, _STEP_STD * rig.encoder.resolution_rad)
+    return ChannelNoise(
+        torque_nm, shear_n or None, _ROUNDING_STD_PER_STEP * rig.encoder.resolution_rad
+    )
 
 
 class TouchEstimates:
-    """Supervise the touch process of one session and collect its estimates."""
+    """Supervisor of the touch process of one session, which collects the estimates."""
 
     def __init__(
         self,
@@ -107,9 +116,9 @@ class TouchEstimates:
         self._group = group
         self._rate_hz = rate_hz
         self._events: list[LogEvent] = []
-        self._news: list[dict[str, Any]] = []
-        self._lost = ""
-        self._ready = False
+        self._new_estimates: list[dict[str, Any]] = []
+        self._failure = ""
+        self._is_ready = False
         self._reports: dict[int, TouchReport] = {}
         job = TouchJob(
             group.channels.specs,
@@ -120,79 +129,94 @@ class TouchEstimates:
             realtime,
         )
         try:
-            group.fresh(TOUCH).start(job)
+            group.idle_process(TOUCH).start(job)
         except ChildError as error:
-            self._lose(str(error))
+            self._continue_without_process(str(error))
 
-    def await_ready(self, meanwhile: Callable[[], bool]) -> None:
-        """Wait until the process is ready or lost, as long as `meanwhile` returns True."""
-        late = await_ready(lambda: self._ready or bool(self._lost), self._listen, meanwhile)
-        if late:
-            self._lose(f"The touch process was {late}.")
+    def await_ready(self, call_while_waiting: Callable[[], bool]) -> None:
+        """Wait until the touch process is ready or has failed.
 
-    def listen(self, patience_s: float) -> bool:
-        """Wait for an estimate for at most `patience_s`; return whether the process is running."""
-        self._listen(patience_s)
-        return not self._lost
+        The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
+        """
+        delay_text = await_ready(
+            lambda: self._is_ready or bool(self._failure),
+            self._process_messages,
+            call_while_waiting,
+        )
+        if delay_text:
+            self._continue_without_process(f"The touch process was {delay_text}.")
+
+    def process_messages(self, timeout_s: float) -> bool:
+        """Wait for messages of the touch process; return whether it is still running."""
+        self._process_messages(timeout_s)
+        return not self._failure
 
     def poll(self) -> list[LogEvent]:
-        """Read the received messages, and return the events for the operator."""
-        self._listen(0.0)
+        """Process the received messages, and return the new events for the operator."""
+        self._process_messages(0.0)
         events, self._events = self._events, []
         return events
 
-    def finish(self, touches: int, meanwhile: Callable[[], None]) -> list[dict[str, Any]]:
-        """Wait for the last estimates of all detected touches; return each touch for JSON.
+    def finish(self, touches: int, call_while_waiting: Callable[[], None]) -> list[dict[str, Any]]:
+        """Wait for the final estimates of all detected touches; return a JSON dictionary for each.
 
-        A touch without an estimate has its number alone. ``final`` is false for a first estimate
-        without a better one.
+        `touches` is the number of detected touches. A touch without an estimate has its number
+        only. ``final_reports`` is false if there is only the first, less accurate estimate.
         """
-        deadline_s = time.monotonic() + _LAST_PATIENCE_S
+        deadline_s = time.monotonic() + _FINAL_ESTIMATES_TIMEOUT_S
 
-        def missing() -> bool:
-            final = [report for report in self._reports.values() if report.final]
-            return len(final) < touches and not self._lost and time.monotonic() < deadline_s
+        def is_estimate_missing() -> bool:
+            final_reports = [report for report in self._reports.values() if report.final]
+            return (
+                len(final_reports) < touches and not self._failure and time.monotonic() < deadline_s
+            )
 
-        while missing():
-            self._listen(_POLL_S)
-            meanwhile()
-        return [_document(number, self._reports.get(number)) for number in range(1, touches + 1)]
+        while is_estimate_missing():
+            self._process_messages(_POLL_S)
+            call_while_waiting()
+        return [
+            _touch_document(number, self._reports.get(number)) for number in range(1, touches + 1)
+        ]
 
-    def packed(self) -> bytes:
-        """Return the last estimates as messages for the session file."""
+    def encoded_touches(self) -> bytes:
+        """Return the latest estimate of each touch as encoded messages for the session file."""
         touches = [(report.tick, report.document) for _, report in sorted(self._reports.items())]
         return packed_touches(touches, self._rate_hz)
 
-    def news(self) -> list[dict[str, Any]]:
-        """Return the estimates received since the last call, for the live view."""
-        news, self._news = self._news, []
-        return news
+    def take_new_estimates(self) -> list[dict[str, Any]]:
+        """Return the estimates that were received since the last call."""
+        estimates, self._new_estimates = self._new_estimates, []
+        return estimates
 
-    def _listen(self, patience_s: float) -> None:
-        if self._lost:
+    def _process_messages(self, timeout_s: float) -> None:
+        """Process messages of the touch process, waiting up to `timeout_s` seconds for them."""
+        if self._failure:
             return
         try:
-            for message in self._group[TOUCH].messages(patience_s):
+            for message in self._group[TOUCH].messages(timeout_s):
                 if isinstance(message, TouchReady):
-                    self._ready = True
+                    self._is_ready = True
                 elif isinstance(message, TouchReport):
                     self._reports[message.number] = message
-                    self._note(message)
+                    self._add_estimate(message)
         except ChildError as error:
-            self._lose(str(error))
+            self._continue_without_process(str(error))
 
-    def _note(self, report: TouchReport) -> None:
-        touch = _document(report.number, report)
-        self._news.append(touch)
+    def _add_estimate(self, report: TouchReport) -> None:
+        """Add an estimate to those for the live view and to the events for the operator."""
+        touch = _touch_document(report.number, report)
+        self._new_estimates.append(touch)
         self._events.append(LogEvent(0, "info", touch_line(touch), notable=True))
 
-    def _lose(self, why: str) -> None:
-        self._lost = why
-        text = f"{why} Touches are detected but not estimated; the session continues."
+    def _continue_without_process(self, reason: str) -> None:
+        """Continue the session without the touch process, and add an event that states why."""
+        self._failure = reason
+        text = f"{reason} Touches are detected but not estimated; the session continues."
         self._events.append(LogEvent(0, "warning", text))
 
 
-def _document(number: int, report: TouchReport | None) -> dict[str, Any]:
+def _touch_document(number: int, report: TouchReport | None) -> dict[str, Any]:
+    """Return a touch as a dictionary for JSON, given its estimate if there is one."""
     if report is None:
         return {"number": number}
     # A first estimate may be the only one.

@@ -1,10 +1,10 @@
-"""The fit process: fits the record of a running session and plans the next excitation.
+"""The fit process, which fits the record of a running session and plans the next excitation.
 
-The process observes the ring of samples as the live publisher does, so that it neither delays the
-loop nor takes samples from the recorder. It passes the samples to the analyser's fit program
-(``python -m analysis.online``) and the answers to the supervisor. If the session runs until a
-precision is reached, each answer also decides on the next segment of the reference
-(`ExcitationPlanner`).
+The process reads the ring buffer of samples like the live publisher, so that it neither delays the
+control loop nor takes samples from the recorder. It passes the samples to the analyser's fit
+program (``python -m analysis.online``), and the program's estimates to the supervisor. If the
+session lasts until a precision is reached, each estimate is also used to plan the next segment of
+the reference (`ExcitationPlanner`).
 """
 
 import contextlib
@@ -35,22 +35,25 @@ from rigd.session.online_fit import (
     write_start,
 )
 
-_PROGRAM: Final = "analysis.online"
-_BLOCK: Final = 500
-_IDLE_S: Final = 0.005
-_EVERY_S: Final = 1.0
-"""Time between two fits of a session with a given reference."""
-_GRACE_S: Final = 1.0
-_FIRST_REQUEST: Final = 1_000_000_000
-"""First id of requested estimates; the ids of periodic estimates start at 0."""
+_FIT_MODULE: Final = "analysis.online"
+_MAX_BLOCK_SAMPLES: Final = 500
+"""Maximum number of samples that are passed to the fit program at once."""
+_IDLE_WAIT_S: Final = 0.005
+"""Time in seconds to wait for a message if there are no new samples."""
+_FIT_INTERVAL_S: Final = 1.0
+"""Time in seconds between two fits of a session whose excitation is planned before its start."""
+_END_TIMEOUT_S: Final = 1.0
+"""Time in seconds that the fit program has to end before it is killed."""
+_FIRST_REQUEST_ID: Final = 1_000_000_000
+"""First identification number of requested estimates; those of periodic estimates start at 0."""
 
 
 class FitProgramError(Exception):
-    """The fit program ended; the message states how."""
+    """Raised if the fit program ended unexpectedly; the message states how it ended."""
 
 
 def main() -> None:
-    """Run as ``python -m rigd.runner.fit_process``."""
+    """Run the fit process of one session; called by ``python -m rigd.runner.fit_process``."""
     ignore_signals()
     parent = Parent()
     job: FitJob = parent.receive_job()
@@ -58,23 +61,23 @@ def main() -> None:
         pin_off_loop_core(job.realtime.cpu)
     try:
         with FitProgram() as program:
-            follower = _Follower(job, parent, program, attach_channels(job.channels))
+            session_fit = _SessionFit(job, parent, program, attach_channels(job.channels))
             try:
-                follower.follow()
+                session_fit.run()
             except BrokenPipeError:
-                raise program.ended() from None
+                raise program.end_error() from None
     except FitProgramError as error:
         parent.send(Failed(str(error)))
         raise SystemExit(1) from None
 
 
 class FitProgram:
-    """The analyser's fit program; leaving the context ends it."""
+    """The analyser's fit program, run in a child process that ends with the context."""
 
     def __init__(self) -> None:
         try:
             self._process = subprocess.Popen(
-                [*OWN_PYTHON, "-m", _PROGRAM, "--parent", str(os.getpid())],
+                [*OWN_PYTHON, "-m", _FIT_MODULE, "--parent", str(os.getpid())],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 env=os.environ | SINGLE_THREADED,
@@ -84,32 +87,39 @@ class FitProgram:
                 f"The fit program cannot be started ({error.strerror})."
             ) from None
         self.input = cast("BinaryIO", self._process.stdin)
-        """Input stream, in the format of `rigd.session.online_fit`."""
-        self._answers: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
-        threading.Thread(target=self._read, daemon=True).start()
+        """Standard input of the program, in the format of `rigd.session.online_fit`."""
+        self._estimates: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+        threading.Thread(target=self._read_estimates, daemon=True).start()
 
-    def answer(self) -> dict[str, Any] | None:
-        """Return the next answer, or None if there is none; raise if the program has ended."""
+    def next_estimate(self) -> dict[str, Any] | None:
+        """Return the program's next estimate, or None if there is no new one.
+
+        Raises
+        ------
+        FitProgramError
+            If the program has ended.
+        """
         try:
-            answer = self._answers.get_nowait()
+            estimate = self._estimates.get_nowait()
         except queue.Empty:
             return None
-        if answer is None:
-            raise self.ended()
-        return answer
+        if estimate is None:
+            raise self.end_error()
+        return estimate
 
-    def ended(self) -> FitProgramError:
-        """Return an error that states how the program ended."""
+    def end_error(self) -> FitProgramError:
+        """Return the error that states how the program ended, after waiting for its end."""
         code = self._process.wait()
         how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
         return FitProgramError(f"The fit program {how}.")
 
-    def _read(self) -> None:
+    def _read_estimates(self) -> None:
+        """Read the program's estimates into a queue until it ends; run in a thread."""
         assert self._process.stdout is not None
         with contextlib.suppress(ValueError):  # incomplete line: the program ended while writing
             for line in self._process.stdout:
-                self._answers.put(json.loads(line))
-        self._answers.put(None)
+                self._estimates.put(json.loads(line))
+        self._estimates.put(None)
 
     def __enter__(self) -> Self:
         return self
@@ -118,14 +128,14 @@ class FitProgram:
         with contextlib.suppress(OSError):
             self.input.close()
         try:
-            self._process.wait(_GRACE_S)
+            self._process.wait(_END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
 
 
-class _Follower:
-    """Fit one session, from its first sample to the fit of the whole record."""
+class _SessionFit:
+    """Passes the samples of one session to the fit program, and its estimates to the supervisor."""
 
     def __init__(
         self, job: FitJob, parent: Parent, program: FitProgram, channels: Channels
@@ -136,117 +146,131 @@ class _Follower:
         self._reader = Observer(channels.samples, job.first)
         self._job = job
         self._search: ExcitationPlanner | None = None
-        self._pending: EstimateRequest | None = None
-        self._ahead = False
-        self._before: dict[str, Any] | None = None
-        self._ticks = self._number = 0
-        self._ended_after: int | None = None
+        self._pending: EstimateRequest | None = None  # request without an estimate so far
+        self._is_early_fit_pending = False  # whether it only provides start values for the next fit
+        self._previous_estimate: dict[str, Any] | None = None  # previous estimate
+        self._passed_ticks = self._request_count = 0
+        self._record_ticks: int | None = None  # ticks of the whole record
 
-    def follow(self) -> None:
-        """Run until the whole record is fitted, or the supervisor has ended."""
+    def run(self) -> None:
+        """Pass samples and estimates on until the whole record is fitted or the supervisor ends."""
         self._parent.send(FitReady())
         while True:
             self._shared_state.beat(StateField.FIT_BEAT)
-            moved = self._feed()
-            answer = self._program.answer()
-            if answer is not None and self._answered(answer):
+            has_passed_samples = self._pass_samples()
+            estimate = self._program.next_estimate()
+            if estimate is not None and self._process_estimate(estimate):
                 return
-            self._ask(drained=not moved)
+            self._request_if_possible(is_drained=not has_passed_samples)
             try:
-                message = self._parent.poll(0.0 if moved else _IDLE_S)
+                message = self._parent.poll(0.0 if has_passed_samples else _IDLE_WAIT_S)
             except EOFError:
                 return
             match message:
                 case FileHeader():
-                    self._begin(message)
+                    self._start_fits(message)
                 case RecordEnded(ticks):
-                    self._ended_after = ticks
-                    if self._search is not None and self._search.due is not None:
-                        before, begun = (
+                    self._record_ticks = ticks
+                    if self._search is not None and self._search.due_tick is not None:
+                        held_ticks_before, begun = (
                             self._shared_state[StateField.HELD_BEFORE],
                             self._shared_state[StateField.BEGUN],
                         )
-                        self._parent.send(self._search.ended(ticks, before, begun))
+                        self._parent.send(
+                            self._search.end_of_record(ticks, held_ticks_before, begun)
+                        )
 
-    def _begin(self, header: FileHeader) -> None:
-        """Start the fits with the header of the session file."""
+    def _start_fits(self, header: FileHeader) -> None:
+        """Send the header of the session file to the fit program, and prepare the planning."""
         job = self._job
         if job.search is not None:
             writer = ReferenceWriter(job.reference, self._shared_state)
             start_rad = float(header.metadata["start_angle_rad"])
             self._search = ExcitationPlanner(job.search, job.profile, writer, start_rad=start_rad)
-        every_s = _EVERY_S if job.search is None else None
+        every_s = _FIT_INTERVAL_S if job.search is None else None
         start = StreamStart(dict(header.metadata), dict(header.segments), every_s)
         write_start(self._program.input, start)
 
-    def _feed(self) -> bool:
-        """Pass recorded samples to the fit program; return whether there were any."""
-        block = self._reader.take(_BLOCK)
+    def _pass_samples(self) -> bool:
+        """Pass new samples to the fit program; return whether there were any."""
+        block = self._reader.take(_MAX_BLOCK_SAMPLES)
         if not block:
             return False
         write_samples(self._program.input, block)
-        self._ticks = int(decode_samples(block[-SAMPLE_SIZE:])["tick"][0]) + 1
+        self._passed_ticks = int(decode_samples(block[-SAMPLE_SIZE:])["tick"][0]) + 1
         return True
 
-    def _ask(self, *, drained: bool) -> None:
-        """Request the next estimate as soon as its samples are available."""
+    def _request_if_possible(self, *, is_drained: bool) -> None:
+        """Request the next estimate if the samples for it have been passed to the fit program.
+
+        `is_drained` states that all samples in the ring buffer have been passed.
+        """
         if self._pending is not None:
             return
         search = self._search
-        if self._ended_after is not None:
-            if drained:
-                self._request(self._ended_after, whole=True)
+        if self._record_ticks is not None:
+            if is_drained:
+                self._request_estimate(self._record_ticks, whole=True)
         elif (
             search is not None
-            and search.due is not None
-            and search.is_begun(self._shared_state[StateField.BEGUN])
+            and search.due_tick is not None
+            and search.has_last_segment_begun(self._shared_state[StateField.BEGUN])
         ):
-            # Read after the samples: the loop counts a held tick before it publishes the sample.
-            tick = search.due + self._shared_state[StateField.HELD]
-            if self._ticks >= tick:
-                self._request(tick, whole=search.may_be_last, from_last=True)
+            # The count of held ticks is read after the samples, because the loop increases it
+            # before it publishes the sample.
+            tick = search.due_tick + self._shared_state[StateField.HELD]
+            if self._passed_ticks >= tick:
+                self._request_estimate(tick, whole=search.may_be_last, from_last=True)
 
-    def _request(self, tick: int, *, whole: bool, from_last: bool = False) -> None:
-        self._number += 1
-        self._pending = EstimateRequest(_FIRST_REQUEST + self._number, tick, whole, from_last)
+    def _request_estimate(self, tick: int, *, whole: bool, from_last: bool = False) -> None:
+        """Request an estimate from the samples before a tick; see `EstimateRequest`."""
+        self._request_count += 1
+        self._pending = EstimateRequest(
+            _FIRST_REQUEST_ID + self._request_count, tick, whole, from_last
+        )
         write_request(self._program.input, self._pending)
 
-    def _answered(self, answer: dict[str, Any]) -> bool:
-        """Report an estimate and plan with it; return whether it is of the whole record."""
+    def _process_estimate(self, estimate: dict[str, Any]) -> bool:
+        """Report an estimate or plan the next segment with it.
+
+        Returns whether the estimate is the final one, of the whole record.
+        """
         request, search = self._pending, self._search
-        if request is not None and request.id != answer["id"]:
+        if request is not None and request.id != estimate["id"]:
             request = None
         # Only the last estimate is requested without start values from the previous one.
-        final = request is not None and request.tick == self._ended_after and not request.from_last
-        ahead = self._ahead
+        is_final = (
+            request is not None and request.tick == self._record_ticks and not request.from_last
+        )
+        was_early_fit = self._is_early_fit_pending
         if request is not None:
-            self._pending, self._ahead = None, False
-        if search is not None and not final:
-            if request is not None and self._ended_after is None and not ahead:
-                self._decide(search, request, answer)
+            self._pending, self._is_early_fit_pending = None, False
+        if search is not None and not is_final:
+            if request is not None and self._record_ticks is None and not was_early_fit:
+                self._plan_next_segment(search, request, estimate)
             return False
-        answer["text"] = estimate_lines(answer, self._before)
+        estimate["text"] = estimate_lines(estimate, self._previous_estimate)
         if search is None:
-            self._before = answer
+            self._previous_estimate = estimate
         else:
-            answer["search"] = search.state(answer)
-        self._parent.send(FitReport(answer, final=final))
-        return final
+            estimate["search"] = search.targets_document(estimate)
+        self._parent.send(FitReport(estimate, final=is_final))
+        return is_final
 
-    def _decide(
-        self, search: ExcitationPlanner, request: EstimateRequest, answer: dict[str, Any]
+    def _plan_next_segment(
+        self, search: ExcitationPlanner, request: EstimateRequest, estimate: dict[str, Any]
     ) -> None:
-        """Plan the next segment from an estimate."""
-        held, before = (
+        """Plan the next segment from an estimate, and send the plan to the supervisor."""
+        held_ticks, held_ticks_before = (
             self._shared_state[StateField.HELD],
             self._shared_state[StateField.HELD_BEFORE],
         )
-        for message in search.decide(answer, held, before):
+        for message in search.plan_next(estimate, held_ticks, held_ticks_before):
             self._parent.send(message)
         if search.needs_early_fit:
-            # This fit of all structures gives start values for the check of the whole record.
-            self._request(request.tick, whole=True, from_last=True)
-            self._ahead = True
+            # This fit of all structures provides start values for the check of the whole record.
+            self._request_estimate(request.tick, whole=True, from_last=True)
+            self._is_early_fit_pending = True
 
 
 if __name__ == "__main__":

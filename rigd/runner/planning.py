@@ -1,4 +1,4 @@
-"""Planning of a session before any motion: stability of the loop, predicted peaks, limits."""
+"""Planning of a session before any motion: loop stability, predicted peaks, and limits."""
 
 import inspect
 import math
@@ -30,8 +30,8 @@ from rigd.runner._move_plant import (
     with_beam,
 )
 from rigd.runner._tip_slope import (
-    NOT_IDENTIFYING,
-    is_limited,
+    KINDS_WITH_TARGET_ANGLE,
+    has_slope_limit,
     slope_remedy,
     tip_document,
     tip_in_words,
@@ -41,123 +41,128 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 
-_MOST_RAD = 2.0 * math.pi
-"""Largest permitted amplitude of an excitation."""
-_ROUNDS = 10
-"""Steps of the search for the largest amplitude; three or four are needed."""
-_NO_FORCE = (
+_MAX_AMPLITUDE_RAD = 2.0 * math.pi
+"""Maximum amplitude in rad that `largest_amplitude` proposes."""
+_MAX_ITERATIONS = 10
+"""Maximum number of iterations of the search for the largest amplitude, which takes 3 or 4."""
+_UNKNOWN_FORCE_WARNING = (
     "Without sensor.shear_projection in the profile the contact force is not known: force_limit_n "
     "(--force-limit) ends nothing, and points are less precise."
 )
 
 
 class RefusedError(UserError):
-    """A session would exceed limits of the profile; the message states them and the remedy."""
+    """Raised if a session is refused, such as for exceeding limits; it states the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionPrediction:
-    """Predicted peak magnitudes of a session that starts at the rig's zero.
+    """Predicted peak magnitudes of angle, speed and torques in a session.
 
-    The prediction uses the linear closed loop without torque limit: saturation shows as a peak
-    above the motor's peak torque.
+    They are predicted with the linear closed loop without torque limit. A torque command that the
+    drive would limit therefore appears as a peak above the motor's peak torque.
     """
 
     peak_angle_rad: float
-    """Angle from the rig's zero."""
+    """Peak magnitude of the motor angle, relative to the rig's zero."""
     peak_velocity_rad_s: float
-    """Speed of the output shaft."""
+    """Peak speed of the output shaft."""
     peak_torque_nm: float
-    """Torque command at the output shaft."""
+    """Peak magnitude of the torque command at the output shaft."""
     peak_tracking_error_rad: float
-    """Reference less angle."""
+    """Peak magnitude of the tracking error (reference minus angle)."""
     peak_coupling_torque_nm: float
-    """Torque between hub and antenna."""
+    """Peak magnitude of the torque between hub and antenna."""
     tip: TipMotion | None = None
-    """Motion of the beam's free end in a vacuum; None without a beam, or where it is irrelevant."""
+    """Predicted motion of the beam's free end in a vacuum, or None if it was not predicted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Prediction of a session, and whether the limits allow it."""
+    """Prediction of a session before any motion, and whether the limits allow the session."""
 
     prediction: SessionPrediction
-    """Predicted peaks."""
+    """Predicted peak magnitudes."""
     warnings: tuple[str, ...]
-    """Sentences for the operator."""
+    """Warnings for the operator, one sentence each."""
     tip_in_words: str
-    """Description of the motion of the free end and of the validity of the linear model."""
+    """Sentence on the predicted motion of the beam's free end and the linear model's validity."""
     refused: str = ""
-    """Reasons against running it, one line for each exceeded limit; empty if it may be run."""
+    """Reasons to refuse the session, one line for each exceeded limit, or empty if allowed."""
     ending: Ending = field(default_factory=Ending)
-    """Motion after the record, for the control process."""
+    """Motion that the control process makes after the record, such as the return to the start."""
     clearance: Clearance = field(default_factory=Clearance)
-    """Results of the checks on paper."""
+    """Results of the checks on the profile that need no device."""
 
 
 class RigPreview:
-    """Preview of the closed loop of a rig, for the design of an excitation.
+    """Model of a rig's closed loop, with which excitations are designed before any motion.
 
     Parameters
     ----------
     profile
-        Profile of the rig. Its closed loop is computed when first needed.
+        Profile of the rig. The closed loop is computed when it is first needed.
     start_rad
-        Motor angle at the start, from the rig's zero.
+        Motor angle at the start of the session, relative to the rig's zero.
     """
 
     def __init__(self, profile: Profile, start_rad: float = 0.0) -> None:
         self._profile = profile
         self.start_rad = start_rad
-        self._estimated: tuple[LoadedBeam, MovePlant] | None = None
+        self._last_estimated_plant: tuple[LoadedBeam, MovePlant] | None = None
 
     @property
     def beam(self) -> Beam:
-        """Beam of the profile."""
+        """Beam that the profile states."""
         return self._profile.rig.beam
 
     @property
     def uniformity(self) -> float:
-        """Relative standard deviation of the modes' frequencies from those of a uniform beam."""
+        """Relative standard deviation of mode frequencies from those of a uniform beam."""
         return self._profile.uncertainty.uniformity_percent / 100.0
 
     @property
     def stated_estimate(self) -> BeamEstimate:
-        """Beam estimate with the values of the profile and the noise of the sensor, all free."""
+        """Beam estimate with the profile's values and the sensor's noise, and free parameters."""
         rig = self._profile.rig
         density_nm2_per_hz = 2.0 * torque_noise_nm(self._profile) ** 2 / rig.rate_hz
         tip_mass_kg = self._profile.loop_model().tip_mass_kg
         return BeamEstimate.stated(rig.beam, rig.damping, density_nm2_per_hz, tip_mass_kg)
 
     @cached_property
-    def _loop(self) -> ClosedLoop:
+    def _closed_loop(self) -> ClosedLoop:
+        """Stable closed loop with the beam of the profile."""
         return stable_loop(self._profile.loop_model())[0]
 
     def tracking(self, frequency_hz: Real) -> Complex:
-        """Return the frequency response from reference to angle, in the shape of the input."""
-        return self._loop.response(frequency_hz)
+        """Return the closed loop's frequency response from reference angle to motor angle.
+
+        The result has the shape of `frequency_hz`.
+        """
+        return self._closed_loop.response(frequency_hz)
 
     def fraction_of_limits(self, reference_rad: Real) -> float:
-        """Return the largest predicted peak of a reference (n,) as a fraction of its limit.
+        """Return the largest ratio of a predicted peak to its limit for a reference angle (n,).
 
         Raises
         ------
         ControlDesignError
-            If the loop is unstable and the response overflows.
+            If the loop is unstable and the predicted response overflows.
         """
-        response = self._loop.simulate(reference_rad)
-        firm, forcible = _limited(self._profile, _peaks(reference_rad, response))
-        return _largest_fraction(firm + forcible)
+        response = self._closed_loop.simulate(reference_rad)
+        always_limited, clippable = _limited_peaks(self._profile, _peaks(reference_rad, response))
+        return _largest_fraction(always_limited + clippable)
 
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
-        """Return the rig model for the planning of a move.
+        """Return the model of motor, beam and closed loop with which a move is planned.
 
         Parameters
         ----------
         path
-            Document of ``analyze --json`` with the beam; empty: the beam of the profile.
+            Path of a document of ``analyze --json`` with an identified beam; empty for the beam of
+            the profile.
         use
-            Purpose of the beam.
+            Purpose of the model, which limits the effects that the identified beam may have.
 
         Raises
         ------
@@ -166,63 +171,65 @@ class RigPreview:
         ControlDesignError
             If the loop is unstable with that beam.
         RealisationError
-            If its damping cannot be realised.
+            If the beam's damping cannot be realised by a model with poles.
         """
-        found = read_identified_beam(path, self.beam.length_m, use) if path else None
-        model = loop_model_with(self._profile, found)
-        return move_plant_of(self._profile, model, _sensor_limit_nm(self._profile), found)
+        identified_beam = read_identified_beam(path, self.beam.length_m, use) if path else None
+        model = loop_model_with(self._profile, identified_beam)
+        return move_plant_of(self._profile, model, _sensor_limit_nm(self._profile), identified_beam)
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
-        """Return the largest predicted slope of the free end for a reference (n,)."""
-        angle_rad = self._loop.simulate(reference_rad).angle_rad
+        """Return the predicted peak slope of the beam's free end for a reference angle (n,)."""
+        angle_rad = self._closed_loop.simulate(reference_rad).angle_rad
         rig = self._profile.rig
         return tip_motion(rig.beam, rig.damping, angle_rad, rig.rate_hz).slope_rad
 
     def plant_with(self, beam: LoadedBeam) -> MovePlant:
-        """Return the rig model with an estimated beam, for the design of excitation.
+        """Return the model of motor, estimated beam and closed loop for the design of excitation.
 
-        If the loop cannot be computed with the estimated damping, that of the profile is used. The
-        effect on the motor is small, because the coupling torque is fed forward. The last model is
-        cached.
+        If the loop cannot be computed with the estimated damping, the damping of the profile is
+        used. The effect on the motor is small, because the coupling torque is fed forward. The last
+        model is cached.
 
         Parameters
         ----------
         beam
-            The estimated loaded beam.
+            Estimated beam with its tip mass and root compliance.
 
         Raises
         ------
         ControlDesignError
             If the loop is unstable with that beam.
         RealisationError
-            If no damping can be realised.
+            If neither damping can be realised by a model with poles.
         """
-        if self._estimated is not None and self._estimated[0] == beam:
-            return self._estimated[1]
+        if self._last_estimated_plant is not None and self._last_estimated_plant[0] == beam:
+            return self._last_estimated_plant[1]
         profile = self._profile
         limit_nm = _sensor_limit_nm(profile)
         try:
             plant = move_plant_of(profile, with_beam(profile.loop_model(), beam), limit_nm)
         except (ControlDesignError, RealisationError):
-            stated = replace(beam, damping=profile.rig.damping)
-            plant = move_plant_of(profile, with_beam(profile.loop_model(), stated), limit_nm)
-        self._estimated = beam, plant
+            beam_with_stated_damping = replace(beam, damping=profile.rig.damping)
+            plant = move_plant_of(
+                profile, with_beam(profile.loop_model(), beam_with_stated_damping), limit_nm
+            )
+        self._last_estimated_plant = beam, plant
         return plant
 
 
 def excitation_for(
     profile: Profile, kind: str, parameters: Mapping[str, Value], start_rad: float = 0.0
 ) -> Excitation:
-    """Make an excitation for a rig: see `rigd.excitation._named.make_excitation`.
+    """Return the excitation of a given kind and parameters for the rig of a profile.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     kind, parameters
-        Name and options of the excitation.
+        Name and parameters of the excitation, as for `rigd.excitation.make_excitation`.
     start_rad
-        Motor angle at the start, from the rig's zero; used only by a move.
+        Motor angle at the start of the session, relative to the rig's zero. Only moves use it.
     """
     if "tip_slope_rad" in inspect.signature(KINDS[kind]).parameters:
         parameters = {"tip_slope_rad": profile.limits.tip_slope_rad} | dict(parameters)
@@ -232,7 +239,7 @@ def excitation_for(
 def plan_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
 ) -> Plan:
-    """Predict a session; raise if the checks on paper or the limits of the profile forbid it.
+    """Return the plan of a session; raise if checks or limits of the profile forbid the session.
 
     Parameters
     ----------
@@ -242,11 +249,12 @@ def plan_session(
     Raises
     ------
     CheckFailedError, UnknownRowError
-        If a check on paper fails and is not accepted, or `accept` has an unknown name.
+        If a check of the profile fails and is not accepted, or `accept` contains an unknown name.
     RefusedError
-        If the session would exceed limits: names each of them and the largest possible amplitude.
+        If the session would exceed limits. The message names these limits and the largest possible
+        amplitude.
     ControlDesignError, RealisationError, UnknownValueError
-        As `predict_session`.
+        As `predict_session` does.
     """
     plan = predict_session(profile, excitation, force=force, accept=accept)
     plan.clearance.require()
@@ -258,71 +266,77 @@ def plan_session(
 def predict_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
 ) -> Plan:
-    """Check a session on paper, predict it, and compare it with the profile's limits.
+    """Return the plan of a session, which states whether checks and limits allow the session.
 
     Parameters
     ----------
     profile, excitation
-        Rig and excitation of the session.
+        Profile of the rig, and excitation of the session.
     force
-        Allow clipped torques of the motor or the sensor. No other limit can be forced, because
-        exceeding it would end the session.
+        Whether the torques of motor and sensor may be clipped. All other limits always apply,
+        because exceeding them would end the session.
     accept
         Names of rows of `rigd check` that may fail.
 
     Raises
     ------
     UnknownRowError
-        If `accept` has an unknown name.
+        If `accept` contains an unknown name.
     UnknownValueError
-        If a value of the profile is unknown.
+        If a required value of the profile is stated as unknown.
     ControlDesignError
         If the loop is unstable.
     RealisationError
-        If the beam's damping cannot be realised.
+        If the beam's damping cannot be realised by a model with poles.
     """
     clearance = check_on_paper(profile, accept)
-    loop, unstable = stable_loop(loop_model_with(profile, excitation.model))
+    loop, instability_warning = stable_loop(loop_model_with(profile, excitation.model))
     prediction = predict(loop, excitation)
-    firm, forcible = (
-        [finding for limited in channels if (finding := limited.violation())]
-        for channels in _limited(profile, prediction)
+    violations, torque_violations = (
+        [violation_text for peak in peaks if (violation_text := peak.violation_text())]
+        for peaks in _limited_peaks(profile, prediction)
     )
     refusals = list(clearance.refusals)
-    slope = _slope(profile, prediction) if is_limited(excitation) else None
-    too_steep = slope is not None and slope.violation()
-    if firm or too_steep or (forcible and not force):
-        lower = _remedy(profile, excitation, force=force)
-        refusals += [f"{finding}; {lower}." for finding in firm]
-        if slope is not None and too_steep:
-            remedy = slope_remedy(excitation, slope.value, slope.limit)
-            refusals.append(f"{too_steep}; {lower}{remedy}.")
-        refusals += [f"{finding}; {lower}, or allow clipping with --force." for finding in forcible]
-    warnings = [*clearance.warnings, *([unstable] if unstable else [])]
+    tip_slope = _limited_tip_slope(profile, prediction) if has_slope_limit(excitation) else None
+    slope_violation = tip_slope is not None and tip_slope.violation_text()
+    if violations or slope_violation or (torque_violations and not force):
+        advice = _amplitude_advice(profile, excitation, force=force)
+        refusals += [f"{violation_text}; {advice}." for violation_text in violations]
+        if tip_slope is not None and slope_violation:
+            remedy = slope_remedy(excitation, tip_slope.value, tip_slope.limit)
+            refusals.append(f"{slope_violation}; {advice}{remedy}.")
+        refusals += [
+            f"{violation_text}; {advice}, or allow clipping with --force."
+            for violation_text in torque_violations
+        ]
+    warnings = [*clearance.warnings, *([instability_warning] if instability_warning else [])]
     if not refusals:
-        warnings += [f"{finding}: it will be clipped and flagged." for finding in forcible]
+        warnings += [
+            f"{violation_text}: it will be clipped and flagged."
+            for violation_text in torque_violations
+        ]
     if excitation.approach is not None and not any(profile.rig.sensor.shear_projection):
-        warnings.append(_NO_FORCE)
+        warnings.append(_UNKNOWN_FORCE_WARNING)
     return Plan(
         prediction,
         warnings=tuple(warnings),
         tip_in_words=tip_in_words(prediction.tip, profile.rig.beam, excitation),
         refused="\n".join(refusals),
-        ending=_ending(loop, stays=excitation.stays),
+        ending=_motion_after_record(loop, stays=excitation.stays),
         clearance=clearance,
     )
 
 
-def _remedy(profile: Profile, excitation: Excitation, *, force: bool) -> str:
-    """Return the remedy for an excitation that would exceed the limits."""
-    if excitation.kind in NOT_IDENTIFYING:
+def _amplitude_advice(profile: Profile, excitation: Excitation, *, force: bool) -> str:
+    """Return the advice, for an error message, on an excitation that would exceed limits."""
+    if excitation.kind in KINDS_WITH_TARGET_ANGLE:
         return "go less far or slower"
     largest_rad = largest_amplitude(profile, excitation, force=force)
     return "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
 
 
-def _ending(loop: ClosedLoop, *, stays: bool) -> Ending:
-    """Plan the motion after the record: a vibration-free return and active damping."""
+def _motion_after_record(loop: ClosedLoop, *, stays: bool) -> Ending:
+    """Return the motion after the record: a vibration-free return to the start, with damping."""
     if loop.model.beam is None:
         return Ending(stays=stays)
     return Ending(stays, tuple(map(complex, mode_poles(loop)[1])), design_damper(loop))
@@ -331,73 +345,77 @@ def _ending(loop: ClosedLoop, *, stays: bool) -> Ending:
 def largest_amplitude(
     profile: Profile, excitation: Excitation, *, force: bool = False
 ) -> float | None:
-    """Return the largest amplitude within all limits, with unchanged other parameters.
+    """Return the largest amplitude of an excitation for which a session stays within all limits.
+
+    All other parameters of the excitation stay the same.
 
     Parameters
     ----------
     profile, excitation
-        Rig and excitation. The amplitude is ignored.
+        Profile of the rig, and excitation, whose own amplitude is ignored.
     force
-        Allow clipped torques, so that only the other limits count.
+        Whether torques may be clipped, so that the torque limits are ignored.
 
     Returns
     -------
     float or None
         Amplitude in rad, rounded down to three digits. None if the excitation has no amplitude
-        (``hold``, ``file``), limits it by itself (``modes``, ``until``), or no amplitude is
+        (``hold``, ``file``), chooses its own amplitude (``modes``, ``until``), or no amplitude is
         possible.
 
     Raises
     ------
     ControlDesignError
-        If the loop is unstable and the response overflows.
+        If the loop is unstable and the predicted response overflows.
     RealisationError
-        If the beam's damping cannot be realised.
+        If the beam's damping cannot be realised by a model with poles.
     """
     if excitation.kind in ("modes", "until") or not _has_amplitude(excitation.kind):
         return None
     loop, _ = stable_loop(profile.loop_model())
-    given_rad = abs(float(excitation.parameters["amplitude_rad"]))
-    # Chirps have no exemption here: the proposed amplitude is in the range of the linear model.
-    steepest = _slope(profile, predict(loop, excitation))
+    stated_amplitude_rad = abs(float(excitation.parameters["amplitude_rad"]))
+    # Chirps are not exempt here, so that the linear model is valid for the proposed amplitude.
+    tip_slope = _limited_tip_slope(profile, predict(loop, excitation))
 
-    def fraction_at(amplitude_rad: float) -> float:
-        scale = amplitude_rad / given_rad
+    def largest_fraction_at(amplitude_rad: float) -> float:
+        scale = amplitude_rad / stated_amplitude_rad
         reference_rad = excitation.reference_rad * scale
-        firm, forcible = _limited(profile, _peaks(reference_rad, loop.simulate(reference_rad)))
-        if steepest is not None:
-            firm += (replace(steepest, value=steepest.value * scale),)
-        return _largest_fraction(firm if force else firm + forcible)
+        always_limited, clippable = _limited_peaks(
+            profile, _peaks(reference_rad, loop.simulate(reference_rad))
+        )
+        if tip_slope is not None:
+            always_limited += (replace(tip_slope, value=tip_slope.value * scale),)
+        return _largest_fraction(always_limited if force else always_limited + clippable)
 
     # All peaks are proportional to the amplitude, except for the friction compensation.
-    amplitude_rad = min(given_rad, _MOST_RAD)
-    for _ in range(_ROUNDS):
-        fraction = fraction_at(amplitude_rad)
+    amplitude_rad = min(stated_amplitude_rad, _MAX_AMPLITUDE_RAD)
+    for _ in range(_MAX_ITERATIONS):
+        fraction = largest_fraction_at(amplitude_rad)
         if not 0.0 < fraction < math.inf:
             return None
-        amplitude_rad = min(amplitude_rad / fraction, _MOST_RAD)
+        amplitude_rad = min(amplitude_rad / fraction, _MAX_AMPLITUDE_RAD)
         if 0.999 < fraction <= 1.0:
             break
     digit_rad = 10.0 ** (math.floor(math.log10(amplitude_rad)) - 2)
     digits = math.floor(amplitude_rad / digit_rad)
-    while digits > 0 and not fraction_at(digits * digit_rad) <= 1.0:
+    while digits > 0 and not largest_fraction_at(digits * digit_rad) <= 1.0:
         digits -= 1
     return float(f"{digits * digit_rad:.3g}") if digits else None
 
 
 def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[str, Any]:
-    """Return a plan for JSON.
+    """Return the plan of a session as a dictionary for JSON.
 
     Parameters
     ----------
     profile, excitation
-        Rig and excitation of the plan.
+        Profile of the rig, and excitation of the session.
     plan
         Result of `predict_session` or `plan_session`.
     """
     return {
         "excitation": excitation.kind,
-        "sweep": _sweep_in_words(excitation),
+        "sweep": _motion_text(excitation),
         "profile": profile.name,
         "parameters": dict(excitation.parameters),
         "segments": {name: list(ends) for name, ends in excitation.segments.items()},
@@ -424,31 +442,43 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
 
 
 def _has_amplitude(kind: str) -> bool:
-    """Return whether an excitation has an amplitude among its parameters."""
+    """Return whether a kind of excitation has a parameter ``amplitude_rad``."""
     return "amplitude_rad" in inspect.signature(KINDS[kind]).parameters
 
 
-def _sweep_in_words(excitation: Excitation) -> str:
-    """Describe the sweep of a chirp or the path of a move or search; else return an empty text."""
+def _motion_text(excitation: Excitation) -> str:
+    """Return text that describes the sweep of a chirp, or the path of a move or of a search.
+
+    It is empty for other excitations.
+    """
     if excitation.kind == "move":
-        return _move_in_words(excitation.parameters)
+        return _move_text(excitation.parameters)
     if excitation.kind == "touch":
-        return _search_in_words(excitation.parameters)
+        return _obstacle_search_text(excitation.parameters)
     if excitation.search is not None:
-        return _scan_in_words(excitation)
+        return _precision_search_text(excitation)
     if excitation.kind != "chirp":
         return ""
     start_hz, stop_hz = (float(excitation.parameters[key]) for key in ("start_hz", "stop_hz"))
-    down = " down" if stop_hz < start_hz else ""
-    back = ""
+    direction = " down" if stop_hz < start_hz else ""
+    return_text = ""
     if excitation.parameters.get("there_and_back"):
-        back = f" and back, {float(excitation.parameters['duration_s']):g} s each way"
-    return f"sweeps{down} from {start_hz:g} to {stop_hz:g} Hz{back}"
+        return_text = f" and back, {float(excitation.parameters['duration_s']):g} s each way"
+    return f"sweeps{direction} from {start_hz:g} to {stop_hz:g} Hz{return_text}"
 
 
-def _move_in_words(parameters: Mapping[str, float | int | str]) -> str:
-    """Describe target, duration and predicted residual vibration of a move."""
-    by_rad, angle_rad, duration_s, fraction, residual_nm, floor_nm, off_nm, quintic_nm = (
+def _move_text(parameters: Mapping[str, float | int | str]) -> str:
+    """Return text with target angle, duration and predicted residual vibration of a move."""
+    (
+        by_rad,
+        angle_rad,
+        duration_s,
+        fraction,
+        residual_nm,
+        floor_nm,
+        detuned_residual_nm,
+        quintic_nm,
+    ) = (
         float(parameters[name])
         for name in (
             *("by_rad", "angle_rad", "duration_s", "limits_share", "residual_nm"),
@@ -458,23 +488,24 @@ def _move_in_words(parameters: Mapping[str, float | int | str]) -> str:
     arrival = "more than 1 s after that"
     if "arrival_s" in parameters:
         arrival = f"after {1e3 * float(parameters['arrival_s']):.0f} ms"
-    left = f"{1e3 * residual_nm:.2g} mN·m"
+    residual_text = f"{1e3 * residual_nm:.2g} mN·m"
     if residual_nm < floor_nm:
-        left = f"below what the sensor shows ({1e3 * floor_nm:.2g} mN·m)"
-    if off_nm > max(residual_nm, floor_nm):
-        left += (
-            f", {1e3 * off_nm:.2g} mN·m if the beam's frequencies are wrong by their uncertainty"
+        residual_text = f"below what the sensor shows ({1e3 * floor_nm:.2g} mN·m)"
+    if detuned_residual_nm > max(residual_nm, floor_nm):
+        residual_text += (
+            f", {1e3 * detuned_residual_nm:.2g} mN·m if the beam's frequencies are wrong by their "
+            "uncertainty"
         )
     return (
         f"moves by {by_rad:.4g} rad to {angle_rad:.4g} rad in {1e3 * duration_s:.0f} ms, the angle "
-        f"within 1 mrad {arrival} ({100 * fraction:.0f} % of the limits); vibration left {left}; "
-        f"a quintic of the same time leaves {1e3 * quintic_nm:.3g} mN·m (beam of "
+        f"within 1 mrad {arrival} ({100 * fraction:.0f} % of the limits); vibration left "
+        f"{residual_text}; a quintic of the same time leaves {1e3 * quintic_nm:.3g} mN·m (beam of "
         f"{parameters['file'] or 'profile'})"
     )
 
 
-def _search_in_words(parameters: Mapping[str, float | int | str]) -> str:
-    """Describe range and speed of a search for an obstacle."""
+def _obstacle_search_text(parameters: Mapping[str, float | int | str]) -> str:
+    """Return text with the target angle and speed of a search for an obstacle."""
     passes = int(parameters["passes"])
     return (
         f"goes to {float(parameters['angle_rad']):.4g} rad at {parameters['speed_rad_s']:g} rad/s"
@@ -484,8 +515,8 @@ def _search_in_words(parameters: Mapping[str, float | int | str]) -> str:
     )
 
 
-def _scan_in_words(excitation: Excitation) -> str:
-    """Describe the first scan and the targets of a session with a precision search."""
+def _precision_search_text(excitation: Excitation) -> str:
+    """Return text with the first scan and the precision targets of an excitation ``until``."""
     assert excitation.search is not None
     start_hz, stop_hz, scan_s, amplitude_rad = (
         float(excitation.parameters[name])
@@ -499,7 +530,7 @@ def _scan_in_words(excitation: Excitation) -> str:
 
 
 def predict(loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
-    """Predict the peaks of a session.
+    """Return the predicted peak magnitudes of a session.
 
     Parameters
     ----------
@@ -511,12 +542,12 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
     Raises
     ------
     ControlDesignError
-        If the loop is unstable and the response overflows.
+        If the loop is unstable and the predicted response overflows.
     """
     response = loop.simulate(excitation.reference_rad)
     peaks = _peaks(excitation.reference_rad, response)
     angle_rad = response.angle_rad.copy()
-    del response  # an hour of it takes 150 MB, and the tip as much again
+    del response  # an hour of response takes 150 MB, and the tip motion needs as much again
     model = loop.model
     if model.beam is not None:
         tip = tip_motion(
@@ -528,13 +559,14 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
             root_compliance_rad_per_nm=model.root_compliance_rad_per_nm,
         )
         peaks = replace(peaks, tip=tip)
-    if excitation.kind not in NOT_IDENTIFYING:
+    if excitation.kind not in KINDS_WITH_TARGET_ANGLE:
         return peaks
     start_rad = float(excitation.parameters["angle_rad"]) - float(excitation.parameters["by_rad"])
     return replace(peaks, peak_angle_rad=_peak(start_rad + angle_rad))
 
 
 def _peaks(reference_rad: Real, response: LoopResponse) -> SessionPrediction:
+    """Return the peak magnitudes of a simulated response to a reference angle (n,)."""
     return SessionPrediction(
         peak_angle_rad=_peak(response.angle_rad),
         peak_velocity_rad_s=_peak(response.velocity_rad_s),
@@ -554,27 +586,28 @@ def predicted_metadata(
     profile
         Profile of the rig, with its limits.
     predicted
-        Prediction of the session.
+        Predicted peaks of the session.
     excitation
-        Excitation of the session. Segments planned during the session have their own slope limit.
+        Excitation of the session. Segments that are planned during the session may reach a tip
+        slope of their own, which is included.
 
     Returns
     -------
     dict of str to str
-        ``predicted_peak_…`` and ``limit_…``, with units in the names.
+        Keys ``predicted_peak_…`` and ``limit_…`` with their units → numbers as texts.
     """
-    firm, forcible = _limited(profile, predicted)
+    always_limited, clippable = _limited_peaks(profile, predicted)
     metadata = {}
-    slope = _slope(profile, predicted)
-    if slope is not None and excitation.search is not None:
-        slope = replace(slope, value=max(slope.value, excitation.search.tip_slope_rad))
-    for peak in (*firm, *forcible, *(() if slope is None else (slope,))):
-        metadata[f"predicted_peak_{_KEYS[peak.name]}"] = repr(peak.value)
-        metadata[f"limit_{_KEYS[peak.name]}"] = repr(peak.limit)
+    tip_slope = _limited_tip_slope(profile, predicted)
+    if tip_slope is not None and excitation.search is not None:
+        tip_slope = replace(tip_slope, value=max(tip_slope.value, excitation.search.tip_slope_rad))
+    for peak in (*always_limited, *clippable, *(() if tip_slope is None else (tip_slope,))):
+        metadata[f"predicted_peak_{_METADATA_KEYS[peak.name]}"] = repr(peak.value)
+        metadata[f"limit_{_METADATA_KEYS[peak.name]}"] = repr(peak.limit)
     return metadata
 
 
-_KEYS = {
+_METADATA_KEYS = {
     "angle": "angle_rad",
     "speed": "velocity_rad_s",
     "tracking error": "tracking_error_rad",
@@ -582,12 +615,12 @@ _KEYS = {
     "torque": "torque_nm",
     "tip slope": "tip_slope_rad",
 }
-"""Metadata keys of the limited peaks."""
+"""Name of a limited peak → the part of its metadata keys after ``predicted_peak_``."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Limited:
-    """Predicted peak and its limit; a NaN peak violates the limit."""
+class _LimitedPeak:
+    """Predicted peak of a quantity, and its limit in the profile; a NaN peak exceeds the limit."""
 
     name: str
     value: float
@@ -595,7 +628,8 @@ class _Limited:
     unit: str
     key: str
 
-    def violation(self) -> str | None:
+    def violation_text(self) -> str | None:
+        """Return text that states how the peak exceeds the limit, or None if it does not."""
         if self.value <= self.limit:
             return None
         return (
@@ -604,21 +638,23 @@ class _Limited:
         )
 
 
-def _limited(
+def _limited_peaks(
     profile: Profile, predicted: SessionPrediction
-) -> tuple[tuple[_Limited, ...], tuple[_Limited, ...]]:
-    """Return the firm limits with their peaks, and those that only clip a torque."""
+) -> tuple[tuple[_LimitedPeak, ...], tuple[_LimitedPeak, ...]]:
+    """Return the peaks whose limits always apply, and the torque peaks that may be clipped."""
     limits, motor = profile.limits, profile.rig.motor
-    firm = (
-        _Limited("angle", predicted.peak_angle_rad, limits.angle_rad, "rad", "limits.angle_rad"),
-        _Limited(
+    always_limited = (
+        _LimitedPeak(
+            "angle", predicted.peak_angle_rad, limits.angle_rad, "rad", "limits.angle_rad"
+        ),
+        _LimitedPeak(
             "speed",
             predicted.peak_velocity_rad_s,
             limits.velocity_rad_s,
             "rad/s",
             "limits.velocity_rad_s",
         ),
-        _Limited(
+        _LimitedPeak(
             "tracking error",
             predicted.peak_tracking_error_rad,
             limits.tracking_error_rad,
@@ -626,49 +662,50 @@ def _limited(
             "limits.tracking_error_rad",
         ),
     )
-    forcible = (
-        _Limited(
+    clippable = (
+        _LimitedPeak(
             "coupling torque",
             predicted.peak_coupling_torque_nm,
             _sensor_limit_nm(profile),
             "N·m",
             "sensor.range",
         ),
-        _Limited(
+        _LimitedPeak(
             "torque", predicted.peak_torque_nm, motor.peak_torque_nm, "N·m", "motor.peak_torque_nm"
         ),
     )
-    return firm, forcible
+    return always_limited, clippable
 
 
-def _slope(profile: Profile, predicted: SessionPrediction) -> _Limited | None:
-    """Return the predicted tip slope with its limit for an identification; None without a beam."""
+def _limited_tip_slope(profile: Profile, predicted: SessionPrediction) -> _LimitedPeak | None:
+    """Return the predicted tip slope and its limit for identification, or None without a beam."""
     if predicted.tip is None:
         return None
     key, limit_rad = "limits.tip_slope_rad", profile.limits.tip_slope_rad
-    return _Limited("tip slope", predicted.tip.slope_rad, limit_rad, "rad", key)
+    return _LimitedPeak("tip slope", predicted.tip.slope_rad, limit_rad, "rad", key)
 
 
-def _largest_fraction(channels: tuple[_Limited, ...]) -> float:
-    """Return the largest predicted peak as a fraction of its limit; NaN if a peak is NaN."""
-    fractions = [channel.value / channel.limit for channel in channels]
+def _largest_fraction(peaks: tuple[_LimitedPeak, ...]) -> float:
+    """Return the largest ratio of a predicted peak to its limit, or NaN if a peak is NaN."""
+    fractions = [peak.value / peak.limit for peak in peaks]
     return math.nan if any(map(math.isnan, fractions)) else max(fractions)
 
 
 def _sensor_limit_nm(profile: Profile) -> float:
-    """Return the coupling torque at which an axis of the sensor first reaches limit or range.
+    """Return the coupling torque in N·m at which the first sensor axis reaches its limit.
 
-    The wrench of a coupling torque is the smallest one that projects to it.
+    The wrench is assumed to be the smallest one whose projection is the coupling torque.
     """
     sensor = profile.rig.sensor
     weight = sum(p * p for p in sensor.projection)
-    used = min(1.0, profile.limits.sensor_range_percent / 100)
+    usable_fraction = min(1.0, profile.limits.sensor_range_percent / 100)
     return min(
-        used * limit * weight / abs(p)
+        usable_fraction * limit * weight / abs(p)
         for p, limit in zip(sensor.projection, sensor.range, strict=True)
         if p != 0.0
     )
 
 
 def _peak(values: Real) -> float:
+    """Return the largest magnitude in an array."""
     return float(np.max(np.abs(values)))

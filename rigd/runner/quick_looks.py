@@ -1,8 +1,8 @@
-"""Quick looks: a separate program analyses each session after its end.
+"""Quick looks, the short reports that a separate program makes of each session after its end.
 
-The program is ``python -m analysis.quick_look``, a process at low priority. One runs at a time. It
-is suspended during a session. It is killed if it takes too long, and ends with the process that
-started it. Time in which it waits for a processor does not count.
+The program is ``python -m analysis.quick_look``, run at low priority. One program runs at a time.
+It is suspended during a session. It is killed if it takes too long, where time in which it waits
+for a processor does not count. It ends with the process that started it.
 """
 
 import contextlib
@@ -22,45 +22,46 @@ from rigd.runner.session import RunResult
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, processor_use
 from rigd.session.quick_look import quick_look_path, read_quick_look
 
-_PROGRAM: Final = "analysis.quick_look"
-_LONGEST_S: Final = 60.0
-"""Longest run time of a quick look, without suspensions and waits for a processor."""
-_END_S: Final = 0.5
-"""Longest wait for a killed quick look at the end of this process."""
-_MOST_WAITING: Final = 3
-"""Largest number of waiting quick looks; the oldest one beyond it is skipped."""
-_LONGEST_ERROR: Final = 500
+_QUICK_LOOK_MODULE: Final = "analysis.quick_look"
+_MAX_RUN_TIME_S: Final = 60.0
+"""Maximum run time of a quick look in seconds, without suspensions and waits for a processor."""
+_KILL_TIMEOUT_S: Final = 0.5
+"""Maximum time in seconds to wait for a killed quick look at the end of this process."""
+_MAX_WAITING: Final = 3
+"""Maximum number of waiting quick looks; beyond it the oldest waiting quick look is skipped."""
+_MAX_ERROR_CHARACTERS: Final = 500
+"""Maximum number of characters of an error message that are shown."""
 
 
 @dataclass(frozen=True, slots=True)
 class QuickLook:
-    """Result of the quick look at one session."""
+    """Quick look at one session, or the reason why it failed."""
 
     session: Path
     """Path of the session file."""
     path: Path | None
-    """Path of the file of the quick look; None if it failed."""
+    """Path of the quick look's file, or None if the quick look failed."""
     content: dict[str, Any] | None
-    """Content of that file; None if it failed."""
+    """Content of the quick look's file, or None if the quick look failed."""
     error: str
-    """Why it failed, a sentence; else empty."""
+    """Sentence that states why the quick look failed; empty if it did not."""
 
     @classmethod
     def failed(cls, session: Path, error: str) -> "QuickLook":
-        """Return a failed quick look.
+        """Return a quick look that failed.
 
         Parameters
         ----------
         session
             Path of the session file.
         error
-            Why, a sentence.
+            Sentence that states why the quick look failed.
         """
         return cls(session, None, None, error)
 
     @classmethod
     def of_event(cls, event: Mapping[str, Any]) -> "QuickLook":
-        """Return the quick look of an event of the daemon."""
+        """Return the quick look that an event of the daemon reports."""
         session, content = Path(event["path"]), event["look"]
         return cls(
             session, None if content is None else quick_look_path(session), content, event["error"]
@@ -68,138 +69,142 @@ class QuickLook:
 
     @property
     def lines(self) -> list[str]:
-        """Lines of text for a terminal."""
+        """Lines of text that report the quick look on a terminal."""
         if self.content is None:
             return [f"No quick look at {self.session.name}: {self.error}"]
         return [printable(str(line)) for line in self.content["text"]]
 
     def note(self, results: list[RunResult]) -> None:
-        """Add the path of the file to the result of its session, if it is in the list."""
+        """Add the path of the quick look to the result of its session in a list of results."""
         for index, result in enumerate(results):
             if result.path == self.session:
                 results[index] = replace(result, quick_look=self.path)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the event of the daemon."""
+        """Return the content of the daemon's event that reports the quick look."""
         return {"path": str(self.session), "look": self.content, "error": self.error}
 
 
 class QuickLooks:
-    """Make quick looks at sessions, one at a time, while no session runs.
+    """Queue of sessions at which quick looks are made, one at a time, while no session runs.
 
     Parameters
     ----------
     on_result
-        Called with the result of each quick look, in the thread that calls :meth:`poll`.
+        Called with each quick look after its end, in the thread that calls :meth:`poll`.
     """
 
     def __init__(self, on_result: Callable[[QuickLook], None]) -> None:
         self._on_result = on_result
         self._lock = threading.Lock()
-        self._waiting: deque[Path] = deque()
+        self._waiting_sessions: deque[Path] = deque()
         self._process: subprocess.Popen[str] | None = None
         self._session = Path()
-        self._held = False
-        self._spent_s = 0.0
-        """Run time of the present quick look at `_counted_s`."""
-        self._counted_s = 0.0
+        self._is_suspended = False
+        self._run_time_s = 0.0
+        """Run time of the present quick look in seconds, up to the time `_run_time_updated_s`."""
+        self._run_time_updated_s = 0.0
         self._processor_s = 0.0
-        """Processor time that it had used at `_counted_s`."""
+        """Processor time in seconds that the quick look had used at `_run_time_updated_s`."""
 
     @property
     def busy(self) -> bool:
         """Whether a quick look is running or waiting."""
-        return self._process is not None or bool(self._waiting)
+        return self._process is not None or bool(self._waiting_sessions)
 
     @property
-    def spent_s(self) -> float:
-        """Run time of the present quick look, without waits for a processor."""
-        return self._spent_s
+    def run_time_s(self) -> float:
+        """Run time of the present quick look in seconds, without waits for a processor."""
+        return self._run_time_s
 
     def begin(self, session: Path) -> None:
-        """Request a quick look at a session."""
+        """Add a session to the queue, and start its quick look if none is running."""
         with self._lock:
-            self._waiting.append(session)
+            self._waiting_sessions.append(session)
         self.poll()
 
     def poll(self) -> None:
-        """Check progress and report results; call this several times a second between sessions."""
+        """Report ended quick looks and start the next one; call this often between sessions."""
         with self._lock:
-            ended = [*self._see(), *self._go_on()]
+            ended = [*self._ended_quick_look(), *self._start_next()]
         for each in ended:
             self._on_result(each)
 
     @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Suspend quick looks during a session."""
+    def suspended(self) -> Iterator[None]:
+        """Suspend the running quick look while the context, a session, lasts."""
         with self._lock:
-            self._held = True
-            self._signal(signal.SIGSTOP)
+            self._is_suspended = True
+            self._send_signal(signal.SIGSTOP)
         try:
             yield
         finally:
             with self._lock:
-                self._held = False
-                self._counted_s = time.monotonic()
-                self._signal(signal.SIGCONT)
+                self._is_suspended = False
+                self._run_time_updated_s = time.monotonic()
+                self._send_signal(signal.SIGCONT)
 
     def close(self) -> None:
-        """End the running quick look and cancel those that wait."""
+        """Kill the running quick look and cancel the waiting quick looks."""
         with self._lock:
-            self._held = True
-            self._waiting.clear()
+            self._is_suspended = True
+            self._waiting_sessions.clear()
             if self._process is not None:
                 self._process.kill()
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    self._process.communicate(timeout=_END_S)
+                    self._process.communicate(timeout=_KILL_TIMEOUT_S)
                 self._process = None
 
-    def _see(self) -> Iterator[QuickLook]:
-        """Check the running process; yield its result after its end."""
-        if self._process is None or self._held:
+    def _ended_quick_look(self) -> Iterator[QuickLook]:
+        """Yield the result of the running quick look if it has ended; kill it if too slow."""
+        if self._process is None or self._is_suspended:
             return
-        self._count(self._process.pid)
-        slow = self._spent_s >= _LONGEST_S
+        self._update_run_time(self._process.pid)
+        is_too_slow = self._run_time_s >= _MAX_RUN_TIME_S
         if self._process.poll() is None:
-            if slow:
-                # Not awaited: at low priority it may end late.
+            if is_too_slow:
+                # Its end is not awaited, because it may end late at low priority.
                 self._process.kill()
             return
         errors = self._process.communicate()[1]
         code, self._process = self._process.returncode, None
-        if slow and code == -signal.SIGKILL:
-            yield QuickLook.failed(self._session, f"it took longer than {_LONGEST_S:g} s.")
+        if is_too_slow and code == -signal.SIGKILL:
+            yield QuickLook.failed(self._session, f"it took longer than {_MAX_RUN_TIME_S:g} s.")
         elif code != 0:
-            words = errors.strip().rpartition("\n")[2].removeprefix("Error: ")[:_LONGEST_ERROR]
+            error_text = (
+                errors.strip().rpartition("\n")[2].removeprefix("Error: ")[:_MAX_ERROR_CHARACTERS]
+            )
             yield QuickLook.failed(
-                self._session, words or f"its program ended with exit code {code}."
+                self._session, error_text or f"its program ended with exit code {code}."
             )
         else:
-            yield self._done()
+            yield self._read_result()
 
-    def _count(self, pid: int) -> None:
-        """Add the run time since the last call."""
+    def _update_run_time(self, pid: int) -> None:
+        """Update the run time of the quick look with the given process id."""
         now_s = time.monotonic()
-        passed_s, self._counted_s = now_s - self._counted_s, now_s
-        if (found := processor_use(pid)) is not None:
-            wants, processor_s = found
-            used_s, self._processor_s = processor_s - self._processor_s, processor_s
-            if wants:
-                passed_s = min(passed_s, used_s)
-        self._spent_s += passed_s
+        elapsed_s, self._run_time_updated_s = now_s - self._run_time_updated_s, now_s
+        if (usage := processor_use(pid)) is not None:
+            is_waiting_for_processor, processor_s = usage
+            used_processor_s, self._processor_s = processor_s - self._processor_s, processor_s
+            if is_waiting_for_processor:
+                elapsed_s = min(elapsed_s, used_processor_s)
+        self._run_time_s += elapsed_s
 
-    def _go_on(self) -> Iterator[QuickLook]:
-        """Start the next quick look; yield those that are skipped or cannot be started."""
-        while len(self._waiting) > _MOST_WAITING:
-            yield QuickLook.failed(self._waiting.popleft(), "skipped in favour of later sessions.")
-        if self._held or self._process is not None or not self._waiting:
+    def _start_next(self) -> Iterator[QuickLook]:
+        """Start the next quick look; yield the quick looks that are skipped or cannot start."""
+        while len(self._waiting_sessions) > _MAX_WAITING:
+            yield QuickLook.failed(
+                self._waiting_sessions.popleft(), "skipped in favour of later sessions."
+            )
+        if self._is_suspended or self._process is not None or not self._waiting_sessions:
             return
-        self._session = self._waiting.popleft()
-        self._spent_s, self._processor_s, self._counted_s = 0.0, 0.0, time.monotonic()
+        self._session = self._waiting_sessions.popleft()
+        self._run_time_s, self._processor_s, self._run_time_updated_s = 0.0, 0.0, time.monotonic()
         try:
             self._process = subprocess.Popen(
                 [
-                    *(*OWN_PYTHON, "-m", _PROGRAM),
+                    *(*OWN_PYTHON, "-m", _QUICK_LOOK_MODULE),
                     *(str(self._session), "--parent", str(os.getpid())),
                 ],
                 stdin=subprocess.DEVNULL,
@@ -215,13 +220,15 @@ class QuickLooks:
                 self._session, f"its program cannot be started ({error.strerror})."
             )
 
-    def _done(self) -> QuickLook:
+    def _read_result(self) -> QuickLook:
+        """Return the quick look that the program has written successfully."""
         path = quick_look_path(self._session)
         content = read_quick_look(path)
         if content is None:
             return QuickLook.failed(self._session, f"{path} cannot be read.")
         return QuickLook(self._session, path, content, "")
 
-    def _signal(self, number: signal.Signals) -> None:
+    def _send_signal(self, number: signal.Signals) -> None:
+        """Send a signal to the running quick look, if there is one."""
         if self._process is not None:
             self._process.send_signal(number)

@@ -1,6 +1,6 @@
-"""Session request: rig, excitation, session file with its disk space and metadata.
+"""Preparation of a requested session: rig, session file, disk space and metadata.
 
-The module prepares a session for sessions in the foreground and for those of the daemon.
+`rigd run` and the daemon use it.
 """
 
 import json
@@ -39,40 +39,43 @@ from rigd.session import PART_SUFFIX
 from rigd.session.user_metadata import META_PREFIX, NOTES
 from rigd.units import unit_of
 
-# Uncompressed: sample, ages, the controller's terms and the index; a file never takes more.
-_BYTES_PER_TICK = 260
-_BYTES_SPARE = 1_000_000
-_GIT_PATIENCE_S = 2.0
+_MAX_BYTES_PER_TICK = 260
+"""Maximum number of bytes that a tick adds to a session file: sample, ages of the readings,
+controller terms and index, uncompressed."""
+_MAX_BYTES_WITHOUT_TICKS = 1_000_000
+"""Assumed maximum number of bytes of a session file without its ticks."""
+_GIT_TIMEOUT_S = 2.0
+"""Maximum time in seconds for the call of git that returns the commit."""
 
 
 class NoRoomError(RefusedError):
-    """A session file cannot be written to its folder."""
+    """Raised if a session file cannot be written to its folder, such as on a full disk."""
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """A session to run, already checked against the limits of the profile."""
+    """Session to run, which was already checked against the limits of the profile."""
 
     profile: Profile
     """Profile of the rig."""
     excitation: Excitation
-    """Excitation with its reference."""
+    """Excitation with its reference angle."""
     path: Path
-    """Final name of the session file."""
+    """Final path of the session file."""
     notes: tuple[tuple[str, str], ...] = ()
-    """Metadata from the user: operator, specimen, note, number in a series and others."""
+    """Metadata of the user (key, text), such as operator, specimen, note and number in a series."""
     predicted: tuple[tuple[str, str], ...] = ()
-    """Predicted peaks and their limits, as metadata."""
+    """Metadata (key, text) with the predicted peaks and their limits."""
     ending: Ending = field(default_factory=Ending)
-    """Motion after the record."""
+    """Motion after the record, such as the return to the start."""
     touch: TouchSearch | None = None
-    """Search for an obstacle; None: no search."""
+    """Settings of the search for an obstacle, or None for a session without a search."""
     watch_fit: bool = False
-    """Fit the record while it is recorded."""
+    """Whether the record is fitted repeatedly during the session."""
     seed: int | None = None
-    """Seed of a simulated rig's noise; None: a random seed."""
+    """Seed of a simulated rig's noise, or None for a random seed."""
     accepted: tuple[FailedCheck, ...] = ()
-    """Failed rows of `rigd check` that the operator accepted."""
+    """Failed checks of the profile that the operator accepted."""
 
 
 def load_rig(
@@ -83,59 +86,60 @@ def load_rig(
     hardware: bool = False,
     obstacles: Sequence[str] = (),
 ) -> tuple[Profile, ActuationTarget]:
-    """Load a profile and find its actuation target: hardware or a simulated rig.
+    """Return a profile, and whether a session with it moves the hardware or a simulated rig.
 
     Parameters
     ----------
     name
-        Name of the profile, or its file.
+        Name of the profile, or path of its file.
     fast
-        The session does not run in real time.
+        Whether the session runs under the virtual clock, faster than real time.
     seed
-        Seed of a simulated rig's noise; None: the seed of the profile, if any.
+        Seed of a simulated rig's noise, or None for the profile's seed, if it states one.
     hardware
-        The operator requests a motion of the hardware.
+        Whether the operator explicitly requests that the hardware moves.
     obstacles
-        Obstacles of a simulated beam, in addition to those of the profile.
+        Obstacles of a simulated beam, in addition to the obstacles of the profile.
 
     Raises
     ------
     ObstacleError
         If an obstacle has a wrong syntax, or cannot be simulated on this rig.
     ProfileError, UnknownDeviceError
-        If the profile cannot be used.
+        If the profile is invalid, or names an unknown device.
     RefusedError
-        If the devices cannot use one bus, an option does not fit the actuation target, or an
-        unreachable simulated rig is running, so that the hardware may not be meant.
+        If the devices cannot be on one bus, if an option does not fit the actuation target, or if a
+        simulated rig is running that this process cannot reach, so that the hardware would move
+        instead.
     """
-    software_commit()  # early, because it is slow: the motor is held while the header is made
+    software_commit()  # called early, because it is slow and the motor is held during the header
     profile = load_profile(name)
     check_selection(profile.rig.devices, profile.path)
     refusals = objections(profile.rig)
     if refusals:
         raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
-    moving = actuation_target(profile.rig)
-    if hardware and moving is not ActuationTarget.HARDWARE:
+    target = actuation_target(profile.rig)
+    if hardware and target is not ActuationTarget.HARDWARE:
         raise RefusedError(
-            f"--hardware: {describe_actuation_target(profile.rig, moving)} Omit the option, or end "
+            f"--hardware: {describe_actuation_target(profile.rig, target)} Omit the option, or end "
             "the simulated rig."
         )
-    if moving is ActuationTarget.HARDWARE and not hardware:
+    if target is ActuationTarget.HARDWARE and not hardware:
         _refuse_unreachable_simulators(profile)
-    if fast and not moving.any_clock:
+    if fast and not target.any_clock:
         raise RefusedError(
-            f"--fast: {moving.value} of {profile.path} moves in real time, which cannot be "
+            f"--fast: {target.value} of {profile.path} moves in real time, which cannot be "
             "skipped; omit the option."
             + (
                 " Or start rigd simulate with --lock-step."
-                if moving is ActuationTarget.SIMULATOR
+                if target is ActuationTarget.SIMULATOR
                 else ""
             )
         )
     if seed is not None:
-        if moving is ActuationTarget.HARDWARE:
+        if target is ActuationTarget.HARDWARE:
             raise RefusedError(
-                f"--seed: {moving.value} of {profile.path} moves, whose noise is not simulated; "
+                f"--seed: {target.value} of {profile.path} moves, whose noise is not simulated; "
                 "omit the option."
             )
         if profile.rig.simulation is None:
@@ -146,52 +150,52 @@ def load_rig(
         simulation = replace(profile.rig.simulation, seed=seed)
         profile = replace(profile, rig=replace(profile.rig, simulation=simulation))
     if obstacles:
-        if moving is not ActuationTarget.SIMULATED:
+        if target is not ActuationTarget.SIMULATED:
             raise RefusedError(
-                f"--obstacle: {moving.value} of {profile.path} is not simulated here; omit the "
+                f"--obstacle: {target.value} of {profile.path} is not simulated here; omit the "
                 "option."
                 + (
                     " Or inject the obstacle into the simulated rig (rigd inject obstacle,x=…)."
-                    if moving is ActuationTarget.SIMULATOR
+                    if target is ActuationTarget.SIMULATOR
                     else ""
                 )
             )
         profile = replace(profile, rig=with_obstacles(profile.rig, obstacles))
-    return profile, moving
+    return profile, target
 
 
 def _refuse_unreachable_simulators(profile: Profile) -> None:
-    """Raise if a simulated rig is running that this command cannot reach."""
+    """Raise if a simulated rig of this profile is running that this command cannot reach."""
     for path in unreachable_simulators(profile.rig.name):
-        remedy, whose = "run this command as its user to use it", "by another user"
+        remedy, owner = "run this command as its user to use it", "by another user"
         with suppress(OSError, ValueError):
             uid = path.stat().st_uid
-            whose = f"by user {uid}"
+            owner = f"by user {uid}"
             if uid == os.getuid():
-                whose = "in another environment"
+                owner = "in another environment"
                 remedy = f"set XDG_RUNTIME_DIR={shlex.quote(str(path.parent.parent))} to use it"
-        shown = printable(str(path))  # another user may have chosen any name
+        shown_path = printable(str(path))  # another user may have chosen any name
         raise RefusedError(
-            f"A simulated rig of {profile.name} is run {whose} ({shown}), which this command does "
-            f"not reach, and the hardware would move instead. Either {remedy}, or end it, or give "
-            "--hardware if the hardware is meant."
+            f"A simulated rig of {profile.name} is run {owner} ({shown_path}), which this command "
+            f"does not reach, and the hardware would move instead. Either {remedy}, or end it, or "
+            "give --hardware if the hardware is meant."
         )
 
 
 def check_required(profile: Profile, notes: Mapping[str, str]) -> None:
-    """Check that a session has all metadata that its profile requires.
+    """Raise if a session lacks metadata that its profile requires.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     notes
-        Metadata by their keys in the session file.
+        Metadata of the user: key in the session file → text.
 
     Raises
     ------
     RefusedError
-        If metadata are missing: names them and their options.
+        If metadata are missing. The message states their names and options.
     """
     missing = [
         name
@@ -200,7 +204,7 @@ def check_required(profile: Profile, notes: Mapping[str, str]) -> None:
     ]
     if missing:
         options = (
-            f"--{name} …" if name in NOTES else f"--meta {name}=…{_in_unit(name)}"
+            f"--{name} …" if name in NOTES else f"--meta {name}=…{_unit_in_parentheses(name)}"
             for name in missing
         )
         raise RefusedError(
@@ -209,7 +213,8 @@ def check_required(profile: Profile, notes: Mapping[str, str]) -> None:
         )
 
 
-def _in_unit(name: str) -> str:
+def _unit_in_parentheses(name: str) -> str:
+    """Return the unit of a metadata name in parentheses, or "" if the name ends in no unit."""
     return f" ({unit_of(name)})" if unit_of(name) else ""
 
 
@@ -219,7 +224,7 @@ def make_folder(folder: Path) -> None:
     Raises
     ------
     NoRoomError
-        If it cannot be created or is not writable.
+        If the folder cannot be created or is not writable.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -233,17 +238,17 @@ def make_folder(folder: Path) -> None:
         )
 
 
-def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
-    """Create the folder, and check that its disk has space for a session.
+def require_disk_space(folder: Path, excitation: Excitation, limits: Limits) -> None:
+    """Create the folder of the session files, and raise if its disk lacks space for a session.
 
     Parameters
     ----------
     folder
         Folder of the session files.
     excitation
-        Excitation; its length determines the size of the file.
+        Excitation of the session, whose length determines the size of the file.
     limits
-        Limits of the profile, with the space that must remain free.
+        Limits of the profile, including the disk space that must remain free.
 
     Raises
     ------
@@ -258,7 +263,7 @@ def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
             f"{folder}: free disk space is unknown ({error.strerror}); check that the "
             "disk is mounted."
         ) from error
-    needed = excitation.reference_rad.size * _BYTES_PER_TICK + _BYTES_SPARE
+    needed = excitation.reference_rad.size * _MAX_BYTES_PER_TICK + _MAX_BYTES_WITHOUT_TICKS
     if free - needed < limits.disk_free_mb * 1e6:
         raise NoRoomError(
             f"{folder}: {free / 1e6:.1f} MB free, of which the session may need "
@@ -268,9 +273,9 @@ def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
 
 
 def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
-    """Return the path of a new session file, from time, excitation and number in a series.
+    """Return an unused path for a session file, made from time, excitation and number.
 
-    The file is not created; the recorder refuses an existing name.
+    The file is not created. The recorder later refuses the path if a file exists there by then.
 
     Parameters
     ----------
@@ -279,28 +284,29 @@ def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
     kind
         Name of the excitation.
     number
-        Number in a series; None for a single session.
+        Number of the session in its series, or None for a single session.
     """
     stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
     if number is not None:
         stem += f"-{number:02d}"
     path = folder / f"{stem}.mcap"
-    return _free(path)
+    return _unused_path(path)
 
 
-def part_of(path: Path) -> Path:
-    """Return the path of the incomplete file, which is renamed at the end of the session."""
+def part_path(path: Path) -> Path:
+    """Return the path that a session file has until it is complete: X.mcap.part for X.mcap."""
     return path.with_name(path.name + PART_SUFFIX)
 
 
-def _free(path: Path) -> Path:
-    while path.exists() or part_of(path).exists():
+def _unused_path(path: Path) -> Path:
+    """Return a path at which no session file exists, with a number appended if necessary."""
+    while path.exists() or part_path(path).exists():
         path = another_path(path)
     return path
 
 
 def another_path(path: Path) -> Path:
-    """Return the next name for a session file whose name is taken: X.mcap, X_2.mcap, …."""
+    """Return the next path for a session file if its path is used: X.mcap → X_2.mcap → X_3.mcap."""
     stem, _, number = path.stem.rpartition("_")
     if stem and number.isdecimal():
         return path.with_name(f"{stem}_{int(number) + 1}{path.suffix}")
@@ -308,28 +314,32 @@ def another_path(path: Path) -> Path:
 
 
 def remaining_file_text(path: Path | None) -> str:
-    """Return a sentence on the remaining file of a failed session, after its processes have ended.
+    """Return a sentence that states what a failed session recorded, and how to recover it.
+
+    Call this after the processes of the session have ended.
 
     Parameters
     ----------
     path
-        File of the session, if it was begun.
+        Path of the session file, or None if no file was begun.
     """
     from rigd.session import holds_samples
 
     if path is None:
         return "It has no file."
-    part = part_of(path)
+    part = part_path(path)
     try:
-        unfinished, whole = part.exists(), path.exists()
+        part_exists, file_exists = part.exists(), path.exists()
     except OSError as error:
         return f"Its folder {path.parent} cannot be read ({error.strerror})."
-    if not unfinished:
-        return f"Its file is {path}." if whole else f"There is no {path.name} in {path.parent}."
+    if not part_exists:
+        return (
+            f"Its file is {path}." if file_exists else f"There is no {path.name} in {path.parent}."
+        )
     if not holds_samples(part):
         return f"Nothing was recorded; {part} holds no sample and can be removed."
-    old, new = (shlex.quote(str(part_of(name))) for name in (path, _free(path)))
-    if not whole:
+    old, new = (shlex.quote(str(part_path(name))) for name in (path, _unused_path(path)))
+    if not file_exists:
         return f"What was recorded is in {part}; rigd recover {old} makes a clean file of it."
     return (
         f"What was recorded is in {part}, whose name without {PART_SUFFIX} is taken: after "
@@ -337,31 +347,34 @@ def remaining_file_text(path: Path | None) -> str:
     )
 
 
-def file_header(order: Order, connected: Connected, tare: Mapping[str, str]) -> FileHeader:
-    """Return metadata, segments and attachments of a session.
+def file_header(order: Order, connection: Connected, tare: Mapping[str, str]) -> FileHeader:
+    """Return the metadata, segments and attachments with which a session file begins.
 
     Parameters
     ----------
     order
         The session.
-    connected
-        Devices and real-time settings, as reported by the control process.
+    connection
+        Devices and real-time settings that the control process has reported.
     tare
         Metadata of the tare, and the seed of a simulated rig's noise.
     """
     specimen = order.profile.specimen
     return FileHeader(
-        metadata=_metadata(order, connected, tare),
+        metadata=_session_metadata(order, connection, tare),
         segments=dict(order.excitation.segments),
         attachments={
             "profile.toml": order.profile.text,
             **({} if specimen is None else {"specimen.toml": specimen.text}),
-            "calibration.json": json.dumps(connected.calibration, indent=1),
+            "calibration.json": json.dumps(connection.calibration, indent=1),
         },
     )
 
 
-def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> dict[str, str]:
+def _session_metadata(
+    order: Order, connection: Connected, tare: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the record ``session`` of a session file: key → text."""
     rig = order.profile.rig
     metadata = {
         "id": order.path.stem,
@@ -369,7 +382,7 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
         "excitation": order.excitation.kind,
         "uniformity_percent": repr(order.profile.uncertainty.uniformity_percent),
         # The parameters of a session may override the uniformity.
-        **{name: _text(value) for name, value in order.excitation.parameters.items()},
+        **{name: _parameter_text(value) for name, value in order.excitation.parameters.items()},
         "beam_length_m": repr(rig.beam.length_m),
         "beam_density_kg_per_m": repr(rig.beam.density_kg_per_m),
         "beam_bending_stiffness_n_m2": repr(rig.beam.bending_stiffness_n_m2),
@@ -381,20 +394,20 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
         "sensor_projection": ",".join(map(repr, rig.sensor.projection)),
         "drive": rig.devices.drive,
         "sensor": rig.devices.sensor,
-        "simulated": str(connected.simulated).lower(),
+        "simulated": str(connection.simulated).lower(),
         "profile": order.profile.name,
         "software": f"rigd {__version__}",
         **software_commit(),
         "host": platform.node(),
-        **{f"realtime_{name}": value for name, value in connected.realtime.items()},
-        **connected.drive,
+        **{f"realtime_{name}": value for name, value in connection.realtime.items()},
+        **connection.drive,
         **tare,
         **dict(order.predicted),
         **dict(order.notes),
     }
     if order.accepted:
         metadata["accepted_checks"] = ", ".join(each.name for each in order.accepted)
-    serial_number = connected.calibration.get("serial_number")
+    serial_number = connection.calibration.get("serial_number")
     if isinstance(serial_number, str):
         metadata["sensor_serial_number"] = serial_number
     differences = simulated_differently(rig)
@@ -422,9 +435,9 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
 
 @cache
 def software_commit() -> dict[str, str]:
-    """Return the commit of this program's checkout as metadata; empty without a checkout.
+    """Return metadata with the git commit of this program, empty if it is not a git checkout.
 
-    The result is cached: the running code is that of the first call.
+    The result of the first call is cached, because the running code does not change.
     """
     checkout = Path(__file__).resolve().parents[2]
     if not (checkout / ".git").exists():
@@ -432,17 +445,18 @@ def software_commit() -> dict[str, str]:
     command = ["git", "--no-optional-locks", "-C", str(checkout), "describe"]
     command += ["--always", "--dirty", "--abbrev=12"]
     try:
-        found = subprocess.run(
-            command, capture_output=True, text=True, timeout=_GIT_PATIENCE_S, check=True
+        git = subprocess.run(
+            command, capture_output=True, text=True, timeout=_GIT_TIMEOUT_S, check=True
         )
     except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
         return {}
-    commit = found.stdout.strip()
+    commit = git.stdout.strip()
     return {"software_commit": commit} if commit.isprintable() and commit else {}
 
 
-def _text(value: float | str) -> str:
-    # A file name may not be valid text; the session file must be written nevertheless.
+def _parameter_text(value: float | str) -> str:
+    """Return the text of an excitation parameter for the metadata."""
+    # A file name may contain invalid characters; the session file must be written nevertheless.
     return (
         value.encode(errors="backslashreplace").decode() if isinstance(value, str) else repr(value)
     )

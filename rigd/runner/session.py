@@ -1,8 +1,8 @@
-"""One session in the processes of a rig, supervised from its start to its file.
+"""Supervision of one session, from its start to the closed session file.
 
-The supervisor moves nothing itself. It has the file opened before the drive is enabled, permits
-tick 0 when the recorder is ready, reports the progress, forwards a stop request, checks that every
-process is running, and has the file closed with the outcome.
+The supervisor moves nothing itself. It makes the recorder open the file before the drive is
+enabled, permits tick 0 when the recorder is ready, reports the progress, forwards a stop request,
+checks that every process is running, and makes the recorder close the file with the outcome.
 """
 
 import json
@@ -36,62 +36,66 @@ from rigd.runner._live_view import LiveView
 from rigd.runner._online_fit import FitSupervisor
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._touch_search import TouchEstimates
-from rigd.runner.request import Order, another_path, file_header, part_of
+from rigd.runner.request import Order, another_path, file_header, part_path
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.02
-"""Longest delay of a message from another process to the operator."""
-_PATIENCE_S = 5.0
-_SLOW_PATIENCE_S = 30.0
-"""Time for enabling or disabling a drive, which may be slow."""
-_START_PATIENCE_S = 30.0
-"""Time for a recorder to start on a busy computer; nothing moves yet."""
-_MOST_NAMES = 100
+"""Time between two checks of the other processes, which delays their messages to the operator."""
+_REPLY_TIMEOUT_S = 5.0
+"""Maximum time for a reply of the recorder, and for the control process to stop."""
+_DRIVE_TIMEOUT_S = 30.0
+"""Maximum time for enabling or disabling a drive, which may be slow."""
+_RECORDER_START_TIMEOUT_S = 30.0
+"""Maximum time for the recorder to start on a busy computer, while nothing moves yet."""
+_MAX_FILE_NAMES = 100
+"""Maximum number of names that are tried for a session file."""
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
-_COUNTED = {
+_COUNTER_FIELDS = {
     "scheduled": StateField.SCHEDULED,
     "missed": StateField.MISSED,
     "late": StateField.LATE,
     "stale_angles": StateField.STALE_ANGLES,
     "stale_wrenches": StateField.STALE_WRENCHES,
 }
-"""Counters of the control process in the shared state, by their names in the result."""
-_NO_TICKS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTED, 0))
+"""Name of a tick count in the result → field of the shared state with the counter."""
+_ZERO_COUNTS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTER_FIELDS, 0))
 
 
 class SessionFailedError(FailureError):
-    """A session could not be run or closed; the message states the reason for the operator.
+    """Raised if a session could not be run or its file not closed; it states the reason.
 
     Attributes
     ----------
     path
-        File of the session, if one was begun.
+        Path of the session file, or None if no file was begun.
     saved_path
-        Path where the record was saved, if that is not the ``.part`` of the file.
+        Path to which the record was saved, if that is not the ``.part`` file.
     counts
-        Known counts of ticks: ``scheduled``, ``missed``, ``late``,
-        ``stale_angles``, ``stale_wrenches``.
+        Counts of ticks: ``scheduled``, ``missed``, ``late``, ``stale_angles``,
+        ``stale_wrenches``.
+    hardware
+        Whether the hardware moved, or None if unknown.
     """
 
     path: Path | None = None
     saved_path: Path | None = None
-    counts: Mapping[str, int] = _NO_TICKS
+    counts: Mapping[str, int] = _ZERO_COUNTS
     hardware: bool | None = None
 
     def result(self) -> "RunResult":
-        """Return the result of the session, after its processes have ended."""
-        part, whole = self.saved_path, None
+        """Return the failed session's result; call this after its processes have ended."""
+        part, complete_path = self.saved_path, None
         if part is None and self.path is not None:
             try:
-                if part_of(self.path).exists():
-                    part = part_of(self.path)
+                if part_path(self.path).exists():
+                    part = part_path(self.path)
                 elif self.path.exists():
-                    whole = self.path  # the recorder was only slow
+                    complete_path = self.path  # the recorder was only slow, and completed the file
             except OSError:
-                part = part_of(self.path)  # the folder cannot be read
+                part = part_path(self.path)  # the folder cannot be read
         return RunResult(
-            path=whole,
+            path=complete_path,
             outcome="fault",
             reason=str(self),
             recorded=None,
@@ -106,56 +110,56 @@ class SessionFailedError(FailureError):
         )
 
 
-class _NameTakenError(SessionFailedError):
-    """A file of this name exists already."""
+class _FileExistsError(SessionFailedError):
+    """Raised if a file with the name of the session file exists already."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """Result of a session."""
+    """Result of a session: how it ended, its file, and counts of ticks."""
 
     path: Path | None
-    """Path of the file; None if the session ended before tick 0 or the file is incomplete."""
+    """Path of the session file; None if the session ended before tick 0 or it is incomplete."""
     outcome: str
-    """``complete``, ``stopped``, ``fault`` or ``unknown``."""
+    """How the session ended: ``complete``, ``stopped``, ``fault`` or ``unknown``."""
     reason: str
-    """Why the session ended early, a sentence; empty if it is complete."""
+    """Sentence that states why the session ended early; empty if it is complete."""
     scheduled: int
-    """Ticks that were due."""
+    """Number of ticks that were due."""
     recorded: int | None
-    """Samples in the file; None if this is unknown until the file is recovered."""
+    """Number of samples in the file; None if it is unknown until the file is recovered."""
     missed: int
-    """Ticks that the loop skipped."""
+    """Number of ticks that the control loop missed."""
     late: int
-    """Ticks that woke late."""
+    """Number of ticks for which the control loop woke up late."""
     lost: int | None
-    """Samples that were taken but not recorded; None as for `recorded`."""
+    """Number of samples that were measured but not recorded; None if it is unknown."""
     fault: bool
     """Whether something failed during or after the record, even if a stop was requested."""
     stale_angles: int = 0
-    """Recorded ticks with a stale angle."""
+    """Number of recorded ticks without a new angle."""
     stale_wrenches: int = 0
-    """Recorded ticks with a stale wrench."""
+    """Number of recorded ticks without a new wrench."""
     live_dropped: int = 0
-    """Samples that the live view did not receive."""
+    """Number of samples that the live view did not receive."""
     part: Path | None = None
-    """Path of an incomplete file that could not be completed."""
+    """Path of the incomplete ``.part`` file, or None if the file was completed."""
     hardware: bool | None = None
-    """Whether the hardware moved and nothing was simulated; None: not known."""
+    """Whether the session moved the hardware (not a simulated rig), or None if unknown."""
     quick_look: Path | None = None
-    """Path of the quick look at the session; None: there is none yet."""
+    """Path of the quick look at the session, or None if it is not made yet."""
     touches: tuple[Mapping[str, Any], ...] | None = None
-    """Touches in the order of their times; None if the session had no touch search."""
+    """Estimated touches, ordered by time, or None if the session searched for no obstacle."""
     fit: Mapping[str, Any] | None = None
-    """Fit of the record during the session, as in JSON documents; None if not requested."""
+    """Result of the fit during the session, as in JSON documents; None if not requested."""
 
     @property
     def went_well(self) -> bool:
-        """Whether the session is complete, without any objection."""
+        """Whether the session is complete and no reason for an early end is stated."""
         return self.outcome == "complete" and not self.reason
 
     def as_dict(self) -> dict[str, object]:
-        """Return the result for JSON."""
+        """Return the session's result as a dictionary for JSON."""
         touches = {} if self.touches is None else {"touches": list(self.touches)}
         fit = {} if self.fit is None else {"fit": dict(self.fit)}
         return {
@@ -184,37 +188,38 @@ class SessionProgress:
     phase: Phase
     """Phase of the session."""
     tick: int
-    """Number of the last tick."""
+    """Number of ticks that were due so far."""
     missed: int
-    """Ticks missed so far."""
+    """Number of ticks missed so far."""
     late: int
-    """Ticks that woke late so far."""
+    """Number of ticks so far for which the control loop woke up late."""
     fits: tuple[Mapping[str, Any], ...] = ()
-    """Fits of the record since the last call, as in JSON documents."""
+    """Fits of the record that were made since the last report, as in JSON documents."""
 
 
-Watcher = Callable[[SessionProgress, list[LogEvent]], None]
-T = TypeVar("T")
+ProgressCallback = Callable[[SessionProgress, list[LogEvent]], None]
+"""Callback for the progress of a session and its events since the last call."""
+MessageType = TypeVar("MessageType")
 
 
 class SessionRun:
-    """Run of one session; :meth:`run` may be called once.
+    """Supervisor of one session; :meth:`run` may be called once.
 
     Parameters
     ----------
     order
         Session to run.
     group
-        Processes of the rig; its control process is connected and idle.
-    connected
-        Message of the control process after its connection.
+        Processes of the rig. The control process must be connected to the devices and idle.
+    connection
+        Message that the control process sent after it had connected to the devices.
     live
-        Live view to supervise, or None.
+        Live view that shows the session, or None.
     watcher
         Called about fifty times a second with the progress and the events since the last call.
-    listens
-        Whether this process can receive a stop request. If it cannot, its heartbeat ends, so that
-        the control process takes it for hung.
+    can_receive_stop
+        Returns whether this process can receive a stop request. If not, this process stops its
+        heartbeat, so that the control process treats it as hung.
 
     Attributes
     ----------
@@ -226,60 +231,62 @@ class SessionRun:
         self,
         order: Order,
         group: ProcessGroup,
-        connected: Connected,
+        connection: Connected,
         live: LiveView | None,
-        watcher: Watcher,
-        listens: Callable[[], bool],
+        watcher: ProgressCallback,
+        can_receive_stop: Callable[[], bool],
     ) -> None:
         self._order = order
         self._group = group
-        self._connected = connected
+        self._connection = connection
         self._live = live
         self._shared_state = group.channels.shared_state
         self._events = Observer(group.channels.events)
         self._watcher = watcher
-        self._listens = listens
-        self._virtual = connected.realtime["clock"] == "virtual"
-        self._pulse = Heartbeat()
-        self._recorder_lost: str | None = None
-        self._control_at_work = False
+        self._can_receive_stop = can_receive_stop
+        self._is_virtual_clock = connection.realtime["clock"] == "virtual"
+        self._control_heartbeat = Heartbeat()
+        self._recorder_failure: str | None = None
+        self._is_control_busy = False
         # The drive is off until it is enabled; afterwards only the control process can confirm it.
-        self._drive_at_end = "The drive is disabled."
-        self._opened: Path | None = None
+        self._final_drive_state = "The drive is disabled."
+        self._opened_path: Path | None = None
         self._saved_path: Path | None = None
         self._touches: TouchEstimates | None = None
         self._fit: FitSupervisor | None = None
         self.device_failed = False
 
     def run(self, stop: StopRequest) -> RunResult:
-        """Run the session to its end.
+        """Run the session to its end, or until a stop is requested, and return its result.
 
         Raises
         ------
         SessionFailedError
-            If the file cannot be opened or written, or the recorder died or hangs.
+            If the file cannot be opened or written, or if the recorder ended or hangs.
         """
-        stop.on_request = self._stop
+        stop.on_request = self._request_stop
         if stop.requested:
-            self._stop()
+            self._request_stop()
         try:
             return self._run()
         except (ChildError, SessionFailedError) as error:
-            self._recorder_lost = self._recorder_lost or str(error)
-            if self._control_at_work:
+            self._recorder_failure = self._recorder_failure or str(error)
+            if self._is_control_busy:
                 self._shared_state[StateField.STOP] = Stop.NO_RECORDER
-                self._listen_to_control()
-            failure = SessionFailedError(f"{self._recorder_lost} {self._drive_at_end}")
-            failure.path, failure.saved_path = self._opened, self._saved_path
+                self._await_control()
+            failure = SessionFailedError(f"{self._recorder_failure} {self._final_drive_state}")
+            failure.path, failure.saved_path = self._opened_path, self._saved_path
             failure.counts = self._counts()
             raise failure from None
         finally:
-            stop.on_request = _nothing
+            stop.on_request = _ignore_stop_request
 
-    def _stop(self) -> None:
+    def _request_stop(self) -> None:
+        """Request the control process to stop the session."""
         self._shared_state[StateField.STOP] = Stop.OPERATOR
 
     def _run(self) -> RunResult:
+        """Start the processes of the session, supervise them to the end, and close the file."""
         group, search = self._group, self._order.excitation.search
         try:
             reference = put_reference(
@@ -294,113 +301,129 @@ class SessionRun:
             ) from None
         order = self._order
         profile = order.profile
-        realtime = None if self._virtual else profile.realtime
+        realtime = None if self._is_virtual_clock else profile.realtime
         if order.touch is not None:
             self._touches = TouchEstimates(group, order.touch, profile.rig.rate_hz, realtime)
-            self._touches.await_ready(self._reports)
+            self._touches.await_ready(self._report_and_check_stop)
         if search is not None or order.watch_fit:
             self._fit = FitSupervisor(group, profile, reference, search, realtime)
-            lost = self._fit.await_ready(self._reports)
-            if lost and search is not None:
-                raise SessionFailedError(lost)
+            failure = self._fit.await_ready(self._report_and_check_stop)
+            if failure and search is not None:
+                raise SessionFailedError(failure)
         self._open_file()
         order = self._order
-        self._control_at_work = True
+        self._is_control_busy = True
         touch = None if order.touch is None else order.touch.order
         job = SessionJob(
             order.profile,
             reference,
-            self._refused_to_supervision(),
+            self._refused_realtime_settings(),
             order.ending,
             touch,
             order.seed,
             tuple(f"{each.name}: {each.text}" for each in order.accepted),
         )
         group.control.send(job)
-        answer = self._listen_to_control()
-        if isinstance(answer, Ready):
-            header = file_header(order, self._connected, answer.tare)
+        message = self._await_control()
+        if isinstance(message, Ready):
+            header = file_header(order, self._connection, message.tare)
             group.recorder.send(header)
             if self._fit is not None:
                 self._fit.begin(header)
-            self._ask_recorder(Armed)
+            self._await_recorder(Armed)
             self._shared_state[StateField.GO] = 1
-            answer = self._listen_to_control()
-        if self._recorder_lost is not None:
-            raise SessionFailedError(self._recorder_lost)
-        assert isinstance(answer, Finished)
-        return self._close(answer)
+            message = self._await_control()
+        if self._recorder_failure is not None:
+            raise SessionFailedError(self._recorder_failure)
+        assert isinstance(message, Finished)
+        return self._close(message)
 
-    def _reports(self) -> bool:
-        """Report before any motion; return whether the session is still requested."""
+    def _report_and_check_stop(self) -> bool:
+        """Report progress before any motion; return whether no stop is requested so far."""
         self._report()
         return self._shared_state[StateField.STOP] == Stop.NO
 
     def _open_file(self) -> None:
-        """Have the file created, under another name if the chosen name is already taken."""
+        """Start the recorder, which creates the file; use another name if the name is taken."""
         group = self._group
-        realtime = None if self._virtual else self._order.profile.realtime
-        for _ in range(_MOST_NAMES):
+        realtime = None if self._is_virtual_clock else self._order.profile.realtime
+        for _ in range(_MAX_FILE_NAMES):
             job = RecorderJob(self._order.path, group.channels.specs, realtime)
-            group.fresh(RECORDER).start(job)
+            group.idle_process(RECORDER).start(job)
             try:
-                opened = self._ask_recorder(Opened, _START_PATIENCE_S)
-            except _NameTakenError as error:
-                taken = error
+                opened = self._await_recorder(Opened, _RECORDER_START_TIMEOUT_S)
+            except _FileExistsError as error:
+                name_error = error
                 self._order = replace(self._order, path=another_path(self._order.path))
             else:
-                self._opened = self._order.path
-                granted = {f"recorder_{name}": text for name, text in opened.realtime.items()}
-                before = self._connected.realtime
-                self._connected = replace(self._connected, realtime={**before, **granted})
+                self._opened_path = self._order.path
+                recorder_settings = {
+                    f"recorder_{name}": text for name, text in opened.realtime.items()
+                }
+                previous_settings = self._connection.realtime
+                self._connection = replace(
+                    self._connection, realtime={**previous_settings, **recorder_settings}
+                )
                 return
-        raise taken
+        raise name_error
 
-    def _refused_to_supervision(self) -> dict[str, str]:
-        """Return the real-time settings refused to supervisor and recorder, with the reasons."""
+    def _refused_realtime_settings(self) -> dict[str, str]:
+        """Return name → reason for real-time settings that the system refused.
+
+        Only settings of the supervisor and of the recorder are included.
+        """
         return {
             name: text
-            for name, text in self._connected.realtime.items()
+            for name, text in self._connection.realtime.items()
             if name.startswith(("supervisor_", "recorder_")) and text.startswith(REFUSED)
         }
 
-    def _listen_to_control(self) -> Ready | Finished:
-        """Wait for the next message of the control process while supervising all processes."""
+    def _await_control(self) -> Ready | Finished:
+        """Supervise all processes until the control process sends a message, and return that.
+
+        A hung control process is killed.
+        """
         deadline, phase = 0.0, -1
         while True:
-            # An estimate of a touch is more urgent than a message of the control process.
-            waited = self._touches is not None and self._touches.listen(_POLL_S)
+            # An estimate of a touch is more urgent than a message from the control process.
+            has_waited = self._touches is not None and self._touches.process_messages(_POLL_S)
             try:
-                answer = self._group.control.poll(0.0 if waited else _POLL_S)
+                message = self._group.control.poll(0.0 if has_waited else _POLL_S)
             except ChildError as error:
                 return self._control_died(str(error))
             self._report()
             now_s = time.monotonic()
             # In lock-step with a simulated rig, a tick may wait for missing replies.
-            torque = self._shared_state[StateField.PHASE] in _TORQUE_PHASES and not self._virtual
+            is_torque_on = (
+                self._shared_state[StateField.PHASE] in _TORQUE_PHASES
+                and not self._is_virtual_clock
+            )
             if (
                 self._shared_state[StateField.STOP] == Stop.NO
                 or self._shared_state[StateField.PHASE] != phase
             ):
                 phase = self._shared_state[StateField.PHASE]
-                patience_s = _PATIENCE_S if torque else _SLOW_PATIENCE_S
-                deadline = now_s + patience_s
-            elif answer is None and now_s > deadline:
-                return self._kill_control(f"did not stop within {patience_s:g} s")
+                timeout_s = _REPLY_TIMEOUT_S if is_torque_on else _DRIVE_TIMEOUT_S
+                deadline = now_s + timeout_s
+            elif message is None and now_s > deadline:
+                return self._kill_control(f"did not stop within {timeout_s:g} s")
             assert CONTROL.hung_after_s is not None
-            hung_after_s = CONTROL.hung_after_s if torque else _SLOW_PATIENCE_S
-            still_s = self._pulse.stalled_for(self._shared_state[StateField.CONTROL_BEAT], now_s)
-            if answer is None and still_s > hung_after_s:
+            hung_after_s = CONTROL.hung_after_s if is_torque_on else _DRIVE_TIMEOUT_S
+            stalled_s = self._control_heartbeat.stalled_for(
+                self._shared_state[StateField.CONTROL_BEAT], now_s
+            )
+            if message is None and stalled_s > hung_after_s:
                 return self._kill_control(f"hung for {hung_after_s:g} s (check CPU load)")
-            if answer is not None:
-                return self._understood(answer)
-            if self._recorder_lost is None:
-                self._recorder_lost = self._recorder_trouble()
-                if self._recorder_lost is not None:
+            if message is not None:
+                return self._checked_control_message(message)
+            if self._recorder_failure is None:
+                self._recorder_failure = self._recorder_failure_reason()
+                if self._recorder_failure is not None:
                     self._shared_state[StateField.STOP] = Stop.NO_RECORDER
 
-    def _understood(self, answer: object) -> Ready | Finished:
-        match answer:
+    def _checked_control_message(self, message: object) -> Ready | Finished:
+        """Return the message of the control process as ``Ready`` or ``Finished``."""
+        match message:
             case Ended(reason):  # before the session began
                 finished = self._control_died(reason)
                 if reason:
@@ -410,51 +433,57 @@ class SessionRun:
                     finished, outcome="stopped", reason="Stopped by the operator.", fault=False
                 )
             case Finished():
-                self._control_at_work = False
-                if answer.device_failed:
+                self._is_control_busy = False
+                if message.device_failed:
                     self.device_failed = True
-                    self._drive_at_end = answer.reason
-                return answer
+                    self._final_drive_state = message.reason
+                return message
             case Ready():
-                return answer
-        raise SessionFailedError(f"The control process answers {answer}.")
+                return message
+        raise SessionFailedError(f"The control process answers {message}.")
 
-    def _kill_control(self, why: str) -> Finished:
-        """End a hung control process; the watchdog of the drive switches the torque off."""
+    def _kill_control(self, predicate: str) -> Finished:
+        """Kill a hung control process, and return the session's end.
+
+        The drive's watchdog then switches the torque off.
+        """
         self._group.control.kill()
         return self._control_died(
-            f"The control process {why} and was killed: without its heartbeat the drive switches "
-            "itself off. Check that it is off."
+            f"The control process {predicate} and was killed: without its heartbeat the drive "
+            "switches itself off. Check that it is off."
         )
 
     def _control_died(self, reason: str) -> Finished:
-        self._control_at_work = False
+        """Mark the control process as ended, and return the session's end with the reason."""
+        self._is_control_busy = False
         self.device_failed = True
-        self._drive_at_end = reason
-        return self._as_finished(reason)
+        self._final_drive_state = reason
+        return self._finished_from_shared_state(reason)
 
-    def _as_finished(self, reason: str) -> Finished:
-        """Construct the result of a dead control process from the shared state."""
+    def _finished_from_shared_state(self, reason: str) -> Finished:
+        """Return the session's end for a dead control process, from counts in shared memory."""
         counts = self._counts()
-        whole = is_whole(
+        is_complete = is_whole(
             self._shared_state, counts["scheduled"], self._order.excitation.reference_rad.size
         )
         return Finished(
-            outcome="complete" if whole else "fault",
-            reason=f"After the record: {reason}" if whole else reason,
+            outcome="complete" if is_complete else "fault",
+            reason=f"After the record: {reason}" if is_complete else reason,
             fault=True,
             counts=counts,
         )
 
     def _counts(self) -> dict[str, int]:
+        """Return the tick counts of this session from shared memory, or zeros before tick 0."""
         shared_state = self._shared_state
         # Before the record of this session the counters are those of the previous one.
         return {
-            name: shared_state[word] if shared_state[StateField.GO] else 0
-            for name, word in _COUNTED.items()
+            name: shared_state[field] if shared_state[StateField.GO] else 0
+            for name, field in _COUNTER_FIELDS.items()
         }
 
-    def _recorder_trouble(self) -> str | None:
+    def _recorder_failure_reason(self) -> str | None:
+        """Return why the recorder failed, or None if it is running."""
         try:
             message = self._group.recorder.poll(0.0)
         except ChildError as error:
@@ -464,28 +493,35 @@ class SessionRun:
             return message.reason
         return None if message is None else str(message)
 
-    def _ask_recorder(self, expected: type[T], patience_s: float = _PATIENCE_S) -> T:
-        """Wait for an answer of the recorder while supervising: the motor may be held."""
-        deadline = time.monotonic() + patience_s
+    def _await_recorder(
+        self, expected: type[MessageType], timeout_s: float = _REPLY_TIMEOUT_S
+    ) -> MessageType:
+        """Wait for a message of a given type from the recorder, and return it.
+
+        Progress is reported meanwhile, because the motor may be held. Raises SessionFailedError if
+        the recorder fails or does not reply in time.
+        """
+        deadline = time.monotonic() + timeout_s
         message = None
         while message is None and time.monotonic() < deadline:
             message = self._group.recorder.poll(_POLL_S)
             self._report()
         if message is None:
             raise SessionFailedError(
-                f"The recorder process does not answer within {patience_s:g} s. Check CPU load and "
+                f"The recorder process does not answer within {timeout_s:g} s. Check CPU load and "
                 "disk."
             )
         if isinstance(message, Failed):
             self._saved_path = message.saved_path
-            raise (_NameTakenError if message.taken else SessionFailedError)(message.reason)
+            raise (_FileExistsError if message.taken else SessionFailedError)(message.reason)
         if not isinstance(message, expected):
             raise SessionFailedError(f"The recorder process answers {message}.")
         return message
 
     def _report(self) -> None:
+        """Signal this process's heartbeat, and pass progress, events and fits to the watcher."""
         shared_state = self._shared_state
-        if self._listens():
+        if self._can_receive_stop():
             shared_state.beat(StateField.SUPERVISOR_BEAT)
         events = read_events(self._events.take(16))
         if self._live is not None:
@@ -493,13 +529,13 @@ class SessionRun:
         if self._touches is not None:
             events += self._touches.poll()
             if self._live is not None:
-                self._live.touched(self._touches.news())
+                self._live.show_touches(self._touches.take_new_estimates())
         fits: Sequence[Mapping[str, Any]] = ()
         if self._fit is not None:
             events += self._fit.poll()
-            fits = self._fit.news()
+            fits = self._fit.take_new_estimates()
             if self._live is not None:
-                self._live.fitted(fits)
+                self._live.show_fits(fits)
         self._watcher(
             SessionProgress(
                 Phase(shared_state[StateField.PHASE]),
@@ -512,6 +548,7 @@ class SessionRun:
         )
 
     def _close(self, finished: Finished) -> RunResult:
+        """Complete touches and fit, make the recorder close the file, and return the result."""
         self._report()
         touches = None
         outcome = {
@@ -532,24 +569,24 @@ class SessionRun:
             self._report()
             outcome["fit"] = json.dumps(fit)
             if finished.outcome == "complete" and not finished.reason:
-                outcome["reason"] = self._fit.shortcoming
+                outcome["reason"] = self._fit.unmet_reason
             elif self._fit.failure:
                 # This failure ends the session, even if a stop was requested before.
                 outcome["reason"] = f"{self._fit.failure} {finished.reason}"
         self._group.recorder.wake()
-        packed = b"" if self._touches is None else self._touches.packed()
-        self._group.recorder.send(Close(outcome, packed, segments))
-        # A disk may stall at the end of a record as long as during it.
+        packed_touches = b"" if self._touches is None else self._touches.encoded_touches()
+        self._group.recorder.send(Close(outcome, packed_touches, segments))
+        # A disk may stall for as long at the end of a record as during the record.
         stall_s = self._order.profile.limits.recorder_lag_s
-        closed = self._ask_recorder(Closed, stall_s + 2 * _PATIENCE_S)
-        # The count of the recorder takes precedence.
-        counts = {**_NO_TICKS, **finished.counts, **closed.counts}
-        ended, reason = finished.outcome, outcome["reason"]
+        closed = self._await_recorder(Closed, stall_s + 2 * _REPLY_TIMEOUT_S)
+        # The recorder's counts take precedence over those of the control process.
+        counts = {**_ZERO_COUNTS, **finished.counts, **closed.counts}
+        outcome_text, reason = finished.outcome, outcome["reason"]
         if closed.path is not None:
-            ended, reason = closed.outcome, closed.reason
+            outcome_text, reason = closed.outcome, closed.reason
         return RunResult(
             path=closed.path,
-            outcome=ended,
+            outcome=outcome_text,
             reason=reason,
             scheduled=counts["scheduled"],
             recorded=counts.get("recorded", 0),
@@ -559,7 +596,7 @@ class SessionRun:
             stale_angles=counts["stale_angles"],
             stale_wrenches=counts["stale_wrenches"],
             fault=finished.fault
-            or ended == "fault"
+            or outcome_text == "fault"
             or (self._fit is not None and bool(self._fit.failure)),
             live_dropped=self._shared_state[StateField.LIVE_DROPPED],
             touches=None if touches is None else tuple(touches),
@@ -568,22 +605,22 @@ class SessionRun:
 
 
 def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
-    """Return the results of a series as a JSON document.
+    """Return the results of a series of sessions as a dictionary for JSON.
 
     Parameters
     ----------
     results
-        Results of its sessions.
+        Results of the sessions.
     """
-    found = [result.touches for result in results if result.touches is not None]
-    touches = {"touches": [touch for each in found for touch in each]} if found else {}
+    touch_lists = [result.touches for result in results if result.touches is not None]
+    touches = {"touches": [touch for each in touch_lists for touch in each]} if touch_lists else {}
     return {"sessions": [result.as_dict() for result in results], **touches}
 
 
-def always() -> bool:
-    """Return True: a stop always arrives, because it is a signal."""
+def can_always_receive_stop() -> bool:
+    """Return True: a process that is stopped by signals can always receive a stop request."""
     return True
 
 
-def _nothing() -> None:
-    """Do nothing at a stop request between two sessions: its flag is enough."""
+def _ignore_stop_request() -> None:
+    """Do nothing when a stop is requested between two sessions, because its flag is read later."""

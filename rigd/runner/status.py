@@ -1,4 +1,4 @@
-"""Status of a rig and of a growing record, read from shared memory."""
+"""Status of a rig and statistics of the running record, read from shared memory."""
 
 import os
 import time
@@ -19,71 +19,75 @@ from rigd.live.address import LiveAddress
 from rigd.runner._process_group import ProcessGroup
 from rigd.session.layout import decode_samples
 
-_WINDOW_S: Final = 1.0
-"""Window of samples from which lateness and rate are computed."""
+_STATISTICS_WINDOW_S: Final = 1.0
+"""Time span of the latest samples, in seconds, from which latency and rate are computed."""
 
 
 @dataclass(frozen=True, slots=True)
 class SignalStatus:
-    """Statistics of the running record, or of the last one."""
+    """Statistics of the running record, or of the last record while none is running."""
 
     rate_hz: float
-    """Ticks per second over the last second, without missed ticks."""
+    """Number of recorded ticks per second in the last second, without missed ticks."""
     lateness_p50_us: float
-    """Wake-up latency over the last second: median."""
+    """Median wake-up latency of the control loop in the last second."""
     lateness_p99_us: float
-    """Wake-up latency over the last second: 99th percentile."""
+    """99th percentile of the control loop's wake-up latency in the last second."""
     work_p99_us: float
-    """Execution time of a tick over the last second: 99th percentile."""
+    """99th percentile of the execution time of a tick in the last second."""
     tracking_error_rad: float
-    """Present reference less angle."""
+    """Present tracking error: reference minus angle."""
     peak_tracking_error_rad: float
-    """Largest magnitude since the record began."""
+    """Largest magnitude of the tracking error in the record so far."""
     peak_coupling_torque_nm: float
-    """Largest magnitude since the record began."""
+    """Largest magnitude of the coupling torque in the record so far."""
     peak_torque_command_nm: float
-    """Largest magnitude since the record began."""
+    """Largest magnitude of the torque command in the record so far."""
 
 
-class SignalWatch:
-    """Observer of the samples in the ring; it may miss samples and never delays the loop.
+class SignalStatisticsReader:
+    """Observer that computes statistics from the samples in shared memory.
+
+    It may miss samples, and never delays the control loop.
 
     Parameters
     ----------
     rate_hz
-        Rate of the rig.
+        Sample rate of the rig.
     """
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
-        self._seen: tuple[Ring, Observer] | None = None
-        self._recent: deque[npt.NDArray[Any]] = deque()
+        self._ring_and_observer: tuple[Ring, Observer] | None = None
+        self._recent_samples: deque[npt.NDArray[Any]] = deque()
         self._peaks = np.zeros(3)
 
     def poll(self, ring: Ring) -> Callable[[], SignalStatus] | None:
-        """Read the samples since the last call; return a function for the statistics, or None.
+        """Read the samples since the last call, and return a function that computes statistics.
 
-        The statistics are computed on request, which is less frequent than the calls.
+        Returns None before the first sample. The statistics are computed only when they are needed,
+        which is less often than this call.
         """
-        if self._seen is None or self._seen[0] is not ring:
-            recent = max(0, ring.written - round(_WINDOW_S * self._rate_hz))
-            self._seen = ring, Observer(ring, recent)
-        while block := self._seen[1].take(ring.capacity // 4):
+        if self._ring_and_observer is None or self._ring_and_observer[0] is not ring:
+            window_start = max(0, ring.written - round(_STATISTICS_WINDOW_S * self._rate_hz))
+            self._ring_and_observer = ring, Observer(ring, window_start)
+        while block := self._ring_and_observer[1].take(ring.capacity // 4):
             try:
                 samples = decode_samples(block)
             except ValueError:
                 continue  # overwritten while it was copied
             for part in np.split(samples, np.flatnonzero(samples["tick"] == 0)):
-                self._take(part)
-        if not self._recent:
+                self._include_samples(part)
+        if not self._recent_samples:
             return None
-        return partial(_figures, self._rate_hz, tuple(self._recent), self._peaks)
+        return partial(_signal_statistics, self._rate_hz, tuple(self._recent_samples), self._peaks)
 
-    def _take(self, samples: npt.NDArray[Any]) -> None:
+    def _include_samples(self, samples: npt.NDArray[Any]) -> None:
+        """Update peaks and latest samples with new samples; tick 0 starts another record."""
         if samples.size == 0:
             return
         if samples["tick"][0] == 0:  # another record
-            self._recent.clear()
+            self._recent_samples.clear()
             self._peaks = np.zeros(3)
         signals = (
             samples["angle_reference_rad"] - samples["angle_rad"],
@@ -91,24 +95,25 @@ class SignalWatch:
             samples["torque_command_nm"],
         )
         self._peaks = np.maximum(self._peaks, [np.abs(signal).max() for signal in signals])
-        self._recent.append(samples)
-        oldest_ns = int(samples["t_ns"][-1]) - round(_WINDOW_S * 1e9)
-        while self._recent[0]["t_ns"][-1] < oldest_ns:
-            self._recent.popleft()
+        self._recent_samples.append(samples)
+        oldest_ns = int(samples["t_ns"][-1]) - round(_STATISTICS_WINDOW_S * 1e9)
+        while self._recent_samples[0]["t_ns"][-1] < oldest_ns:
+            self._recent_samples.popleft()
 
 
-def _figures(
-    rate_hz: float, parts: tuple[npt.NDArray[Any], ...], peaks: npt.NDArray[np.float64]
+def _signal_statistics(
+    rate_hz: float, sample_blocks: tuple[npt.NDArray[Any], ...], peaks: npt.NDArray[np.float64]
 ) -> SignalStatus:
-    recent = np.concatenate(parts)
-    last = recent[-1]
-    span = int(last["tick"]) - int(recent["tick"][0]) + 1
-    late_us = 1e-3 * np.percentile(recent["lateness_ns"], (50, 99))
+    """Return the statistics of the samples in the window, with the peaks of the record."""
+    samples = np.concatenate(sample_blocks)
+    last = samples[-1]
+    tick_span = int(last["tick"]) - int(samples["tick"][0]) + 1
+    latency_us = 1e-3 * np.percentile(samples["lateness_ns"], (50, 99))
     return SignalStatus(
-        rate_hz=rate_hz * recent.size / span,
-        lateness_p50_us=float(late_us[0]),
-        lateness_p99_us=float(late_us[1]),
-        work_p99_us=float(1e-3 * np.percentile(recent["work_ns"], 99)),
+        rate_hz=rate_hz * samples.size / tick_span,
+        lateness_p50_us=float(latency_us[0]),
+        lateness_p99_us=float(latency_us[1]),
+        work_p99_us=float(1e-3 * np.percentile(samples["work_ns"], 99)),
         tracking_error_rad=float(last["angle_reference_rad"] - last["angle_rad"]),
         peak_tracking_error_rad=float(peaks[0]),
         peak_coupling_torque_nm=float(peaks[1]),
@@ -118,93 +123,93 @@ def _figures(
 
 @dataclass(frozen=True, slots=True)
 class ProcessStatus:
-    """Status of one process of the table."""
+    """Status of one process of the rig."""
 
     name: str
-    """Name in the table of processes."""
+    """Name of the process, such as ``control`` or ``recorder``."""
     pid: int
     """Process id."""
     state: str
-    """``running``, ``waiting`` (for a session), ``hung`` or ``ended``."""
+    """State of the process: ``running``, ``waiting`` (for a session), ``hung`` or ``ended``."""
     still_s: float
-    """Time without a heartbeat, as observed by the last calls."""
+    """Time in seconds since the last heartbeat of the process, as observed so far."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicStatus:
-    """Status of one topic of the table."""
+    """Status of one topic, through which the control process passes messages to the recorder."""
 
     name: str
-    """Name in the table of topics."""
+    """Name of the topic, such as ``/rig/sample``."""
     written: int
-    """Records written since the memory was laid out."""
+    """Number of messages written since the shared memory was allocated."""
     rate_hz: float | None
-    """Rate since the last call; None at the first call."""
+    """Number of messages per second since the last call, or None at the first call."""
     expected_hz: float | None
-    """Rate expected during a record; None if none is expected."""
+    """Expected number of messages per second during a record, or None if irregular."""
     waiting: int
-    """Records that the recorder has not yet read."""
+    """Number of messages that the recorder has not read yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class RigStatus:
-    """Status of the rig, as read from shared memory."""
+    """Present status of a connected rig and of its session."""
 
     phase: Phase
     """Phase of the session."""
     activity: Activity
-    """State of the session for its operator."""
+    """What the rig is doing, in terms for the operator."""
     angle_rad: float
-    """Angle from the rig's zero."""
+    """Motor angle relative to the rig's zero."""
     coupling_torque_nm: float
-    """Measured torque after the tare."""
+    """Measured coupling torque after the tare."""
     torque_command_nm: float
-    """Last torque command."""
+    """Last torque command to the drive."""
     tick: int
-    """Number of the last tick."""
+    """Number of ticks of the record that were due so far."""
     missed: int
-    """Ticks missed so far."""
+    """Number of ticks that the control loop missed so far."""
     late: int
-    """Ticks that woke late so far."""
+    """Number of ticks so far for which the control loop woke up late."""
     lost: int
-    """Samples lost so far."""
+    """Number of samples so far that could not be recorded."""
     bus_load_percent: float | None
-    """Load of the busiest bus line; None without a bus."""
+    """Load of the busiest bus line in percent, or None without a bus."""
     bus_errors: int | None
-    """Errors on all bus lines; None: not known."""
+    """Number of errors on all bus lines, or None if unknown."""
     sensor_status: int | None
-    """Status word of the sensor; None: not known."""
+    """Status word of the force-torque sensor, or None if unknown."""
     disk_free_mb: int | None
-    """Free space on the disk of the session file; None before it is known."""
+    """Free space in MB on the disk of the session file, or None if it is not known yet."""
     view_dropped: int
-    """Samples that the live view did not receive."""
+    """Number of samples that the live view did not receive."""
     signals: Callable[[], SignalStatus] | None
-    """Returns the statistics of the record; None before its first sample."""
+    """Function that computes statistics of the record, or None before the first sample."""
     processes: tuple[ProcessStatus, ...]
-    """Processes of the rig."""
+    """Status of each process of the rig."""
     topics: tuple[TopicStatus, ...]
-    """Traffic to the recorder."""
+    """Status of each topic, through which the recorder gets its messages."""
     live_view: LiveAddress | None = None
-    """Address of the live view; None: there is none."""
+    """Address of the live view, or None if there is none."""
 
 
-class StatusWatch:
-    """Observer of a rig; it derives rates from consecutive calls.
+class StatusReader:
+    """Reader of a rig's status, which computes message rates between consecutive calls.
 
     Parameters
     ----------
     rate_hz
-        Rate of the rig.
+        Sample rate of the rig.
     """
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
-        self._pulses = {process: Heartbeat() for process in PROCESSES}
-        self._written: tuple[float, tuple[int, ...]] | None = None
-        self._signals = SignalWatch(rate_hz)
+        self._heartbeats = {process: Heartbeat() for process in PROCESSES}
+        self._last_time_and_counts: tuple[float, tuple[int, ...]] | None = None
+        self._signals = SignalStatisticsReader(rate_hz)
 
     def read(self, group: ProcessGroup) -> RigStatus:
-        """Return the present status."""
+        """Return the present status of the rig with these processes."""
         shared_state = group.channels.shared_state
         load_ppm = shared_state.known(StateField.BUS_LOAD_PPM)
         return RigStatus(
@@ -223,33 +228,41 @@ class StatusWatch:
             disk_free_mb=shared_state[StateField.DISK_FREE_MB] or None,
             view_dropped=shared_state[StateField.LIVE_DROPPED],
             signals=self._signals.poll(group.channels.samples),
-            processes=tuple(self._processes(group)),
-            topics=tuple(self._topics(group)),
+            processes=tuple(self._process_statuses(group)),
+            topics=tuple(self._topic_statuses(group)),
         )
 
-    def _topics(self, group: ProcessGroup) -> Iterator[TopicStatus]:
+    def _topic_statuses(self, group: ProcessGroup) -> Iterator[TopicStatus]:
+        """Yield the status of each topic, with its message rate since the last call."""
         rings, now_s = group.channels.rings, time.monotonic()
         written = tuple(ring.written for ring in rings)
-        before_s, before = self._written or (now_s, written)
-        self._written = now_s, written
-        passed_s = now_s - before_s
-        for topic, ring, now, first in zip(TOPICS, rings, written, before, strict=True):
+        previous_s, previous_counts = self._last_time_and_counts or (now_s, written)
+        self._last_time_and_counts = now_s, written
+        elapsed_s = now_s - previous_s
+        for topic, ring, now, previous_count in zip(
+            TOPICS, rings, written, previous_counts, strict=True
+        ):
             # New processes have new rings, whose counts start at 0.
-            rate_hz = (now - first) / passed_s if passed_s > 0.0 and now >= first else None
+            rate_hz = (
+                (now - previous_count) / elapsed_s
+                if elapsed_s > 0.0 and now >= previous_count
+                else None
+            )
             expected_hz = topic.expected_hz(self._rate_hz)
             yield TopicStatus(topic.name, now, rate_hz, expected_hz, ring.waiting)
 
-    def _processes(self, group: ProcessGroup) -> Iterator[ProcessStatus]:
+    def _process_statuses(self, group: ProcessGroup) -> Iterator[ProcessStatus]:
+        """Yield the status of each started process, with the time since its last heartbeat."""
         shared_state, now_s = group.channels.shared_state, time.monotonic()
         for process in PROCESSES:
-            still_s = self._pulses[process].stalled_for(shared_state[process.beat], now_s)
+            still_s = self._heartbeats[process].stalled_for(shared_state[process.beat], now_s)
             if process is SUPERVISOR:
                 yield ProcessStatus(process.name, os.getpid(), "running", still_s)
                 continue
             if process not in group:
                 continue
-            child = group[process]
-            if not child.running:
+            child_process = group[process]
+            if not child_process.running:
                 state = "ended"
             elif not group.has_job(process):
                 state = "waiting"
@@ -257,4 +270,4 @@ class StatusWatch:
                 state = "hung"
             else:
                 state = "running"
-            yield ProcessStatus(process.name, child.pid, state, still_s)
+            yield ProcessStatus(process.name, child_process.pid, state, still_s)

@@ -1,4 +1,4 @@
-"""Background work: lowest priority, one thread, ends with the process that started it."""
+"""Background programs, which have low priority and one thread, and end with their parent."""
 
 import os
 import signal
@@ -15,40 +15,41 @@ if TYPE_CHECKING:
 SINGLE_THREADED: Final = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
 )
-"""Environment variables that stop numpy from starting threads."""
+"""Environment variables that stop NumPy from starting threads."""
 
 OWN_PYTHON: Final = (sys.executable, "-P")
-"""Start of the command line of a program of this project. With -P no file of the working folder is
-imported by mistake."""
+"""First words of the command line that runs a Python module of this project. With -P no file of the
+working folder is imported by mistake."""
 
 _LOWEST_PRIORITY: Final = 19
+"""Niceness with the lowest priority."""
 
 
 def use_one_thread() -> None:
-    """Stop numpy from starting threads, in this process and its children.
+    """Stop NumPy from starting threads, in this process and its children.
 
-    Threads do not speed up small matrices, and cost a tenth of the time of a fit. With real-time
-    priority they are harmful: threads of one calculation wait for each other in busy loops and
-    block their core, so that one second becomes one minute.
+    Threads do not speed up small matrices, and take a tenth of the time of a fit. With real-time
+    priority they are harmful: the threads of one calculation wait for each other in busy loops and
+    block their core, so that a calculation of one second takes one minute.
 
-    Call this before the first import of numpy, which reads the environment only once.
+    Call this before the first import of NumPy, which reads the environment only once.
     """
     os.environ.update(SINGLE_THREADED)
 
 
 def prefer_oom_kill() -> None:
-    """Make this process and its children the first victims of the OOM killer."""
+    """Make Linux end this process and its children first if memory runs out (OOM killer)."""
     with suppress(OSError):  # not on Linux
         Path("/proc/self/oom_score_adj").write_text("1000")
 
 
 def give_way(pid: int = 0) -> None:
-    """Run a process and its children only while no other process needs the processor.
+    """Let a process and its children run only while no other process needs the processor.
 
     Parameters
     ----------
     pid
-        Number of the process; 0: this one.
+        Process id, or 0 for this process.
     """
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, _LOWEST_PRIORITY)
@@ -57,18 +58,18 @@ def give_way(pid: int = 0) -> None:
 
 
 def processor_use(pid: int) -> tuple[bool, float] | None:
-    """Return the scheduling state and processor time of a process.
+    """Return whether a process is runnable, and the processor time that it has used.
 
     Parameters
     ----------
     pid
-        Number of the process.
+        Process id.
 
     Returns
     -------
     tuple of bool and float, or None
-        Whether the process runs or waits for a processor, and its processor time in s. None if this
-        is not known: the process has ended, or the system is not Linux.
+        Whether the process runs or waits for a processor, and its processor time in seconds. None
+        if the process has ended, or the system is not Linux.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text()
@@ -81,7 +82,7 @@ def processor_use(pid: int) -> tuple[bool, float] | None:
 
 
 def die_with_parent(parent: int) -> None:
-    """End this process when its parent ends, in whatever way.
+    """Make the system end this process when its parent ends, for whatever reason.
 
     Parameters
     ----------
@@ -94,13 +95,15 @@ def die_with_parent(parent: int) -> None:
 
 
 def begin_background(parser: "ArgumentParser") -> "Namespace":
-    """Set up a background program: one thread, first victim of the OOM killer; parse its options.
+    """Set up a background program with one thread, and return its parsed options.
+
+    If memory runs out, the system ends it first.
 
     Parameters
     ----------
     parser
-        Command line of the program. The option ``--parent`` is added: the program ends with that
-        process.
+        Command line of the program. The option ``--parent`` is added, which states the process id
+        of a process with which the program ends.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Locks: a file with one holder at a time, and the lock of a rig."""
+"""Lock files, which one program holds at a time, and the lock of a rig."""
 
 import errno
 import fcntl
@@ -12,41 +12,46 @@ from typing import Self
 from rigd.errors import FailureError
 from rigd.runtime.addresses import file_name, runtime_folder
 
-_COMMON = Path("/run/lock")
-_LOCKS = Path("/proc/locks")
-_NAME_SIZE = 200
-_RIG_LOCK = re.compile(r"/(?:rigd-)?rig-([^/]*)\.lock(?: \(deleted\))?$")
+_COMMON_LOCK_FOLDER = Path("/run/lock")
+_LOCK_TABLE = Path("/proc/locks")
+_MAX_HOLDER_BYTES = 200
+_RIG_LOCK_PATTERN = re.compile(r"/(?:rigd-)?rig-([^/]*)\.lock(?: \(deleted\))?$")
 
 
 class HeldError(Exception):
-    """Another program holds the file; the message is the description of that program."""
+    """Raised if another program holds a lock file; its text describes that program."""
 
 
 class HeldFile:
-    """Lock file that contains the name of its holder.
+    """Lock file that contains the name of the program that holds it.
 
     Parameters
     ----------
     name
-        Name of the locked resource; all characters except letters and digits are equivalent.
+        Name of the locked resource. All characters except letters and digits are equivalent.
     everybody
-        The resource is hardware, common to all users of this computer: the lock is in
-        ``/run/lock`` if this folder exists. Otherwise it is in the user's own runtime folder.
+        Whether the resource is common to all users of this computer, as hardware is. The file is
+        then in ``/run/lock`` if that folder is writable. Otherwise it is in the user's runtime
+        folder.
     """
 
     def __init__(self, name: str, *, everybody: bool) -> None:
-        plain = file_name(name)
-        common = everybody and os.access(_COMMON, os.W_OK)
-        self.path = _COMMON / f"rigd-{plain}.lock" if common else runtime_folder() / f"{plain}.lock"
+        file_stem = file_name(name)
+        is_common = everybody and os.access(_COMMON_LOCK_FOLDER, os.W_OK)
+        self.path = (
+            _COMMON_LOCK_FOLDER / f"rigd-{file_stem}.lock"
+            if is_common
+            else runtime_folder() / f"{file_stem}.lock"
+        )
         self._fd: int | None = None
 
     def acquire(self, holder: str, *, alone: bool = True) -> None:
-        """Acquire the lock, either exclusively or together with other non-exclusive holders.
+        """Acquire the lock, exclusively or together with other non-exclusive holders.
 
         Parameters
         ----------
         holder
-            Name of the holder, for the messages of other programs.
+            Name of this program, for error messages of other programs.
         alone
             Whether the lock is exclusive.
 
@@ -55,12 +60,12 @@ class HeldFile:
         HeldError
             If another program holds the lock.
         OSError
-            If the file cannot be created.
+            If the lock file cannot be created.
         """
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        fd = self._open()
+        fd = self._open_file()
         try:
-            _lock(fd, alone=alone)
+            _lock_descriptor(fd, alone=alone)
             os.ftruncate(fd, 0)
             os.pwrite(fd, f"{holder}, process {os.getpid()}".encode(), 0)
         except BaseException:
@@ -69,18 +74,18 @@ class HeldFile:
         self._fd = fd
 
     def release(self) -> None:
-        """Release the lock; repeated calls do nothing."""
+        """Release the lock, if this program holds it; may be called repeatedly."""
         if self._fd is not None:
             os.close(self._fd)
             self._fd = None
 
-    def _open(self) -> int:
-        """Open the file for reading and writing, whichever user created it."""
+    def _open_file(self) -> int:
+        """Return a descriptor of the lock file, which is created if it does not exist."""
         with suppress(FileExistsError):
             fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
             os.fchmod(fd, 0o666)  # despite the umask: the next holder may be another user
             return fd
-        # In a folder that is writable for others the name may be a link to any file.
+        # In a folder that others can write to, the name may be a link to any file.
         fd = os.open(self.path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             os.close(fd)
@@ -88,37 +93,38 @@ class HeldFile:
         return fd
 
 
-def _lock(fd: int, *, alone: bool) -> None:
+def _lock_descriptor(fd: int, *, alone: bool) -> None:
+    """Lock an open file without waiting; raise HeldError if another program holds it."""
     try:
         fcntl.flock(fd, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except OSError:
-        holder = os.pread(fd, _NAME_SIZE, 0).decode(errors="replace").strip() or "unknown"
-        raise HeldError(holder + _others(fd, holder)) from None
+        holder = os.pread(fd, _MAX_HOLDER_BYTES, 0).decode(errors="replace").strip() or "unknown"
+        raise HeldError(holder + _unnamed_holder_text(fd, holder)) from None
 
 
-def _others(fd: int, holder: str) -> str:
-    """Return the holders in the kernel's table that the file does not name.
+def _unnamed_holder_text(fd: int, holder: str) -> str:
+    """Return text on a process that holds the lock but is not named in the lock file, else "".
 
-    Any user can write to the file and hold the lock.
+    Any user can write to the file, so its content may be wrong. The kernel's table is right.
     """
     inode = os.fstat(fd).st_ino
     try:
-        holders = sorted(pid for pid, held in _held_inodes() if held == inode)
+        holders = sorted(pid for pid, held_inode in _held_inodes() if held_inode == inode)
     except OSError:
         return ""
-    found = ""
+    text = ""
     for pid in holders:
         if re.search(rf"\bprocess {pid}\b", holder):
             return ""
         with suppress(OSError):
-            found = f"; held by process {pid} of user {Path('/proc', str(pid)).stat().st_uid}"
-    return found
+            text = f"; held by process {pid} of user {Path('/proc', str(pid)).stat().st_uid}"
+    return text
 
 
 def _held_inodes() -> set[tuple[int, int]]:
     """Return process id and inode of each file lock in the kernel's table."""
     # 1: FLOCK ADVISORY WRITE PID MAJOR:MINOR:INODE START END
-    rows = [line.split() for line in _LOCKS.read_text("ascii").splitlines()]
+    rows = [line.split() for line in _LOCK_TABLE.read_text("ascii").splitlines()]
     return {
         (int(row[4]), int(row[5].rpartition(":")[2]))
         for row in rows
@@ -130,41 +136,41 @@ def _held_inodes() -> set[tuple[int, int]]:
 
 
 class RigBusyError(FailureError):
-    """Another program uses the rig; the message names it."""
+    """Raised if another program uses the rig; the message states which program."""
 
 
 class RigLock:
-    """Lock of a rig, held within its context.
+    """Lock that prevents two programs from using a rig, held while its context lasts.
 
     Parameters
     ----------
     rig
-        The profile's name.
+        Name of the rig's profile.
     holder
-        Name of this program, for messages to a second one.
+        Name of this program, for error messages of a second program.
     hardware
-        The rig is hardware, common to all users of this computer.
+        Whether the rig is hardware, which is common to all users of this computer.
     alone
-        Hold the lock exclusively. Otherwise only exclusive holders are excluded: sessions on
-        simulated rigs of their own do not disturb each other.
+        Whether the lock is exclusive. Programs with a non-exclusive lock can run at the same time,
+        because each simulates a rig of its own.
     """
 
     def __init__(self, rig: str, holder: str, *, hardware: bool, alone: bool = True) -> None:
         self._rig = rig
         self._holder = holder
-        self._alone = alone
+        self._is_exclusive = alone
         self._file = HeldFile(f"rig-{rig}", everybody=hardware)
 
     def acquire(self) -> None:
-        """Acquire the rig.
+        """Acquire the lock of the rig.
 
         Raises
         ------
         RigBusyError
-            If another program holds it, or this cannot be determined.
+            If another program holds the lock, or this cannot be determined.
         """
         try:
-            self._file.acquire(self._holder, alone=self._alone)
+            self._file.acquire(self._holder, alone=self._is_exclusive)
         except HeldError as holder:
             raise RigBusyError(
                 f"The rig {self._rig} is in use ({holder}). Wait until it is free; if a daemon has "
@@ -177,7 +183,7 @@ class RigLock:
             ) from None
 
     def release(self) -> None:
-        """Release the rig."""
+        """Release the lock of the rig."""
         self._file.release()
 
     def __enter__(self) -> Self:
@@ -189,57 +195,58 @@ class RigLock:
 
 
 def holds_rig(pid: int, rig: str, folder: Path) -> bool:
-    """Return whether a process holds the lock of a rig, from the kernel's table of locks.
+    """Return whether a process holds the lock of a rig, according to the kernel's table of locks.
 
     Parameters
     ----------
     pid
-        Number of the process.
+        Process id.
     rig
         Name of the rig.
     folder
-        Runtime folder to search for the lock, in addition to the folder where the process opened
-        it.
+        Runtime folder that may contain the lock file. The files that the process has open are
+        searched too.
 
     Raises
     ------
     OSError
-        If the system has no such table.
+        If the system has no table of locks.
     """
-    held = _held_inodes()
-    plain = f"rig-{file_name(rig)}"
-    files = [folder / f"{plain}.lock", _COMMON / f"rigd-{plain}.lock"]
-    files += [path for name, path in _open_locks(pid) if name == file_name(rig)]
+    held_inodes = _held_inodes()
+    file_stem = f"rig-{file_name(rig)}"
+    files = [folder / f"{file_stem}.lock", _COMMON_LOCK_FOLDER / f"rigd-{file_stem}.lock"]
+    files += [path for name, path in _open_rig_locks(pid) if name == file_name(rig)]
     for path in files:
         with suppress(OSError):
-            if (pid, path.stat().st_ino) in held:
+            if (pid, path.stat().st_ino) in held_inodes:
                 return True
     return False
 
 
 def held_rig(pid: int) -> str | None:
-    """Return the rig whose lock file a process has open, as spelled in file names.
+    """Return the name of the rig whose lock file a process has open.
 
     Parameters
     ----------
     pid
-        Number of the process.
+        Process id.
 
     Returns
     -------
     str or None
-        The name; None if there is none, or the system does not show the files of the process.
+        Name of the rig as in file names. None if the process has no such file open, or the system
+        does not show the files of the process.
     """
-    return next((name for name, _ in _open_locks(pid)), None)
+    return next((name for name, _ in _open_rig_locks(pid)), None)
 
 
-def _open_locks(pid: int) -> list[tuple[str, Path]]:
-    """Return the rig locks that a process has open: name of the rig and path in /proc."""
-    found = []
+def _open_rig_locks(pid: int) -> list[tuple[str, Path]]:
+    """Return the rig locks that a process has open: name of the rig, and path in /proc."""
+    rig_locks = []
     with suppress(OSError):
         for entry in Path("/proc", str(pid), "fd").iterdir():
             with suppress(OSError):
-                match = _RIG_LOCK.search(str(entry.readlink()))
+                match = _RIG_LOCK_PATTERN.search(str(entry.readlink()))
                 if match is not None:
-                    found.append((match[1], entry))
-    return found
+                    rig_locks.append((match[1], entry))
+    return rig_locks

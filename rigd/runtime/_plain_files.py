@@ -1,4 +1,4 @@
-"""Safe opening of files named by users, which may be of any kind."""
+"""Safe opening of files that users name, which may be pipes, devices or very large."""
 
 import errno
 import os
@@ -6,58 +6,59 @@ import stat
 from pathlib import Path
 from typing import Final, TextIO
 
-_FLAGS: Final = os.O_RDONLY | sum(
+_OPEN_FLAGS: Final = os.O_RDONLY | sum(
     getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NONBLOCK", "O_BINARY")
 )
-"""Flags for opening; some do not exist on Windows."""
+"""Flags with which a file is opened; some do not exist on Windows."""
 
 
-def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) -> TextIO:
+def open_plain_file(path: Path, max_bytes: int, *, newline: str | None = None) -> TextIO:
     """Open a regular text file of limited size, without blocking on a pipe.
 
     Parameters
     ----------
     path
-        Name of the file.
-    most_bytes
-        Largest permitted size.
+        Path of the file.
+    max_bytes
+        Maximum size of the file in bytes.
     newline
-        Argument of `open`.
+        Treatment of line ends, as for `open`.
 
     Raises
     ------
     OSError
         If the file cannot be opened, is not a regular file, or is too large.
     """
-    fd = _open(path, most_bytes)
+    fd = _open_regular_file(path, max_bytes)
     return open(fd, newline=newline, encoding="utf-8-sig")  # noqa: PTH123 - of a descriptor
 
 
-def read_plain_file(path: Path, most_bytes: int) -> bytes:
+def read_plain_file(path: Path, max_bytes: int) -> bytes:
     """Return the content of a regular file of limited size, without blocking on a pipe.
 
     Parameters
     ----------
     path
-        Name of the file.
-    most_bytes
-        Largest permitted size.
+        Path of the file.
+    max_bytes
+        Maximum size of the file in bytes.
 
     Raises
     ------
     OSError
         If the file cannot be read, is not a regular file, or is too large.
     """
-    with open(_open(path, most_bytes), "rb") as file:
-        return file.read(most_bytes)
+    with open(_open_regular_file(path, max_bytes), "rb") as file:
+        return file.read(max_bytes)
 
 
-def _open(path: Path, most_bytes: int) -> int:
+def _open_regular_file(path: Path, max_bytes: int) -> int:
+    """Return a descriptor of a regular file; raise OSError for any other or too large file."""
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "its name contains a NUL character")
-    fd = os.open(path, _FLAGS)
+    fd = os.open(path, _OPEN_FLAGS)
     status = os.fstat(fd)
-    if not stat.S_ISREG(status.st_mode) or status.st_size > most_bytes:
+    if not stat.S_ISREG(status.st_mode) or status.st_size > max_bytes:
         os.close(fd)
-        raise OSError(errno.EINVAL, f"not a file of at most {most_bytes / 1e6:g} MB")
+        raise OSError(errno.EINVAL, f"not a file of at most {max_bytes / 1e6:g} MB")
     return fd

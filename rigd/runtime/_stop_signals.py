@@ -1,10 +1,10 @@
-r"""Signals that request an end, and the reaction of each process.
+r"""Signals that request the end of a program or of its session, and how the processes react.
 
-Ctrl-C, Ctrl-\, Ctrl-Z and the closing of a terminal reach all its processes; a service manager
-sends SIGTERM to all processes. A command ends by an exception (`raise_on`). For the supervisor and
-the control process each of the signals means a safe stop (`StopRequest`); a suspended control
-process would leave its last torque on. The recorder and the live publisher ignore them (`ignore`)
-and are ended by the supervisor.
+Ctrl-C, Ctrl-\, Ctrl-Z and the closing of a terminal send a signal to all processes of the terminal,
+and a service manager sends SIGTERM to all processes. A command ends by an exception (`raise_on`).
+The supervisor and the control process stop their session safely at each of these signals
+(`StopRequest`), because a suspended control process would leave its last torque on. The recorder
+and the live publisher ignore the signals (`ignore`), and are ended by the supervisor.
 """
 
 import contextlib
@@ -16,35 +16,37 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Final, NoReturn
 
-_REPEAT_S: Final = 0.01
+_SIGNAL_REPEAT_DELAY_S: Final = 0.01
+"""Delay in seconds after which a signal is repeated whose exception was dropped."""
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
 
 class Interruption(KeyboardInterrupt):
-    """Signal that requests the end; its number is the argument.
+    """Raised by a signal that requests the program's end; the argument is the signal's number.
 
-    After a plain `KeyboardInterrupt` has passed through an `exec` of text, as in the definition of
-    a named tuple or dataclass, `python -m` ends by the signal and ignores the exit code.
+    It differs from `KeyboardInterrupt` because of a peculiarity of Python: if a plain
+    `KeyboardInterrupt` passes through an `exec` of text, as in the definition of a named tuple or
+    dataclass, `python -m` ends by the signal and ignores the exit code.
     """
 
 
 def raise_on(*numbers: int) -> None:
-    """Make these signals raise an :class:`Interruption`."""
+    """Make the given signals raise an :class:`Interruption` in the main thread."""
     if hasattr(signal, "SIGALRM"):  # not on Windows
-        sys.unraisablehook = _unraisable
+        sys.unraisablehook = _repeat_dropped_signal
     for number in numbers:
         signal.signal(number, interrupt)
 
 
 def interrupt(number: int, _frame: FrameType | None) -> NoReturn:
-    """Raise an :class:`Interruption` for a signal."""
+    """Raise an :class:`Interruption`; installed as a signal handler."""
     raise Interruption(number)
 
 
 def ignore_handled_signals() -> None:
-    """Ignore the signals handled so far, so that another Ctrl-C does not interrupt the cleanup.
+    """Ignore all signals that have a handler, so that no further Ctrl-C interrupts the cleanup.
 
-    Otherwise Python restores the default action of handled signals before its cleanup has ended,
+    Otherwise Python would restore the default action of these signals before its cleanup has ended,
     and a signal would end the process.
     """
     for number in signal.valid_signals():
@@ -52,40 +54,41 @@ def ignore_handled_signals() -> None:
             signal.signal(number, signal.SIG_IGN)
 
 
-def _unraisable(dropped: "sys.UnraisableHookArgs") -> None:
-    """Repeat a signal whose exception Python dropped, as in the finalizer of an object.
+def _repeat_dropped_signal(dropped: "sys.UnraisableHookArgs") -> None:
+    """Repeat a signal whose :class:`Interruption` Python dropped; installed as unraisable hook.
 
-    Finalizers run anywhere, for example in callbacks of the locks of the import system. An
-    exception raised here would also be dropped, so the signal is sent again a little later.
+    Python drops an exception in the finalizer of an object, which may run anywhere. An exception
+    raised here would be dropped, too. The signal is therefore sent again a little later.
     """
-    lost = dropped.exc_value
-    if not isinstance(lost, Interruption):
+    interruption = dropped.exc_value
+    if not isinstance(interruption, Interruption):
         sys.__unraisablehook__(dropped)
         return
-    (number,) = lost.args
+    (number,) = interruption.args
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
-    signal.setitimer(signal.ITIMER_REAL, _REPEAT_S)
+    signal.setitimer(signal.ITIMER_REAL, _SIGNAL_REPEAT_DELAY_S)
 
 
 def signal_when_orphaned(number: int) -> None:
-    """Make the system send a signal to this process when its parent ends.
+    """Make the system send a signal to this process when its parent ends (Linux only).
 
-    A suspended process is also continued, because nothing else would wake it.
+    A suspended process is also continued.
     """
-    with contextlib.suppress(AttributeError):  # Linux has it, others do without
+    with contextlib.suppress(AttributeError):  # other systems have no such call
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
 
 
 # In the processes of a rig
 
 STOP_SIGNAL: Final = signal.SIGUSR1
-"""Requests a stop of the sessions of a process; a daemon itself continues.
+"""Signal that requests a process to stop its sessions, after which a daemon continues to run.
 
-The process table shows whether there may be sessions: a process with the default action has not yet
-begun, a process that handles the signal may run one, a process that ignores it has finished.
+The process table shows how each process reacts to the signal, and thus whether it may run sessions.
+The default action means that the process is starting, a handler that it may run a session, and an
+ignored signal that it runs no more sessions.
 """
 
-_STOPPING = (
+_END_SIGNALS = (
     *(signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP),
     STOP_SIGNAL,
 )
@@ -93,33 +96,34 @@ _STOPPING = (
 
 @contextmanager
 def signals_blocked() -> Iterator[None]:
-    """Block these signals; a process started in this context inherits the block.
+    """Block the signals that request an end in the context, for a process that is started there.
 
-    It unblocks them with :meth:`StopRequest.catch` or :func:`ignore` when it can handle them.
+    The process inherits the block. It unblocks the signals by :meth:`StopRequest.catch` or
+    :func:`ignore` when it can handle them.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPING)
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, _END_SIGNALS)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
 
 
 def ignore() -> None:
-    """Ignore the signals that request an end."""
-    for number in _STOPPING:
+    """Make this process ignore the signals that request an end, such as SIGINT and SIGTERM."""
+    for number in _END_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPPING)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _END_SIGNALS)
 
 
 class StopRequest:
-    """Stop request of the operator, set by signals.
+    """Flag that states whether the operator has requested a stop, which signals can set.
 
     Attributes
     ----------
     requested
         Whether a stop was requested.
     on_request
-        Called from the signal handler at each request.
+        Function that is called at each request, by the signal handler if a signal requests it.
     """
 
     def __init__(self) -> None:
@@ -127,19 +131,19 @@ class StopRequest:
         self.on_request: Callable[[], None] = lambda: None
 
     def catch(self) -> None:
-        """Handle the signals from now on, except those that were ignored before (nohup)."""
-        for number in _STOPPING:
+        """Make the signals that request an end set this flag, except for ignored ones (nohup)."""
+        for number in _END_SIGNALS:
             if signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, lambda *_: self.request())
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPPING)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _END_SIGNALS)
 
-    def sessions_are_over(self) -> None:
-        """Show in the process table that this process runs no more sessions."""
+    def ignore_stop_signal(self) -> None:
+        """Ignore `STOP_SIGNAL`, so that the process table shows that no more sessions follow."""
         if callable(signal.getsignal(STOP_SIGNAL)):
             with contextlib.suppress(ValueError):  # not in the main thread
                 signal.signal(STOP_SIGNAL, signal.SIG_IGN)
 
     def request(self) -> None:
-        """Request a stop."""
+        """Set the flag, and call `on_request`."""
         self.requested = True
         self.on_request()

@@ -1,7 +1,8 @@
-"""Addresses of the processes of this user, and detection of dead processes.
+"""Addresses of this user's processes in the runtime folder, and detection of dead processes.
 
-A process has a Unix socket or a small JSON file in the runtime folder. A socket of a dead process
-is recognised because nobody listens (`answers`), a file because the process is gone (`started_at`).
+The address of a process is a Unix socket or a small JSON file in the runtime folder. The socket of
+a dead process is detected because no process listens (`answers`), and its file because the process
+no longer exists (`started_at`).
 """
 
 import itertools
@@ -18,33 +19,36 @@ from typing import Any, Final
 
 from rigd.errors import FailureError
 
-_LOGINS: Final = Path("/run/user")
+_LOGIN_FOLDERS: Final = Path("/run/user")
 """Parent of the runtime folders of all logged-in users."""
-_FALLBACK: Final = re.compile(r"rigd-(\d{1,10})(?:-(\d{1,9}))?")
-_PROBE_S: Final = 1.0
-_MOST_BYTES: Final = 65_536
+_FALLBACK_FOLDER_NAME: Final = re.compile(r"rigd-(\d{1,10})(?:-(\d{1,9}))?")
+"""Name of a fallback runtime folder in the folder for temporary files: user id and number."""
+_CONNECT_TIMEOUT_S: Final = 1.0
+"""Maximum time in seconds to connect to a socket."""
+_MAX_ADDRESS_BYTES: Final = 65_536
+"""Maximum number of bytes that are read of an address file."""
 
 
 # Folder
 
 
 class UnsafeFolderError(FailureError):
-    """Other users can modify the runtime folder; the message names the remedy."""
+    """Raised if other users can write to the runtime folder; the message states the remedy."""
 
 
 def runtime_folder() -> Path:
-    """Return this user's folder for sockets and addresses, which a restart removes.
+    """Return this user's folder for sockets and address files, which a restart removes.
 
     Raises
     ------
     UnsafeFolderError
-        If other users can write to it.
+        If other users can write to the folder.
     """
     base = os.environ.get("XDG_RUNTIME_DIR")
     if base and Path(base).is_dir():
         folder = Path(base) / "rigd"
     else:
-        folder = _own_folder(Path(tempfile.gettempdir()))
+        folder = _own_fallback_folder(Path(tempfile.gettempdir()))
     fault = folder_fault(folder)
     if fault:
         raise UnsafeFolderError(fault)
@@ -52,27 +56,27 @@ def runtime_folder() -> Path:
 
 
 def folder_fault(folder: Path, *, shared: bool = False) -> str:
-    """Return why other users can replace files in a runtime folder; empty if they cannot.
+    """Return text that states why other users can replace files in a runtime folder, or "" if not.
 
     Parameters
     ----------
     folder
-        The folder. A folder that does not exist is safe if its parent is.
+        Path of the folder. A folder that does not exist is safe if its parent folder is safe.
     shared
-        The folder may belong to any user, as that of a group does.
+        Whether the folder may belong to any user, like the folder of a group.
     """
     for path in (folder.parent, folder):
         try:
             status = path.stat()
         except OSError:
             continue
-        writable = status.st_mode & 0o022
+        write_bits = status.st_mode & 0o022
         if path == folder.parent and status.st_mode & stat.S_ISVTX:
-            writable = 0  # in a sticky folder users can remove only their own files
-        if writable:
-            whom = "every user" if writable & 0o002 else "its group"
+            write_bits = 0  # in a sticky folder users can remove only their own files
+        if write_bits:
+            writers = "every user" if write_bits & 0o002 else "its group"
             return (
-                f"The runtime folder {path} is writable by {whom} (mode "
+                f"The runtime folder {path} is writable by {writers} (mode "
                 f"{stat.S_IMODE(status.st_mode):04o}), who could replace the daemon's socket; run "
                 f"chmod go-w {path}, or set XDG_RUNTIME_DIR to a folder that only you can write to."
             )
@@ -86,57 +90,59 @@ def folder_fault(folder: Path, *, shared: bool = False) -> str:
 
 
 def known_folders(uid: int | None) -> list[Path]:
-    """Return all possible runtime folders of a user, for any environment of the processes.
+    """Return all folders that may be a user's runtime folder in some process environment.
 
     Parameters
     ----------
     uid
-        User id; None: any user.
+        User id, or None for all users.
 
     Returns
     -------
     list of Path
-        Folders of this environment, of the login session, and in the folder for temporary files.
+        Runtime folder by this process's environment, by the login session, and fallback folders
+        among temporary files. Some may not exist.
     """
     base = os.environ.get("XDG_RUNTIME_DIR")
-    found = [Path(base) / "rigd"] if base else []
+    folders = [Path(base) / "rigd"] if base else []
     if uid is None:
         with suppress(OSError):
-            found += [each / "rigd" for each in _LOGINS.iterdir()]
+            folders += [each / "rigd" for each in _LOGIN_FOLDERS.iterdir()]
     else:
-        found.append(_LOGINS / str(uid) / "rigd")
+        folders.append(_LOGIN_FOLDERS / str(uid) / "rigd")
     for temporary in {Path(tempfile.gettempdir()), Path("/tmp")}:
-        found += _fallback_folders(temporary, uid)
-    return sorted(set(found))
+        folders += _fallback_folders(temporary, uid)
+    return sorted(set(folders))
 
 
 def _fallback_folders(base: Path, uid: int | None) -> list[Path]:
-    """Return the folders made by `_own_folder` for a user, or for all, by increasing number.
+    """Return the fallback runtime folders of a user, or of all users if `uid` is None.
 
-    A folder of such a name that belongs to another user is omitted.
+    They are sorted by user id and number. A folder that belongs to another user than its name
+    states is left out.
     """
-    found = []
+    numbered_folders = []
     with suppress(OSError), os.scandir(base) as entries:
         for entry in entries:
-            match = _FALLBACK.fullmatch(entry.name)
+            match = _FALLBACK_FOLDER_NAME.fullmatch(entry.name)
             if match is None or uid not in (None, int(match[1])):
                 continue
             with suppress(OSError):
                 status = entry.stat(follow_symlinks=False)
                 if stat.S_ISDIR(status.st_mode) and status.st_uid == int(match[1]):
-                    found.append((int(match[1]), int(match[2] or 0), Path(entry.path)))
-    return [path for *_, path in sorted(found)]
+                    numbered_folders.append((int(match[1]), int(match[2] or 0), Path(entry.path)))
+    return [path for *_, path in sorted(numbered_folders)]
 
 
-def _own_folder(base: Path) -> Path:
-    """Return the user's folder in the common folder; create it if there is none.
+def _own_fallback_folder(base: Path) -> Path:
+    """Return the user's fallback runtime folder within `base`; create it if it does not exist.
 
-    A name taken by another user is skipped. The folder is found again even after the other user has
-    released the name.
+    A number is appended if another user has created a folder with the name. The numbered folder is
+    found again even after that other folder was removed.
     """
     uid = os.getuid()
-    own = _fallback_folders(base, uid)
-    path = own[0] if own else base / f"rigd-{uid}"
+    own_folders = _fallback_folders(base, uid)
+    path = own_folders[0] if own_folders else base / f"rigd-{uid}"
     for number in itertools.count(1):
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)
@@ -149,72 +155,72 @@ def _own_folder(base: Path) -> Path:
     raise AssertionError("never reached")
 
 
-# Files and sockets in it
+# Files and sockets in the runtime folder
 
 
 def file_name(rig: str) -> str:
-    """Return a rig's name for file names, with ``-`` for all but letters and digits."""
+    """Return a rig's name as used in file names, with ``-`` for all but letters and digits."""
     return "".join(c if c.isalnum() else "-" for c in rig).strip("-")
 
 
 def address_files(pattern: str, *folders: Path) -> list[Path]:
-    """Return the files of a pattern in some folders, sorted by path.
+    """Return the files in runtime folders whose names match a pattern, sorted by path.
 
     Parameters
     ----------
     pattern
-        Pattern of file names, as of :meth:`pathlib.Path.glob`.
+        Pattern of file names, as for :meth:`pathlib.Path.glob`.
     *folders
-        Folders to search; unreadable ones are skipped. Default: the user's runtime folder.
+        Folders to search; by default the user's runtime folder. Unreadable folders are skipped.
     """
-    found: list[Path] = []
+    paths: list[Path] = []
     for folder in folders or (runtime_folder(),):
         with suppress(OSError):
-            found += folder.glob(pattern)
-    return sorted(found)
+            paths += folder.glob(pattern)
+    return sorted(paths)
 
 
 def announce(path: Path, address: Mapping[str, object]) -> None:
-    """Write an address to a file that only this user can read.
+    """Write the address of a process to a JSON file that only this user can read.
 
-    The file is replaced atomically. The folder is created if necessary.
+    The file is replaced atomically. Its folder is created if necessary.
 
     Parameters
     ----------
     path
-        File to write; an existing one is replaced.
+        Path of the file; an existing file is replaced.
     address
-        Values that JSON can represent, by name.
+        Name → value that JSON can represent.
 
     Raises
     ------
     OSError
-        If it cannot be written.
+        If the file cannot be written.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    fresh = path.with_suffix(f".{os.getpid()}")
-    fresh.unlink(missing_ok=True)
-    fresh.touch(mode=0o600)
-    fresh.write_text(json.dumps(address), encoding="utf-8")
-    fresh.replace(path)
+    new_path = path.with_suffix(f".{os.getpid()}")
+    new_path.unlink(missing_ok=True)
+    new_path.touch(mode=0o600)
+    new_path.write_text(json.dumps(address), encoding="utf-8")
+    new_path.replace(path)
 
 
 def read_address(path: Path) -> dict[str, Any]:
-    """Return an announced address; empty if there is no valid file."""
+    """Return the address that `announce` wrote to a file, or an empty dictionary if invalid."""
     try:
         # The file may be of any kind, even one that blocks on opening.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
         with os.fdopen(descriptor, "rb") as file:
-            found = json.loads(file.read(_MOST_BYTES))
+            address = json.loads(file.read(_MAX_ADDRESS_BYTES))
     except (OSError, ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return address if isinstance(address, dict) else {}
 
 
 def answers(path: str | Path) -> bool:
     """Return whether a process listens on a Unix socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(_PROBE_S)
+        probe.settimeout(_CONNECT_TIMEOUT_S)
         try:
             probe.connect(os.fspath(path))
         except (BlockingIOError, TimeoutError):
@@ -225,13 +231,14 @@ def answers(path: str | Path) -> bool:
 
 
 def started_at(pid: int) -> int | None:
-    """Return the start time of a process in clock ticks after that of the computer.
+    """Return the start time of a process in clock ticks since the computer was started.
 
-    Process id and start time together are unique. None if the process does not run.
+    Process id and start time together identify a process uniquely. The result is None if the
+    process is not running.
     """
     try:
         text = Path(f"/proc/{pid}/stat").read_text("utf-8")
     except OSError:
         return None
-    state, *rest = text.rpartition(")")[2].split()  # the name before may contain any character
-    return None if state in "ZX" else int(rest[18])
+    state, *fields = text.rpartition(")")[2].split()  # the name before may contain any character
+    return None if state in "ZX" else int(fields[18])

@@ -1,7 +1,7 @@
-"""Process table of this computer from the kernel: running processes, sockets and locks.
+"""The kernel's tables of running processes and of listening sockets.
 
-The table does not depend on the environment of the calling process, nor on the folder in which
-another process of the same user created its socket.
+They show processes and sockets of the user even if these were started in another environment, with
+another runtime folder.
 """
 
 import os
@@ -13,71 +13,73 @@ from typing import Final
 
 from rigd.runtime.addresses import started_at
 
-_PROC: Final = Path("/proc")
-_SOCKETS: Final = Path("/proc/net/unix")
-_LISTENER: Final = re.compile(r"\S+: \S+ \S+ ([0-9A-Fa-f]{1,8}) \S+ \S+ +\S+ (/.*)")
-"""Line of the table of sockets; any user can choose any name, even with a line break."""
-_LISTENS: Final = 0x10000
+_PROCESS_TABLE: Final = Path("/proc")
+_SOCKET_TABLE: Final = Path("/proc/net/unix")
+_SOCKET_LINE_PATTERN: Final = re.compile(r"\S+: \S+ \S+ ([0-9A-Fa-f]{1,8}) \S+ \S+ +\S+ (/.*)")
+"""Pattern of a line in the table of sockets; paths may contain any character, even line breaks."""
+_LISTENING_FLAG: Final = 0x10000
 
 
 @dataclass(frozen=True, slots=True)
 class RunningProcess:
-    """One row of the process table."""
+    """Running process, as the kernel's process table described it when it was read."""
 
     pid: int
     """Process id."""
     parent: int
-    """Process id of the parent or, after its end, of the adopting process."""
+    """Process id of the parent or, after the parent's end, of the adopting process."""
     uid: int
-    """User id; -1 while the process changes users (a setuid program)."""
+    """User id; -1 if the process has several user ids, as a setuid program has."""
     name: str
-    """Short name (`name_this_process`)."""
+    """Short name, which `name_this_process` sets."""
     command: tuple[str, ...]
-    """Command line."""
-    caught: int
-    """Mask of handled signals: bit n-1 for signal n, also in the next two masks."""
-    ignored: int
-    """Mask of ignored signals."""
-    pending: int
-    """Mask of pending signals."""
+    """Command line: program and arguments."""
+    handled_signals: int
+    """Bit mask of the signals that have a handler; bit n-1 represents signal n."""
+    ignored_signals: int
+    """Bit mask of the ignored signals; bit n-1 represents signal n."""
+    pending_signals: int
+    """Bit mask of the signals that were sent but not received yet; bit n-1 represents signal n."""
     suspended: bool
-    """Whether the process is stopped by a signal or a debugger."""
+    """Whether the process is suspended by a signal or a debugger."""
 
     @property
-    def born(self) -> int | None:
-        """Start time in clock ticks after that of the computer; None: the process has ended."""
+    def start_ticks(self) -> int | None:
+        """Start time in clock ticks since the computer was started, or None if it has ended."""
         return started_at(self.pid)
 
     def handles(self, number: int) -> bool:
         """Return whether the process has a handler for a signal."""
-        return bool(self.caught >> (number - 1) & 1)
+        return bool(self.handled_signals >> (number - 1) & 1)
 
     def ignores(self, number: int) -> bool:
         """Return whether the process ignores a signal."""
-        return bool(self.ignored >> (number - 1) & 1)
+        return bool(self.ignored_signals >> (number - 1) & 1)
 
-    def awaits(self, number: int) -> bool:
-        """Return whether a signal is pending."""
-        return bool(self.pending >> (number - 1) & 1)
+    def has_pending(self, number: int) -> bool:
+        """Return whether a signal was sent to the process but not received yet."""
+        return bool(self.pending_signals >> (number - 1) & 1)
 
 
 def read_processes() -> list[RunningProcess]:
-    """Return all running processes that this user can see, by process id.
+    """Return all running processes that this user can see, sorted by process id.
 
     Raises
     ------
     OSError
-        If the system has no process table.
+        If the process table cannot be read.
     """
-    numbers = sorted(int(entry.name) for entry in _PROC.iterdir() if entry.name.isdigit())
-    found = [process for process in map(read_process, numbers) if process is not None]
-    if not any(process.pid == os.getpid() for process in found):
-        raise FileNotFoundError(2, "this process is not in it", os.fspath(_PROC))
-    return found
+    process_ids = sorted(
+        int(entry.name) for entry in _PROCESS_TABLE.iterdir() if entry.name.isdigit()
+    )
+    processes = [process for process in map(read_process, process_ids) if process is not None]
+    if not any(process.pid == os.getpid() for process in processes):
+        raise FileNotFoundError(2, "this process is not in it", os.fspath(_PROCESS_TABLE))
+    return processes
 
 
 def read_process(pid: int) -> RunningProcess | None:
-    """Return the row of one process, or None if it has ended or cannot be seen.
+    """Return the process with an id, or None if it has ended or this user cannot see it.
 
     Parameters
     ----------
@@ -85,16 +87,17 @@ def read_process(pid: int) -> RunningProcess | None:
         Process id.
     """
     try:
-        status = Path(_PROC, str(pid), "status").read_text("utf-8", errors="replace")
-        command = Path(_PROC, str(pid), "cmdline").read_bytes()
-        return _row(pid, status, command)
+        status = Path(_PROCESS_TABLE, str(pid), "status").read_text("utf-8", errors="replace")
+        command = Path(_PROCESS_TABLE, str(pid), "cmdline").read_bytes()
+        return _parsed_process(pid, status, command)
     except (OSError, KeyError, ValueError, IndexError):
         return None
 
 
-def _row(pid: int, status: str, command: bytes) -> RunningProcess | None:
+def _parsed_process(pid: int, status: str, command: bytes) -> RunningProcess | None:
+    """Return a process from its files in /proc, or None if it has ended."""
     rows = [line.partition(":\t") for line in status.split("\n")]
-    fields = {key: value for key, _, value in reversed(rows)}  # the first value of a name is used
+    fields = {key: value for key, _, value in reversed(rows)}  # a name's first value is used
     state = fields["State"][:1]
     if state in "ZX":
         return None
@@ -105,26 +108,26 @@ def _row(pid: int, status: str, command: bytes) -> RunningProcess | None:
         uid=users.pop() if len(users) == 1 else -1,
         name=fields["Name"],
         command=tuple(os.fsdecode(command).split("\0")[:-1]),
-        caught=int(fields["SigCgt"], 16),
-        ignored=int(fields["SigIgn"], 16),
-        pending=int(fields["SigPnd"], 16) | int(fields["ShdPnd"], 16),
+        handled_signals=int(fields["SigCgt"], 16),
+        ignored_signals=int(fields["SigIgn"], 16),
+        pending_signals=int(fields["SigPnd"], 16) | int(fields["ShdPnd"], 16),
         suspended=state in "Tt",
     )
 
 
-def send_signal(process: RunningProcess, born: int, number: int) -> bool:
-    """Send a signal to a process, unless it has ended; return whether it was sent.
+def send_signal(process: RunningProcess, start_ticks: int, number: int) -> bool:
+    """Send a signal to a process unless it has ended, and return whether the signal was sent.
 
     Parameters
     ----------
     process
-        The process.
-    born
-        Its start time, because its process id may have been reused.
+        Process that gets the signal.
+    start_ticks
+        Start time of the process, which shows whether its process id was reused meanwhile.
     number
-        The signal.
+        Number of the signal.
     """
-    if process.born != born:
+    if process.start_ticks != start_ticks:
         return False
     with suppress(OSError):
         os.kill(process.pid, number)
@@ -138,7 +141,7 @@ def name_this_process(name: str) -> None:
     Parameters
     ----------
     name
-        At most 15 bytes.
+        Short name of at most 15 bytes.
     """
     with suppress(OSError):  # not on Linux
         Path("/proc/thread-self/comm").write_text(name)
@@ -153,9 +156,9 @@ def listening_sockets() -> list[Path]:
     Raises
     ------
     OSError
-        If the system has no such list.
+        If the system has no table of sockets.
     """
     # Num RefCount Protocol Flags Type St Inode Path
-    lines = _SOCKETS.read_text("utf-8", errors="surrogateescape").split("\n")
-    matches = filter(None, map(_LISTENER.fullmatch, lines))
-    return sorted({Path(match[2]) for match in matches if int(match[1], 16) & _LISTENS})
+    lines = _SOCKET_TABLE.read_text("utf-8", errors="surrogateescape").split("\n")
+    matches = filter(None, map(_SOCKET_LINE_PATTERN.fullmatch, lines))
+    return sorted({Path(match[2]) for match in matches if int(match[1], 16) & _LISTENING_FLAG})

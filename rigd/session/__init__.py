@@ -1,14 +1,16 @@
-"""Session files (MCAP): format, writer, reader, recovery.
+"""Session files (MCAP): format, writer, reader and recovery.
 
-Offers the writer (`SessionWriter`), readers (`read_session`, `read_controls`, `read_timings`,
-`read_touches`; `read_summary` without the samples), a text summary (`describe`), validity of the
-numbers of a record (`Validity`) and recovery (`recover`). Its public modules are `layout` (bytes of
-the messages, flags of a sample), `limits` (most data that is read), `user_metadata` (metadata of
-users), `touches` (estimated touches in metadata and words), `quick_look` (files of quick looks) and
-`online_fit` (stream of a running session to the online fit). It depends on no devices and no loop.
+The package offers the writer (`SessionWriter`), readers (`read_session`, `read_controls`,
+`read_timings`, `read_touches`, and `read_summary` without the samples), a summary for the operator
+(`describe`), the validity of numbers estimated from a record (`Validity`), and recovery of damaged
+files (`recover`). Its public modules are `layout` (byte layout of the messages, flags of a sample),
+`limits` (maximum amounts of data that are read), `user_metadata` (metadata that users add),
+`touches` (estimated touches in metadata and text), `quick_look` (files of quick looks) and
+`online_fit` (stream of a running session to the online fit). It does not depend on devices or on
+the control loop.
 
-Names are imported on first use, so that the control process, which packs messages only, does not
-pay for the rest.
+Names are imported on first use, so that the control process, which only encodes messages, does not
+load the other modules.
 """
 
 import lazy_loader as lazy

@@ -1,15 +1,15 @@
-"""Errors of session files."""
+"""Errors that are raised when session files are read or written."""
 
 from rigd.errors import FailureError
 
 
 class SessionError(FailureError):
-    """A session file cannot be read or written; the message names the file and the remedy."""
+    """Raised if a session file cannot be read or written; its text names file and remedy."""
 
 
 class SessionAccessError(SessionError):
-    """The system does not let the file be read now; it may be sound, and readable another time."""
+    """Raised if the operating system refuses to read a session file, which may be intact."""
 
 
 class SessionExistsError(SessionError):
-    """The file to be written exists already, and nothing is ever overwritten."""
+    """Raised if the session file to be written exists already; no file is ever overwritten."""

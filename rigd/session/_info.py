@@ -1,4 +1,4 @@
-"""Summary of a session file, as text and as a document."""
+"""Summary of a session file for `rigd info`, as lines of text and as JSON."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,74 +14,81 @@ import numpy as np
 from rigd.printable import counts_text, grouped, listed, printable
 from rigd.session import limits
 from rigd.session._errors import SessionError
-from rigd.session._reader import SURVEY_FIELDS, LoggedEvent, Session, read_session
+from rigd.session._reader import ORDER_AND_FLAG_FIELDS, LoggedEvent, Session, read_session
 from rigd.session.layout import Status
 from rigd.session.online_fit import mode_line
 from rigd.session.quick_look import fit_of
 from rigd.session.touches import touch_line, touches_of
 from rigd.units import suffix_of, unit_of
 
-_RECOVERED: Final = "recovered_"
-_MOST_CHARACTERS: Final = 200_000
-_AROUND: Final = 120
-"""Characters around an entry in either form."""
-_LONGEST_KEY: Final = 200
-_LONGEST_TEXT: Final = 10_000
-_WIDEST_KEY: Final = 40
-_COUNTS: Final = frozenset(
+_RECOVERY_KEY_PREFIX: Final = "recovered_"
+_MAX_METADATA_CHARACTERS: Final = 200_000
+"""Maximum number of characters of the metadata that are shown."""
+_ENTRY_OVERHEAD_CHARACTERS: Final = 120
+"""Number of characters that the text or JSON form adds to an entry, such as quotes and spaces."""
+_MAX_KEY_CHARACTERS: Final = 200
+"""Maximum number of characters of a key that are shown."""
+_MAX_TEXT_CHARACTERS: Final = 10_000
+"""Maximum number of characters of a value that are shown."""
+_MAX_KEY_COLUMN_WIDTH: Final = 40
+"""Maximum width in characters of the first column of the text form."""
+_COUNT_KEYS: Final = frozenset(
     {"scheduled", "recorded", "missed", "late", "lost", "stale_angles", "stale_wrenches"}
 )
-_UTC: Final = "_utc_ns"
-_START: Final = f"start{_UTC}"
-_DIGITS: Final = 6
-_MEASURED_DIGITS: Final = 3
-"""Significant digits of a tare: more are noise in half a second."""
-_LONGEST_NUMBERS: Final = 200
-_LONGEST_COUNT: Final = 12
-"""Digits of a number of ticks: of thirty years at 1 kHz."""
+_UTC_KEY_SUFFIX: Final = "_utc_ns"
+_START_KEY: Final = f"start{_UTC_KEY_SUFFIX}"
+_SIGNIFICANT_DIGITS: Final = 6
+"""Number of significant digits with which numbers of the metadata are shown."""
+_TARE_DIGITS: Final = 3
+"""Number of significant digits of a tare: further digits are noise in half a second."""
+_MAX_ROUNDED_CHARACTERS: Final = 200
+"""Maximum number of characters of a list of numbers that is rounded."""
+_MAX_COUNT_DIGITS: Final = 12
+"""Maximum number of digits of a tick count, which is enough for thirty years at 1 kHz."""
 
 _Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True, slots=True)
 class SessionInfo:
-    """Summary of a session file without analysing it."""
+    """Summary of a session file: metadata, counts of samples, and log."""
 
     path: Path
-    """The file."""
+    """Path of the session file."""
     size_bytes: int
-    """Its size."""
+    """Length of the session file in bytes."""
     start_utc: str
-    """ISO 8601, to the microsecond."""
+    """UTC time of tick 0 in ISO 8601 format, to the microsecond."""
     rate_hz: float
-    """Nominal rate."""
+    """Nominal sample rate."""
     samples: int
-    """Recorded samples."""
+    """Number of samples in the file."""
     ticks: int
-    """Number of ticks from the first recorded one to the last, both included."""
+    """Number of ticks from the first recorded tick to the last, or the number of scheduled ticks if
+    that is larger."""
     duration_s: float
-    """`ticks` at the nominal rate."""
+    """Duration of the session: `ticks` at the nominal sample rate."""
     missing_ticks: int
-    """Gaps between the first recorded tick and the last."""
+    """Number of ticks without a sample: `ticks` minus `samples`."""
     status_counts: dict[str, int]
-    """Name of a status bit → samples that have it; only those that occur."""
+    """Name of a status flag → number of samples with that flag, for flags that occur."""
     segments: dict[str, tuple[int, int]]
-    """Name → first tick and end (exclusive)."""
+    """Segment name → first tick and end tick (exclusive)."""
     metadata: dict[str, str]
-    """The record ``session``, with texts cut to a readable length."""
+    """Record ``session``, with texts cut to a readable length."""
     outcome: dict[str, str] | None
-    """End of the session; None if the file does not state it."""
+    """Record ``outcome``: how the session ended; None if the file does not state it."""
     events: list[LoggedEvent]
-    """Its log, with texts cut as well."""
+    """Events of the session's log, with texts cut to a readable length."""
     attachments: dict[str, int]
-    """Name → bytes."""
-    left_out: list[str]
-    """Parts of the file that are too long to be shown, in words."""
-    absent: str = ""
-    """Samples that were recorded but are not in the file, in words; empty: none, or unknown."""
+    """Name of an attached file → its length in bytes."""
+    omission_texts: list[str]
+    """Sentences that state which contents of the file are too long to be shown."""
+    missing_samples_text: str = ""
+    """Sentence that states which recorded samples are missing from the file; empty if none are."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the summary as a document of JSON types."""
+        """Return the summary as a dictionary that can be written as JSON."""
         return {
             "path": str(self.path),
             "size_bytes": self.size_bytes,
@@ -105,18 +112,18 @@ class SessionInfo:
                 for event in self.events
             ],
             "attachments": self.attachments,
-            "left_out": self.left_out,
-            "absent": self.absent,
+            "left_out": self.omission_texts,
+            "absent": self.missing_samples_text,
         }
 
     def lines(self) -> list[str]:
-        """Return the summary as lines of text, with rounded numbers and local times as well."""
+        """Return the summary as text lines, with rounded numbers, and times in UTC and locally."""
         rows = [
             ("file", f"{self.path} ({self.size_bytes / 1e6:.2f} MB)"),
-            ("started", _clock(datetime.fromisoformat(self.start_utc))),
-            *_outcome(self.outcome or {}, is_whole=not self.absent),
-            *([("absent", self.absent)] if self.absent else []),
-            *(("recovered", f"{k}: {v}") for k, v in _recovery(self.outcome or {}).items()),
+            ("started", _time_text(datetime.fromisoformat(self.start_utc))),
+            *_outcome_rows(self.outcome or {}, is_whole=not self.missing_samples_text),
+            *([("absent", self.missing_samples_text)] if self.missing_samples_text else []),
+            *(("recovered", f"{k}: {v}") for k, v in _recovery_items(self.outcome or {}).items()),
             (
                 "samples",
                 f"{grouped(self.samples)} at {self.rate_hz:g} Hz, {self.duration_s:g} s, "
@@ -131,19 +138,23 @@ class SessionInfo:
                 for name, (first, end) in self.segments.items()
             ),
             *(("attached", f"{name} ({size} bytes)") for name, size in self.attachments.items()),
-            *(_rounded(key, value) for key, value in self.metadata.items() if key != _START),
+            *(
+                _rounded_row(key, value)
+                for key, value in self.metadata.items()
+                if key != _START_KEY
+            ),
             *(
                 (f"{event.t_ns / 1e9:.3f} s", f"{event.level}: {event.message} [{event.name}]")
                 for event in self.events
             ),
-            *(("not shown", sentence) for sentence in self.left_out),
+            *(("not shown", sentence) for sentence in self.omission_texts),
         ]
-        width = min(max(len(key) for key, _ in rows), _WIDEST_KEY)
+        width = min(max(len(key) for key, _ in rows), _MAX_KEY_COLUMN_WIDTH)
         return [f"{printable(key):{width}}  {printable(value)}" for key, value in rows]
 
 
 def describe(path: str | PathLike[str]) -> SessionInfo:
-    """Read a session file and summarise it.
+    """Return a summary of a session file.
 
     Raises
     ------
@@ -158,7 +169,9 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
     (1000.0, 21500, 'complete')
     """
     path = Path(path)
-    session = read_session(path, fields=SURVEY_FIELDS, max_samples=limits.MAX_SURVEYED)
+    session = read_session(
+        path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
+    )
     rate_hz = session.number("rate_hz")
     if rate_hz <= 0:
         raise SessionError(
@@ -166,170 +179,189 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
             "Hz. The writing program must correct it."
         )
     ticks = session.samples["tick"]
-    span = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
-    left_out: list[str] = []
+    ticks_spanned = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
+    omission_texts: list[str] = []
     # Ticks missing at the end leave no gap; only the outcome states them.
-    scheduled = (session.outcome or {}).get("scheduled", "")
-    if scheduled.isascii() and scheduled.isdigit():
-        if _is_count(scheduled):
-            span = max(span, int(scheduled))
+    scheduled_text = (session.outcome or {}).get("scheduled", "")
+    if scheduled_text.isascii() and scheduled_text.isdigit():
+        if _is_count(scheduled_text):
+            ticks_spanned = max(ticks_spanned, int(scheduled_text))
         else:
-            left_out.append(f"scheduled of the outcome, a number of {len(scheduled)} digits")
+            omission_texts.append(
+                f"scheduled of the outcome, a number of {len(scheduled_text)} digits"
+            )
     return SessionInfo(
         path=path,
         size_bytes=path.stat().st_size,
-        start_utc=_iso(session.start_utc_ns),
+        start_utc=_iso_text(session.start_utc_ns),
         rate_hz=rate_hz,
         samples=len(ticks),
-        ticks=span,
-        duration_s=span / rate_hz,
-        missing_ticks=span - len(ticks),
+        ticks=ticks_spanned,
+        duration_s=ticks_spanned / rate_hz,
+        missing_ticks=ticks_spanned - len(ticks),
         status_counts=_status_counts(session),
-        segments=_Excerpt("segments", 50_000, left_out).mapping(session.segments),
-        metadata=_Excerpt("keys", _MOST_CHARACTERS, left_out).texts(session.metadata),
+        segments=_EntryLimiter("segments", 50_000, omission_texts).mapping(session.segments),
+        metadata=_EntryLimiter("keys", _MAX_METADATA_CHARACTERS, omission_texts).texts(
+            session.metadata
+        ),
         outcome=None
         if session.outcome is None
-        else _Excerpt("keys of the outcome", 100_000, left_out).texts(session.outcome),
-        events=_Excerpt("messages of the log", 500_000, left_out).events(
-            session.events, session.events_left_out
+        else _EntryLimiter("keys of the outcome", 100_000, omission_texts).texts(session.outcome),
+        events=_EntryLimiter("messages of the log", 500_000, omission_texts).events(
+            session.events, session.omitted_event_count
         ),
-        attachments=_Excerpt("attachments", 50_000, left_out).mapping(
+        attachments=_EntryLimiter("attachments", 50_000, omission_texts).mapping(
             {name: len(data) for name, data in session.attachments.items()}
         ),
-        left_out=left_out,
-        absent=_absent(session),
+        omission_texts=omission_texts,
+        missing_samples_text=_missing_samples_sentence(session),
     )
 
 
-def _absent(session: Session) -> str:
-    """Describe samples that outcome or segments state and the file lacks: it was trimmed."""
+def _missing_samples_sentence(session: Session) -> str:
+    """Return a sentence on samples that outcome or segments state but a trimmed file lacks.
+
+    Returns an empty text if no sample is missing.
+    """
     ticks = session.samples["tick"]
-    stated = (session.outcome or {}).get("recorded", "")
-    recorded = int(stated) if _is_count(stated) else 0
-    there = f"those of ticks {ticks[0]} to {ticks[-1]} are" if len(ticks) else "none is"
+    stated_count = (session.outcome or {}).get("recorded", "")
+    recorded = int(stated_count) if _is_count(stated_count) else 0
+    present_text = f"those of ticks {ticks[0]} to {ticks[-1]} are" if len(ticks) else "none is"
     if recorded > len(ticks):
         return (
             f"{grouped(recorded - len(ticks))} of the {grouped(recorded)} samples that were "
-            f"recorded are not in this file ({there}): it was trimmed. Take the original."
+            f"recorded are not in this file ({present_text}): it was trimmed. Take the original."
         )
     first, end = (int(ticks[0]), int(ticks[-1]) + 1) if len(ticks) else (0, 0)
-    outside = [
+    incomplete_segments = [
         name
-        for name, (begins, ends) in session.segments.items()
-        if ends > begins and (begins < first or ends > end)
+        for name, (first_tick, end_tick) in session.segments.items()
+        if end_tick > first_tick and (first_tick < first or end_tick > end)
     ]
-    if outside and (session.outcome or {}).get("outcome") == "complete":
+    if incomplete_segments and (session.outcome or {}).get("outcome") == "complete":
         return (
-            f"Samples of {listed(outside)} are not in this file ({there}): it was trimmed. Take "
-            "the original."
+            f"Samples of {listed(incomplete_segments)} are not in this file ({present_text}): it "
+            "was trimmed. Take the original."
         )
     return ""
 
 
 def _is_count(text: str) -> bool:
-    return text.isascii() and text.isdigit() and len(text) <= _LONGEST_COUNT
+    """Return whether a text is a whole number of at most twelve digits."""
+    return text.isascii() and text.isdigit() and len(text) <= _MAX_COUNT_DIGITS
 
 
-def _cut(text: str, most: int) -> str:
-    if len(text) <= most:
+def _shortened(text: str, max_characters: int) -> str:
+    """Return the first characters of a text, followed by the number of omitted characters."""
+    if len(text) <= max_characters:
         return text
-    return f"{text[:most]}… and {len(text) - most} more characters"
+    return f"{text[:max_characters]}… and {len(text) - max_characters} more characters"
 
 
 def readable_texts(values: Mapping[str, str], what: str) -> tuple[dict[str, str], list[str]]:
-    """Cut texts of a file to a readable length, and make them harmless to a terminal.
+    """Cut texts of a file to a readable length, and escape control characters.
 
     Parameters
     ----------
-    values : texts by their keys, of any number and length
-    what : name of the texts, in the plural
+    values : key → text, of any number and length
+    what : plural noun for the texts, for the line on omitted ones
 
     Returns
     -------
-    The first of them, and a line on the others if there are any.
+    The first texts by their keys, and a list with a line on the omitted texts, if there are any.
     """
-    left_out: list[str] = []
-    shown = _Excerpt(what, _MOST_CHARACTERS, left_out).texts(values)
-    return {printable(key): printable(value) for key, value in shown.items()}, left_out
+    omission_texts: list[str] = []
+    shown_texts = _EntryLimiter(what, _MAX_METADATA_CHARACTERS, omission_texts).texts(values)
+    return {printable(key): printable(value) for key, value in shown_texts.items()}, omission_texts
 
 
-class _Excerpt:
-    """First characters of an entry of the file, whose length is not limited.
+class _EntryLimiter:
+    """Cuts one kind of a file's entries, such as its events, to a total number of characters.
 
-    Parameters
-    ----------
-    what : name of the part, in the plural
-    most : characters to show, in either form; those of all parts stay below 1 MB
-    left_out : gets a line if the part is longer
+    `what` is a plural noun for the entries. `max_characters` is the maximum number of characters in
+    text or JSON form. A line on omitted entries is appended to `omission_texts`.
     """
 
-    def __init__(self, what: str, most: int, left_out: list[str]) -> None:
-        self._what = what
-        self._left_out = left_out
-        self._room = most
+    def __init__(self, what: str, max_characters: int, omission_texts: list[str]) -> None:
+        self._entries_noun = what
+        self._omission_texts = omission_texts
+        self._remaining_characters = max_characters
 
     def mapping(self, values: Mapping[str, _Value]) -> dict[str, _Value]:
-        """Return the first entries, each cut to a readable length."""
-        shown: dict[str, _Value] = {}
+        """Return the first entries of a mapping, up to the maximum, with long keys cut."""
+        shown_entries: dict[str, _Value] = {}
         for count, (key, value) in enumerate(values.items()):
-            short_key = _cut(key, _LONGEST_KEY)
-            if not self._has_room(short_key, str(value)):
-                self._leave_out(len(values) - count)
+            short_key = _shortened(key, _MAX_KEY_CHARACTERS)
+            if not self._fits(short_key, str(value)):
+                self._report_omitted(len(values) - count)
                 break
-            shown[short_key] = value
-        return shown
+            shown_entries[short_key] = value
+        return shown_entries
 
     def texts(self, values: Mapping[str, str]) -> dict[str, str]:
-        """Return the first entries, with long values cut."""
-        return self.mapping({key: _cut(value, _LONGEST_TEXT) for key, value in values.items()})
+        """Return the first entries of a mapping of texts, with long keys and long texts cut."""
+        return self.mapping(
+            {key: _shortened(value, _MAX_TEXT_CHARACTERS) for key, value in values.items()}
+        )
 
     def events(self, events: Sequence[LoggedEvent], unread: int) -> list[LoggedEvent]:
-        """Return the first events, with long texts cut; `unread` more are in the file."""
-        shown: list[LoggedEvent] = []
+        """Return the first events, up to the maximum, with long texts cut.
+
+        `unread` is the number of further events in the file.
+        """
+        shown_events: list[LoggedEvent] = []
         for event in events:
             short = replace(
                 event,
-                name=_cut(event.name, _LONGEST_KEY),
-                message=_cut(event.message, _LONGEST_TEXT),
+                name=_shortened(event.name, _MAX_KEY_CHARACTERS),
+                message=_shortened(event.message, _MAX_TEXT_CHARACTERS),
             )
-            if not self._has_room(short.name, short.message):
+            if not self._fits(short.name, short.message):
                 break
-            shown.append(short)
-        self._leave_out(len(events) - len(shown) + unread)
-        return shown
+            shown_events.append(short)
+        self._report_omitted(len(events) - len(shown_events) + unread)
+        return shown_events
 
-    def _has_room(self, *texts: str) -> bool:
-        # In JSON a character may take twelve, and both forms add something to a text.
-        self._room -= sum(len(json.dumps(text)) for text in texts) + _AROUND
-        return self._room >= 0
+    def _fits(self, *texts: str) -> bool:
+        """Return whether another entry fits; subtract its length from the available length."""
+        # A character may take twelve characters in JSON, and both forms add some to a text.
+        self._remaining_characters -= (
+            sum(len(json.dumps(text)) for text in texts) + _ENTRY_OVERHEAD_CHARACTERS
+        )
+        return self._remaining_characters >= 0
 
-    def _leave_out(self, count: int) -> None:
+    def _report_omitted(self, count: int) -> None:
+        """Append a line on `count` omitted entries, unless there are none."""
         if count:
-            self._left_out.append(f"… and {count} more {self._what} not shown")
+            self._omission_texts.append(f"… and {count} more {self._entries_noun} not shown")
 
 
 def _status_counts(session: Session) -> dict[str, int]:
+    """Return name of a status flag → number of samples with it, for flags that occur."""
     status = session.samples["status"]
     counts = {flag.name or "": int(np.count_nonzero(status & flag.value)) for flag in Status}
     return {name.lower(): count for name, count in counts.items() if count}
 
 
-def _iso(utc_ns: int) -> str:
-    return _utc(utc_ns).isoformat(timespec="microseconds")
+def _iso_text(utc_ns: int) -> str:
+    """Return a time given in nanoseconds since the Unix epoch as ISO 8601 text."""
+    return _utc_datetime(utc_ns).isoformat(timespec="microseconds")
 
 
-def _utc(utc_ns: int) -> datetime:
+def _utc_datetime(utc_ns: int) -> datetime:
+    """Return a time given in nanoseconds since the Unix epoch as a UTC datetime."""
     return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
 
 
-def _outcome(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[str, str]]:
+def _outcome_rows(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[str, str]]:
+    """Yield the rows (title, text) for the record ``outcome``, with its touches and its fit."""
     shown_keys = {"outcome", "reason", "touches", "fit"}
-    shown_keys |= {_RECOVERED + key for key in _recovery(outcome)}
+    shown_keys |= {_RECOVERY_KEY_PREFIX + key for key in _recovery_items(outcome)}
     text = outcome.get("outcome", "unknown")
     text = text.capitalize() if is_whole else f"Recorded as {text}"
     with suppress(KeyError, ValueError):  # outcome of another program, or of a recovery
         text += f": {counts_text(outcome)}"
-        shown_keys |= _COUNTS
+        shown_keys |= _COUNT_KEYS
     reason = outcome.get("reason")
     yield "outcome", f"{text}. {reason}" if reason else text
     for touch in touches_of(outcome):
@@ -338,41 +370,43 @@ def _outcome(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[str, 
         if mode["shown"]:
             yield "fit", mode_line(mode)
     yield from (
-        _rounded(key, value) for key, value in outcome.items() if key not in shown_keys and value
+        _rounded_row(key, value)
+        for key, value in outcome.items()
+        if key not in shown_keys and value
     )
 
 
-def _rounded(key: str, value: str) -> tuple[str, str]:
-    """Return a key and its value as text, a number rounded and with its unit.
+def _rounded_row(key: str, value: str) -> tuple[str, str]:
+    """Return a metadata key and its value for a row of text, with rounded numbers and units.
 
-    JSON has the original key and all digits.
+    A value that is not a number or a list of numbers is returned unchanged.
     """
-    if len(value) > _LONGEST_NUMBERS:
+    if len(value) > _MAX_ROUNDED_CHARACTERS:
         return key, value
     with suppress(ValueError, OverflowError):
-        if key.endswith(_UTC):
-            return key.removesuffix(_UTC), _clock(_utc(int(value)))
-        digits = _MEASURED_DIGITS if key.startswith("tare_") else _DIGITS
-        shown = [
+        if key.endswith(_UTC_KEY_SUFFIX):
+            return key.removesuffix(_UTC_KEY_SUFFIX), _time_text(_utc_datetime(int(value)))
+        digits = _TARE_DIGITS if key.startswith("tare_") else _SIGNIFICANT_DIGITS
+        rounded_numbers = [
             f"{float(each):.{digits}g}" if "." in each else f"{int(each)}"
             for each in value.split(",")
         ]
         name = key.removesuffix(suffix_of(key)).replace("_", " ")
-        return name, f"{', '.join(shown)} {unit_of(key)}".rstrip()
+        return name, f"{', '.join(rounded_numbers)} {unit_of(key)}".rstrip()
     return key.replace("_", " "), value
 
 
-def _clock(moment: datetime) -> str:
-    """Return a time in UTC and in the local time zone."""
-    utc = f"{moment:%Y-%m-%d %H:%M:%S} UTC"
-    local = moment.astimezone()
-    return f"{utc} ({local:%Y-%m-%d %H:%M:%S %Z})" if local.utcoffset() else utc
+def _time_text(time_utc: datetime) -> str:
+    """Return the text of a time in UTC, and in the local time zone if that is another one."""
+    utc = f"{time_utc:%Y-%m-%d %H:%M:%S} UTC"
+    local_time = time_utc.astimezone()
+    return f"{utc} ({local_time:%Y-%m-%d %H:%M:%S %Z})" if local_time.utcoffset() else utc
 
 
-def _recovery(outcome: dict[str, str]) -> dict[str, str]:
-    """Return the outcome's items on a recovery, without the common prefix of the keys."""
+def _recovery_items(outcome: dict[str, str]) -> dict[str, str]:
+    """Return the items of the record ``outcome`` on a recovery, without their keys' prefix."""
     return {
-        key.removeprefix(_RECOVERED): value
+        key.removeprefix(_RECOVERY_KEY_PREFIX): value
         for key, value in outcome.items()
-        if key.startswith(_RECOVERED)
+        if key.startswith(_RECOVERY_KEY_PREFIX)
     }

@@ -1,8 +1,8 @@
-"""Limits on memory and time for reading an MCAP file, and the unpacking of its chunks.
+"""Decompression of MCAP chunks, and limits on memory and time for reading an MCAP file.
 
-A few bytes may unpack to any number of records. Therefore `MAX_CHUNK_BYTES` bounds the stated size
-of a chunk, and `MAX_TOTAL_BYTES` their sum over the file; a long chunk is unpacked in parts; and
-every step of the program counts against `MAX_STEPS`.
+A few bytes may decompress to any number of records. Therefore `MAX_CHUNK_BYTES` limits the stated
+size of a chunk, and `MAX_TOTAL_BYTES` the sum of these sizes over the file. A long chunk is
+decompressed in parts. Each record or run of messages counts as work against `MAX_STEPS`.
 """
 
 import struct
@@ -17,203 +17,218 @@ from rigd.session import limits
 from rigd.session.layout import Buffer
 
 MAX_SKIPPED: Final = 20
-"""Most damaged records that are reported singly."""
+"""Maximum number of damaged records that are described one by one."""
 
 CHUNK_STEPS: Final = 20
+"""Number of steps of work, of `MAX_STEPS`, for which a chunk counts."""
 DECLARATION_STEPS: Final = 15
-"""Steps for which a chunk and a declaration count."""
+"""Number of steps of work, of `MAX_STEPS`, for which a schema, channel or attachment counts."""
 
-_DECLARED_COST: Final = 1000
-"""Approximate bytes of an object for one declaration, however small its record."""
+_DECLARATION_MEMORY_BYTES: Final = 1000
+"""Approximate memory in bytes of the Python object for one declaration, however short it is."""
 
-MOST_UNPACKED_BYTES: Final = 4 << 20
-"""Longest chunk that is unpacked at once, and length of a part of a longer one."""
-_FEED_BYTES: Final = 1 << 18
-_MAX_ZSTD_WINDOW: Final = 32 << 20
+MAX_UNPACKED_BYTES: Final = 4 << 20
+"""Size in bytes up to which a chunk is decompressed at once; a longer one is read in such parts."""
+_LZ4_INPUT_BYTES: Final = 1 << 18
+"""Number of compressed bytes that the LZ4 decompressor gets at once."""
+_MAX_ZSTD_WINDOW_BYTES: Final = 32 << 20
+"""Maximum memory in bytes of the Zstandard decompressor's window."""
 
 
 class McapError(Exception):
-    """The bytes are not a usable MCAP file; the message is a predicate to the file's name."""
+    """Raised if a file is not a usable MCAP file.
+
+    The message ends a sentence that begins with the file's name.
+    """
 
 
 class McapTooLargeError(McapError):
-    """The file takes more memory or time than allowed; the message is a predicate to its name."""
+    """Raised if reading an MCAP file would take too much memory or time.
+
+    The message ends a sentence that begins with the file's name.
+    """
 
 
 class McapDamageError(Exception):
-    """Something in the file contradicts the format; the message is a predicate to its name."""
+    """Raised if a file is damaged or violates the MCAP format.
+
+    The message ends a sentence that begins with the file's name.
+    """
 
 
-class Allowance:
-    """Memory and time that one file has used so far."""
+class ReadingBudget:
+    """Counters of the work and memory for reading one MCAP file, which raise beyond the limits."""
 
     def __init__(self) -> None:
-        self._steps = 0
-        self._unpacked = 0
-        self._declared = 0
-        self._declared_text = 0
-        self._entries = 0
+        self._used_steps = 0
+        self._unpacked_bytes = 0
+        self._declared_bytes = 0
+        self._declared_text_bytes = 0
+        self._count_keys = 0
 
-    def spend(self, steps: int) -> None:
-        """Count steps of work.
-
-        Raises
-        ------
-        McapTooLargeError
-            If the file takes more than it may.
-        """
-        self._steps += steps
-        if self._steps > limits.MAX_STEPS:
+    def count_steps(self, steps: int) -> None:
+        """Count steps of work; raise McapTooLargeError beyond `MAX_STEPS` for the file."""
+        self._used_steps += steps
+        if self._used_steps > limits.MAX_STEPS:
             raise McapTooLargeError(
                 "is made of so many small parts that reading it would take too long: more than "
                 f"{limits.MAX_STEPS} runs of messages, chunks and other records, each weighed by "
                 "its work"
             )
 
-    def unpack(self, size: int, where: str) -> None:
-        """Count the stated size of a chunk before it is unpacked.
+    def count_unpacked(self, size: int, location_text: str) -> None:
+        """Count the stated size of a chunk in bytes before the chunk is decompressed.
 
-        Raises
-        ------
-        McapDamageError
-            If it is more than a chunk or a file may have.
+        Raises McapDamageError if the chunk, or all chunks of the file together, are too long.
         """
-        self._unpacked += size
-        if size > limits.MAX_CHUNK_BYTES or self._unpacked > limits.MAX_TOTAL_BYTES:
+        self._unpacked_bytes += size
+        if size > limits.MAX_CHUNK_BYTES or self._unpacked_bytes > limits.MAX_TOTAL_BYTES:
             raise McapDamageError(
-                f"claims {size} bytes{where}, which is more than the "
+                f"claims {size} bytes{location_text}, which is more than the "
                 f"{limits.MAX_CHUNK_BYTES >> 20} MiB for a chunk or the "
                 f"{limits.MAX_TOTAL_BYTES >> 20} MiB for a file that are accepted"
             )
 
-    def declare(self, opcode: int, content: Buffer, where: str) -> None:
-        """Count the memory of a declaration before it is parsed.
+    def count_declared(self, opcode: int, content: Buffer, location_text: str) -> None:
+        """Count the memory of a schema, channel, metadata record or attachment before it is parsed.
 
-        Parameters
-        ----------
-        opcode, content
-            Opcode and content of the record.
-        where
-            Its position, for messages.
-
-        Raises
-        ------
-        McapError
-            If there are too many declarations, or they are too long.
+        `location_text` ends the error message. Raises McapError if there are too many such records
+        in the file, or if they are too long.
         """
-        self._declared += len(content) + _DECLARED_COST
+        self._declared_bytes += len(content) + _DECLARATION_MEMORY_BYTES
         if opcode != Opcode.ATTACHMENT:
-            self._declared_text += len(content)
+            self._declared_text_bytes += len(content)
         if opcode in (Opcode.METADATA, Opcode.CHANNEL):
-            self._entries += _entries(content, opcode, limits.MAX_ENTRIES)
-        for amount, most, of_what in (
+            self._count_keys += _count_keys(content, opcode, limits.MAX_ENTRIES)
+        for used_bytes, max_bytes, unit_text in (
             (
-                self._declared,
+                self._declared_bytes,
                 limits.MAX_DECLARED_BYTES,
                 "MiB of channels, schemas, metadata and files",
             ),
-            (self._declared_text, limits.MAX_TEXT_BYTES, "MiB of channels, schemas and metadata"),
+            (
+                self._declared_text_bytes,
+                limits.MAX_TEXT_BYTES,
+                "MiB of channels, schemas and metadata",
+            ),
         ):
-            if amount > most:
+            if used_bytes > max_bytes:
                 raise McapError(
                     "declares channels, schemas, metadata and attachments without limit: more than "
-                    f"{most >> 20} {of_what}{where}"
+                    f"{max_bytes >> 20} {unit_text}{location_text}"
                 )
-        if self._entries > limits.MAX_ENTRIES:
-            raise McapError(f"has more than {limits.MAX_ENTRIES} keys in its metadata{where}")
+        if self._count_keys > limits.MAX_ENTRIES:
+            raise McapError(
+                f"has more than {limits.MAX_ENTRIES} keys in its metadata{location_text}"
+            )
 
 
 def zstd_decompressor() -> zstandard.ZstdDecompressor:
-    """Return a decompressor for all chunks of a file: creating one for each would be slow."""
-    return zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
+    """Return a Zstandard decompressor, which is used for all chunks of a file to save time."""
+    return zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW_BYTES)
 
 
-def unpacked(
-    zstd: zstandard.ZstdDecompressor, compression: bytes, packed: memoryview, size: int, where: str
+def decompressed_chunk(
+    zstd: zstandard.ZstdDecompressor,
+    compression: bytes,
+    packed: memoryview,
+    size: int,
+    location_text: str,
 ) -> bytes:
-    """Decompress a chunk to exactly `size` bytes, never allocating more.
+    """Return the decompressed content of a chunk, which must have exactly `size` bytes.
 
     Parameters
     ----------
     zstd
-        Made by :func:`zstd_decompressor`.
+        Decompressor made by :func:`zstd_decompressor`.
     compression
-        Compression that the chunk names.
+        Name of the compression in the chunk: ``zstd``, ``lz4``, or empty for none.
     packed
-        Packed content of the chunk.
+        Compressed content of the chunk.
     size
-        Bytes that it claims to hold.
-    where
-        Its position, for messages.
+        Length of the decompressed content in bytes, as the chunk states it.
+    location_text
+        Position of the chunk, for error messages.
 
     Raises
     ------
     McapDamageError
-        If it is impossible.
+        If the content cannot be decompressed, or has another length.
     """
     try:
         if compression == b"":
             records = bytes(packed[: size + 1])
         elif compression == b"zstd":
-            _check_zstd_size(packed, size, where)
+            _check_zstd_size(packed, size, location_text)
             records = zstd.decompress(packed, max_output_size=size)
         elif compression == b"lz4":
             # One byte more than allowed, so that a longer chunk is detected.
             records = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
         else:
-            raise McapDamageError(f"uses the unknown compression {compression!r}{where}")
+            raise McapDamageError(f"uses the unknown compression {compression!r}{location_text}")
     except (zstandard.ZstdError, RuntimeError, ValueError):
-        raise McapDamageError(f"does not decompress{where}") from None
+        raise McapDamageError(f"does not decompress{location_text}") from None
     if len(records) != size:
-        raise McapDamageError(f"decompresses to a wrong size{where}")
+        raise McapDamageError(f"decompresses to a wrong size{location_text}")
     return records
 
 
-def unpacked_parts(
-    zstd: zstandard.ZstdDecompressor, compression: bytes, packed: memoryview, size: int, where: str
+def decompressed_parts(
+    zstd: zstandard.ZstdDecompressor,
+    compression: bytes,
+    packed: memoryview,
+    size: int,
+    location_text: str,
 ) -> Iterator[Buffer]:
-    """Yield a chunk in parts, at most one part more than its `size`.
+    """Yield the decompressed content of a long chunk in parts.
 
-    Parameters and errors are those of :func:`unpacked`.
+    The parts together may exceed `size` by one part. Parameters and errors are those of
+    :func:`decompressed_chunk`, but the caller compares the length.
     """
-    done = 0
+    unpacked_bytes = 0
     try:
         if compression == b"":
-            for start in range(0, len(packed), MOST_UNPACKED_BYTES):
-                yield packed[start : start + MOST_UNPACKED_BYTES]
+            for start in range(0, len(packed), MAX_UNPACKED_BYTES):
+                yield packed[start : start + MAX_UNPACKED_BYTES]
         elif compression == b"zstd":
-            _check_zstd_size(packed, size, where)
+            _check_zstd_size(packed, size, location_text)
             stream = zstd.stream_reader(packed)
-            while done <= size and (part := stream.read(MOST_UNPACKED_BYTES)):
-                done += len(part)
+            while unpacked_bytes <= size and (part := stream.read(MAX_UNPACKED_BYTES)):
+                unpacked_bytes += len(part)
                 yield part
         elif compression == b"lz4":
             lz4_stream = lz4.frame.LZ4FrameDecompressor()
-            for start in range(0, len(packed), _FEED_BYTES):
-                feed: Buffer = packed[start : start + _FEED_BYTES]
-                while not lz4_stream.eof and done <= size:
-                    part = lz4_stream.decompress(feed, max_length=MOST_UNPACKED_BYTES)
-                    done += len(part)
+            for start in range(0, len(packed), _LZ4_INPUT_BYTES):
+                lz4_input: Buffer = packed[start : start + _LZ4_INPUT_BYTES]
+                while not lz4_stream.eof and unpacked_bytes <= size:
+                    part = lz4_stream.decompress(lz4_input, max_length=MAX_UNPACKED_BYTES)
+                    unpacked_bytes += len(part)
                     if part:
                         yield part
                     if lz4_stream.needs_input:
                         break
-                    feed = b""
+                    lz4_input = b""
         else:
-            raise McapDamageError(f"uses the unknown compression {compression!r}{where}")
+            raise McapDamageError(f"uses the unknown compression {compression!r}{location_text}")
     except (zstandard.ZstdError, RuntimeError, ValueError, EOFError):
-        raise McapDamageError(f"does not decompress{where}") from None
+        raise McapDamageError(f"does not decompress{location_text}") from None
 
 
-def _check_zstd_size(packed: memoryview, size: int, where: str) -> None:
-    """Check the size in the frame, which the decompressor would trust."""
-    stated = zstandard.get_frame_parameters(packed).content_size
-    if stated not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-        raise McapDamageError(f"states two different sizes{where}")
+def _check_zstd_size(packed: memoryview, size: int, location_text: str) -> None:
+    """Raise if the Zstandard frame states another size than the chunk.
+
+    The decompressor would allocate the size that the frame states.
+    """
+    stated_size = zstandard.get_frame_parameters(packed).content_size
+    if stated_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+        raise McapDamageError(f"states two different sizes{location_text}")
 
 
-def prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:
-    """Return the bytes after a length of format `prefix`, and their end."""
+def read_prefixed_bytes(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:
+    """Return the bytes that follow a length field at `position`, and the offset of their end.
+
+    `prefix` is the length field's format for the module ``struct``.
+    """
     (length,) = struct.unpack_from(prefix, content, position)
     start = position + struct.calcsize(prefix)
     if length > len(content) - start:
@@ -221,24 +236,24 @@ def prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryvie
     return content[start : start + length], start + length
 
 
-def _entries(content: Buffer, opcode: int, most: int) -> int:
-    """Count the entries of the map at the end of a metadata or channel record, up to `most` + 1.
+def _count_keys(content: Buffer, opcode: int, max_count: int) -> int:
+    """Return the number of keys in the map of a metadata or channel record, up to `max_count` + 1.
 
-    A malformed map has none: parsing the record finds the error.
+    Counting ends at a malformed entry, which raises an error when the record is parsed.
     """
     view = memoryview(content)
     count = 0
     try:
         if opcode == Opcode.METADATA:
-            _, position = prefixed(view, 0, "<I")
+            _, position = read_prefixed_bytes(view, 0, "<I")
         else:
-            _, position = prefixed(view, 4, "<I")
-            _, position = prefixed(view, position, "<I")
-        entries, _ = prefixed(view, position, "<I")
+            _, position = read_prefixed_bytes(view, 4, "<I")
+            _, position = read_prefixed_bytes(view, position, "<I")
+        entries, _ = read_prefixed_bytes(view, position, "<I")
         position = 0
-        while position < len(entries) and count <= most:
-            _, position = prefixed(entries, position, "<I")
-            _, position = prefixed(entries, position, "<I")
+        while position < len(entries) and count <= max_count:
+            _, position = read_prefixed_bytes(entries, position, "<I")
+            _, position = read_prefixed_bytes(entries, position, "<I")
             count += 1
     except struct.error:
         pass

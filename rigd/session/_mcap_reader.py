@@ -1,11 +1,12 @@
-"""MCAP container, read record by record with every length checked and every checksum verified.
+"""Reader of MCAP files that checks every length and verifies every checksum.
 
-The data section is read from its beginning, which takes a millisecond for the chunks of a session.
-This one way of reading serves files of any chunking, with or without a summary, and finds how far a
-truncated file is readable. Messages are passed on block by block and not stored. Consecutive
-messages of equal length, as a session's are, are passed on as one run of bytes.
+The data section is read from its beginning, record by record, which takes a millisecond for the
+chunks of a session. This reads files with any size of chunks, with or without a summary, and finds
+how far a truncated file is readable. Messages are passed on block by block and not stored.
+Consecutive messages of equal length, as in a session, are passed on as one run of bytes.
 
-Every claim of the file is checked before use, and no file can exceed its limits of memory and time
+Every length and number in the file is checked before use, and reading stays within fixed limits of
+memory and time
 (:mod:`rigd.session._mcap_limits`).
 """
 
@@ -30,134 +31,143 @@ from rigd.session._mcap_limits import (
     CHUNK_STEPS,
     DECLARATION_STEPS,
     MAX_SKIPPED,
-    MOST_UNPACKED_BYTES,
-    Allowance,
+    MAX_UNPACKED_BYTES,
     McapDamageError,
     McapError,
     McapTooLargeError,
-    prefixed,
-    unpacked,
-    unpacked_parts,
+    ReadingBudget,
+    decompressed_chunk,
+    decompressed_parts,
+    read_prefixed_bytes,
     zstd_decompressor,
 )
-from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD
+from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD_FORMAT
 from rigd.session.layout import Buffer
 
-RECORD_HEAD: Final = struct.Struct("<BQ")
-# Opcode, length and channel, which are equal throughout a run: 11 bytes as two words that overlap.
-_RUN_HEAD: Final = struct.Struct("<BQH")
-_RUN_KEY: Final = np.dtype(
+RECORD_HEAD_FORMAT: Final = struct.Struct("<BQ")
+# Opcode, length and channel, which are equal throughout a run: 11 bytes, as two overlapping
+# 8-byte integers.
+_RUN_HEAD_FORMAT: Final = struct.Struct("<BQH")
+_RUN_HEAD_DTYPE: Final = np.dtype(
     {"names": ["head", "tail"], "formats": ["<u8", "<u8"], "offsets": [0, 3], "itemsize": 11}
 )
-_CHUNK_HEAD: Final = struct.Struct("<QQQI")
-_DECLARATIONS: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
-_CHANNEL_ID: Final = struct.Struct("<H")
-FOOTER: Final = struct.Struct("<BQ QQI")
+_CHUNK_HEAD_FORMAT: Final = struct.Struct("<QQQI")
+_DECLARATION_OPCODES: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
+_CHANNEL_NUMBER_FORMAT: Final = struct.Struct("<H")
+FOOTER_FORMAT: Final = struct.Struct("<BQ QQI")
 _FOOTER_CONTENT_SIZE: Final = 20
-_BARE_MESSAGES: Final = 250
-"""Messages outside of chunks that form one unit."""
-_SHORT_RUN: Final = 8
-"""Messages that are compared one by one before an array of them pays off."""
-_FIRST_STEP: Final = 256
-_MOST_RUNS: Final = 1 << 16
-"""Runs that are passed on at once."""
-_PASSED_BYTES: Final = 32 << 20
-"""Length of the file after which the memory of the part already read is given back."""
+_MAX_GROUP_MESSAGES: Final = 250
+"""Maximum number of messages outside of chunks that are treated like one chunk."""
+_MAX_SINGLE_COMPARISONS: Final = 8
+"""Number of messages that are compared one by one before an array comparison is faster."""
+_FIRST_COMPARISON_MESSAGES: Final = 256
+"""Number of messages in the first array comparison of `_run_length`."""
+_MAX_BLOCK_RUNS: Final = 1 << 16
+"""Maximum number of runs that are passed on in one block."""
+_RELEASE_INTERVAL_BYTES: Final = 32 << 20
+"""Number of bytes after which the memory of the part already read is released."""
 
 _Record = TypeVar("_Record")
 Run = tuple[int, int, int, int]
-"""Consecutive messages of equal length: channel, bytes of a record with its head, byte at which the
-first begins, and their number."""
+"""Consecutive messages of equal length: channel number, length of one message record in bytes with
+its head, offset of the first record in the buffer, and number of messages."""
 
 
 @dataclass(frozen=True, slots=True)
 class MessageBlock:
-    """Consecutive message records of a file."""
+    """Consecutive message records of an MCAP file, as passed to the reader's callback."""
 
     records: Buffer
-    """Buffer with the runs; the reader does not hold it."""
+    """Bytes of the message records; the reader retains no reference to them."""
     runs: list[Run]
     """Runs of messages of the wanted topics, in the order of the file."""
-    unit: int
-    """Byte of the file at which their chunk begins, or that of some messages without a chunk."""
+    chunk_position: int
+    """Offset in the file of the chunk with these messages, or of the first of up to 250 messages
+    outside of chunks."""
 
 
 @dataclass(slots=True)
 class McapContents:
-    """Content of a file as far as it could be read, without the messages."""
+    """Records that were read from an MCAP file, up to its end or its first damage.
+
+    Messages are counted only, not stored.
+    """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     message_counts: dict[int, int] = field(default_factory=lambda: defaultdict(int))
-    """Channel → number of messages read, wanted or not."""
+    """Channel number → number of messages read, of wanted and unwanted topics."""
     declared_in_chunks: set[int] = field(default_factory=set)
-    """Channels that were declared where a checksum covers them and their schemas."""
+    """Numbers of the channels that were declared in chunks, where a checksum covers them."""
     skipped: list[str] = field(default_factory=list)
-    """Damaged records that were skipped, as predicates like `damage`. The last one states how many
-    more there are than `MAX_SKIPPED`."""
+    """Descriptions of the damaged records that were skipped, each the end of a sentence that begins
+    with the file's name. The last one states how many more there are than `MAX_SKIPPED`."""
     stated_counts: dict[int, int] = field(default_factory=dict)
-    """Channel → number of messages by the file's statistics; empty if these are damaged."""
+    """Channel number → number of messages that the file's statistics state, for a damaged file read
+    in salvage mode. It is empty for a sound file and if the statistics are damaged."""
     sound_bytes: int = 0
-    """Length of the file that was read: up to the end of a record."""
+    """Number of bytes at the start of the file that were read without error."""
     verified: bool = False
     """Whether the file has a correct checksum over its whole data section."""
     complete: bool = False
-    """Whether the file has its end."""
+    """Whether the file ends with the footer and the magic bytes of a complete MCAP file."""
     damage: str | None = None
-    """Reason why reading stopped: a sentence's predicate, with the byte. None: it did not stop."""
+    """Why and where reading stopped, as the end of a sentence that begins with the file's name.
+
+    None if the file was read to a sound end."""
 
     def count(self, topic: str) -> int:
-        """Return the number of messages read of a topic."""
+        """Return the number of messages of a topic that were read."""
         channels = [channel.id for channel in self.channels.values() if channel.topic == topic]
         return sum(self.message_counts[channel] for channel in channels)
 
 
 def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return the offset of each message if the runs follow one another.
+    """Return the byte offset of each message in a buffer in which the runs follow one another.
 
     Parameters
     ----------
-    runs : (n, 3), channel, bytes of a record, and count
+    runs : array (n, 3) with channel number, length of a message record in bytes, and message count
 
     Returns
     -------
-    array (sum of the counts,) of offsets from the beginning of the first
+    array (sum of the counts,) of offsets from the beginning of the first message
     """
     _, sizes, counts = runs.T
     lengths = sizes * counts
-    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    index_in_run = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     return np.asarray(
-        np.repeat(np.cumsum(lengths) - lengths, counts) + number * np.repeat(sizes, counts)
+        np.repeat(np.cumsum(lengths) - lengths, counts) + index_in_run * np.repeat(sizes, counts)
     )
 
 
 OnBlock = Callable[[McapContents, MessageBlock], None]
-"""Callback for messages as they are read, with the contents read before them."""
+"""Callback for each block of messages; it also gets the contents that were read before it."""
 
 
 def read_mcap(
     data: memoryview,
     topics: Collection[str] | None,
     *,
-    take: OnBlock | None = None,
+    on_block: OnBlock | None = None,
     salvage: bool = False,
     on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
-    """Read an MCAP file as far as it is sound.
+    """Read an MCAP file up to its end or its first damage.
 
     Parameters
     ----------
-    data : the file; pages of an ``mmap`` are given back when they have been read
-    topics : topics of the wanted messages; None for all
-    take
-        Called with the wanted messages, block by block in the order of the file. Damage may be
-        found behind them only.
+    data : bytes of the file; pages of an ``mmap`` are released when they have been read
+    topics : topics whose messages are wanted; None for all
+    on_block
+        Called with the wanted messages, block by block in the order of the file, before it is known
+        whether the rest of the file is damaged.
     salvage
-        Read as much as possible: skip damaged records outside of chunks, on which no message
-        depends, and search a damaged file for its statistics.
-    on_progress : called now and then with the completed fraction of the file
+        Read as much as possible: skip damaged records outside of chunks on which no message
+        depends, and read the statistics of a damaged file.
+    on_progress : called repeatedly with the fraction of the file that was read, from 0 to 1
 
     Returns
     -------
@@ -166,10 +176,10 @@ def read_mcap(
     Raises
     ------
     McapError
-        If the file does not begin as an MCAP file does, or declares more than
-        `MAX_DECLARED_BYTES`.
+        If the file does not begin like an MCAP file, or its schemas, channels, metadata and
+        attachments are longer than `MAX_DECLARED_BYTES`.
     McapTooLargeError
-        If the file or a wanted message is too long, or the file has too many parts.
+        If the file is too long, or contains too many records.
     """
     if bytes(data[: len(MAGIC)]) != MAGIC:
         raise McapError("is not an MCAP file")
@@ -178,9 +188,9 @@ def read_mcap(
             f"has {len(data) >> 20} MiB, more than the {limits.MAX_FILE_BYTES >> 20} MiB that are "
             "read"
         )
-    reader = _ContainerReader(data, topics, take, salvage=salvage)
+    reader = _ContainerReader(data, topics, on_block, salvage=salvage)
     contents = reader.contents
-    contents.complete = _has_end(data)
+    contents.complete = _has_footer(data)
     try:
         reader.read(on_progress)
     except McapDamageError as error:
@@ -192,44 +202,52 @@ def read_mcap(
     return contents
 
 
-def _has_end(data: memoryview) -> bool:
-    """Return whether the file ends with a footer and the magic."""
-    start = len(data) - len(MAGIC) - FOOTER.size
+def _has_footer(data: memoryview) -> bool:
+    """Return whether an MCAP file ends with a footer record and the magic bytes."""
+    start = len(data) - len(MAGIC) - FOOTER_FORMAT.size
     if start < len(MAGIC) or bytes(data[-len(MAGIC) :]) != MAGIC:
         return False
-    return RECORD_HEAD.unpack_from(data, start) == (Opcode.FOOTER, _FOOTER_CONTENT_SIZE)
+    return RECORD_HEAD_FORMAT.unpack_from(data, start) == (
+        Opcode.FOOTER,
+        _FOOTER_CONTENT_SIZE,
+    )
 
 
-def _record_at(data: Buffer, position: int, where: str) -> tuple[int, int, int]:
-    """Return opcode, start of the content and end of the record at `position`."""
-    content = position + RECORD_HEAD.size
+def _locate_record(data: Buffer, position: int, location_text: str) -> tuple[int, int, int]:
+    """Return the opcode of the record at byte `position`, and where its content starts and ends.
+
+    `location_text` ends the error message for a truncated record.
+    """
+    content = position + RECORD_HEAD_FORMAT.size
     if content > len(data):
-        raise _torn(position, where)
-    opcode, length = RECORD_HEAD.unpack_from(data, position)
+        raise _truncated_record_error(position, location_text)
+    opcode, length = RECORD_HEAD_FORMAT.unpack_from(data, position)
     if opcode == 0:
-        raise _no_record(position, where)
+        raise _missing_record_error(position, location_text)
     end = content + length
     if end > len(data):
-        raise _torn(position, where)
+        raise _truncated_record_error(position, location_text)
     return opcode, content, end
 
 
-def _torn(position: int, where: str) -> McapDamageError:
-    return McapDamageError(f"ends in the middle of a record, at byte {position}{where}")
+def _truncated_record_error(position: int, location_text: str) -> McapDamageError:
+    """Return the error for a file that ends within a record."""
+    return McapDamageError(f"ends in the middle of a record, at byte {position}{location_text}")
 
 
-def _no_record(position: int, where: str) -> McapDamageError:
-    return McapDamageError(f"has no record where one must be, at byte {position}{where}")
+def _missing_record_error(position: int, location_text: str) -> McapDamageError:
+    """Return the error for bytes that are not a record, although one must begin there."""
+    return McapDamageError(f"has no record where one must be, at byte {position}{location_text}")
 
 
 class _ContainerReader:
-    """One pass over a file."""
+    """Reads an MCAP file once from its start, with the arguments of `read_mcap`."""
 
     def __init__(
         self,
         data: memoryview,
         topics: Collection[str] | None,
-        take: OnBlock | None,
+        on_block: OnBlock | None,
         *,
         salvage: bool,
     ) -> None:
@@ -237,30 +255,31 @@ class _ContainerReader:
         self._salvage = salvage
         self._data = data
         self._topics = topics
-        self._take = take
-        self._wanted: dict[int, bool] = {}  # channel → whether its messages are wanted
-        self._allowance = Allowance()
+        self._on_block = on_block
+        self._is_wanted: dict[int, bool] = {}  # channel → whether its messages are wanted
+        self._budget = ReadingBudget()
         self._zstd = zstd_decompressor()
         self._skipped = 0
-        self._unit = 0  # first byte of messages without chunk, and how many still belong to them
-        self._unit_room = 0
+        self._group_position = 0  # offset of the first of a group of messages outside of chunks
+        self._group_room = 0  # how many more messages can join that group
         self._declarations: dict[tuple[int, bytes], bytes] = {}  # opcode and number → content
         self._crc = 0
-        self._passed = 0  # end of the part whose checksum is computed and memory given back
+        self._released_end = 0  # end of the part whose checksum is computed and memory released
 
     def read(self, on_progress: Callable[[float], None] | None) -> None:
+        """Read all records into `contents`; raise McapDamageError at the first damage."""
         data, contents = self._data, self.contents
         end = len(MAGIC)
         while end < len(data):
             start = end
-            opcode, content, end = _record_at(data, start, "")
-            self._allowance.spend(1)
+            opcode, content, end = _locate_record(data, start, "")
+            self._budget.count_steps(1)
             if opcode == Opcode.CHUNK:
                 self._read_chunk(data[content:end], start)
                 if on_progress is not None:
                     on_progress(end / len(data))
             elif opcode == Opcode.MESSAGE:
-                end = self._read_bare_messages(start, end)
+                end = self._read_unchunked_messages(start, end)
                 if on_progress is not None:
                     on_progress(end / len(data))
             elif opcode == Opcode.DATA_END:
@@ -273,18 +292,18 @@ class _ContainerReader:
                 break
             else:
                 try:
-                    self._read_other(opcode, data[content:end], f" at byte {start}")
+                    self._read_declaration(opcode, data[content:end], f" at byte {start}")
                 except McapDamageError as error:
                     if not self._salvage:
                         raise
-                    self._skip(str(error))
+                    self._add_skipped(str(error))
             contents.sound_bytes = end
-            if end - self._passed > _PASSED_BYTES:
-                self._give_back(end)
+            if end - self._released_end > _RELEASE_INTERVAL_BYTES:
+                self._release_up_to(end)
         raise McapDamageError("has no end of its data section")
 
-    def _skip(self, damage: str) -> None:
-        """Record a skipped damaged record; beyond the maximum, their number only."""
+    def _add_skipped(self, damage: str) -> None:
+        """Store the description of a skipped record; beyond `MAX_SKIPPED` store a count only."""
         self._skipped += 1
         skipped = self.contents.skipped
         if self._skipped > MAX_SKIPPED:
@@ -292,183 +311,210 @@ class _ContainerReader:
             damage = f"has {self._skipped - MAX_SKIPPED} more damaged records"
         skipped.append(damage)
 
-    def _give_back(self, end: int) -> None:
-        """Compute the checksum up to `end`, and release the memory of the file up to there."""
-        self._crc = self._crc_of(self._passed, end, self._crc)
-        self._passed = end
+    def _release_up_to(self, end: int) -> None:
+        """Update the checksum of the data section up to `end`, and release the memory before it."""
+        self._crc = self._crc_of_range(self._released_end, end, self._crc)
+        self._released_end = end
 
-    def _crc_of(self, start: int, end: int, crc: int = 0) -> int:
-        for position in range(start, end, _PASSED_BYTES):
-            crc = zlib.crc32(self._data[position : min(position + _PASSED_BYTES, end)], crc)
-            self._let_go()
+    def _crc_of_range(self, start: int, end: int, crc: int = 0) -> int:
+        """Return the CRC-32 of the bytes from `start` to `end`, continuing from `crc`."""
+        for position in range(start, end, _RELEASE_INTERVAL_BYTES):
+            crc = zlib.crc32(
+                self._data[position : min(position + _RELEASE_INTERVAL_BYTES, end)], crc
+            )
+            self._release_pages()
         return crc
 
-    def _let_go(self) -> None:
-        """Give the file's pages back to the system: they would count as memory of the process."""
-        mapped = self._data.obj
-        if len(self._data) > _PASSED_BYTES and isinstance(mapped, mmap.mmap):
-            mapped.madvise(mmap.MADV_DONTNEED)
+    def _release_pages(self) -> None:
+        """Release the pages of the mapped file, which would count as memory of the process."""
+        mapped_file = self._data.obj
+        if len(self._data) > _RELEASE_INTERVAL_BYTES and isinstance(mapped_file, mmap.mmap):
+            mapped_file.madvise(mmap.MADV_DONTNEED)
 
-    def _read_bare_messages(self, start: int, first_end: int) -> int:
-        """Read the messages outside of chunks from `start` on; return their end."""
-        where = f" at byte {start}"
-        if first_end - start < MESSAGE_HEAD.size:
-            raise McapDamageError(f"has a message that is too short{where}")
-        if self._is_stray(_RUN_HEAD.unpack_from(self._data, start)[2]):
-            # Its writer uses chunks: this is another record, with a damaged opcode.
-            raise McapDamageError(f"has a message outside of a chunk{where}")
-        if self._unit_room == 0:
-            self._unit, self._unit_room = start, _BARE_MESSAGES
-        limit = min(len(self._data), max(first_end, start + MOST_UNPACKED_BYTES))
+    def _read_unchunked_messages(self, start: int, first_end: int) -> int:
+        """Read consecutive messages outside of chunks, and return the offset where they end.
+
+        The first message is the record from `start` to `first_end`.
+        """
+        location_text = f" at byte {start}"
+        if first_end - start < MESSAGE_HEAD_FORMAT.size:
+            raise McapDamageError(f"has a message that is too short{location_text}")
+        if self._is_stray_message(_RUN_HEAD_FORMAT.unpack_from(self._data, start)[2]):
+            # The writing program uses chunks: this is another record, with a damaged opcode.
+            raise McapDamageError(f"has a message outside of a chunk{location_text}")
+        if self._group_room == 0:
+            self._group_position, self._group_room = start, _MAX_GROUP_MESSAGES
+        limit = min(len(self._data), max(first_end, start + MAX_UNPACKED_BYTES))
         end, count = self._read_messages(
-            self._data, start, limit, self._unit, where, self._unit_room
+            self._data, start, limit, self._group_position, location_text, self._group_room
         )
-        self._unit_room -= count
+        self._group_room -= count
         return end
 
-    def _is_stray(self, channel: int) -> bool:
+    def _is_stray_message(self, channel: int) -> bool:
+        """Return whether a message outside of chunks belongs to a channel declared in chunks."""
         return self._salvage and channel in self.contents.declared_in_chunks
 
-    def _read_other(self, opcode: int, content: Buffer, where: str) -> None:
-        """Read a record that is neither chunk nor message; skip unnecessary ones."""
+    def _read_declaration(self, opcode: int, content: Buffer, location_text: str) -> None:
+        """Store a schema, channel, metadata record or attachment; ignore other kinds of record."""
         contents = self.contents
-        if opcode not in _DECLARATIONS:
+        if opcode not in _DECLARATION_OPCODES:
             return
-        self._allowance.spend(DECLARATION_STEPS)
+        self._budget.count_steps(DECLARATION_STEPS)
         # Many writers repeat schemas and channels in every chunk; a repetition takes no memory.
-        number = (opcode, bytes(content[: _CHANNEL_ID.size]))
+        number = (opcode, bytes(content[: _CHANNEL_NUMBER_FORMAT.size]))
         if self._declarations.get(number) == content:
             return
-        self._allowance.declare(opcode, content, where)
+        self._budget.count_declared(opcode, content, location_text)
         if opcode == Opcode.SCHEMA:
-            schema = parsed(Schema.read, content, where)
+            schema = parse_record(Schema.read, content, location_text)
             if contents.schemas.setdefault(schema.id, schema) != schema:
-                raise McapDamageError(f"declares schema {schema.id} twice, differently{where}")
+                raise McapDamageError(
+                    f"declares schema {schema.id} twice, differently{location_text}"
+                )
             self._declarations[number] = bytes(content)
         elif opcode == Opcode.CHANNEL:
-            channel = parsed(Channel.read, content, where)
+            channel = parse_record(Channel.read, content, location_text)
             if contents.channels.setdefault(channel.id, channel) != channel:
-                raise McapDamageError(f"declares channel {channel.id} twice, differently{where}")
-            self._wanted[channel.id] = self._topics is None or channel.topic in self._topics
+                raise McapDamageError(
+                    f"declares channel {channel.id} twice, differently{location_text}"
+                )
+            self._is_wanted[channel.id] = self._topics is None or channel.topic in self._topics
             self._declarations[number] = bytes(content)
         elif opcode == Opcode.METADATA:
-            contents.metadata.append(parsed(Metadata.read, content, where))
+            contents.metadata.append(parse_record(Metadata.read, content, location_text))
         elif opcode == Opcode.ATTACHMENT:
             if len(content) >= 4:
                 (crc,) = struct.unpack_from("<I", content, len(content) - 4)
                 if crc not in (0, zlib.crc32(content[:-4])):
-                    raise McapDamageError(f"has an attachment with a wrong checksum{where}")
-            contents.attachments.append(parsed(Attachment.read, content, where))
+                    raise McapDamageError(f"has an attachment with a wrong checksum{location_text}")
+            contents.attachments.append(parse_record(Attachment.read, content, location_text))
 
     def _read_chunk(self, content: memoryview, start: int) -> None:
-        self._allowance.spend(CHUNK_STEPS)
-        where = f" in the chunk at byte {start}"
+        """Decompress a chunk, verify its checksum, and read the records in it."""
+        self._budget.count_steps(CHUNK_STEPS)
+        location_text = f" in the chunk at byte {start}"
         try:
-            *_, size, crc = _CHUNK_HEAD.unpack_from(content)
-            name, position = prefixed(content, _CHUNK_HEAD.size, "<I")
-            packed, _ = prefixed(content, position, "<Q")
+            *_, size, crc = _CHUNK_HEAD_FORMAT.unpack_from(content)
+            name, position = read_prefixed_bytes(content, _CHUNK_HEAD_FORMAT.size, "<I")
+            packed, _ = read_prefixed_bytes(content, position, "<Q")
         except struct.error:
-            raise McapDamageError(f"has a malformed head{where}") from None
-        self._allowance.unpack(size, where)
+            raise McapDamageError(f"has a malformed head{location_text}") from None
+        self._budget.count_unpacked(size, location_text)
         compression = bytes(name[:20])
-        if size <= MOST_UNPACKED_BYTES:
-            records = unpacked(self._zstd, compression, packed, size, where)
+        if size <= MAX_UNPACKED_BYTES:
+            records = decompressed_chunk(self._zstd, compression, packed, size, location_text)
             if crc not in (0, zlib.crc32(records)):
-                raise McapDamageError(f"has a wrong checksum{where}")
-            end = self._read_records(records, 0, start, where)
+                raise McapDamageError(f"has a wrong checksum{location_text}")
+            end = self._read_records(records, 0, start, location_text)
             if end < len(records):
-                raise _torn(end, where)
+                raise _truncated_record_error(end, location_text)
             return
-        # Too long for memory: unpacked once to be checked, and once more to be read.
-        found, found_crc = 0, 0
-        for part in unpacked_parts(self._zstd, compression, packed, size, where):
-            found += len(part)
-            found_crc = zlib.crc32(part, found_crc)
-            self._let_go()
-        if found != size:
-            raise McapDamageError(f"decompresses to a wrong size{where}")
-        if crc not in (0, found_crc):
-            raise McapDamageError(f"has a wrong checksum{where}")
-        self._read_parts(unpacked_parts(self._zstd, compression, packed, size, where), start, where)
+        # Too long for memory: decompressed once to verify the checksum, and again to be read.
+        unpacked_bytes, unpacked_crc = 0, 0
+        for part in decompressed_parts(self._zstd, compression, packed, size, location_text):
+            unpacked_bytes += len(part)
+            unpacked_crc = zlib.crc32(part, unpacked_crc)
+            self._release_pages()
+        if unpacked_bytes != size:
+            raise McapDamageError(f"decompresses to a wrong size{location_text}")
+        if crc not in (0, unpacked_crc):
+            raise McapDamageError(f"has a wrong checksum{location_text}")
+        self._read_parts(
+            decompressed_parts(self._zstd, compression, packed, size, location_text),
+            start,
+            location_text,
+        )
 
-    def _read_parts(self, parts: Iterator[Buffer], unit: int, where: str) -> None:
-        """Read records that may begin in one part and end in another; skip unwanted ones."""
-        rest = b""
-        base = 0  # offset of `rest` in the chunk
-        skip = 0  # remaining bytes of an unwanted record
+    def _read_parts(self, parts: Iterator[Buffer], chunk_position: int, location_text: str) -> None:
+        """Read the records of a chunk that arrives in parts; a record may span several parts."""
+        remainder = b""  # beginning of a record whose end is in a later part
+        remainder_offset = 0  # offset of `rest` in the chunk
+        bytes_to_skip = 0  # remaining bytes of an unwanted record
         for part in parts:
-            self._let_go()
-            if skip >= len(part):
-                skip -= len(part)
-                base += len(part)
+            self._release_pages()
+            if bytes_to_skip >= len(part):
+                bytes_to_skip -= len(part)
+                remainder_offset += len(part)
                 continue
-            rest += part[skip:]
-            base += skip
-            skip = 0
-            used = self._read_records(rest, base, unit, where)
-            rest = rest[used:]
-            base += used
-            if len(rest) >= _RUN_HEAD.size:
-                skip = self._needless_bytes(rest, base, where)
-                if skip:
-                    base += len(rest)
-                    skip -= len(rest)
-                    rest = b""
-        if rest or skip:
-            raise _torn(base, where)
+            remainder += part[bytes_to_skip:]
+            remainder_offset += bytes_to_skip
+            bytes_to_skip = 0
+            used_bytes = self._read_records(
+                remainder, remainder_offset, chunk_position, location_text
+            )
+            remainder = remainder[used_bytes:]
+            remainder_offset += used_bytes
+            if len(remainder) >= _RUN_HEAD_FORMAT.size:
+                bytes_to_skip = self._skippable_bytes(remainder, remainder_offset, location_text)
+                if bytes_to_skip:
+                    remainder_offset += len(remainder)
+                    bytes_to_skip -= len(remainder)
+                    remainder = b""
+        if remainder or bytes_to_skip:
+            raise _truncated_record_error(remainder_offset, location_text)
 
-    def _needless_bytes(self, records: bytes, base: int, where: str) -> int:
-        """Return the length of the first record if it is not needed, else 0."""
-        opcode, length, channel = _RUN_HEAD.unpack_from(records)
+    def _skippable_bytes(self, records: bytes, buffer_offset: int, location_text: str) -> int:
+        """Return the length of the first record in bytes if it can be skipped, else 0."""
+        opcode, length, channel = _RUN_HEAD_FORMAT.unpack_from(records)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             if length > limits.MAX_TEXT_BYTES:
-                raise _torn(base, where)
+                raise _truncated_record_error(buffer_offset, location_text)
             return 0
         if opcode == Opcode.MESSAGE:
-            if self._wanted.get(channel, True) and self._is_short(length, where):
+            if self._is_wanted.get(channel, True) and self._is_accepted_length(
+                length, location_text
+            ):
                 return 0
             self.contents.message_counts[channel] += 1
-        return int(length) + RECORD_HEAD.size
+        return int(length) + RECORD_HEAD_FORMAT.size
 
-    def _is_short(self, length: int, where: str) -> bool:
-        """Return whether a message is short enough; in salvage mode a longer one is skipped."""
+    def _is_accepted_length(self, length: int, location_text: str) -> bool:
+        """Return whether a message is within the maximum length; record a longer one as skipped.
+
+        Raises McapDamageError for a longer message unless in salvage mode.
+        """
         if length <= limits.MAX_MESSAGE_BYTES:
             return True
         damage = (
-            f"has a message of {length} bytes{where}, more than the "
+            f"has a message of {length} bytes{location_text}, more than the "
             f"{limits.MAX_MESSAGE_BYTES >> 20} MiB that are accepted"
         )
         if not self._salvage:
             raise McapDamageError(damage)
-        self._skip(damage)
+        self._add_skipped(damage)
         return False
 
-    def _read_records(self, records: bytes, base: int, unit: int, where: str) -> int:
-        """Read the complete records of a chunk; return the start of the incomplete one.
+    def _read_records(
+        self, records: bytes, buffer_offset: int, chunk_position: int, location_text: str
+    ) -> int:
+        """Read the complete records of a buffer, and return the offset where the rest begins.
 
-        `base` is the offset of the records in the chunk.
+        `buffer_offset` is the offset of the buffer in its chunk.
         """
         end = 0
         while end < len(records):
             start = end
-            end, count = self._read_messages(records, start, len(records), unit, where)
+            end, count = self._read_messages(
+                records, start, len(records), chunk_position, location_text
+            )
             if count:
                 continue
-            if start + RECORD_HEAD.size > len(records):
+            if start + RECORD_HEAD_FORMAT.size > len(records):
                 return start
-            opcode, length = RECORD_HEAD.unpack_from(records, start)
+            opcode, length = RECORD_HEAD_FORMAT.unpack_from(records, start)
             if opcode == 0:
-                raise _no_record(base + start, where)
-            content = start + RECORD_HEAD.size
+                raise _missing_record_error(buffer_offset + start, location_text)
+            content = start + RECORD_HEAD_FORMAT.size
             end = content + length
             if end > len(records):
                 return start
-            self._allowance.spend(1)
+            self._budget.count_steps(1)
             if opcode == Opcode.MESSAGE:
-                raise McapDamageError(f"has a message that is too short{where}")
-            self._read_other(opcode, records[content:end], where)
+                raise McapDamageError(f"has a message that is too short{location_text}")
+            self._read_declaration(opcode, records[content:end], location_text)
             if opcode == Opcode.CHANNEL:
-                (channel,) = _CHANNEL_ID.unpack_from(records, content)
+                (channel,) = _CHANNEL_NUMBER_FORMAT.unpack_from(records, content)
                 self.contents.declared_in_chunks.add(channel)
         return end
 
@@ -477,147 +523,162 @@ class _ContainerReader:
         records: Buffer,
         start: int,
         limit: int,
-        unit: int,
-        where: str,
-        most: int | None = None,
+        chunk_position: int,
+        location_text: str,
+        max_messages: int | None = None,
     ) -> tuple[int, int]:
-        """Pass on consecutive messages from `start` on that end before `limit`.
+        """Pass the messages from `start` to the callback, up to another record or `limit`.
 
-        Outside of chunks at most `most`. Returns the start of the first other record and the number
-        of messages.
+        `max_messages` limits the number of messages outside of chunks. Returns the offset after the
+        last message, and the number of messages.
         """
-        unpack = _RUN_HEAD.unpack_from
-        wanted, counts = self._wanted, self.contents.message_counts
+        unpack_run_head = _RUN_HEAD_FORMAT.unpack_from
+        wanted_by_channel, message_counts = self._is_wanted, self.contents.message_counts
         runs: list[Run] = []
         position = start
-        taken = passed = 0  # messages, and runs of them
+        message_count = run_count = 0  # number of messages, and number of runs of messages
         try:
-            while position + MESSAGE_HEAD.size <= limit and passed < _MOST_RUNS:
-                key = unpack(records, position)
-                opcode, length, channel = key
-                size = length + RECORD_HEAD.size
-                if opcode != Opcode.MESSAGE or size < MESSAGE_HEAD.size or position + size > limit:
+            while position + MESSAGE_HEAD_FORMAT.size <= limit and run_count < _MAX_BLOCK_RUNS:
+                run_head = unpack_run_head(records, position)
+                opcode, length, channel = run_head
+                size = length + RECORD_HEAD_FORMAT.size
+                if (
+                    opcode != Opcode.MESSAGE
+                    or size < MESSAGE_HEAD_FORMAT.size
+                    or position + size > limit
+                ):
                     break
-                is_wanted = wanted.get(channel)
+                is_wanted = wanted_by_channel.get(channel)
                 if is_wanted is None:
                     raise McapDamageError(
-                        f"has a message of an undeclared channel {channel}{where}"
+                        f"has a message of an undeclared channel {channel}{location_text}"
                     )
-                if most is not None and (taken == most or self._is_stray(channel)):
+                if max_messages is not None and (
+                    message_count == max_messages or self._is_stray_message(channel)
+                ):
                     break
                 end = position + size
                 count = 1
-                while end + size <= limit and unpack(records, end) == key:
+                while end + size <= limit and unpack_run_head(records, end) == run_head:
                     end += size
                     count += 1
-                    if count == _SHORT_RUN:
+                    if count == _MAX_SINGLE_COMPARISONS:
                         count = _run_length(records, position, size, limit)
                         break
-                if most is not None:
-                    count = min(count, most - taken)
-                if is_wanted and self._is_short(length, where):
+                if max_messages is not None:
+                    count = min(count, max_messages - message_count)
+                if is_wanted and self._is_accepted_length(length, location_text):
                     runs.append((channel, size, position, count))
-                counts[channel] += count
+                message_counts[channel] += count
                 position += size * count
-                taken += count
-                passed += 1
+                message_count += count
+                run_count += 1
         finally:
-            if runs and self._take is not None:
-                self._take(self.contents, MessageBlock(records, runs, unit))
-        self._allowance.spend(passed)
-        return position, taken
+            if runs and self._on_block is not None:
+                self._on_block(self.contents, MessageBlock(records, runs, chunk_position))
+        self._budget.count_steps(run_count)
+        return position, message_count
 
     def _check_data_end(self, content: memoryview, start: int) -> None:
+        """Verify the checksum over the data section, which its last record contains."""
         if len(content) < 4:
             raise McapDamageError(f"has a malformed end of its data section at byte {start}")
         (crc,) = struct.unpack_from("<I", content)
-        if crc != 0 and crc != self._crc_of(self._passed, start, self._crc):
+        if crc != 0 and crc != self._crc_of_range(self._released_end, start, self._crc):
             raise McapDamageError("has a wrong checksum over its data section")
         self.contents.verified = crc != 0
 
     def _check_summary(self, start: int) -> None:
-        """Compare the summary, if there is one, with the contents read."""
+        """Verify footer, checksum and message counts of the summary section, which may be empty."""
         data = self._data
         if not self.contents.complete:
             raise McapDamageError(
                 "ends in the middle of its summary, or something was appended to it"
             )
-        footer = len(data) - len(MAGIC) - FOOTER.size
-        *_, summary_start, _, crc = FOOTER.unpack_from(data, footer)
+        footer = len(data) - len(MAGIC) - FOOTER_FORMAT.size
+        *_, summary_start, _, crc = FOOTER_FORMAT.unpack_from(data, footer)
         if summary_start not in (0, start) or (summary_start == 0 and footer != start):
             raise McapDamageError(
                 f"has a footer that contradicts its data section at byte {footer}"
             )
-        if crc not in (0, self._crc_of(start, footer + FOOTER.size - 4)):
+        if crc not in (0, self._crc_of_range(start, footer + FOOTER_FORMAT.size - 4)):
             raise McapDamageError("has a wrong checksum over its summary")
         for opcode, content in self._summary_records(start, footer):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                # Declarations of channels without messages may be here only.
-                self._read_other(opcode, content, " in the summary")
+                # A channel without messages may be declared in the summary only.
+                self._read_declaration(opcode, content, " in the summary")
             elif opcode == Opcode.STATISTICS:
-                statistics = parsed(Statistics.read, content, " in the summary")
-                found = self.contents.message_counts
-                counts = statistics.channel_message_counts
-                if any(found[channel] != count for channel, count in counts.items()):
+                statistics = parse_record(Statistics.read, content, " in the summary")
+                read_counts = self.contents.message_counts
+                stated_counts = statistics.channel_message_counts
+                if any(read_counts[channel] != count for channel, count in stated_counts.items()):
                     raise McapDamageError("does not contain the messages that its statistics count")
 
     def _summary_records(self, start: int, footer: int) -> Iterator[tuple[int, memoryview]]:
-        """Yield opcode and content of the summary's records."""
-        data, end, passed = self._data[:footer], start, start
+        """Yield opcode and content of each record between `start` and `footer`."""
+        data, end, released_end = self._data[:footer], start, start
         while end < footer:
-            opcode, content, end = _record_at(data, end, " of the summary")
-            if end - passed > _PASSED_BYTES:
-                passed = end
-                self._let_go()
+            opcode, content, end = _locate_record(data, end, " of the summary")
+            if end - released_end > _RELEASE_INTERVAL_BYTES:
+                released_end = end
+                self._release_pages()
             # Each channel in the statistics takes time.
             is_statistics = opcode == Opcode.STATISTICS
-            self._allowance.spend(1 + (end - content) // 4 if is_statistics else 1)
+            self._budget.count_steps(1 + (end - content) // 4 if is_statistics else 1)
             yield opcode, data[content:end]
 
     def stated_counts(self) -> dict[int, int]:
-        """Return the statistics' message counts, if the checksum of the summary is correct."""
+        """Return the message count of each channel from the file's statistics.
+
+        Returns an empty dictionary if the summary has no correct checksum.
+        """
         data = self._data
-        footer = len(data) - len(MAGIC) - FOOTER.size
-        *_, start, _, crc = FOOTER.unpack_from(data, footer)
+        footer = len(data) - len(MAGIC) - FOOTER_FORMAT.size
+        *_, start, _, crc = FOOTER_FORMAT.unpack_from(data, footer)
         if not len(MAGIC) <= start <= footer:
             return {}
-        if crc == 0 or crc != self._crc_of(start, footer + FOOTER.size - 4):
+        if crc == 0 or crc != self._crc_of_range(start, footer + FOOTER_FORMAT.size - 4):
             return {}
         try:
             for opcode, content in self._summary_records(start, footer):
                 if opcode == Opcode.STATISTICS:
-                    statistics = parsed(Statistics.read, content, "")
+                    statistics = parse_record(Statistics.read, content, "")
                     return dict(statistics.channel_message_counts)
         except McapDamageError:
             pass
         return {}
 
 
-def parsed(read: Callable[[ReadDataStream], _Record], content: Buffer, where: str) -> _Record:
-    """Parse a record with the ``mcap`` package."""
+def parse_record(
+    read: Callable[[ReadDataStream], _Record], content: Buffer, location_text: str
+) -> _Record:
+    """Return a record parsed with the ``mcap`` package; raise McapDamageError if malformed."""
     try:
         stream = ReadDataStream(BytesIO(content))
         record = read(stream)
     except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError):
-        raise McapDamageError(f"has a malformed record{where}") from None
+        raise McapDamageError(f"has a malformed record{location_text}") from None
     return record
 
 
 def _run_length(records: Buffer, start: int, size: int, limit: int) -> int:
-    """Count the records of equal opcode, length and channel from `start` on, up to `limit`.
+    """Return the number of consecutive records from `start` with the same opcode, length, channel.
 
-    The examined step grows, so that short runs in long chunks stay cheap.
+    Records end before `limit`. Ever more records are compared at once, so that short runs in long
+    chunks take little time.
     """
-    (head, tail) = np.frombuffer(records[start : start + _RUN_KEY.itemsize], _RUN_KEY)[0]
-    most = (limit - start) // size
-    known, step = 1, _FIRST_STEP
-    while known < most:
-        count = min(step, most - known)
-        keys = np.ndarray(count, _RUN_KEY, records, start + known * size, (size,))
-        equal = (keys["head"] == head) & (keys["tail"] == tail)
-        first = int(equal.argmin())
-        if not equal[first]:
-            return known + first
-        known += count
-        step *= 8
-    return known
+    (head, tail) = np.frombuffer(
+        records[start : start + _RUN_HEAD_DTYPE.itemsize], _RUN_HEAD_DTYPE
+    )[0]
+    max_count = (limit - start) // size
+    equal_count, messages_to_compare = 1, _FIRST_COMPARISON_MESSAGES
+    while equal_count < max_count:
+        count = min(messages_to_compare, max_count - equal_count)
+        run_heads = np.ndarray(count, _RUN_HEAD_DTYPE, records, start + equal_count * size, (size,))
+        is_equal = (run_heads["head"] == head) & (run_heads["tail"] == tail)
+        first_different = int(is_equal.argmin())
+        if not is_equal[first_different]:
+            return equal_count + first_different
+        equal_count += count
+        messages_to_compare *= 8
+    return equal_count

@@ -1,4 +1,4 @@
-"""MCAP container, written a whole chunk at a time.
+"""Writer of MCAP files, which writes a whole chunk at a time.
 
 The writer of the ``mcap`` package takes messages one by one, at several microseconds each. Here the
 caller passes a chunk's records and their index as arrays; the ``mcap`` package serialises all other
@@ -32,29 +32,30 @@ from mcap.records import (
 )
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-# Against zstd at level 3: files 20 % larger, half the time to compress and to decompress them.
+"""Bytes with which every MCAP file begins and ends."""
+# Compared with zstd at level 3, files are 20 % larger, and (de)compression takes half the time.
 COMPRESSION: Final = "lz4"
-_CHUNK_HEAD: Final = struct.Struct(f"<BQ QQQI I{len(COMPRESSION)}s Q")
-_INDEX_HEAD: Final = struct.Struct("<BQ HI")
-_FOOTER_HEAD: Final = struct.Struct("<BQ QQ")
+_CHUNK_HEAD_FORMAT: Final = struct.Struct(f"<BQ QQQI I{len(COMPRESSION)}s Q")
+_INDEX_HEAD_FORMAT: Final = struct.Struct("<BQ HI")
+_FOOTER_HEAD_FORMAT: Final = struct.Struct("<BQ QQ")
 RECORD_HEAD_SIZE: Final = 9
-"""Opcode and length of a record, which the length does not include."""
+"""Number of bytes of a record's opcode and length, which that length does not include."""
 
-MESSAGE_HEAD: Final = struct.Struct("<BQ HIQQ")
-"""Opcode, length, channel, sequence, log time, publish time: the bytes before a message's data."""
+MESSAGE_HEAD_FORMAT: Final = struct.Struct("<BQ HIQQ")
+"""Format of the bytes before a message's data: opcode, length, channel, sequence, log and publish
+time."""
 LOG_TIME_OFFSET: Final = RECORD_HEAD_SIZE + 2 + 4
+"""Offset of the log time in a message record, in bytes."""
 
 INDEX_DTYPE: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
-"""One entry of a message index: offset of a message's record in the uncompressed chunk."""
+"""Entry of a message index: log time in ns, and offset of the record in the uncompressed chunk."""
 
 
 class McapWriter:
-    """Writes an indexed MCAP file of lz4 chunks with all checksums.
+    """Writes an MCAP file with LZ4-compressed chunks, message indexes and all checksums.
 
-    Parameters
-    ----------
-    stream : open for binary writing, at the beginning of an empty file
-    library : name of the writing library, for the header
+    `stream` is an empty file that is open for binary writing. `library` is the name of the writing
+    program in the file's header.
     """
 
     def __init__(self, stream: BinaryIO, library: str) -> None:
@@ -69,10 +70,10 @@ class McapWriter:
         self._message_counts: dict[int, int] = {}
         self._start_time: int | None = None
         self._end_time = 0
-        self._write(MAGIC + _serialised(Header(profile="", library=library)))
+        self._write(MAGIC + _record_bytes(Header(profile="", library=library)))
 
     def _write(self, data: bytes) -> int:
-        """Append to the data section and return the position of `data`."""
+        """Append bytes to the data section, and return the offset in the file where they begin."""
         position = self._position
         self._stream.write(data)
         self._data_crc = zlib.crc32(data, self._data_crc)
@@ -80,21 +81,21 @@ class McapWriter:
         return position
 
     def declare(self, schemas: Iterable[Schema], channels: Iterable[Channel]) -> None:
-        """Declare all channels, in a separate chunk: its checksum covers them at once."""
+        """Write all schemas and channels in a chunk of their own, whose checksum covers them."""
         self._schemas = list(schemas)
         self._channels = list(channels)
         self._message_counts = {channel.id: 0 for channel in self._channels}
-        self.add_chunk(b"".join(map(_serialised, [*self._schemas, *self._channels])), {})
+        self.add_chunk(b"".join(map(_record_bytes, [*self._schemas, *self._channels])), {})
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Append a metadata record."""
-        data = _serialised(Metadata(name=name, metadata=dict(values)))
+        """Append a metadata record with the given name, keys and values."""
+        data = _record_bytes(Metadata(name=name, metadata=dict(values)))
         position = self._write(data)
         self._metadata_indexes.append(MetadataIndex(offset=position, length=len(data), name=name))
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
-        """Append an attachment, created and recorded at `time_ns`."""
-        record = _serialised(
+        """Append an attachment; `time_ns` becomes its creation time and log time."""
+        record = _record_bytes(
             Attachment(
                 create_time=time_ns, log_time=time_ns, name=name, media_type=media_type, data=data
             )
@@ -113,22 +114,24 @@ class McapWriter:
         )
 
     def add_chunk(self, records: bytes, indexes: Mapping[int, npt.NDArray[np.void]]) -> None:
-        """Append a chunk and its message indexes.
+        """Compress and append a chunk of records, with its message indexes.
 
         Parameters
         ----------
-        records : message records, one after another
-        indexes : channel id → array (n > 0,) of `INDEX_DTYPE`, in the order of the messages
+        records : records of the chunk, one after another
+        indexes : channel number → array (n > 0,) of `INDEX_DTYPE`, in the order of the messages
         """
-        start = min((int(index["log_time"].min()) for index in indexes.values()), default=0)
-        end = max((int(index["log_time"].max()) for index in indexes.values()), default=0)
+        first_log_time = min(
+            (int(index["log_time"].min()) for index in indexes.values()), default=0
+        )
+        last_log_time = max((int(index["log_time"].max()) for index in indexes.values()), default=0)
         compressed = lz4.frame.compress(records)
         name = COMPRESSION.encode()
-        head = _CHUNK_HEAD.pack(
+        head = _CHUNK_HEAD_FORMAT.pack(
             Opcode.CHUNK,
-            _CHUNK_HEAD.size - RECORD_HEAD_SIZE + len(compressed),
-            start,
-            end,
+            _CHUNK_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(compressed),
+            first_log_time,
+            last_log_time,
             len(records),
             zlib.crc32(records),
             len(name),
@@ -136,28 +139,32 @@ class McapWriter:
             len(compressed),
         )
         chunk_length = len(head) + len(compressed)
-        parts = [head, compressed]
+        chunk_and_indexes = [head, compressed]
         index_position = self._position + chunk_length
         index_offsets: dict[int, int] = {}
         index_length = 0
         for channel, index in indexes.items():
             index_offsets[channel] = index_position + index_length
             entries = index.tobytes()
-            length = _INDEX_HEAD.size - RECORD_HEAD_SIZE + len(entries)
-            parts += [
-                _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, length, channel, len(entries)),
+            length = _INDEX_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(entries)
+            chunk_and_indexes += [
+                _INDEX_HEAD_FORMAT.pack(Opcode.MESSAGE_INDEX, length, channel, len(entries)),
                 entries,
             ]
-            index_length += _INDEX_HEAD.size + len(entries)
+            index_length += _INDEX_HEAD_FORMAT.size + len(entries)
             self._message_counts[channel] += len(index)
-        position = self._write(b"".join(parts))
+        position = self._write(b"".join(chunk_and_indexes))
         if indexes:
-            self._start_time = start if self._start_time is None else min(start, self._start_time)
-            self._end_time = max(end, self._end_time)
+            self._start_time = (
+                first_log_time
+                if self._start_time is None
+                else min(first_log_time, self._start_time)
+            )
+            self._end_time = max(last_log_time, self._end_time)
         self._chunk_indexes.append(
             ChunkIndex(
-                message_start_time=start,
-                message_end_time=end,
+                message_start_time=first_log_time,
+                message_end_time=last_log_time,
                 chunk_start_offset=position,
                 chunk_length=chunk_length,
                 message_index_offsets=index_offsets,
@@ -169,8 +176,8 @@ class McapWriter:
         )
 
     def finish(self) -> None:
-        """Write the end of the data section, the summary and the footer."""
-        self._write(_serialised(DataEnd(data_section_crc=self._data_crc)))
+        """Complete the file: write the end of the data section, the summary and the footer."""
+        self._write(_record_bytes(DataEnd(data_section_crc=self._data_crc)))
         statistics = Statistics(
             message_count=sum(self._message_counts.values()),
             schema_count=len(self._schemas),
@@ -207,21 +214,25 @@ class McapWriter:
         offset_start = self._position + summary.count
         for offset in offsets:
             offset.write(summary)
-        data = _contents(summary)
+        data = _built_bytes(summary)
         # The summary's checksum covers the footer up to the checksum itself.
         footer = Footer(
             summary_start=self._position, summary_offset_start=offset_start, summary_crc=0
         )
-        footer.summary_crc = zlib.crc32(_serialised(footer)[: _FOOTER_HEAD.size], zlib.crc32(data))
-        self._stream.write(data + _serialised(footer) + MAGIC)
+        footer.summary_crc = zlib.crc32(
+            _record_bytes(footer)[: _FOOTER_HEAD_FORMAT.size], zlib.crc32(data)
+        )
+        self._stream.write(data + _record_bytes(footer) + MAGIC)
 
 
-def _serialised(record: McapRecord) -> bytes:
+def _record_bytes(record: McapRecord) -> bytes:
+    """Return the bytes of an MCAP record."""
     builder = RecordBuilder()
     record.write(builder)
-    return _contents(builder)
+    return _built_bytes(builder)
 
 
-def _contents(builder: RecordBuilder) -> bytes:
+def _built_bytes(builder: RecordBuilder) -> bytes:
+    """Return the bytes that were written to a record builder."""
     data: bytes = builder.end()  # type: ignore[no-untyped-call]
     return data

@@ -1,9 +1,9 @@
-"""Decoder of messages: samples, controls, timings and touches as arrays, from any writer.
+"""Decoder of protobuf messages to NumPy arrays: samples, controller terms, ages and touches.
 
-Messages of the fixed layout (`rigd.session.layout`) are copied directly. Any other protobuf library
-may order the fields differently, omit zeros, number or type fields differently. The decoder then
-finds the offsets of the fields in one such message by its schema, and decodes all messages with the
-same tags at the same offsets together. It decodes the remaining ones singly, up to a limit.
+Messages of the fixed layout (`rigd.session.layout`) are copied directly. Another writing program
+may order, number or type the fields differently, or omit zeros. The decoder then finds the offsets
+of the fields in one such message by its schema, and decodes all messages with the same tags at the
+same offsets together. It decodes the remaining messages one by one, up to a limit.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from rigd.session import limits
 from rigd.session._errors import SessionError
 from rigd.session._mcap_reader import McapContents, MessageBlock, message_starts
-from rigd.session._mcap_writer import MESSAGE_HEAD
+from rigd.session._mcap_writer import MESSAGE_HEAD_FORMAT
 from rigd.session._schema import (
     CONTROL_SCHEMA,
     CONTROL_TOPIC,
@@ -55,44 +55,53 @@ if TYPE_CHECKING:
 
 
 _BLOCK_BYTES: Final = 1 << 18
-"""Bytes of messages that are decoded together: they stay in the processor's cache."""
-_BLOCK_RUNS: Final = 1 << 16
-_FEW: Final = 16
-"""Below this number messages are decoded singly."""
-_MOST_LAYOUTS: Final = 16
-"""Layouts of messages of one channel and length: a writer that omits zeros produces a few."""
-_MOST_GROUPS: Final = 100_000
-"""Times that messages of one layout are decoded together, at about 100 µs each."""
+"""Number of bytes of messages that are decoded together, so that they fit the processor's cache."""
+_MAX_BLOCK_RUNS: Final = 1 << 16
+"""Maximum number of runs of messages that are decoded together."""
+_MIN_GROUP_MESSAGES: Final = 16
+"""Number of messages below which they are decoded one by one."""
+_MAX_LAYOUTS: Final = 16
+"""Maximum number of field layouts for messages of one channel and length. A program that omits
+zeros writes a few layouts."""
+_MAX_LAYOUT_COMPARISONS: Final = 100_000
+"""Maximum number of comparisons of messages with a field layout, which take about 100 µs each."""
 
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protobuf
-_MOST_FIELD_NUMBER: Final = (1 << 29) - 1
-_MOST_TAG_BYTES: Final = 5
-_MOST_VARINT_BYTES: Final = 9
-"""Bytes of 63 bits: a longer varint is negative or padded."""
+_VARINT_WIRE_TYPE, _FIXED64_WIRE_TYPE, _BYTES_WIRE_TYPE, _FIXED32_WIRE_TYPE = (
+    0,
+    1,
+    2,
+    5,
+)  # wire types of protobuf
+_MAX_FIELD_NUMBER: Final = (1 << 29) - 1
+_MAX_TAG_BYTES: Final = 5
+_MAX_VARINT_BYTES: Final = 9
+"""Maximum length of a non-negative 64-bit varint in bytes: a longer one is negative or padded."""
 
 
 @dataclass(frozen=True, slots=True)
 class MessageLayout:
-    """A channel of fixed-layout messages."""
+    """Topic, schema and array types of one kind of messages with the fixed layout."""
 
     topic: str
     schema_name: str
     types: dict[str, str]
     required: tuple[str, ...]
-    """Fields that a schema must have; any other absent one reads as 0."""
+    """Fields that a file's schema must have; any other field that it lacks is decoded as 0."""
     record_dtype: np.dtype[np.void]
-    """A message record in the file: its ``head``, then the ``wire`` form."""
+    """Array type of a message record in the file: its ``head``, then the ``wire`` message."""
     dtype: np.dtype[np.void]
+    """Array type of a decoded message."""
 
     def dtype_of(self, fields: Sequence[str] | None) -> np.dtype[np.void]:
-        """Return the type of a decoded message of some fields; None for all."""
+        """Return the array type of a decoded message with only the given fields, or all if None."""
         if fields is None:
             return self.dtype
         return np.dtype([(name, self.dtype[name]) for name in fields], align=True)
 
 
 def _record_dtype(wire_dtype: np.dtype[np.void]) -> np.dtype[np.void]:
-    return np.dtype([("head", f"V{MESSAGE_HEAD.size}"), ("wire", wire_dtype)])
+    """Return the array type of an MCAP message record whose data has the type `wire_dtype`."""
+    return np.dtype([("head", f"V{MESSAGE_HEAD_FORMAT.size}"), ("wire", wire_dtype)])
 
 
 SAMPLES: Final = MessageLayout(
@@ -129,8 +138,8 @@ TOUCHES: Final = MessageLayout(
     TOUCH_DTYPE,
 )
 
-# Declared type → how to read it as the array's type, where no value can be lost.
-_SAME: Final = {
+# Type of the fixed layout → protobuf type in the file's schema → how to read it without loss.
+_LOSSLESS_CONVERSIONS: Final = {
     "double": {"TYPE_DOUBLE": "<f8", "TYPE_FLOAT": "<f4"},
     "sfixed64": {"TYPE_SFIXED64": "<i8", "TYPE_INT64": "varint", "TYPE_UINT32": "varint32"},
     "fixed32": {"TYPE_FIXED32": "<u4", "TYPE_UINT32": "varint32"},
@@ -139,39 +148,44 @@ _SAME: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _FieldOffsets:
-    """Offsets of the fields in messages of one length whose bytes are `pattern` under `mask`."""
+    """Offsets of the fields in messages of one length with the same tags at the same bytes.
+
+    A message has these offsets if its bytes, combined with `mask` by AND, equal `pattern`.
+    """
 
     mask: npt.NDArray[np.uint8]
     pattern: npt.NDArray[np.uint8]
     fields: tuple[tuple[str, int, int, str], ...]
-    """Name, first byte, bytes, and numpy type, "varint" or "varint32"."""
-    absent: tuple[str, ...]
-    """Missing fields, which read as 0."""
+    """For each field: name, offset of its first byte, length in bytes, and NumPy type or "varint"
+    or "varint32"."""
+    absent_fields: tuple[str, ...]
+    """Names of the fields that such messages lack, which are decoded as 0."""
 
 
 class MessageSink(Protocol):
-    """Destination of decoded messages."""
+    """Destination of decoded messages, which provides the arrays that the decoder fills."""
 
-    def room(self, count: int) -> npt.NDArray[np.void]:
-        """Return an array (count,) of the decoder's dtype to be filled with the next messages."""
+    def array_for(self, count: int) -> npt.NDArray[np.void]:
+        """Return an array (count,) that the decoder fills with the next messages."""
         ...
 
     def store(self, messages: npt.NDArray[np.void]) -> None:
-        """Take that array, filled."""
+        """Process the array from `array_for` after the decoder has filled it."""
         ...
 
 
 class MessageDecoder:
     """Decodes the messages of one topic, in the order of the file.
 
-    An error is raised at the end only: damage of the file is reported first.
+    An error is stored in `error` and raised by `finish`, so that damage of the file can be reported
+    first.
 
     Parameters
     ----------
-    path : the file, for messages
+    path : path of the file, for error messages
     layout : layout of the messages
-    sink : gets the decoded messages of `fields`, block by block
-    fields : fields of the layout to decode; by default all
+    sink : destination of the decoded messages, which it gets block by block
+    fields : names of the fields to decode; None for all
     """
 
     def __init__(
@@ -186,52 +200,57 @@ class MessageDecoder:
         self._sink = sink
         self.dtype = layout.dtype_of(fields)
         self.error: SessionError | None = None
-        self._channels: dict[int, bool] = {}  # channel → whether it is of the topic
-        self._fixed: dict[int, bool] = {}  # channel of the topic → whether its schema is the fixed
+        self._is_topic_channel: dict[int, bool] = {}  # channel → whether it is of the topic
+        self._is_fixed_schema: dict[
+            int, bool
+        ] = {}  # channel of the topic → whether its layout is fixed
         self._classes: dict[int, type[Message]] = {}
         self._offsets: dict[tuple[int, int], list[_FieldOffsets]] = {}
         self._contents: McapContents | None = None
-        self._parts: list[Buffer] = []
-        self._runs: list[tuple[int, int, int]] = []  # channel, bytes of a record, count
-        self._length = 0
-        self._single = 0
-        self._groups = 0
+        self._collected_records: list[Buffer] = []
+        self._collected_runs: list[tuple[int, int, int]] = []  # channel, bytes of a record, count
+        self._collected_bytes = 0
+        self._single_messages = 0
+        self._layout_comparisons = 0
 
-    def take(self, contents: McapContents, block: MessageBlock) -> None:
-        """Collect the messages of the topic in a block of records."""
+    def add_block(self, contents: McapContents, block: MessageBlock) -> None:
+        """Collect the messages of the topic from a block, and decode when enough are collected."""
         if self.error is not None:
             return
         self._contents = contents
-        known = self._channels
+        is_topic_channel = self._is_topic_channel
         records = memoryview(block.records)
         for channel, size, start, count in block.runs:
-            is_mine = known.get(channel)
-            if is_mine is None:
-                is_mine = self.is_of_topic(contents, channel)
-            if not is_mine:
+            is_of_topic = is_topic_channel.get(channel)
+            if is_of_topic is None:
+                is_of_topic = self.is_of_topic(contents, channel)
+            if not is_of_topic:
                 continue
             part = records[start : start + size * count]
             # A slice holds all of the records in memory, which is fine where it is most of them.
-            self._parts.append(part if 2 * len(part) > len(records) else bytes(part))
-            self._runs.append((channel, size, count))
-            self._length += len(part)
-            if self._length >= _BLOCK_BYTES or len(self._runs) >= _BLOCK_RUNS:
+            self._collected_records.append(part if 2 * len(part) > len(records) else bytes(part))
+            self._collected_runs.append((channel, size, count))
+            self._collected_bytes += len(part)
+            if (
+                self._collected_bytes >= _BLOCK_BYTES
+                or len(self._collected_runs) >= _MAX_BLOCK_RUNS
+            ):
                 self.flush()
                 if self.error is not None:
                     return
 
     def is_of_topic(self, contents: McapContents, channel: int) -> bool:
         """Return whether a channel belongs to the decoded topic."""
-        is_mine = self._channels.get(channel)
-        if is_mine is None:
-            is_mine = contents.channels[channel].topic == self._layout.topic
-            self._channels[channel] = is_mine
-        return is_mine
+        is_of_topic = self._is_topic_channel.get(channel)
+        if is_of_topic is None:
+            is_of_topic = contents.channels[channel].topic == self._layout.topic
+            self._is_topic_channel[channel] = is_of_topic
+        return is_of_topic
 
     def flush(self) -> None:
-        """Decode the collected messages and pass them on."""
-        parts, runs = self._parts, self._runs
-        self._parts, self._runs, self._length = [], [], 0
+        """Decode the collected messages, and pass them to the sink."""
+        parts, runs = self._collected_records, self._collected_runs
+        self._collected_records, self._collected_runs, self._collected_bytes = [], [], 0
         if not runs or self.error is not None:
             return
         try:
@@ -240,12 +259,9 @@ class MessageDecoder:
             self.error = error
 
     def finish(self, contents: McapContents) -> None:
-        """Decode the last messages.
+        """Decode the remaining messages, and check the schemas of channels without messages.
 
-        Raises
-        ------
-        SessionError
-            If a message, or a schema of the topic, cannot be read.
+        Raises SessionError if a message or a schema of the topic cannot be decoded.
         """
         self.flush()
         if self.error is None:
@@ -256,37 +272,40 @@ class MessageDecoder:
             raise self.error
 
     def _decode(self, parts: list[Buffer], runs: npt.NDArray[np.int64]) -> None:
-        """Decode runs of messages whose bytes follow one another in `parts`."""
+        """Decode the messages in `parts`.
+
+        `runs` (n, 3) are channel number, record length in bytes, and number of messages.
+        """
         channel, size, _ = runs[0].tolist()
         if (runs[:, :2] == runs[0, :2]).all():
             block = b"".join(parts)
             # A block is a little longer than `_BLOCK_BYTES`; a much longer one is cut.
             is_long = len(block) > 2 * _BLOCK_BYTES
-            most = max(_BLOCK_BYTES // size, 1) * size if is_long else len(block)
-            for first in range(0, len(block), most):
-                part = block[first : first + most]
-                out = self._sink.room(len(part) // size)
+            part_bytes = max(_BLOCK_BYTES // size, 1) * size if is_long else len(block)
+            for first in range(0, len(block), part_bytes):
+                part = block[first : first + part_bytes]
+                out = self._sink.array_for(len(part) // size)
                 self._decode_group(channel, size, part, out)
                 self._sink.store(out)
             return
         records = np.frombuffer(b"".join(parts), np.uint8)
         starts = message_starts(runs)
-        kinds = np.repeat(runs[:, 0] << 40 | runs[:, 1], runs[:, 2])
-        out = self._sink.room(len(starts))
-        for kind in np.unique(kinds).tolist():
-            (indices,) = np.nonzero(kinds == kind)
-            size = kind & ((1 << 40) - 1)
-            every = np.ndarray(len(records) - size + 1, f"V{size}", records, 0, (1,))
-            group = every[starts[indices]].tobytes()
+        groups = np.repeat(runs[:, 0] << 40 | runs[:, 1], runs[:, 2])
+        out = self._sink.array_for(len(starts))
+        for group in np.unique(groups).tolist():
+            (indices,) = np.nonzero(groups == group)
+            size = group & ((1 << 40) - 1)
+            all_offsets = np.ndarray(len(records) - size + 1, f"V{size}", records, 0, (1,))
+            group_records = all_offsets[starts[indices]].tobytes()
             decoded = np.empty(len(indices), self.dtype)
-            self._decode_group(kind >> 40, size, group, decoded)
+            self._decode_group(group >> 40, size, group_records, decoded)
             out[indices] = decoded
         self._sink.store(out)
 
     def _decode_group(
         self, channel: int, size: int, records: bytes, out: npt.NDArray[np.void]
     ) -> None:
-        """Decode message records of one channel and length."""
+        """Decode records of one channel and of `size` bytes each into the array `out`."""
         contents, layout = self._contents, self._layout
         assert contents is not None
         if size > limits.MAX_DECODED_BYTES:
@@ -298,13 +317,15 @@ class MessageDecoder:
         if self._has_fixed_schema(contents, channel) and size == layout.record_dtype.itemsize:
             wire = np.frombuffer(records, layout.record_dtype)["wire"]
             to_native(wire, out.dtype.names or (), out)
-            fixed = is_fixed_layout(wire, layout.types)
-            if fixed.all():
+            is_fixed = is_fixed_layout(wire, layout.types)
+            if is_fixed.all():
                 return
-            (indices,) = np.nonzero(~fixed)
+            (indices,) = np.nonzero(~is_fixed)
         else:
             indices = np.arange(len(out))
-        data = np.frombuffer(records, np.uint8).reshape(len(out), size)[:, MESSAGE_HEAD.size :]
+        data = np.frombuffer(records, np.uint8).reshape(len(out), size)[
+            :, MESSAGE_HEAD_FORMAT.size :
+        ]
         self._decode_by_offsets(channel, data, indices, out)
 
     def _decode_by_offsets(
@@ -314,101 +335,133 @@ class MessageDecoder:
         indices: npt.NDArray[np.int64],
         out: npt.NDArray[np.void],
     ) -> None:
-        """Decode the messages (n, bytes) at `indices`, those of one layout together."""
-        known = self._offsets.setdefault((channel, data.shape[1]), [])
-        number = 0
-        while len(indices) >= _FEW and self._groups < _MOST_GROUPS:
+        """Decode the rows `indices` of `data` (n, bytes) into `out`, grouped by field layout."""
+        known_layouts = self._offsets.setdefault((channel, data.shape[1]), [])
+        layout_index = 0
+        while (
+            len(indices) >= _MIN_GROUP_MESSAGES
+            and self._layout_comparisons < _MAX_LAYOUT_COMPARISONS
+        ):
             rows = data if len(indices) == len(data) else data[indices]
-            if number == len(known):
-                found = self._find_offsets(channel, rows[0].tobytes())
-                if found is None or number == _MOST_LAYOUTS:
+            if layout_index == len(known_layouts):
+                new_layout = self._find_offsets(channel, rows[0].tobytes())
+                if new_layout is None or layout_index == _MAX_LAYOUTS:
                     break
-                known.append(found)
-            layout = known[number]
-            alike = ((rows & layout.mask) == layout.pattern).all(axis=1)
-            self._groups += 1
-            number += 1
-            if alike.any():
-                _take_at_offsets(layout, rows[alike], indices[alike], out)
-                indices = indices[~alike]
+                known_layouts.append(new_layout)
+            layout = known_layouts[layout_index]
+            has_layout = ((rows & layout.mask) == layout.pattern).all(axis=1)
+            self._layout_comparisons += 1
+            layout_index += 1
+            if has_layout.any():
+                _decode_at_offsets(layout, rows[has_layout], indices[has_layout], out)
+                indices = indices[~has_layout]
         if len(indices):
-            self._decode_single(channel, [data[i].tobytes() for i in indices], indices, out)
+            self._decode_one_by_one(channel, [data[i].tobytes() for i in indices], indices, out)
 
     def _find_offsets(self, channel: int, message: bytes) -> _FieldOffsets | None:
-        """Return the offsets of a message's fields; None if it must be decoded singly."""
-        cls = self._class(channel)
-        empty, descriptor = cls(), cls.DESCRIPTOR
-        if not empty.IsInitialized() or any(len(group.fields) > 1 for group in descriptor.oneofs):
+        """Return the offsets of the fields in a message.
+
+        Returns None if such messages must be decoded one by one with the protobuf package.
+        """
+        cls = self._message_class(channel)
+        empty_message, descriptor = cls(), cls.DESCRIPTOR
+        if not empty_message.IsInitialized() or any(
+            len(group.fields) > 1 for group in descriptor.oneofs
+        ):
             return None
         mask, fields = np.zeros(len(message), np.uint8), {}
         position = 0
         while position < len(message):
             start = position
-            tag, position = _varint(message, start)
-            number, wire = tag >> 3, tag & 7
-            begin = position
-            if wire == _VARINT:
-                _, position = _varint(message, begin)
-                mask[begin:position] = 0x80
-            elif wire in (_FIXED64, _FIXED32):
-                position += 8 if wire == _FIXED64 else 4
-            elif wire == _BYTES:
-                length, position = _varint(message, begin)
-                mask[begin:position] = 0xFF
+            tag, position = _read_varint(message, start)
+            number, wire_type = tag >> 3, tag & 7
+            value_start = position
+            if wire_type == _VARINT_WIRE_TYPE:
+                _, position = _read_varint(message, value_start)
+                mask[value_start:position] = 0x80
+            elif wire_type in (_FIXED64_WIRE_TYPE, _FIXED32_WIRE_TYPE):
+                position += 8 if wire_type == _FIXED64_WIRE_TYPE else 4
+            elif wire_type == _BYTES_WIRE_TYPE:
+                length, position = _read_varint(message, value_start)
+                mask[value_start:position] = 0xFF
                 position += length
             else:
                 return None
             if (
-                not 1 <= number <= _MOST_FIELD_NUMBER
+                not 1 <= number <= _MAX_FIELD_NUMBER
                 or position > len(message)
-                or begin - start > _MOST_TAG_BYTES
-                or (wire == _VARINT and position - begin > _MOST_VARINT_BYTES)
+                or value_start - start > _MAX_TAG_BYTES
+                or (wire_type == _VARINT_WIRE_TYPE and position - value_start > _MAX_VARINT_BYTES)
             ):
                 return None
-            mask[start:begin] = 0xFF
-            declared = descriptor.fields_by_number.get(number)
-            if declared is not None:
-                kind = self._kind(declared, wire)
-                if kind is None:
+            mask[start:value_start] = 0xFF
+            field_descriptor = descriptor.fields_by_number.get(number)
+            if field_descriptor is not None:
+                conversion = self._array_conversion(field_descriptor, wire_type)
+                if conversion is None:
                     return None
-                fields[declared.name] = (declared.name, begin, position - begin, kind)
+                fields[field_descriptor.name] = (
+                    field_descriptor.name,
+                    value_start,
+                    position - value_start,
+                    conversion,
+                )
         names = self.dtype.names or ()
-        absent = {name: getattr(empty, name, 0) for name in names if name not in fields}
-        if any(absent.values()):  # not zero by default, and possibly out of range
+        absent_fields = {
+            name: getattr(empty_message, name, 0) for name in names if name not in fields
+        }
+        if any(absent_fields.values()):  # not zero by default, and possibly out of range
             return None
         return _FieldOffsets(
             mask,
             np.frombuffer(message, np.uint8) & mask,
             tuple(entry for name, entry in fields.items() if name in names),
-            tuple(absent),
+            tuple(absent_fields),
         )
 
-    def _kind(self, declared: "FieldDescriptor | UpbFieldDescriptor", wire: int) -> str | None:
-        """Return how to read a field of many messages at once; None if that is impossible."""
-        kinds = _SAME.get(self._layout.types.get(declared.name, ""), {})
-        for name, kind in kinds.items():
-            if declared.type == getattr(declared, name):
-                needed = {"<f8": _FIXED64, "<i8": _FIXED64, "<f4": _FIXED32, "<u4": _FIXED32}
-                return kind if wire == needed.get(kind, _VARINT) else None
+    def _array_conversion(
+        self, field_descriptor: "FieldDescriptor | UpbFieldDescriptor", wire_type: int
+    ) -> str | None:
+        """Return the NumPy type, "varint" or "varint32" that decodes a field in many messages.
+
+        Returns None if the field must be decoded message by message. `wire_type` is the number of
+        the protobuf wire type.
+        """
+        conversions = _LOSSLESS_CONVERSIONS.get(
+            self._layout.types.get(field_descriptor.name, ""), {}
+        )
+        for name, conversion in conversions.items():
+            if field_descriptor.type == getattr(field_descriptor, name):
+                required_wire_types = {
+                    "<f8": _FIXED64_WIRE_TYPE,
+                    "<i8": _FIXED64_WIRE_TYPE,
+                    "<f4": _FIXED32_WIRE_TYPE,
+                    "<u4": _FIXED32_WIRE_TYPE,
+                }
+                return (
+                    conversion
+                    if wire_type == required_wire_types.get(conversion, _VARINT_WIRE_TYPE)
+                    else None
+                )
         return None
 
-    def _decode_single(
+    def _decode_one_by_one(
         self,
         channel: int,
         messages: list[bytes],
         indices: npt.NDArray[np.int64],
         out: npt.NDArray[np.void],
     ) -> None:
-        """Decode messages with protobuf, absent fields as 0."""
-        self._single += len(messages)
-        if self._single > limits.MAX_SINGLE_MESSAGES:
+        """Decode messages one by one with the protobuf package; absent fields become 0."""
+        self._single_messages += len(messages)
+        if self._single_messages > limits.MAX_SINGLE_MESSAGES:
             raise SessionError(
                 f"{self._path}: more than {limits.MAX_SINGLE_MESSAGES} messages of "
                 f"{self._layout.topic} differ so much from one another that they would have to be "
                 "decoded one by one, which would take too long. The writing program must write all "
                 "fields of every message, in one order."
             )
-        decode = self._class(channel).FromString
+        decode = self._message_class(channel).FromString
         decoded = [decoded_message(self._path, self._layout.topic, decode, m) for m in messages]
         names = self.dtype.names or ()
         try:
@@ -423,34 +476,32 @@ class MessageDecoder:
                 "format."
             ) from None
 
-    def _class(self, channel: int) -> "type[Message]":
-        """Return the class that decodes the messages of a channel of the topic."""
-        found = self._classes.get(channel)
-        if found is None:
+    def _message_class(self, channel: int) -> "type[Message]":
+        """Return the protobuf class that decodes the messages of a channel."""
+        decoding_class = self._classes.get(channel)
+        if decoding_class is None:
             assert self._contents is not None
-            found = class_of_channel(self._path, self._contents, channel)
-            self._classes[channel] = found
-        return found
+            decoding_class = class_of_channel(self._path, self._contents, channel)
+            self._classes[channel] = decoding_class
+        return decoding_class
 
     def _has_fixed_schema(self, contents: McapContents, channel: int) -> bool:
-        known = self._fixed.get(channel)
-        if known is None:
+        """Return whether a channel's schema is that of the fixed layout."""
+        is_fixed = self._is_fixed_schema.get(channel)
+        if is_fixed is None:
             self._contents = contents
-            known = self._fixed[channel] = self._check_schema(contents, channel)
-        return known
+            is_fixed = self._is_fixed_schema[channel] = self._check_schema(contents, channel)
+        return is_fixed
 
     def _check_schema(self, contents: McapContents, channel_id: int) -> bool:
-        """Return whether a schema gives every field the number and type of the fixed layout.
+        """Return whether a channel's schema has the field numbers and types of the fixed layout.
 
-        Raises
-        ------
-        SessionError
-            If messages of that schema cannot be decoded to the layout's fields at all.
+        Raises SessionError if its messages cannot be decoded to the layout's fields at all.
         """
         layout, path = self._layout, self._path
         channel = contents.channels[channel_id]
         schema = contents.schemas.get(channel.schema_id)
-        if len(self._fixed) >= limits.MAX_CHANNELS:
+        if len(self._is_fixed_schema) >= limits.MAX_CHANNELS:
             raise SessionError(
                 f"{path} has more than {limits.MAX_CHANNELS} channels {layout.topic}. The writing "
                 "program must put all such messages into one."
@@ -462,45 +513,48 @@ class MessageDecoder:
             and schema.data == schema_data(layout.schema_name)
         ):
             return True
-        decoding = self._class(channel_id)
-        empty = decoding()
-        fixed = True
-        for number, (name, kind) in enumerate(layout.types.items(), start=1):
-            declared = decoding.DESCRIPTOR.fields_by_name.get(name)
-            if declared is None:
+        decoding_class = self._message_class(channel_id)
+        empty_message = decoding_class()
+        is_fixed = True
+        for number, (name, protobuf_type) in enumerate(layout.types.items(), start=1):
+            field_descriptor = decoding_class.DESCRIPTOR.fields_by_name.get(name)
+            if field_descriptor is None:
                 if name in layout.required:
                     raise SessionError(
                         f"{path}: the schema of {layout.topic} has no field {name}, which is "
-                        f"required there, of type {kind}."
+                        f"required there, of type {protobuf_type}."
                     )
-                fixed = False
+                is_fixed = False
                 continue
             # The default value distinguishes singular numbers from everything else.
-            if not isinstance(getattr(empty, name), float | int if kind == "double" else int):
+            if not isinstance(
+                getattr(empty_message, name), float | int if protobuf_type == "double" else int
+            ):
                 raise SessionError(
                     f"{path}: the field {name} of {layout.topic} is not of a type that can be read "
-                    f"as {kind}, which it should be."
+                    f"as {protobuf_type}, which it should be."
                 )
-            expected = getattr(declared, f"TYPE_{kind.upper()}")
-            fixed = fixed and declared.number == number and declared.type == expected
-        return fixed
+            expected_type = getattr(field_descriptor, f"TYPE_{protobuf_type.upper()}")
+            is_fixed = (
+                is_fixed
+                and field_descriptor.number == number
+                and field_descriptor.type == expected_type
+            )
+        return is_fixed
 
 
 def class_of_channel(path: Path, contents: McapContents, channel_id: int) -> "type[Message]":
-    """Return the class that decodes the messages of a channel, by the schema in the file.
+    """Return the protobuf class that decodes the messages of a channel, from its schema.
 
-    Raises
-    ------
-    SessionError
-        If the channel is not protobuf, or its schema cannot be used.
+    Raises SessionError if the channel's encoding is not protobuf, or if its schema is unusable.
     """
     channel = contents.channels[channel_id]
     schema = contents.schemas.get(channel.schema_id)
     if channel.message_encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
         raise SessionError(
-            f"{path}: {channel.topic} has the encoding {quoted(channel.message_encoding)} and the "
-            f"schema encoding {quoted(schema.encoding if schema else '')}. A session file has "
-            "protobuf there, for both."
+            f"{path}: {channel.topic} has the encoding {quoted_excerpt(channel.message_encoding)} "
+            f"and the schema encoding {quoted_excerpt(schema.encoding if schema else '')}. A "
+            "session file has protobuf there, for both."
         )
     try:
         return message_class(schema.name, schema.data)
@@ -514,12 +568,9 @@ def class_of_channel(path: Path, contents: McapContents, channel_id: int) -> "ty
 def decoded_message(
     path: Path, topic: str, decode: "Callable[[bytes], Message]", data: bytes
 ) -> "Message":
-    """Decode a message.
+    """Return the protobuf message that `decode` makes from its bytes.
 
-    Raises
-    ------
-    SessionError
-        If it contradicts its schema.
+    Raises SessionError if the bytes contradict the message's schema.
     """
     from google.protobuf.message import DecodeError
 
@@ -532,36 +583,39 @@ def decoded_message(
         ) from None
 
 
-def quoted(text: str) -> str:
-    """Quote a value of the file, which may be of any length and contain anything."""
+def quoted_excerpt(text: str) -> str:
+    """Return a text from a file in quotes, with escaped characters, and cut to 40 characters."""
     return repr(text if len(text) <= 40 else text[:40] + "…")
 
 
-def _take_at_offsets(
+def _decode_at_offsets(
     layout: _FieldOffsets,
     rows: npt.NDArray[np.uint8],
     indices: npt.NDArray[np.int64],
     out: npt.NDArray[np.void],
 ) -> None:
-    """Decode messages (n, bytes) of one layout to `indices` of the array."""
+    """Decode messages `rows` (n, bytes) of one field layout into elements `indices` of `out`."""
     rows = np.ascontiguousarray(rows)
     count, size = rows.shape
-    for name, first, length, kind in layout.fields:
-        if kind.startswith("varint"):
+    for name, first, length, conversion in layout.fields:
+        if conversion.startswith("varint"):
             value = np.zeros(count, np.uint64)
             for i in range(length):
                 value |= (rows[:, first + i] & 0x7F).astype(np.uint64) << np.uint64(7 * i)
-            if kind == "varint32":
+            if conversion == "varint32":
                 value &= np.uint64(0xFFFFFFFF)
             out[name][indices] = value.astype(out.dtype[name])
         else:
-            out[name][indices] = np.ndarray(count, kind, rows, first, (size,))
-    for name in layout.absent:
+            out[name][indices] = np.ndarray(count, conversion, rows, first, (size,))
+    for name in layout.absent_fields:
         out[name][indices] = 0
 
 
-def _varint(data: bytes, position: int) -> tuple[int, int]:
-    """Return a number and the offset of its end; negative, with an end behind the data, if none."""
+def _read_varint(data: bytes, position: int) -> tuple[int, int]:
+    """Return the varint at `position` and the offset of its end.
+
+    Returns -1 and an offset after the end of `data` if there is no complete varint.
+    """
     value = 0
     for i, byte in enumerate(data[position : position + 10]):
         value |= (byte & 0x7F) << 7 * i

@@ -18,7 +18,7 @@ from rigd.session import limits
 from rigd.session._errors import SessionAccessError, SessionError
 from rigd.session._mcap_limits import McapError, McapTooLargeError
 from rigd.session._mcap_reader import McapContents, MessageBlock, OnBlock, read_mcap
-from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD
+from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD_FORMAT
 from rigd.session._message_decoder import (
     CONTROLS,
     SAMPLES,
@@ -28,7 +28,7 @@ from rigd.session._message_decoder import (
     MessageLayout,
     class_of_channel,
     decoded_message,
-    quoted,
+    quoted_excerpt,
 )
 from rigd.session._schema import EVENT_LEVELS, EVENT_TOPIC, FORMAT_VERSION, SAMPLE_TOPIC
 from rigd.session._writer import is_being_written
@@ -38,66 +38,67 @@ from rigd.units import unit_of
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
-SURVEY_FIELDS: Final = ("t_ns", "tick", "status")
-"""Fields that give the number of samples, their order and their flags."""
+ORDER_AND_FLAG_FIELDS: Final = ("t_ns", "tick", "status")
+"""Sample fields that are read to learn number, order and flags of the samples, without signals."""
 MAX_EVENTS: Final = 100_000
-"""Most lines of a session's log that are read."""
+"""Maximum number of events that are read from a session's log."""
 MAX_EVENT_BYTES: Final = 1 << 20
-"""Longest message of the log that is read; of a longer one its length is stated."""
+"""Maximum length in bytes of a log message that is read; a longer one is replaced by its length."""
 MAX_LOG_BYTES: Final = 16 << 20
-"""Most of the log that is read."""
+"""Maximum total length in bytes of the log messages that are read."""
 
-_GROWTH: Final = 1 << 16
-_BYTES_A_SAMPLE: Final = 60
-"""Least size of a sample in the file, unless it repeats itself."""
-_LONGEST_NUMBER: Final = 400
-"""Characters: the longest finite number in decimal, without its fraction, has 309."""
+_MIN_ARRAY_GROWTH: Final = 1 << 16
+"""Minimum number of messages by which the array of decoded messages grows."""
+_MIN_SAMPLE_BYTES: Final = 60
+"""Assumed minimum size of a sample in the file, in bytes after compression."""
+_MAX_NUMBER_CHARACTERS: Final = 400
+"""Maximum length of a number's text: the longest finite number has 309 digits before the point."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoggedEvent:
-    """Line of a session's log."""
+    """Event in the log of a session file."""
 
     t_ns: int
-    """ns since the session start."""
+    """Time of the event in nanoseconds since the session start."""
     level: str
-    """"unknown", "debug", "info", "warning", "error" or "fatal"."""
+    """Severity: "unknown", "debug", "info", "warning", "error" or "fatal"."""
     name: str
-    """Process or part that logged it."""
+    """Name of the process or component that logged the event."""
     message: str
-    """Text for the operator."""
+    """Text of the event for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A recorded session."""
+    """Content of a session file: samples, metadata, log and attachments."""
 
     path: Path
-    """The file."""
+    """Path of the session file."""
     samples: npt.NDArray[np.void]
-    """(n,) of ``SAMPLE_DTYPE``, ticks strictly increasing."""
+    """Samples, an array (n,) of ``SAMPLE_DTYPE`` with strictly increasing ticks."""
     start_utc_ns: int
-    """Wall clock at tick 0, ns since the Unix epoch."""
+    """Wall-clock time of tick 0, in nanoseconds since the Unix epoch."""
     metadata: dict[str, str]
-    """The record ``session``."""
+    """Record ``session``: key → text."""
     segments: dict[str, tuple[int, int]]
-    """Name → first tick and end (exclusive); may be empty."""
+    """Segment name → first tick and end tick (exclusive). It may be empty."""
     outcome: dict[str, str] | None
-    """End of the session; None if the file does not state it."""
+    """Record ``outcome``: how the session ended; None if the file does not state it."""
     events: list[LoggedEvent]
-    """Its log, in the order of time."""
+    """Events of the session's log, in the order of the file."""
     attachments: dict[str, bytes]
-    """Name → contents."""
-    events_left_out: int = 0
-    """Number of further log lines, which exceeded the limit."""
+    """Name of an attached file → its contents."""
+    omitted_event_count: int = 0
+    """Number of further events in the file, which were not read because of the limits."""
 
     def number(self, key: str, default: float | None = None) -> float:
-        """Return a number of the metadata.
+        """Return the number that the metadata states for a key.
 
         Parameters
         ----------
-        key : key of the record ``session``; its suffix is its unit
-        default : returned without that key; None if the key is required
+        key : key of the record ``session``; its suffix is the unit
+        default : number to return if the key is missing; None if the key is required
 
         Raises
         ------
@@ -114,13 +115,13 @@ class Session:
                 f"state it as a number{unit}."
             )
         try:
-            value = float(text) if len(text) <= _LONGEST_NUMBER else float("nan")
+            value = float(text) if len(text) <= _MAX_NUMBER_CHARACTERS else float("nan")
         except ValueError:
             value = float("nan")
         if not isfinite(value):
             raise SessionError(
-                f"{self.path}: {key} in the metadata 'session' is {quoted(text)}, which is not a "
-                f"finite number. The writing program must state it as a number{unit}."
+                f"{self.path}: {key} in the metadata 'session' is {quoted_excerpt(text)}, which is "
+                f"not a finite number. The writing program must state it as a number{unit}."
             )
         return value
 
@@ -132,14 +133,14 @@ def read_session(
     max_samples: int = limits.MAX_SAMPLES,
     on_samples: Callable[[npt.NDArray[np.void]], None] | None = None,
 ) -> Session:
-    """Read a whole session file.
+    """Read a complete session file: samples, metadata, log and attachments.
 
     Parameters
     ----------
-    path : a complete file as docs/session_format.md defines it
-    fields : fields of the samples to read, ``tick`` and ``t_ns`` among them; default all
-    max_samples : most samples that are stored; they take up to 112 bytes each
-    on_samples : called with all fields of the samples, block by block, as they are read
+    path : path of a complete file, whose format docs/session_format.md defines
+    fields : sample fields to store, which must include ``tick`` and ``t_ns``; None for all
+    max_samples : maximum number of samples, each of which takes up to 112 bytes of memory
+    on_samples : called with each block of samples, with all fields, while the file is read
 
     Raises
     ------
@@ -157,20 +158,20 @@ def read_session(
     21500 0.98
     """
     path = Path(path)
-    log = _Log()
+    log = _UndecodedLog()
     samples = TopicBuffer(path, SAMPLES, fields, max_samples, on_samples)
 
-    def take(contents: McapContents, block: MessageBlock) -> None:
-        samples.decoder.take(contents, block)
-        log.take(contents, block)
+    def add_block(contents: McapContents, block: MessageBlock) -> None:
+        samples.decoder.add_block(contents, block)
+        log.add_block(contents, block)
 
-    contents = _load(path, (SAMPLE_TOPIC, EVENT_TOPIC), take)
+    contents = _load_sound_contents(path, (SAMPLE_TOPIC, EVENT_TOPIC), add_block)
     metadata = merged_metadata(contents, "session") or {}
     version = metadata.get("format_version", FORMAT_VERSION)
     if version != FORMAT_VERSION:
         raise SessionError(
-            f"{path} is of session format version {quoted(version)}, and this program reads "
-            f"version {FORMAT_VERSION}. Use a newer version of it."
+            f"{path} is of session format version {quoted_excerpt(version)}, and this program "
+            f"reads version {FORMAT_VERSION}. Use a newer version of it."
         )
     array = samples.finish(contents)
     _check_ticks(path, array)
@@ -180,20 +181,20 @@ def read_session(
         samples=array,
         start_utc_ns=start_utc_ns,
         metadata=metadata,
-        segments=_segments(path, merged_metadata(contents, "segments") or {}),
+        segments=_parsed_segments(path, merged_metadata(contents, "segments") or {}),
         outcome=merged_metadata(contents, "outcome"),
         events=log.events(path, contents, start_utc_ns),
         attachments={attachment.name: attachment.data for attachment in contents.attachments},
-        events_left_out=log.left_out,
+        omitted_event_count=log.omitted_count,
     )
 
 
 def read_timings(path: str | PathLike[str]) -> npt.NDArray[np.void]:
-    """Read the ages of the readings of a session file.
+    """Read the ages of the angle and wrench readings at each tick of a session.
 
     Returns
     -------
-    array (n,) of ``TIMING_DTYPE``; empty if the file has none
+    array (n,) of ``TIMING_DTYPE``; empty if the file contains no ages
 
     Raises
     ------
@@ -204,11 +205,11 @@ def read_timings(path: str | PathLike[str]) -> npt.NDArray[np.void]:
 
 
 def read_controls(path: str | PathLike[str]) -> npt.NDArray[np.void]:
-    """Read the controller's terms of a session file.
+    """Read the torques of the controller's terms (proportional, integral, …) in a session.
 
     Returns
     -------
-    array (n,) of ``CONTROL_DTYPE``; empty if the file has none
+    array (n,) of ``CONTROL_DTYPE``; empty if the file contains no controller terms
 
     Raises
     ------
@@ -219,11 +220,11 @@ def read_controls(path: str | PathLike[str]) -> npt.NDArray[np.void]:
 
 
 def read_touches(path: str | PathLike[str]) -> npt.NDArray[np.void]:
-    """Read the estimated touches of a session file.
+    """Read the contacts of the beam with an obstacle that were estimated during a session.
 
     Returns
     -------
-    array (n,) of ``TOUCH_DTYPE``; empty if the file has none
+    array (n,) of ``TOUCH_DTYPE``; empty if the file contains no touches
 
     Raises
     ------
@@ -234,20 +235,21 @@ def read_touches(path: str | PathLike[str]) -> npt.NDArray[np.void]:
 
 
 def _read_topic(path: Path, layout: MessageLayout) -> npt.NDArray[np.void]:
+    """Return all messages of one topic of a session file as an array (n,)."""
     buffer = TopicBuffer(path, layout, None, limits.MAX_SAMPLES)
-    return buffer.finish(_load(path, (layout.topic,), buffer.decoder.take))
+    return buffer.finish(_load_sound_contents(path, (layout.topic,), buffer.decoder.add_block))
 
 
 class TopicBuffer:
-    """Decoded messages of a topic, in an array that grows with the file.
+    """Growing array of the decoded messages of one topic.
 
     Parameters
     ----------
-    path : the file, for error messages
+    path : path of the file, for its size and for error messages
     layout : layout of the messages
-    fields : fields to store; None for all
-    most : most messages that may be stored
-    on_messages : called with all fields of the messages, block by block
+    fields : names of the fields to store; None for all
+    max_messages : maximum number of messages; more of them raise an error
+    on_messages : called with each block of messages, with all fields
     """
 
     def __init__(
@@ -255,103 +257,106 @@ class TopicBuffer:
         path: Path,
         layout: MessageLayout,
         fields: Sequence[str] | None,
-        most: int,
+        max_messages: int,
         on_messages: Callable[[npt.NDArray[np.void]], None] | None = None,
     ) -> None:
         self.decoder = MessageDecoder(path, layout, self, None if on_messages else fields)
         self._path = path
         self._topic = layout.topic
-        self._most = most
+        self._max_messages = max_messages
         self._on_messages = on_messages
         # Unused memory of the array is never allocated, and most files need no more.
-        expected = min(_file_size(path) // _BYTES_A_SAMPLE, most)
-        self._array = np.empty(expected, layout.dtype_of(fields))
-        self._length = 0
+        expected_messages = min(_file_size(path) // _MIN_SAMPLE_BYTES, max_messages)
+        self._array = np.empty(expected_messages, layout.dtype_of(fields))
+        self._message_count = 0
 
-    def room(self, count: int) -> npt.NDArray[np.void]:
-        """Return room for messages; see `rigd.session._message_decoder.MessageSink`."""
-        end = self._length + count
-        if end > self._most:
+    def array_for(self, count: int) -> npt.NDArray[np.void]:
+        """Return the array elements for the next `count` messages.
+
+        Raises SessionError if there are more than the maximum number of messages.
+        """
+        end = self._message_count + count
+        if end > self._max_messages:
             raise SessionError(
-                f"{self._path} holds more than the {self._most} messages of {self._topic} that fit "
-                "into the memory that reading a session may take. Give a shorter session."
+                f"{self._path} holds more than the {self._max_messages} messages of {self._topic} "
+                "that fit into the memory that reading a session may take. Give a shorter session."
             )
         if end > len(self._array):
             # Resized without a copy, by a small fraction: two arrays would take too much memory.
-            grown = max(end, len(self._array) + max(_GROWTH, len(self._array) // 8))
-            self._array.resize(min(grown, self._most), refcheck=False)
+            new_length = max(end, len(self._array) + max(_MIN_ARRAY_GROWTH, len(self._array) // 8))
+            self._array.resize(min(new_length, self._max_messages), refcheck=False)
         if self._on_messages is not None:
             return np.empty(count, self.decoder.dtype)
-        return self._array[self._length : end]
+        return self._array[self._message_count : end]
 
     def store(self, messages: npt.NDArray[np.void]) -> None:
-        """Count the messages, which are in the array already unless all fields are requested."""
-        end = self._length + len(messages)
+        """Include the decoded messages in the array, after passing them to `on_messages`."""
+        end = self._message_count + len(messages)
         if self._on_messages is not None:
             self._on_messages(messages)
-            to_native(messages, self._array.dtype.names or (), self._array[self._length : end])
-        self._length = end
+            to_native(
+                messages, self._array.dtype.names or (), self._array[self._message_count : end]
+            )
+        self._message_count = end
 
     def finish(self, contents: McapContents) -> npt.NDArray[np.void]:
-        """Return the stored messages.
+        """Decode the remaining messages, and return all of them as an array (n,).
 
-        Raises
-        ------
-        SessionError
-            If the messages violate the format, or there are too many.
+        Raises SessionError if the messages violate the format, or if there are too many.
         """
         self.decoder.finish(contents)
-        self._array.resize(self._length, refcheck=False)
+        self._array.resize(self._message_count, refcheck=False)
         return self._array
 
 
 def _file_size(path: Path) -> int:
+    """Return the length of a file in bytes, or 0 if it cannot be determined."""
     try:
         return path.stat().st_size
     except OSError:  # reported when the file is opened
         return 0
 
 
-class _Log:
-    """Messages of the session's log, up to a limit of memory."""
+class _UndecodedLog:
+    """Undecoded messages of a session's log, up to limits of their number and length."""
 
     def __init__(self) -> None:
         self.first_log_time: int | None = None
-        """Log time of the first sample."""
-        self.left_out = 0
-        """Number of messages of the log that were not stored."""
-        self._stored: list[tuple[int, int, bytes | int]] = []
-        """Channel, log time, and data or its length."""
-        self._bytes = 0
+        """Log time of the file's first sample, in nanoseconds since the Unix epoch."""
+        self.omitted_count = 0
+        """Number of log messages that were not stored because of the limits."""
+        self._stored_messages: list[tuple[int, int, bytes | int]] = []
+        """For each log message: channel, log time in ns, and its data or the length of it."""
+        self._stored_bytes = 0
 
-    def take(self, contents: McapContents, block: MessageBlock) -> None:
-        """Store the messages of the log."""
+    def add_block(self, contents: McapContents, block: MessageBlock) -> None:
+        """Store the log messages of a block, and the log time of the first sample."""
         records = block.records
         for channel, size, start, count in block.runs:
             topic = contents.channels[channel].topic
             if topic == SAMPLE_TOPIC:
                 if self.first_log_time is None:
-                    self.first_log_time = int(MESSAGE_HEAD.unpack_from(records, start)[4])
+                    self.first_log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, start)[4])
                 continue
-            room = MAX_EVENTS - len(self._stored)
-            for first in range(start, start + size * min(count, room), size):
-                log_time = int(MESSAGE_HEAD.unpack_from(records, first)[4])
-                length = size - MESSAGE_HEAD.size
+            remaining = MAX_EVENTS - len(self._stored_messages)
+            for first in range(start, start + size * min(count, remaining), size):
+                log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, first)[4])
+                length = size - MESSAGE_HEAD_FORMAT.size
                 if length > MAX_EVENT_BYTES:
-                    self._stored.append((channel, log_time, length))
-                elif self._bytes + length > MAX_LOG_BYTES:
-                    self.left_out += 1
+                    self._stored_messages.append((channel, log_time, length))
+                elif self._stored_bytes + length > MAX_LOG_BYTES:
+                    self.omitted_count += 1
                 else:
-                    self._bytes += length
-                    data = bytes(records[first + MESSAGE_HEAD.size : first + size])
-                    self._stored.append((channel, log_time, data))
-            self.left_out += max(count - room, 0)
+                    self._stored_bytes += length
+                    data = bytes(records[first + MESSAGE_HEAD_FORMAT.size : first + size])
+                    self._stored_messages.append((channel, log_time, data))
+            self.omitted_count += max(count - remaining, 0)
 
     def events(self, path: Path, contents: McapContents, start_utc_ns: int) -> list[LoggedEvent]:
-        """Decode the log; one that is not protobuf is left out, because no reader needs it."""
+        """Return the decoded log messages; a log whose encoding is not protobuf is left out."""
         events: list[LoggedEvent] = []
         decoders: dict[int, Callable[[bytes], Message]] = {}
-        for channel, log_time, data in self._stored:
+        for channel, log_time, data in self._stored_messages:
             if contents.channels[channel].message_encoding != "protobuf":
                 continue
             t_ns = log_time - start_utc_ns
@@ -368,22 +373,22 @@ class _Log:
                     )
                 decoders[channel] = class_of_channel(path, contents, channel).FromString
             message = decoded_message(path, EVENT_TOPIC, decoders[channel], data)
-            events.append(_event(message, t_ns))
+            events.append(_decoded_event(message, t_ns))
         return events
 
 
-def _load(path: Path, topics: Sequence[str], take: OnBlock) -> McapContents:
-    """Read the container of a session file that must be complete and sound."""
-    contents = load_contents(path, topics, take=take)
+def _load_sound_contents(path: Path, topics: Sequence[str], on_block: OnBlock) -> McapContents:
+    """Return the contents of a session file; raise if it is incomplete or damaged."""
+    contents = load_contents(path, topics, on_block=on_block)
     if contents.damage is not None:
         raise SessionError(_damage_message(path, contents))
     if SAMPLE_TOPIC not in {channel.topic for channel in contents.channels.values()}:
-        raise no_session(path)
+        raise no_samples_error(path)
     return contents
 
 
-def no_session(path: Path) -> SessionError:
-    """Return the error of an MCAP file without samples' channel."""
+def no_samples_error(path: Path) -> SessionError:
+    """Return the error for an MCAP file that has no channel of samples."""
     return SessionError(
         f"{path} is an MCAP file without the channel {SAMPLE_TOPIC}, so it is not a session. "
         "Give a file that `rigd run` or a program following docs/session_format.md recorded."
@@ -394,57 +399,51 @@ def load_contents(
     path: Path,
     topics: Sequence[str] | None,
     *,
-    take: OnBlock | None = None,
+    on_block: OnBlock | None = None,
     salvage: bool = False,
     on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
-    """Read the container of a file as far as it is sound.
+    """Return the contents of an MCAP file up to its end or its first damage.
 
-    Parameters
-    ----------
-    path : the file
-    topics, take, salvage, on_progress : see `rigd.session._mcap_reader.read_mcap`
-
-    Raises
-    ------
-    SessionError
-        If the file is missing, empty, too large or not an MCAP file.
+    The arguments are those of `rigd.session._mcap_reader.read_mcap`. Raises SessionError if the
+    file is missing, empty, too large or not an MCAP file.
     """
-    with opened(path) as file:
+    with open_mcap_file(path) as file:
         mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         return read_mcap(
-            memoryview(mapped), topics, take=take, salvage=salvage, on_progress=on_progress
+            memoryview(mapped), topics, on_block=on_block, salvage=salvage, on_progress=on_progress
         )
 
 
 def check_beginning(path: Path) -> None:
-    """Check that a file begins as a session file.
+    """Raise if a file does not begin with the magic bytes of an MCAP file.
 
     Raises
     ------
     SessionError
-        If it is missing, empty or not an MCAP file.
+        If the file is missing, empty or not an MCAP file.
     """
-    with opened(path) as file:
+    with open_mcap_file(path) as file:
         read_mcap(memoryview(file.read(len(MAGIC))), ())
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a file; turn errors while it is read as MCAP into session errors."""
+def open_mcap_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file for reading, and convert errors of the enclosed code into SessionError."""
     try:
-        _refuse_no_file(path)
+        _require_nonempty_file(path)
         with path.open("rb") as file:
             yield file
     except OSError as error:
-        raise _unreadable(path, error) from None
+        raise _access_error(path, error) from None
     except McapTooLargeError as error:
         raise SessionError(f"{path} {error}. Give a shorter session.") from None
     except McapError as error:
-        raise _not_mcap(path, error) from None
+        raise _format_error(path, error) from None
 
 
-def _refuse_no_file(path: Path) -> None:
+def _require_nonempty_file(path: Path) -> None:
+    """Raise if the path is not that of a regular file, or if the file is empty."""
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise SessionError(f"{path} is not a file. Give the path of a session file (*.mcap).")
@@ -452,40 +451,49 @@ def _refuse_no_file(path: Path) -> None:
         raise SessionError(f"{path} is empty, nothing was recorded to it. Record it again.")
 
 
-def _unreadable(path: Path, error: OSError) -> SessionAccessError:
+def _access_error(path: Path, error: OSError) -> SessionAccessError:
+    """Return the error for a file that the operating system does not let the program read."""
     return SessionAccessError(
         f"{path} cannot be read: {error.strerror or error}. Check the path and its permissions."
     )
 
 
-def _not_mcap(path: Path, error: McapError) -> SessionError:
+def _format_error(path: Path, error: McapError) -> SessionError:
+    """Return the error for a file that is not a usable MCAP file."""
     return SessionError(f"{path} {error}. Give a session file (*.mcap).")
 
 
 def _damage_message(path: Path, contents: McapContents) -> str:
-    from rigd.session._recovery import remedy  # imported here, because it imports this module
+    """Return the error message for an incomplete or damaged file, with the remedy."""
+    from rigd.session._recovery import (
+        recovery_advice,
+    )  # imported here, because it imports this module
 
     if contents.complete:
-        return f"{path} is damaged: it {contents.damage}{remedy(path, was_whole=True)}"
+        return f"{path} is damaged: it {contents.damage}{recovery_advice(path, was_whole=True)}"
     if is_being_written(path):
         return (
             f"{path} is incomplete, because it is still being recorded. Wait for the end of the "
             "session, or stop it."
         )
-    return f"{path} is incomplete: it {contents.damage}{remedy(path, was_whole=False)}"
+    return f"{path} is incomplete: it {contents.damage}{recovery_advice(path, was_whole=False)}"
 
 
 def merged_metadata(contents: McapContents, name: str) -> dict[str, str] | None:
-    """Return the metadata of one name, later records over earlier ones; None without any."""
+    """Return the metadata records of one name as one dictionary, or None if there are none.
+
+    A later record replaces the values of an earlier one.
+    """
     records = [record.metadata for record in contents.metadata if record.name == name]
     return {key: value for record in records for key, value in record.items()} if records else None
 
 
 def _check_ticks(path: Path, samples: npt.NDArray[np.void]) -> None:
+    """Raise if the ticks do not increase from each sample to the next."""
     ticks = samples["tick"]
-    backward = np.flatnonzero(ticks[1:] <= ticks[:-1])
-    if len(backward):
-        first = int(backward[0])
+    backward_indices = np.flatnonzero(ticks[1:] <= ticks[:-1])
+    if len(backward_indices):
+        first = int(backward_indices[0])
         raise SessionError(
             f"{path}: tick {ticks[first + 1]} follows tick {ticks[first]} in {SAMPLE_TOPIC}, but "
             "ticks must increase from sample to sample. Those that do are saved with `rigd recover "
@@ -496,21 +504,25 @@ def _check_ticks(path: Path, samples: npt.NDArray[np.void]) -> None:
 def _start_utc_ns(
     path: Path, metadata: dict[str, str], log_time: int | None, samples: npt.NDArray[np.void]
 ) -> int:
-    """Return the wall clock at tick 0; `log_time` is that of the first sample."""
+    """Return the wall-clock time of tick 0 in nanoseconds since the Unix epoch, or 0 if unknown.
+
+    It is taken from the metadata, or from `log_time`, the log time of the first sample.
+    """
     text = metadata.get("start_utc_ns")
     if text is not None:
         if text.isascii() and text.isdigit() and len(text) < 20:
             return int(text)
         raise SessionError(
-            f"{path}: start_utc_ns in the metadata 'session' is {quoted(text)}. The writing "
-            "program must state it as a whole number of ns since 1970, or leave it out."
+            f"{path}: start_utc_ns in the metadata 'session' is {quoted_excerpt(text)}. The "
+            "writing program must state it as a whole number of ns since 1970, or leave it out."
         )
     if log_time is not None and len(samples):
         return log_time - int(samples["t_ns"][0])
     return 0
 
 
-def _segments(path: Path, texts: dict[str, str]) -> dict[str, tuple[int, int]]:
+def _parsed_segments(path: Path, texts: dict[str, str]) -> dict[str, tuple[int, int]]:
+    """Return the segments (name → first tick, end tick) from the texts of the record."""
     segments = {}
     for name, text in texts.items():
         numbers = text.split(",")
@@ -519,25 +531,26 @@ def _segments(path: Path, texts: dict[str, str]) -> dict[str, tuple[int, int]]:
             or len(text) > 40
         ):
             raise SessionError(
-                f"{path}: the segment {quoted(name)} is {quoted(text)}. The writing program "
-                "must state it as 'first,end', two whole numbers of ticks."
+                f"{path}: the segment {quoted_excerpt(name)} is {quoted_excerpt(text)}. The "
+                "writing program must state it as 'first,end', two whole numbers of ticks."
             )
         first, end = (int(n) for n in numbers)
         if end < first:
             raise SessionError(
-                f"{path}: the segment {quoted(name)} ends at tick {end}, before its first, "
+                f"{path}: the segment {quoted_excerpt(name)} ends at tick {end}, before its first, "
                 f"{first}. The writing program must correct it."
             )
         segments[name] = (first, end)
     return segments
 
 
-def _event(message: "Message", t_ns: int) -> LoggedEvent:
+def _decoded_event(message: "Message", t_ns: int) -> LoggedEvent:
+    """Return the event of a decoded log message."""
     level = getattr(message, "level", 0)
-    known = isinstance(level, int) and 0 <= level < len(EVENT_LEVELS)
+    is_known = isinstance(level, int) and 0 <= level < len(EVENT_LEVELS)
     return LoggedEvent(
         t_ns=t_ns,
-        level=EVENT_LEVELS[level if known else 0],
+        level=EVENT_LEVELS[level if is_known else 0],
         name=str(getattr(message, "name", "")),
         message=str(getattr(message, "message", "")),
     )

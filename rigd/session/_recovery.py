@@ -1,11 +1,12 @@
-"""Recovery of damaged session files: the intact part of one is written to a valid file.
+"""Recovery of damaged session files: the intact messages are written to a new valid file.
 
 Only verified data is used: messages, channels and schemas are in chunks with a checksum each, the
-records ``session`` and ``segments`` are taken from the copy in such a chunk, and attachments have a
-checksum of their own. The outcome counts only if the checksum of the whole data section is correct.
-A file of another writer may lack some checksums; it is recovered and marked as unprotected.
+records ``session`` and ``segments`` are taken from the copy in such a chunk, and each attachment
+has its own checksum. The record ``outcome`` is used only if the checksum of the whole data section
+is correct. The file of another program may lack some checksums. It is recovered and marked as
+unprotected.
 
-`remedy` states how much of an incomplete file can be recovered, and by which command.
+`recovery_advice` states how much of an incomplete file can be recovered, and by which command.
 """
 
 import contextlib
@@ -30,13 +31,18 @@ from rigd.session._mcap_reader import McapContents, MessageBlock, message_starts
 from rigd.session._mcap_writer import INDEX_DTYPE, LOG_TIME_OFFSET, McapWriter
 from rigd.session._message_decoder import SAMPLES, MessageDecoder
 from rigd.session._reader import (
-    SURVEY_FIELDS,
+    ORDER_AND_FLAG_FIELDS,
     TopicBuffer,
     load_contents,
     merged_metadata,
     read_session,
 )
-from rigd.session._schema import OWN_TOPICS, SAMPLE_TOPIC, protected_metadata, unprotected_metadata
+from rigd.session._schema import (
+    OWN_TOPICS,
+    SAMPLE_TOPIC,
+    metadata_for_channel,
+    metadata_from_channel,
+)
 from rigd.session._writer import (
     PART_SUFFIX,
     copy_new,
@@ -47,46 +53,49 @@ from rigd.session._writer import (
 from rigd.session.layout import SAMPLE_DTYPE, SAMPLE_FIELDS, Status
 
 RECOVERED_FROM: Final = "recovered_from"
-"""Key of the record ``outcome`` that marks a recovered file: the name of the one it is from."""
+"""Key of the record ``outcome`` of a recovered file; its value is the damaged file's name."""
 
 _SESSION_SUFFIX: Final = ".mcap"
 _RECOVERED_SUFFIX: Final = ".recovered.mcap"
-_LEAST_CHUNK_BYTES: Final = 1 << 14
-_LONG_CHUNK: Final = 4 << 20
-_MOST_CHUNKS: Final = 10_000
-"""Number of chunks after which they are made longer."""
-_MOST_CHANNELS: Final = 32
-"""Most channels that are copied, of the session's own topics and of others each."""
-_READING_FRACTION: Final = 0.3
-"""Fraction of the time of a recovery for reading."""
+_MIN_CHUNK_BYTES: Final = 1 << 14
+_LONG_CHUNK_BYTES: Final = 4 << 20
+"""Length of the collected messages, in bytes, above which a chunk is written in any case."""
+_CHUNKS_BEFORE_GROWTH: Final = 10_000
+"""Number of chunks after which new chunks become longer, since each one takes index space."""
+_MAX_COPIED_CHANNELS: Final = 32
+"""Maximum number of channels to copy with the session's own topics, and likewise with others."""
+_FIRST_READING_FRACTION: Final = 0.3
+"""Fraction of the reported progress at which the first reading of the damaged file ends."""
 
-_BEGINNING_BYTES: Final = 1 << 20
-"""Length of the beginning that contains the first samples, if there are any."""
+_SEARCHED_BYTES: Final = 1 << 20
+"""Number of bytes at the start of a file in which its first samples lie, if there are any."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """Result of a recovery."""
+    """Result of the recovery of a damaged session file."""
 
     source: Path
-    """The given file."""
+    """Path of the damaged file."""
     path: Path | None
-    """The new file; None if `source` is a sound session already."""
+    """Path of the new file, or None if `source` is a complete and intact session file."""
     samples: int
-    """Number of intact samples."""
+    """Number of recovered samples."""
     outcome: Mapping[str, str]
-    """The record ``outcome`` of the new file, with the losses."""
+    """Record ``outcome`` of the new file, with the counts of lost ticks."""
     damage: str | None
-    """Damage of `source`, a sentence's predicate; None if it is sound."""
+    """Description of the first damage, as the end of a sentence that begins with the file's name.
+
+    None if the file is intact."""
     bytes_lost: int
-    """Bytes of `source` after the last intact record."""
+    """Number of bytes of `source` after the last intact record."""
     skipped: tuple[str, ...]
-    """Damaged records before it that were left out, as predicates."""
+    """Descriptions of further damage that was left out, in the form of `damage`."""
     protected: bool
-    """Whether checksums cover rate, beam and segments."""
+    """Whether checksums cover the sample rate, the beam data and the segments."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the result as a document of JSON types."""
+        """Return the recovery's result as a dictionary that can be written as JSON."""
         return {
             "source": str(self.source),
             "path": None if self.path is None else str(self.path),
@@ -99,7 +108,7 @@ class Recovery:
         }
 
     def lines(self) -> list[str]:
-        """Return the result as lines of text."""
+        """Return the text lines that report the recovery's result to the operator."""
         if self.path is None:
             return [f"{self.source} is complete and intact; there is nothing to recover."]
         if self.damage is None:
@@ -109,7 +118,7 @@ class Recovery:
             ]
         lines = [
             f"{self.path}: {self.samples} samples recovered from {self.source}, which "
-            f"{self.damage}{_loss(self.bytes_lost)}."
+            f"{self.damage}{_loss_text(self.bytes_lost)}."
         ]
         lines += [f"Left out: {self.source} {skipped}." for skipped in self.skipped]
         if not self.protected:
@@ -121,7 +130,10 @@ class Recovery:
 
 
 def recovered_path(path: Path) -> Path:
-    """Return the path of the recovered file: ``X.mcap.part`` → ``X.mcap``, else a new name."""
+    """Return the path of the recovered file: ``X.mcap`` for ``X.mcap.part``.
+
+    For ``X.mcap`` the path is ``X.recovered.mcap``.
+    """
     if path.name.endswith(_SESSION_SUFFIX + PART_SUFFIX):
         return path.with_name(path.name.removesuffix(PART_SUFFIX))
     return path.with_name(path.name.removesuffix(_SESSION_SUFFIX) + _RECOVERED_SUFFIX)
@@ -130,23 +142,27 @@ def recovered_path(path: Path) -> Path:
 def recover(
     path: str | os.PathLike[str], on_progress: Callable[[float], None] | None = None
 ) -> Recovery:
-    """Write the intact part of a session file, up to the damage, to a new file in its folder.
+    """Write the intact part of a damaged session file to a new file in the same folder.
 
-    The original file is not changed. The new one gets its name when it is complete, on the disk,
-    and was read back.
+    The original file is not changed. The new file gets its name after it was written to the disk
+    completely and read back.
 
     Parameters
     ----------
-    path : an incomplete ``.part`` or a damaged session file
-    on_progress : called now and then with the completed fraction of the work
+    path : path of an incomplete ``.part`` file or of a damaged session file
+    on_progress : called repeatedly with the completed fraction of the work, from 0 to 1
+
+    Returns
+    -------
+    The path of the new file, the number of its samples, and descriptions of the damage.
 
     Raises
     ------
-        If the new name exists already.
-        If the new name is taken.
+    SessionExistsError
+        If a file with the name of the new file exists.
     SessionError
-        If the file cannot be read, is still being recorded, or has no sample before the damage; or
-        if the new one cannot be written.
+        If the file cannot be read, is still being recorded, or has no sample before the damage, or
+        if the new file cannot be written.
     """
     path = Path(path)
     if path.exists() and not path.is_file():  # reading a pipe would block
@@ -154,38 +170,43 @@ def recover(
     target = recovered_path(path)
     if is_being_written(path):
         raise SessionError(f"{path} is still being recorded. Wait for the end of the session.")
-    survey = _Survey(path)
+    selection = _SampleSelection(path)
     contents = load_contents(
-        path, None, take=survey.take, salvage=True,
-        on_progress=_part(on_progress, 0.0, _READING_FRACTION),
+        path, None, on_block=selection.add_block, salvage=True,
+        on_progress=_scaled_progress(on_progress, 0.0, _FIRST_READING_FRACTION),
     )  # fmt: skip
-    survey.finish(contents)
-    if contents.damage is None and not contents.skipped and survey.left_out is None:
-        return _recover_sound(path, target)
-    found = [contents.damage, *contents.skipped, survey.left_out]
-    damage, *others = [each for each in found if each is not None]
-    if not survey.retained.any():
+    selection.finish(contents)
+    if contents.damage is None and not contents.skipped and selection.order_error is None:
+        return _copy_sound_file(path, target)
+    damages = [contents.damage, *contents.skipped, selection.order_error]
+    damage, *other_damage = [each for each in damages if each is not None]
+    if not selection.is_copied.any():
         raise SessionError(
             f"{path} {damage}; no sample is intact before that, so there is nothing to recover."
         )
-    recovery = _plan(path, target, contents, survey, damage, others)
-    _refuse_taken(path, target)
-    with _new_file(path, target) as temporary:
-        expected = _write(
-            temporary, path, contents, survey, recovery, _part(on_progress, _READING_FRACTION, 1.0)
+    recovery = _planned_recovery(path, target, contents, selection, damage, other_damage)
+    _require_target_absent(path, target)
+    with _temporary_target(path, target) as temporary:
+        written_digest = _write_recovered_file(
+            temporary,
+            path,
+            contents,
+            selection,
+            recovery,
+            _scaled_progress(on_progress, _FIRST_READING_FRACTION, 1.0),
         )
-        written = SampleDigest()
+        read_back_digest = SampleDigest()
         try:
             read_session(
                 temporary,
-                fields=SURVEY_FIELDS,
-                max_samples=limits.MAX_SURVEYED,
-                on_samples=written.take,
+                fields=ORDER_AND_FLAG_FIELDS,
+                max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
+                on_samples=read_back_digest.add,
             )
         except SessionError as error:
-            named = str(error).replace(str(temporary), str(path))
-            raise SessionError(f"{path} cannot be recovered to a session. {named}") from None
-        if written.digest() != expected.digest():
+            reason = str(error).replace(str(temporary), str(path))
+            raise SessionError(f"{path} cannot be recovered to a session. {reason}") from None
+        if read_back_digest.digest() != written_digest.digest():
             raise SessionError(
                 f"{target} was not made: what was written for it does not read back as it is in "
                 f"{path}. Check the disk."
@@ -194,152 +215,160 @@ def recover(
 
 
 class SampleDigest:
-    """Checksum of samples, all fields and bit by bit, independent of their blocks."""
+    """Checksum of all bits of all fields of samples that arrive in blocks of any size."""
 
     def __init__(self) -> None:
         self._sums = {name: hashlib.blake2b() for name in SAMPLE_FIELDS}
 
-    def take(self, samples: npt.NDArray[np.void]) -> None:
-        """Add samples."""
+    def add(self, samples: npt.NDArray[np.void]) -> None:
+        """Include further samples, an array of ``SAMPLE_DTYPE``, in the checksum."""
         for name, checksum in self._sums.items():
             checksum.update(samples[name].tobytes())
 
     def digest(self) -> bytes:
-        """Return the checksum of the samples so far."""
+        """Return the checksum of all samples added so far."""
         return b"".join(checksum.digest() for checksum in self._sums.values())
 
 
-class _Survey:
-    """First pass of a recovery: finds the samples to copy, and the units that contain them."""
+class _SampleSelection:
+    """First reading of a damaged file, which selects the samples to copy to the new file."""
 
     def __init__(self, path: Path) -> None:
-        self.left_out: str | None = None
-        """Error in the order of the samples, a sentence's predicate."""
-        self.retained: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
-        """Whether each sample in the file is copied."""
-        self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)
-        """Tick and status of the copied samples."""
-        self._samples = TopicBuffer(path, SAMPLES, SURVEY_FIELDS, limits.MAX_SURVEYED)
-        self._units: dict[int, int] = {}
+        self.order_error: str | None = None
+        """Description of samples that repeat or are out of order, or None if there are none.
 
-    def take(self, contents: McapContents, block: MessageBlock) -> None:
-        """Count the messages of a block."""
-        self._samples.decoder.take(contents, block)
+        It is the end of a sentence that begins with the file's name."""
+        self.is_copied: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
+        """For each sample in the file, whether it is copied to the new file."""
+        self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)
+        """Time, tick and status of the samples that are copied."""
+        self._samples = TopicBuffer(
+            path, SAMPLES, ORDER_AND_FLAG_FIELDS, limits.MAX_SAMPLES_WITHOUT_SIGNALS
+        )
+        self._samples_per_chunk: dict[
+            int, int
+        ] = {}  # position of a chunk in the file → number of samples
+
+    def add_block(self, contents: McapContents, block: MessageBlock) -> None:
+        """Decode the samples of a block of messages, and count them for each chunk."""
+        self._samples.decoder.add_block(contents, block)
         is_sample = self._samples.decoder.is_of_topic
         count = sum(run[3] for run in block.runs if is_sample(contents, run[0]))
-        self._units[block.unit] = self._units.get(block.unit, 0) + count
+        self._samples_per_chunk[block.chunk_position] = (
+            self._samples_per_chunk.get(block.chunk_position, 0) + count
+        )
 
     def finish(self, contents: McapContents) -> None:
-        """Decide which samples are copied.
-
-        Raises
-        ------
-        SessionError
-            If the samples cannot be decoded.
-        """
+        """Select the samples to copy, with increasing ticks, after all blocks were read."""
         samples = self._samples.finish(contents)
         ticks = samples["tick"]
-        self.retained = _increasing(ticks)
-        (others,) = np.nonzero(~self.retained)
-        if len(others):
-            self.left_out = (
-                f"has {len(others)} samples that repeat or precede others, the first of them with "
-                f"tick {ticks[others[0]]}"
+        self.is_copied = _increasing_ticks_mask(ticks)
+        (excluded,) = np.nonzero(~self.is_copied)
+        if len(excluded):
+            self.order_error = (
+                f"has {len(excluded)} samples that repeat or precede others, the first of them "
+                f"with tick {ticks[excluded[0]]}"
             )
-            samples = samples[self.retained]
+            samples = samples[self.is_copied]
         self.samples = samples
 
-    def dropped_units(self) -> set[int]:
-        """Return the units with samples of which none is copied: they are duplicates."""
-        counts = np.array(list(self._units.values()), np.int64)
-        # Number of copied samples up to the end of each unit, and from it in each unit.
-        retained = np.append(0, np.cumsum(self.retained))
+    def duplicate_chunks(self) -> set[int]:
+        """Return the file positions of chunks that contain samples, but none that is copied."""
+        counts = np.array(list(self._samples_per_chunk.values()), np.int64)
+        # Number of copied samples up to each end of a chunk, and from it the number in each chunk.
+        copied_before = np.append(0, np.cumsum(self.is_copied))
         ends = np.cumsum(counts)
-        retained_in = retained[ends] - retained[ends - counts]
-        dropped = (counts > 0) & (retained_in == 0)
-        return {unit for unit, is_dropped in zip(self._units, dropped, strict=True) if is_dropped}
+        copied_in_chunk = copied_before[ends] - copied_before[ends - counts]
+        is_duplicate = (counts > 0) & (copied_in_chunk == 0)
+        return {
+            position
+            for position, is_chunk_duplicate in zip(
+                self._samples_per_chunk, is_duplicate, strict=True
+            )
+            if is_chunk_duplicate
+        }
 
 
 def holds_samples(path: Path) -> bool:
-    """Return whether `recover` finds a sample in the beginning of a file.
+    """Return whether `recover` may find a sample in a file.
 
-    Returns True for a file that cannot be read.
+    Only the first mebibyte is searched. The result is True for a longer MCAP file, and for a file
+    that cannot be opened.
     """
     try:
         with path.open("rb") as file:
-            beginning = file.read(_BEGINNING_BYTES)
-            longer = bool(file.read(1))
+            beginning = file.read(_SEARCHED_BYTES)
+            is_longer = bool(file.read(1))
     except OSError:
         return True
     try:
         contents = read_mcap(memoryview(beginning), (), salvage=True)
     except McapError:
         return False
-    return longer or contents.count(SAMPLE_TOPIC) > 0
+    return is_longer or contents.count(SAMPLE_TOPIC) > 0
 
 
-def remedy(path: Path, *, was_whole: bool) -> str:
-    """Describe how much of an incomplete or damaged file is intact, and how to recover that.
+def recovery_advice(path: Path, *, was_whole: bool) -> str:
+    """Return the end of an error message: how much of a damaged file is intact and recoverable.
 
-    Parameters
-    ----------
-    path : the file
-    was_whole : whether it was complete once, so that a sound copy may exist
-
-    Returns
-    -------
-    Continuation of the sentence on the damage, from the mark after it.
+    The text begins with the punctuation mark that follows the description of the damage.
+    `was_whole` states whether the file was complete once, so that an intact copy may exist.
     """
     try:
         count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)
     except SessionError:
         count = 0
-    again = ". Copy it again from where it was recorded"
-    readable = f"; {count} complete samples are readable before that"
+    copy_again = ". Copy it again from where it was recorded"
+    readable_samples = f"; {count} complete samples are readable before that"
     if not count:
-        nothing = ", so there is nothing to recover"
+        no_samples = ", so there is nothing to recover"
         if was_whole:
-            return f"{readable}{nothing}{again}."
-        return f"{readable}{nothing}. Copy it again if there is a complete one, or record it again."
+            return f"{readable_samples}{no_samples}{copy_again}."
+        return (
+            f"{readable_samples}{no_samples}. Copy it again if there is a complete one, or record "
+            "it again."
+        )
     target = recovered_path(path)
-    command = f"`rigd recover {shlex.quote(str(path))}`"
+    recover_command = f"`rigd recover {shlex.quote(str(path))}`"
     if os.path.lexists(target):
-        command += f", once {target}, which may hold it already, is moved away"
+        recover_command += f", once {target}, which may hold it already, is moved away"
     if was_whole:
-        return f"{again}, or save what is intact with {command}."
-    return f"{readable}. Save them with {command}."
+        return f"{copy_again}, or save what is intact with {recover_command}."
+    return f"{readable_samples}. Save them with {recover_command}."
 
 
-def _increasing(ticks: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
-    """Return which ticks to copy so that they increase.
+def _increasing_ticks_mask(ticks: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
+    """Return a mask of the ticks to copy, so that the copied ticks increase strictly.
 
-    Those above all before them; or, if there are more, those below all after them: a single tick
-    that is far too high then costs no others.
+    The mask selects ticks that exceed all previous ticks, or ticks below all later ticks if these
+    are more. A single tick that is far too high then does not exclude the ticks after it.
     """
-    above, below = np.ones((2, len(ticks)), np.bool_)
-    above[1:] = ticks[1:] > np.maximum.accumulate(ticks)[:-1]
-    if above.all():
-        return above
-    below[:-1] = ticks[:-1] < np.minimum.accumulate(ticks[::-1])[::-1][1:]
-    return below if below.sum() > above.sum() else above
+    exceeds_previous, is_below_later = np.ones((2, len(ticks)), np.bool_)
+    exceeds_previous[1:] = ticks[1:] > np.maximum.accumulate(ticks)[:-1]
+    if exceeds_previous.all():
+        return exceeds_previous
+    is_below_later[:-1] = ticks[:-1] < np.minimum.accumulate(ticks[::-1])[::-1][1:]
+    return is_below_later if is_below_later.sum() > exceeds_previous.sum() else exceeds_previous
 
 
-def _part(
-    on_progress: Callable[[float], None] | None, first: float, end: float
+def _scaled_progress(
+    on_progress: Callable[[float], None] | None, start_fraction: float, end_fraction: float
 ) -> Callable[[float], None] | None:
-    """Scale the progress of one part of the work to its range of the whole."""
+    """Return a callback that scales the progress of one step to its range of the whole progress."""
     if on_progress is None:
         return None
-    return lambda fraction: on_progress(first + (end - first) * fraction)
+    return lambda fraction: on_progress(start_fraction + (end_fraction - start_fraction) * fraction)
 
 
-def _recover_sound(path: Path, target: Path) -> Recovery:
-    """Give a complete file its name, if it has another one."""
-    session = read_session(path, fields=SURVEY_FIELDS, max_samples=limits.MAX_SURVEYED)
+def _copy_sound_file(path: Path, target: Path) -> Recovery:
+    """Copy a complete ``.part`` file to its final name; leave any other complete file alone."""
+    session = read_session(
+        path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
+    )
     is_part = path.name.endswith(PART_SUFFIX)
     if is_part:
-        _refuse_taken(path, target)
-        with _new_file(path, target, like=path):
+        _require_target_absent(path, target)
+        with _temporary_target(path, target, copied_file=path):
             pass
     return Recovery(
         source=path,
@@ -353,7 +382,8 @@ def _recover_sound(path: Path, target: Path) -> Recovery:
     )
 
 
-def _refuse_taken(path: Path, target: Path) -> None:
+def _require_target_absent(path: Path, target: Path) -> None:
+    """Raise if a file with the name of the new file exists."""
     if os.path.lexists(target):
         raise SessionExistsError(
             f"{target} exists and is not overwritten. Move it away to recover {path} again."
@@ -361,18 +391,21 @@ def _refuse_taken(path: Path, target: Path) -> None:
 
 
 @contextlib.contextmanager
-def _new_file(path: Path, target: Path, like: Path | None = None) -> Iterator[Path]:
-    """Yield a temporary path in the folder of `target`; rename it to `target` on success."""
+def _temporary_target(path: Path, target: Path, copied_file: Path | None = None) -> Iterator[Path]:
+    """Yield a temporary path in the folder of `target`, and rename it to `target` on success.
+
+    The temporary file starts as a copy of the file `copied_file`, if one is given.
+    """
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     try:
-        if like is not None:
-            with like.open("rb") as source:
+        if copied_file is not None:
+            with copied_file.open("rb") as source:
                 copy_new(source.fileno(), temporary)
         yield temporary
         rename_new(temporary, target)
         fsync_directory(target.parent)
     except FileExistsError:
-        _refuse_taken(path, target)  # it may have appeared meanwhile
+        _require_target_absent(path, target)  # the target may have been created meanwhile
         raise
     except OSError as error:
         raise SessionError(
@@ -383,19 +416,19 @@ def _new_file(path: Path, target: Path, like: Path | None = None) -> Iterator[Pa
         temporary.unlink(missing_ok=True)
 
 
-def _plan(
+def _planned_recovery(
     path: Path,
     target: Path,
     contents: McapContents,
-    survey: _Survey,
+    selection: _SampleSelection,
     damage: str,
     skipped: list[str],
 ) -> Recovery:
-    """Return the result with outcome and protection of the new file."""
-    samples = survey.samples
+    """Return the result of a recovery whose new file is still to be written."""
+    samples = selection.samples
     bytes_lost = path.stat().st_size - contents.sound_bytes
-    # The recorded outcome applies to all samples.
-    is_whole = contents.verified and survey.left_out is None
+    # The recorded outcome describes all samples: it is used only if none is missing.
+    is_outcome_valid = contents.verified and selection.order_error is None
     recovery = Recovery(
         source=path,
         path=target,
@@ -404,16 +437,16 @@ def _plan(
         damage=damage,
         bytes_lost=bytes_lost,
         skipped=tuple(skipped),
-        protected=contents.verified or bool(_protected_records(contents)),
+        protected=contents.verified or bool(_metadata_from_chunk(contents)),
     )
     outcome: dict[str, str] = {}
-    if is_whole:
+    if is_outcome_valid:
         outcome |= merged_metadata(contents, "outcome") or {}
     else:
         outcome["outcome"] = "fault"
-        outcome["reason"] = f"Recovered from {path.name}, which {damage}{_loss(bytes_lost)}."
-        stated = _count(contents.stated_counts, contents)
-        outcome |= _counts(samples, max(stated - len(samples), 0))
+        outcome["reason"] = f"Recovered from {path.name}, which {damage}{_loss_text(bytes_lost)}."
+        stated_samples = _sample_count(contents.stated_counts, contents)
+        outcome |= _tick_counts(samples, max(stated_samples - len(samples), 0))
     outcome |= {
         RECOVERED_FROM: path.name,
         "recovered_by": f"rigd {rigd.__version__}",
@@ -426,12 +459,13 @@ def _plan(
     return replace(recovery, outcome=outcome)
 
 
-def _loss(count: int) -> str:
+def _loss_text(count: int) -> str:
+    """Return the words that report the number of lost bytes, or "" for 0."""
     return f"; {count} bytes from there on were lost" if count else ""
 
 
-def _count(counts: Mapping[int, int], contents: McapContents) -> int:
-    """Sum a count of messages over the channels of samples."""
+def _sample_count(counts: Mapping[int, int], contents: McapContents) -> int:
+    """Return the number of samples, given the number of messages by channel number."""
     return sum(
         counts.get(channel.id, 0)
         for channel in contents.channels.values()
@@ -439,60 +473,64 @@ def _count(counts: Mapping[int, int], contents: McapContents) -> int:
     )
 
 
-def _counts(samples: npt.NDArray[np.void], known_to_be_gone: int) -> dict[str, str]:
-    """Account for every tick that is known to have been due.
+def _tick_counts(samples: npt.NDArray[np.void], unrecovered_samples: int) -> dict[str, str]:
+    """Return the tick counts of the record ``outcome`` for a recovered file.
 
-    A gap whose next sample is not flagged as missed was lost, in the loop or by the damage.
-    `known_to_be_gone` samples were in the file once.
+    A gap in the ticks counts as missed if the flags of the next sample state that, and as lost
+    otherwise. `unrecovered_samples` is the number of samples that the damaged file contained once
+    and that were not recovered.
     """
     status = samples["status"]
-    gaps = np.diff(samples["tick"].astype(np.int64), prepend=-1) - 1
+    missing_before = np.diff(samples["tick"].astype(np.int64), prepend=-1) - 1
     was_lost = (status & Status.AFTER_LOST) != 0
     was_missed = ~was_lost & ((status & Status.AFTER_MISSED) != 0)
-    missed = int(gaps[was_missed].sum())
-    unexplained = int(gaps[~was_lost & ~was_missed].sum())
-    lost = int(gaps[was_lost].sum()) + max(unexplained, known_to_be_gone)
+    missed_ticks = int(missing_before[was_missed].sum())
+    unexplained = int(missing_before[~was_lost & ~was_missed].sum())
+    lost_ticks = int(missing_before[was_lost].sum()) + max(unexplained, unrecovered_samples)
     return {
-        "scheduled": str(len(samples) + missed + lost),
+        "scheduled": str(len(samples) + missed_ticks + lost_ticks),
         "recorded": str(len(samples)),
-        "missed": str(missed),
-        "lost": str(lost),
+        "missed": str(missed_ticks),
+        "lost": str(lost_ticks),
         "late": str(int(np.count_nonzero(status & Status.LATE))),
         "stale_angles": str(int(np.count_nonzero(status & Status.ANGLE_STALE))),
         "stale_wrenches": str(int(np.count_nonzero(status & Status.WRENCH_STALE))),
     }
 
 
-def _protected_records(contents: McapContents) -> dict[str, dict[str, str]]:
-    """Return ``session`` and ``segments`` from a chunk; empty if no chunk has them."""
+def _metadata_from_chunk(contents: McapContents) -> dict[str, dict[str, str]]:
+    """Return the records ``session`` and ``segments`` that are repeated in a chunk's channel.
+
+    Returns an empty dictionary if no chunk contains them.
+    """
     for channel in contents.channels.values():
         if channel.topic == SAMPLE_TOPIC and channel.id in contents.declared_in_chunks:
-            records = unprotected_metadata(channel.metadata)
+            records = metadata_from_channel(channel.metadata)
             if "session" in records:
                 return records
     return {}
 
 
-def _records(contents: McapContents) -> dict[str, dict[str, str]]:
-    """Return the metadata to copy, by name, without the outcome."""
-    protected = _protected_records(contents)
+def _metadata_records(contents: McapContents) -> dict[str, dict[str, str]]:
+    """Return the metadata records to copy, except ``outcome``: name → keys and values."""
+    protected = _metadata_from_chunk(contents)
     if protected and not contents.verified:
         return protected
     names = dict.fromkeys(record.name for record in contents.metadata if record.name != "outcome")
     return {name: merged_metadata(contents, name) or {} for name in names}
 
 
-def _write(
+def _write_recovered_file(
     path: Path,
     source: Path,
     contents: McapContents,
-    survey: _Survey,
+    selection: _SampleSelection,
     recovery: Recovery,
     on_progress: Callable[[float], None] | None,
 ) -> SampleDigest:
-    """Write the new file; return the checksum of its samples."""
-    records = _records(contents)
-    channels = _channels(contents, records)
+    """Write the recovered file to `path`, and return the checksum of its samples."""
+    records = _metadata_records(contents)
+    channels = _channels_to_copy(contents, records)
     schema_ids = {channel.schema_id for channel in channels}
     with path.open("xb") as stream:
         mcap = McapWriter(stream, library=f"rigd {rigd.__version__}")
@@ -505,10 +543,12 @@ def _write(
         mcap.declare(
             [schema for schema in contents.schemas.values() if schema.id in schema_ids], channels
         )
-        copy = _Copy(source, mcap, survey, {channel.id for channel in channels})
-        # Second pass, as far as the first one, which has found the samples to copy.
-        again = load_contents(source, None, take=copy.take, salvage=True, on_progress=on_progress)
-        digest = copy.finish(again)
+        copy = _MessageCopier(source, mcap, selection, {channel.id for channel in channels})
+        # Second reading, up to the same damage as the first one, which selected the samples.
+        contents_read_again = load_contents(
+            source, None, on_block=copy.add_block, salvage=True, on_progress=on_progress
+        )
+        digest = copy.finish(contents_read_again)
         if on_progress is not None:
             on_progress(1.0)  # the damaged end is not read
         mcap.add_metadata("outcome", recovery.outcome)
@@ -518,127 +558,133 @@ def _write(
     return digest
 
 
-class _Copy:
-    """Second pass of a recovery: copies the messages.
+class _MessageCopier:
+    """Second reading of a damaged file, which copies the selected messages to the new file.
 
-    Parameters
-    ----------
-    source : the file, for error messages
-    mcap : the new file
-    survey : first pass, with the samples to copy
-    channels : declared channels
+    `channels` are the numbers of the channels that are declared in the new file.
     """
 
-    def __init__(self, source: Path, mcap: McapWriter, survey: _Survey, channels: set[int]) -> None:
+    def __init__(
+        self, source: Path, mcap: McapWriter, selection: _SampleSelection, channels: set[int]
+    ) -> None:
         self._source = source
         self._mcap = mcap
-        self._retained = survey.retained
-        self._dropped = survey.dropped_units()
-        self._channels = channels
+        self._is_copied = selection.is_copied
+        self._duplicate_chunks = selection.duplicate_chunks()
+        self._declared_channels = channels
         self._digest = SampleDigest()
         self._decoder = MessageDecoder(source, SAMPLES, self)
-        self._read = 0  # samples of the file
-        self._decoded = 0
-        self._parts: list[bytes] = []
-        self._runs: list[tuple[int, int, int]] = []  # channel, bytes of a record, count
-        self._length = 0
-        self._written = 0
-        self._unit = 0
+        self._samples_read = 0  # samples of the damaged file in the blocks so far
+        self._samples_decoded = 0  # samples decoded so far
+        self._collected_records: list[bytes] = []
+        self._collected_runs: list[tuple[int, int, int]] = []  # channel, bytes of a record, count
+        self._collected_bytes = 0  # bytes collected for the next chunk
+        self._written_bytes = 0  # bytes in chunks so far
+        self._chunk_position = 0  # position of the current chunk in the damaged file
 
-    def room(self, count: int) -> npt.NDArray[np.void]:
-        """Return room for samples; see `rigd.session._message_decoder.MessageSink`."""
+    def array_for(self, count: int) -> npt.NDArray[np.void]:
+        """Return an uninitialised array for the next `count` decoded samples."""
         return np.empty(count, SAMPLE_DTYPE)
 
     def store(self, messages: npt.NDArray[np.void]) -> None:
-        """Add the copied samples to the checksum."""
-        end = self._decoded + len(messages)
-        retained = self._retained[self._decoded : end]
-        self._digest.take(messages if retained.all() else messages[: len(retained)][retained])
-        self._decoded = end
+        """Add those decoded samples that are copied to the checksum."""
+        end = self._samples_decoded + len(messages)
+        is_copied = self._is_copied[self._samples_decoded : end]
+        self._digest.add(messages if is_copied.all() else messages[: len(is_copied)][is_copied])
+        self._samples_decoded = end
 
-    def take(self, contents: McapContents, block: MessageBlock) -> None:
-        """Copy the messages of a block."""
-        # Small chunks are merged, to longer ones in longer files: each takes room in the index.
-        least = max(_LEAST_CHUNK_BYTES, self._written // _MOST_CHUNKS)
-        if self._length >= least and (block.unit != self._unit or self._length > _LONG_CHUNK):
+    def add_block(self, contents: McapContents, block: MessageBlock) -> None:
+        """Collect the messages to copy from a block; write a chunk when enough are collected."""
+        # Small chunks are merged, because each takes space in the index. They grow with the file.
+        min_bytes = max(_MIN_CHUNK_BYTES, self._written_bytes // _CHUNKS_BEFORE_GROWTH)
+        if self._collected_bytes >= min_bytes and (
+            block.chunk_position != self._chunk_position
+            or self._collected_bytes > _LONG_CHUNK_BYTES
+        ):
             self._flush()
-        self._unit = block.unit
-        self._decoder.take(contents, block)
-        is_dropped = block.unit in self._dropped
+        self._chunk_position = block.chunk_position
+        self._decoder.add_block(contents, block)
+        is_duplicate = block.chunk_position in self._duplicate_chunks
         records = memoryview(block.records)
         for channel, size, start, count in block.runs:
-            parts = [(start, count)]
+            copied_ranges = [(start, count)]
             if self._decoder.is_of_topic(contents, channel):
-                retained = self._retained[self._read : self._read + count]
-                self._read += count
+                is_copied = self._is_copied[self._samples_read : self._samples_read + count]
+                self._samples_read += count
                 if count == 1:  # frequent where channels alternate: avoid a function call each
-                    if not retained[0]:
+                    if not is_copied[0]:
                         continue
-                elif not retained.all():
-                    parts = [(start + size * first, n) for first, n in _retained_blocks(retained)]
-            if is_dropped or channel not in self._channels:
+                elif not is_copied.all():
+                    copied_ranges = [
+                        (start + size * first, n) for first, n in _true_blocks(is_copied)
+                    ]
+            if is_duplicate or channel not in self._declared_channels:
                 continue
-            for first, number in parts:
-                self._parts.append(bytes(records[first : first + size * number]))
-                self._runs.append((channel, size, number))
-                self._length += size * number
+            for first, number in copied_ranges:
+                self._collected_records.append(bytes(records[first : first + size * number]))
+                self._collected_runs.append((channel, size, number))
+                self._collected_bytes += size * number
 
     def finish(self, contents: McapContents) -> SampleDigest:
-        """Write the remaining messages; return the checksum of the samples.
+        """Write the remaining messages, and return the checksum of the copied samples.
 
-        Raises
-        ------
-        SessionError
-            If the file has changed since the first pass.
+        Raises SessionError if the damaged file has changed since the first reading.
         """
         self._flush()
         self._decoder.finish(contents)
-        if not self._read == self._decoded == len(self._retained):
+        if not self._samples_read == self._samples_decoded == len(self._is_copied):
             raise SessionError(
                 f"{self._source} has changed while it was read. Recover it when nothing writes it."
             )
         return self._digest
 
     def _flush(self) -> None:
-        """Write a chunk, with a rebuilt index."""
-        if not self._runs:
+        """Write the collected messages as a chunk with a new message index."""
+        if not self._collected_runs:
             return
-        data = b"".join(self._parts)
-        runs = np.array(self._runs, np.int64)
-        self._written += len(data)
-        self._parts, self._runs, self._length = [], [], 0
+        data = b"".join(self._collected_records)
+        runs = np.array(self._collected_runs, np.int64)
+        self._written_bytes += len(data)
+        self._collected_records, self._collected_runs, self._collected_bytes = [], [], 0
         starts = message_starts(runs)
         index = np.empty(len(starts), INDEX_DTYPE)
-        times = np.ndarray(len(data) - 7, "<u8", data, 0, (1,))
-        index["log_time"] = times[starts + LOG_TIME_OFFSET]
+        log_times = np.ndarray(len(data) - 7, "<u8", data, 0, (1,))
+        index["log_time"] = log_times[starts + LOG_TIME_OFFSET]
         index["offset"] = starts
         channels = np.repeat(runs[:, 0], runs[:, 2])
         order = np.argsort(channels, kind="stable")
-        numbers, firsts = np.unique(channels[order], return_index=True)
-        parts = np.split(index[order], firsts[1:])
-        self._mcap.add_chunk(data, dict(zip(numbers.tolist(), parts, strict=True)))
+        channel_numbers, first_entries = np.unique(channels[order], return_index=True)
+        channel_indexes = np.split(index[order], first_entries[1:])
+        self._mcap.add_chunk(
+            data, dict(zip(channel_numbers.tolist(), channel_indexes, strict=True))
+        )
 
 
-def _retained_blocks(retained: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return start and length of each block of retained samples."""
-    edges = np.flatnonzero(np.diff(retained, prepend=False, append=False))
+def _true_blocks(mask: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return start index and length of each block of consecutive True values."""
+    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
     return list(zip(edges[::2].tolist(), (edges[1::2] - edges[::2]).tolist(), strict=True))
 
 
-def _channels(contents: McapContents, records: Mapping[str, Mapping[str, str]]) -> list[Channel]:
-    """Return the channels to copy; that of the samples gets the metadata that readers need."""
-    only_proven = bool(_protected_records(contents)) and not contents.verified
-    metadata = protected_metadata(records.get("session", {}), records.get("segments", {}))
-    proven = [
+def _channels_to_copy(
+    contents: McapContents, records: Mapping[str, Mapping[str, str]]
+) -> list[Channel]:
+    """Return the channels to copy; the channel of the samples repeats the session's metadata."""
+    only_protected = bool(_metadata_from_chunk(contents)) and not contents.verified
+    metadata = metadata_for_channel(records.get("session", {}), records.get("segments", {}))
+    candidates = [
         channel
         for channel in contents.channels.values()
-        if channel.id in contents.declared_in_chunks or not only_proven
+        if channel.id in contents.declared_in_chunks or not only_protected
     ]
-    ours = [channel for channel in proven if channel.topic in OWN_TOPICS]
-    others = [channel for channel in proven if channel.topic not in OWN_TOPICS]
+    own_channels = [channel for channel in candidates if channel.topic in OWN_TOPICS]
+    other_channels = [channel for channel in candidates if channel.topic not in OWN_TOPICS]
     return [
         replace(channel, metadata={**channel.metadata, **metadata})
         if channel.topic == SAMPLE_TOPIC
         else channel
-        for channel in (*ours[:_MOST_CHANNELS], *others[:_MOST_CHANNELS])
+        for channel in (
+            *own_channels[:_MAX_COPIED_CHANNELS],
+            *other_channels[:_MAX_COPIED_CHANNELS],
+        )
     ]

@@ -1,4 +1,4 @@
-"""Digests of a record's samples, to recognise the same samples in another file."""
+"""Digests of a record's samples, which show whether another file contains the same samples."""
 
 import hashlib
 from typing import Final
@@ -6,33 +6,35 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-_WINDOW: Final = 128
-"""Number of samples in a digest."""
-_FEWEST_CHANGES: Final = 32
-"""Least changes of the torque in a window: a sensor at rest gives the same values in any file."""
-_ANCHOR: Final = 8
-"""Number of samples that decide whether a window begins."""
-_EVERY: Final = 256
-"""On average one in so many samples begins a window, wherever the record was cut."""
-_MULTIPLIER: Final = np.uint64(0x9E3779B97F4A7C15)
+_WINDOW_SAMPLES: Final = 128
+"""Number of consecutive samples from which one digest is computed."""
+_MIN_TORQUE_CHANGES: Final = 32
+"""Minimum number of changes of the torque in a window with a digest: a sensor at rest returns the
+same values in any file."""
+_ANCHOR_SAMPLES: Final = 8
+"""Number of consecutive torque samples whose hash decides whether a window begins at the first."""
+_MEAN_WINDOW_DISTANCE: Final = 256
+"""Average number of samples from the start of one window to the start of the next."""
+_HASH_MULTIPLIER: Final = np.uint64(0x9E3779B97F4A7C15)
+"""Multiplier of the hash that decides whether a window begins."""
 
 
 def sample_digests(
     angle_rad: NDArray[np.float64], torque_nm: NDArray[np.float64]
 ) -> frozenset[bytes]:
-    """Return digests of a record's windows of samples.
+    """Return digests of windows of a record, to find the same samples in another record.
 
     Parameters
     ----------
     angle_rad, torque_nm : ndarray, shape (n,)
-        Measured angle and coupling torque.
+        Measured angle and coupling torque of the record.
 
     Returns
     -------
     frozenset of bytes
-        Two records with a common digest have common samples: noise does not repeat itself. The
-        samples decide where windows begin, so that a record cut at either end has digests of the
-        whole one. A torque without noise has none at rest.
+        Two records with a common digest contain the same samples, since measurement noise does not
+        repeat. The samples themselves decide where windows begin, so that a record that was cut at
+        either end has digests of the original. A constant torque yields no digests.
 
     Examples
     --------
@@ -46,20 +48,25 @@ def sample_digests(
     frozenset()
     """
     angle, torque = (np.ascontiguousarray(each) + 0.0 for each in (angle_rad, torque_nm))
-    count = torque.size - _WINDOW + 1
+    count = torque.size - _WINDOW_SAMPLES + 1
     if count <= 0:
         return frozenset()
-    bits = torque.view(np.uint64)
-    mixed = np.zeros(count, dtype=np.uint64)
-    for offset in range(_ANCHOR):
-        mixed = (mixed + bits[offset : offset + count]) * _MULTIPLIER
-        mixed ^= mixed >> np.uint64(29)
-    changes = np.concatenate([[0], np.cumsum(np.diff(torque) != 0.0)])
-    busy = changes[_WINDOW - 1 :] - changes[:count] >= _FEWEST_CHANGES
+    torque_bits = torque.view(np.uint64)
+    anchor_hashes = np.zeros(count, dtype=np.uint64)
+    for offset in range(_ANCHOR_SAMPLES):
+        anchor_hashes = (anchor_hashes + torque_bits[offset : offset + count]) * _HASH_MULTIPLIER
+        anchor_hashes ^= anchor_hashes >> np.uint64(29)
+    change_counts = np.concatenate([[0], np.cumsum(np.diff(torque) != 0.0)])
+    has_enough_changes = (
+        change_counts[_WINDOW_SAMPLES - 1 :] - change_counts[:count] >= _MIN_TORQUE_CHANGES
+    )
     return frozenset(
         hashlib.blake2b(
-            angle[first : first + _WINDOW].tobytes() + torque[first : first + _WINDOW].tobytes(),
+            angle[first : first + _WINDOW_SAMPLES].tobytes()
+            + torque[first : first + _WINDOW_SAMPLES].tobytes(),
             digest_size=8,
         ).digest()
-        for first in np.flatnonzero((mixed % np.uint64(_EVERY) == 0) & busy).tolist()
+        for first in np.flatnonzero(
+            (anchor_hashes % np.uint64(_MEAN_WINDOW_DISTANCE) == 0) & has_enough_changes
+        ).tolist()
     )

@@ -1,4 +1,4 @@
-"""Channels of a session file and their protobuf schemas, built without a protobuf compiler.
+"""Channels of a session file, and their protobuf schemas, built without a protobuf compiler.
 
 An MCAP schema of encoding ``protobuf`` is a serialised ``FileDescriptorSet`` with the message and
 all types to which it refers.
@@ -16,12 +16,14 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
 
 FORMAT_VERSION: Final = "1"
+"""Version of the session file format, in the metadata of each file."""
 
 SAMPLE_TOPIC: Final = "/rig/sample"
 CONTROL_TOPIC: Final = "/rig/control"
 TIMING_TOPIC: Final = "/rig/timing"
 TOUCH_TOPIC: Final = "/rig/touch"
 EVENT_TOPIC: Final = "/rig/event"
+"""Topic of the session's log."""
 
 OWN_TOPICS: Final = (SAMPLE_TOPIC, CONTROL_TOPIC, TIMING_TOPIC, EVENT_TOPIC, TOUCH_TOPIC)
 
@@ -30,41 +32,46 @@ CONTROL_SCHEMA: Final = "rigd.Control"
 TIMING_SCHEMA: Final = "rigd.Timing"
 TOUCH_SCHEMA: Final = "rigd.Touch"
 EVENT_SCHEMA: Final = "foxglove.Log"
+"""Name of the protobuf message of the session's log."""
 
 
 EVENT_LEVELS: Final = ("unknown", "debug", "info", "warning", "error", "fatal")
-"""Names of the values 0…5 of ``foxglove.Log.Level``."""
+"""Names of the severity levels 0…5 of ``foxglove.Log.Level``."""
 
 
 def _fixed_layout_file(schema_name: str, types: dict[str, str]) -> "FileDescriptorProto":
+    """Return the protobuf file descriptor of a message with the given field names and types."""
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
     package, name = schema_name.split(".")
-    file = FileDescriptorProto(
+    file_descriptor = FileDescriptorProto(
         name=f"{package}/{name.lower()}.proto", package=package, syntax="proto3"
     )
-    message = file.message_type.add(name=name)
-    for number, (field, kind) in enumerate(types.items(), start=1):
+    message = file_descriptor.message_type.add(name=name)
+    for number, (field, protobuf_type) in enumerate(types.items(), start=1):
         message.field.add(
             name=field,
             number=number,
             label=FieldDescriptorProto.LABEL_OPTIONAL,
-            type=FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}"),
+            type=FieldDescriptorProto.Type.Value(f"TYPE_{protobuf_type.upper()}"),
         )
-    return file
+    return file_descriptor
 
 
 def _event_file() -> "FileDescriptorProto":
-    """Return the used part of ``foxglove.Log`` of https://github.com/foxglove/foxglove-sdk."""
+    """Return the protobuf file descriptor of the log message ``foxglove.Log``.
+
+    It contains the fields used here of https://github.com/foxglove/foxglove-sdk.
+    """
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
-    file = FileDescriptorProto(
+    file_descriptor = FileDescriptorProto(
         name="foxglove/Log.proto",
         package="foxglove",
         syntax="proto3",
         dependency=["google/protobuf/timestamp.proto"],
     )
-    message = file.message_type.add(name="Log")
+    message = file_descriptor.message_type.add(name="Log")
     level = message.enum_type.add(name="Level")
     for value, name in enumerate(EVENT_LEVELS):
         level.value.add(name=name.upper(), number=value)
@@ -76,20 +83,20 @@ def _event_file() -> "FileDescriptorProto":
         ("file", FieldDescriptorProto.TYPE_STRING, None),
         ("line", FieldDescriptorProto.TYPE_FIXED32, None),
     )
-    for number, (name, kind, type_name) in enumerate(fields, start=1):
+    for number, (name, protobuf_type, type_name) in enumerate(fields, start=1):
         message.field.add(
             name=name,
             number=number,
             label=FieldDescriptorProto.LABEL_OPTIONAL,
-            type=kind,
+            type=protobuf_type,
             type_name=type_name,
         )
-    return file
+    return file_descriptor
 
 
 @cache
 def schema_data(schema_name: str) -> bytes:
-    """Return the serialised ``FileDescriptorSet`` of one of the schemas of a session file."""
+    """Return the serialised ``FileDescriptorSet`` that a session file contains for a schema."""
     from google.protobuf import timestamp_pb2
     from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 
@@ -110,9 +117,9 @@ def schema_data(schema_name: str) -> bytes:
 
 @lru_cache(maxsize=16)
 def message_class(schema_name: str, data: bytes) -> "type[Message]":
-    """Return the class that decodes the messages of a protobuf schema.
+    """Return the protobuf class that decodes the messages of a schema.
 
-    Building one takes as long as decoding dozens of messages, so the last few are cached.
+    Building a class takes as long as decoding dozens of messages, so the last few are cached.
 
     Parameters
     ----------
@@ -122,42 +129,43 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
     Raises
     ------
     ValueError
-        If `data` is not a consistent ``FileDescriptorSet`` that holds `schema_name`.
+        If `data` is not a consistent ``FileDescriptorSet`` that contains `schema_name`.
     """
     from google.protobuf import descriptor_pool, message_factory
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from google.protobuf.message import DecodeError
 
-    shown = repr(schema_name if len(schema_name) <= 40 else schema_name[:40] + "…")
+    shown_name = repr(schema_name if len(schema_name) <= 40 else schema_name[:40] + "…")
     if len(data) > limits.MAX_SCHEMA_BYTES:
         raise ValueError(
-            f"schema {shown} has {len(data)} bytes, more than the {limits.MAX_SCHEMA_BYTES} that "
-            "are read"
+            f"schema {shown_name} has {len(data)} bytes, more than the {limits.MAX_SCHEMA_BYTES} "
+            "that are read"
         )
     try:
-        remaining = {file.name: file for file in FileDescriptorSet.FromString(data).file}
+        files_to_add = {file.name: file for file in FileDescriptorSet.FromString(data).file}
         pool = descriptor_pool.DescriptorPool()
 
         def add(name: str) -> None:
-            # A file is added to the pool after its imports, in any order of the file.
-            file = remaining.pop(name, None)
+            # A file must be added to the pool after the files that it imports.
+            file = files_to_add.pop(name, None)
             if file is not None:
                 for dependency in file.dependency:
                     add(dependency)
                 pool.Add(file)
 
-        while remaining:
-            add(next(iter(remaining)))
+        while files_to_add:
+            add(next(iter(files_to_add)))
         descriptor = pool.FindMessageTypeByName(schema_name)
     except (DecodeError, TypeError, KeyError, RecursionError) as error:
-        raise ValueError(f"schema {shown} is not a usable protobuf schema") from error
+        raise ValueError(f"schema {shown_name} is not a usable protobuf schema") from error
     return message_factory.GetMessageClass(descriptor)
 
 
-def protected_metadata(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
-    """Return both records as metadata of the sample channel, where a checksum covers them.
+def metadata_for_channel(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
+    """Return the records ``session`` and ``segments`` as metadata of the samples' channel.
 
-    The format has no checksum for a metadata record, and that of the whole file is at its end.
+    A checksum covers the channel. MCAP has no checksum for a metadata record, and the checksum of
+    the whole file is at its end.
     """
     return {
         **{f"session.{key}": value for key, value in session.items()},
@@ -165,16 +173,19 @@ def protected_metadata(session: Mapping[str, str], segments: Mapping[str, str]) 
     }
 
 
-def unprotected_metadata(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
-    """Return ``session`` and ``segments`` from `protected_metadata`; empty without them."""
-    found: dict[str, dict[str, str]] = {}
+def metadata_from_channel(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """Return the records ``session`` and ``segments`` from the metadata of the samples' channel.
+
+    This is the inverse of `metadata_for_channel`. The result lacks a record without any key.
+    """
+    records: dict[str, dict[str, str]] = {}
     for key, value in channel.items():
-        record, dot, name = key.partition(".")
-        if dot and record in ("session", "segments"):
-            found.setdefault(record, {})[name] = value
-    return found
+        record, separator, name = key.partition(".")
+        if separator and record in ("session", "segments"):
+            records.setdefault(record, {})[name] = value
+    return records
 
 
 def event_class() -> "type[Message]":
-    """Return the message class of ``foxglove.Log`` as this package writes it."""
+    """Return the protobuf class that encodes a message of the session's log."""
     return message_class(EVENT_SCHEMA, schema_data(EVENT_SCHEMA))

@@ -1,17 +1,19 @@
-"""Segments of a record, and the frequency of a sweep in them."""
+"""Segments of a record, and the frequency of a linear sweep at a tick."""
 
 from collections.abc import Mapping
 
 
 def segments_until(segments: Mapping[str, tuple[int, int]], end: int) -> dict[str, tuple[int, int]]:
-    """Cut segments off at a tick; those that begin there or later are left out.
+    """Return the segments of a record that ends at a tick.
+
+    Segments that begin at that tick or later are left out.
 
     Parameters
     ----------
     segments : mapping of str to (int, int)
-        Name → first tick and end (exclusive).
+        Segment name → first tick and end tick (exclusive).
     end : int
-        First tick that is left out.
+        First tick that no longer belongs to the record.
     """
     return {
         name: (first, min(last, end)) for name, (first, last) in segments.items() if first < end
@@ -21,15 +23,15 @@ def segments_until(segments: Mapping[str, tuple[int, int]], end: int) -> dict[st
 def sweep_frequency_hz(
     segments: Mapping[str, tuple[int, int]], ends_hz: tuple[float, float], tick: int
 ) -> float | None:
-    """Return the frequency of a linear sweep at a tick; None before and after it.
+    """Return the frequency of a linear sweep at a tick, or None before and after the sweep.
 
     Parameters
     ----------
     segments : mapping of str to (int, int)
-        ``sweep`` → first tick and end (exclusive); of a sweep there and back, ``there`` and
-        ``back``.
+        ``sweep`` → first tick and end tick (exclusive). If the sweep returns to its start
+        frequency, also ``first_half`` for its first half and ``back`` for its second half.
     ends_hz : tuple of float
-        Frequencies at the start and at the end of the (first) sweep.
+        Start and end frequency of the sweep, or of its first half.
     tick : int
         Tick of the record.
 
@@ -41,9 +43,9 @@ def sweep_frequency_hz(
     [25.0, 25.0, None]
     """
     start_hz, stop_hz = ends_hz
-    there = segments.get("there", segments["sweep"])
+    first_half = segments.get("there", segments["sweep"])
     for (first, end), begin_hz, end_hz in (
-        (there, start_hz, stop_hz),
+        (first_half, start_hz, stop_hz),
         (segments.get("back", (0, 0)), stop_hz, start_hz),
     ):
         if first <= tick < end:

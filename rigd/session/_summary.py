@@ -1,8 +1,9 @@
-"""Summary of a session file from its two ends: metadata and counts, without its samples.
+"""Metadata and number of samples of a session file, read without its samples.
 
-The summary section of a complete file gives the offsets of its metadata and the number of messages:
-a few reads suffice for a file of any length. A file without a usable summary is read whole; of one
-without its end only the beginning is read, which contains ``session``.
+The summary section at the end of a complete file contains the offsets of the metadata and the
+number of messages, so that a few reads suffice for a file of any length. A complete file without a
+usable summary section is read as a whole. Only the beginning of an incomplete file is read, which
+contains the record ``session``.
 """
 
 import shlex
@@ -17,40 +18,49 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, MetadataIndex, Statistics
 
 from rigd.session._mcap_limits import McapDamageError
-from rigd.session._mcap_reader import FOOTER, RECORD_HEAD, McapContents, parsed, read_mcap
+from rigd.session._mcap_reader import (
+    FOOTER_FORMAT,
+    RECORD_HEAD_FORMAT,
+    McapContents,
+    parse_record,
+    read_mcap,
+)
 from rigd.session._mcap_writer import MAGIC
-from rigd.session._reader import load_contents, merged_metadata, no_session, opened
+from rigd.session._reader import load_contents, merged_metadata, no_samples_error, open_mcap_file
 from rigd.session._schema import SAMPLE_TOPIC
 from rigd.session._writer import is_being_written
 
 _CHECKSUM_SIZE: Final = 4
-_BEGINNING_BYTES: Final = 1 << 18
-"""Length of the beginning that is read of a file without its end."""
-_MOST_SUMMARY_BYTES: Final = 16 << 20
-_MOST_METADATA_BYTES: Final = 1 << 20
-_MOST_RECORDS: Final = 100
-"""Longest summary, longest metadata record and most of them that are read by their index; beyond
-that the general reader, which limits memory and time, is used."""
+_INCOMPLETE_FILE_BYTES: Final = 1 << 18
+"""Number of bytes at the start of an incomplete file that are read for its metadata."""
+_MAX_SUMMARY_BYTES: Final = 16 << 20
+"""Maximum length in bytes of a summary section that is used; otherwise the whole file is read."""
+_MAX_METADATA_BYTES: Final = 1 << 20
+"""Maximum length in bytes of a metadata record that is read by its offset."""
+_MAX_METADATA_RECORDS: Final = 100
+"""Maximum number of metadata records that are read by their offsets."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionSummary:
-    """Metadata and counts of a session file."""
+    """Metadata, outcome and number of samples of a session file."""
 
     metadata: dict[str, str]
-    """The record ``session``; empty if an incomplete file has lost it."""
+    """Record ``session``: key → text; empty if an incomplete file does not contain it."""
     outcome: dict[str, str] | None
-    """End of the session; None if the file does not state it."""
+    """Record ``outcome``: how the session ended; None if the file does not state it."""
     samples: int | None
-    """Number of recorded samples; None for a file without its end."""
+    """Number of recorded samples, or None for an incomplete or damaged file."""
     problem: str
-    """Problem of the file and remedy, a sentence; empty for a sound file."""
+    """Sentence on damage of the file and its remedy; empty for an intact file."""
     recording: bool
     """Whether the session is still being recorded."""
 
 
 def read_summary(path: str | PathLike[str]) -> SessionSummary:
-    """Read metadata and counts of a session file; its samples are neither read nor checked.
+    """Read metadata, outcome and number of samples of a session file.
+
+    The samples are neither read nor checked.
 
     Raises
     ------
@@ -65,15 +75,15 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
     ('chirp', 'complete', 21500)
     """
     path = Path(path)
-    with opened(path) as file:
-        contents = _indexed(file, path.stat().st_size)
+    with open_mcap_file(path) as file:
+        contents = _read_by_summary(file, path.stat().st_size)
         if contents is None:
             file.seek(0)
-            beginning = read_mcap(memoryview(file.read(_BEGINNING_BYTES)), ())
-            ended = _has_end(file)
+            beginning = read_mcap(memoryview(file.read(_INCOMPLETE_FILE_BYTES)), ())
+            is_complete = _has_final_magic(file)
     problem, recording = "", False
     remedy = f"save what is intact with rigd recover {shlex.quote(str(path))}"
-    if contents is None and ended:
+    if contents is None and is_complete:
         contents = load_contents(path, ())
         if contents.damage is not None:
             problem = f"The file is damaged: it {contents.damage}; {remedy}."
@@ -82,9 +92,9 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
         problem = (
             "The session is being recorded." if recording else f"The file is incomplete; {remedy}."
         )
-    sampled = SAMPLE_TOPIC in {channel.topic for channel in contents.channels.values()}
-    if not sampled and not problem:
-        raise no_session(path)
+    has_samples_channel = SAMPLE_TOPIC in {channel.topic for channel in contents.channels.values()}
+    if not has_samples_channel and not problem:
+        raise no_samples_error(path)
     return SessionSummary(
         metadata=merged_metadata(contents, "session") or {},
         outcome=merged_metadata(contents, "outcome"),
@@ -94,64 +104,77 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
     )
 
 
-def _has_end(file: BinaryIO) -> bool:
+def _has_final_magic(file: BinaryIO) -> bool:
+    """Return whether a file ends with the magic bytes of a complete MCAP file."""
     file.seek(-len(MAGIC), 2)
     return file.read() == MAGIC
 
 
-def _indexed(file: BinaryIO, size: int) -> McapContents | None:
-    """Read the records to which the summary section points; None if it is not sound."""
-    footer_start = size - len(MAGIC) - FOOTER.size
+def _read_by_summary(file: BinaryIO, size: int) -> McapContents | None:
+    """Return channels, message counts and metadata that the summary section leads to.
+
+    Returns None if the file of `size` bytes has no usable summary section with a correct checksum.
+    """
+    footer_start = size - len(MAGIC) - FOOTER_FORMAT.size
     if footer_start < len(MAGIC) or file.read(len(MAGIC)) != MAGIC:
         return None
     file.seek(footer_start)
-    end = file.read()
-    if len(end) != FOOTER.size + len(MAGIC) or not end.endswith(MAGIC):
+    footer_and_magic = file.read()
+    if len(footer_and_magic) != FOOTER_FORMAT.size + len(MAGIC) or not footer_and_magic.endswith(
+        MAGIC
+    ):
         return None
-    opcode, length, summary_start, _, crc = FOOTER.unpack_from(end)
-    if (opcode, length) != (Opcode.FOOTER, FOOTER.size - RECORD_HEAD.size):
+    opcode, length, summary_start, _, crc = FOOTER_FORMAT.unpack_from(footer_and_magic)
+    if (opcode, length) != (Opcode.FOOTER, FOOTER_FORMAT.size - RECORD_HEAD_FORMAT.size):
         return None
-    if not len(MAGIC) < summary_start <= footer_start <= summary_start + _MOST_SUMMARY_BYTES:
+    if not len(MAGIC) < summary_start <= footer_start <= summary_start + _MAX_SUMMARY_BYTES:
         return None
     file.seek(summary_start)
     summary = file.read(footer_start - summary_start)
-    covered = FOOTER.size - _CHECKSUM_SIZE
-    if crc == 0 or zlib.crc32(end[:covered], zlib.crc32(summary)) != crc:
+    checked_length = FOOTER_FORMAT.size - _CHECKSUM_SIZE
+    if crc == 0 or zlib.crc32(footer_and_magic[:checked_length], zlib.crc32(summary)) != crc:
         return None
     try:
-        return _led_to(file, summary)
+        return _contents_from_summary(file, summary)
     except (McapDamageError, struct.error):
         return None
 
 
-def _led_to(file: BinaryIO, summary: bytes) -> McapContents | None:
+def _contents_from_summary(file: BinaryIO, summary: bytes) -> McapContents | None:
+    """Return the contents that a summary section leads to.
+
+    Returns None if the section is incomplete, or the metadata are too long.
+    """
     contents = McapContents()
     indexes: list[MetadataIndex] = []
     statistics: Statistics | None = None
     position = 0
     while position < len(summary):
-        opcode, length = RECORD_HEAD.unpack_from(summary, position)
-        content = position + RECORD_HEAD.size
+        opcode, length = RECORD_HEAD_FORMAT.unpack_from(summary, position)
+        content = position + RECORD_HEAD_FORMAT.size
         position = content + length
         record = summary[content:position]
         if opcode == Opcode.CHANNEL:
-            channel = parsed(Channel.read, record, "")
+            channel = parse_record(Channel.read, record, "")
             contents.channels[channel.id] = channel
         elif opcode == Opcode.STATISTICS:
-            statistics = parsed(Statistics.read, record, "")
+            statistics = parse_record(Statistics.read, record, "")
         elif opcode == Opcode.METADATA_INDEX:
-            indexes.append(parsed(MetadataIndex.read, record, ""))
-            if len(indexes) > _MOST_RECORDS:
+            indexes.append(parse_record(MetadataIndex.read, record, ""))
+            if len(indexes) > _MAX_METADATA_RECORDS:
                 return None
     if statistics is None or len(indexes) != statistics.metadata_count:
         return None
     contents.message_counts |= statistics.channel_message_counts
     for index in indexes:
-        if not RECORD_HEAD.size <= index.length <= _MOST_METADATA_BYTES:
+        if not RECORD_HEAD_FORMAT.size <= index.length <= _MAX_METADATA_BYTES:
             return None
         file.seek(index.offset)
         record = file.read(index.length)
-        if RECORD_HEAD.unpack_from(record) != (Opcode.METADATA, index.length - RECORD_HEAD.size):
+        if RECORD_HEAD_FORMAT.unpack_from(record) != (
+            Opcode.METADATA,
+            index.length - RECORD_HEAD_FORMAT.size,
+        ):
             return None
-        contents.metadata.append(parsed(Metadata.read, record[RECORD_HEAD.size :], ""))
+        contents.metadata.append(parse_record(Metadata.read, record[RECORD_HEAD_FORMAT.size :], ""))
     return contents

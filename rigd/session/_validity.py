@@ -1,6 +1,7 @@
-"""Validity of the numbers that are estimated from a record.
+"""Validity of numbers that are estimated from a record.
 
-States the error of the linear model, and whether a uniform beam predicts the modes.
+It consists of the error of the linear beam model at the record's tip slopes, and of a test whether
+the model of a uniform beam predicts the modes.
 """
 
 from collections.abc import Mapping
@@ -9,25 +10,27 @@ from typing import Any, Final
 
 from rigd.units import finite_number
 
-_LEAST_P: Final = 1e-300
+_MIN_SHOWN_P_VALUE: Final = 1e-300
+"""Smallest p-value that is shown; a smaller one is shown as "p < 1e-300"."""
 _NOT_TESTED: Final = "not tested"
-_SHORT: Final = {"passed": "yes", "refused": "no", _NOT_TESTED: _NOT_TESTED}
-"""Whether the beam is uniform, by status."""
+_UNIFORM_BY_STATUS: Final = {"passed": "yes", "refused": "no", _NOT_TESTED: _NOT_TESTED}
+"""Status of the test of a uniform beam → text for a table: whether the beam is uniform."""
 
-_LEAST_ERROR: Final = 1e-3
-"""Errors of the linear model below this are stated as an upper bound."""
+_MIN_SHOWN_ERROR: Final = 1e-3
+"""Smallest relative error of the linear model that is shown; a smaller one is shown as "below"."""
 
 
 @dataclass(frozen=True, slots=True)
 class BeamUniformity:
-    """Whether a uniform beam predicts the modes that a record shows.
+    """Result of a test whether the model of a uniform beam predicts the modes in a record.
 
     Attributes
     ----------
     status
         "passed", "refused" or "not tested".
     p_value
-        Probability of such a difference by chance; None: not tested.
+        Probability of so large a difference between predicted and estimated modes by chance, or
+        None if not tested.
 
     Examples
     --------
@@ -43,14 +46,14 @@ class BeamUniformity:
 
     @classmethod
     def of_document(cls, document: object) -> "BeamUniformity | None":
-        """Return the result in a document; None without a usable one.
+        """Return the test result in a document, or None if the document contains no valid one.
 
         Parameters
         ----------
         document
-            Value of ``uniform_beam`` in any document.
+            Value of the key ``uniform_beam`` of a document from any source.
         """
-        if not isinstance(document, Mapping) or document.get("status") not in _SHORT:
+        if not isinstance(document, Mapping) or document.get("status") not in _UNIFORM_BY_STATUS:
             return None
         status, p_value = str(document["status"]), finite_number(document.get("p_value"))
         if status == _NOT_TESTED:
@@ -59,7 +62,7 @@ class BeamUniformity:
 
     @property
     def sentence(self) -> str:
-        """The result as a sentence."""
+        """Sentence that states whether a uniform beam predicts the modes."""
         if self.status == "passed":
             return f"A uniform beam predicts the modes ({self.chance})."
         if self.status == "refused":
@@ -71,33 +74,36 @@ class BeamUniformity:
 
     @property
     def short(self) -> str:
-        """The result for a cell of a table."""
-        word = _SHORT[self.status]
-        return word if self.p_value is None else f"{word} ({self.chance})"
+        """Test result for a cell of a table: "yes", "no" or "not tested", with the p-value."""
+        is_uniform = _UNIFORM_BY_STATUS[self.status]
+        return is_uniform if self.p_value is None else f"{is_uniform} ({self.chance})"
 
     @property
     def chance(self) -> str:
-        """The p-value as text."""
+        """Text with the p-value, such as "p = 0.44"."""
         p_value = self.p_value or 0.0
-        return f"p = {p_value:.2g}" if p_value >= _LEAST_P else f"p < {_LEAST_P:g}"
+        return (
+            f"p = {p_value:.2g}" if p_value >= _MIN_SHOWN_P_VALUE else f"p < {_MIN_SHOWN_P_VALUE:g}"
+        )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the result as in documents, with the sentence."""
+        """Return the test result as a dictionary for JSON: status, p-value and sentence."""
         return {"status": self.status, "p_value": self.p_value, "sentence": self.sentence}
 
 
 @dataclass(frozen=True, slots=True)
 class Validity:
-    """Validity of the linear model for a record, and of a uniform beam.
+    """Validity of the linear beam model and of a uniform beam for a record.
 
     Attributes
     ----------
     predicted_peak_tip_slope_rad
-        Largest slope of the antenna's tip against its root, by the linear model; None: unknown.
+        Largest slope of the antenna's tip relative to its root that the linear model predicts, or
+        None if unknown.
     linear_model_error
-        Bound of that model's relative error at such slopes; None: unknown.
+        Upper bound of the linear model's relative error at such slopes, or None if unknown.
     uniform_beam
-        Whether a uniform beam predicts the modes; None: unknown.
+        Result of the test whether a uniform beam predicts the modes, or None if unknown.
 
     Examples
     --------
@@ -114,12 +120,12 @@ class Validity:
 
     @classmethod
     def of_document(cls, document: object) -> "Validity":
-        """Return the validity in a document; unknown without one.
+        """Return the validity that a document states; its values are None if not stated.
 
         Parameters
         ----------
         document
-            Value of ``validity`` in any document.
+            Value of the key ``validity`` of a document from any source.
         """
         if not isinstance(document, Mapping):
             return cls()
@@ -132,32 +138,37 @@ class Validity:
 
     @property
     def sentence(self) -> str:
-        """Slope and error as a sentence."""
+        """Sentence that states the peak tip slope and the error of the linear model."""
         if self.predicted_peak_tip_slope_rad is None or self.linear_model_error is None:
             return "The slope of the tip, and with it the error of the linear model, is unknown."
         slope = f"Tip slopes up to {self.predicted_peak_tip_slope_rad:.2g} rad"
         if self.linear_model_error >= 1.0:
             return f"{slope}: the linear model does not hold there (error above 100 %)."
-        return f"{slope}; error of the linear model {self._at_most('at most ', 'below ')}."
+        return f"{slope}; error of the linear model {self._error_bound_text('at most ', 'below ')}."
 
     @property
     def short(self) -> str:
-        """Slope and error for a cell of a table."""
+        """Peak tip slope and error of the linear model as text for a cell of a table."""
         if self.predicted_peak_tip_slope_rad is None or self.linear_model_error is None:
             return "unknown"
         slope = f"{self.predicted_peak_tip_slope_rad:.2g} rad"
         if self.linear_model_error >= 1.0:
             return f"{slope}, error > 100 %"
-        return f"{slope}, error {self._at_most('≤ ', '< ')}"
+        return f"{slope}, error {self._error_bound_text('≤ ', '< ')}"
 
-    def _at_most(self, at_most: str, below: str) -> str:
+    def _error_bound_text(self, upper_bound_words: str, below_words: str) -> str:
+        """Return the linear model's error in percent after the words for its upper bound.
+
+        These are `below_words` for an error below the smallest value that is shown, and
+        `upper_bound_words` for any other error.
+        """
         error = self.linear_model_error or 0.0
-        if error < _LEAST_ERROR:
-            return f"{below}{100.0 * _LEAST_ERROR:g} %"
-        return f"{at_most}{100.0 * error:.2g} %"
+        if error < _MIN_SHOWN_ERROR:
+            return f"{below_words}{100.0 * _MIN_SHOWN_ERROR:g} %"
+        return f"{upper_bound_words}{100.0 * error:.2g} %"
 
     def as_json(self) -> dict[str, Any]:
-        """Return the validity as in documents, with the sentences."""
+        """Return the validity as a dictionary for JSON, with sentences."""
         uniform_beam = self.uniform_beam
         return {
             "predicted_peak_tip_slope_rad": self.predicted_peak_tip_slope_rad,

@@ -1,8 +1,9 @@
 """Writer of session files.
 
-Samples, controls and timings arrive as blocks of records and are written chunk by chunk, with the
-events; an error is written at once. The file has the suffix ``.part`` and a lock until it is
-complete, and is then renamed to its final name, never over another file.
+Samples, controller terms and ages of readings arrive as blocks of messages. They are written chunk
+by chunk together with the events. An event that reports an error is written at once. The file has
+the suffix ``.part`` and a lock until it is complete. It is then renamed to its final name, and
+never replaces another file.
 """
 
 import contextlib
@@ -22,7 +23,7 @@ from mcap.records import Channel, Schema
 
 import rigd
 from rigd.session._errors import SessionError, SessionExistsError
-from rigd.session._mcap_writer import INDEX_DTYPE, MESSAGE_HEAD, RECORD_HEAD_SIZE, McapWriter
+from rigd.session._mcap_writer import INDEX_DTYPE, MESSAGE_HEAD_FORMAT, RECORD_HEAD_SIZE, McapWriter
 from rigd.session._schema import (
     CONTROL_SCHEMA,
     CONTROL_TOPIC,
@@ -37,7 +38,7 @@ from rigd.session._schema import (
     TOUCH_SCHEMA,
     TOUCH_TOPIC,
     event_class,
-    protected_metadata,
+    metadata_for_channel,
     schema_data,
 )
 from rigd.session.layout import (
@@ -59,12 +60,14 @@ except ImportError:  # sessions are recorded on Linux, but read anywhere
 
 
 PART_SUFFIX: Final = ".part"
+"""Suffix that a session file has after its name until it is complete."""
 
 CHUNK_SAMPLES: Final = 250
+"""Maximum number of samples in a chunk: a killed recorder loses no more samples than that."""
 CHUNK_S: Final = 0.25
-"""Samples and time per chunk: a killed recorder loses at most the lesser of the two."""
+"""Time span of a chunk in seconds at low sample rates: a killed recorder loses no longer span."""
 SYNC_INTERVAL_S: Final = 1.0
-"""Wall time between two syncs to the disk: the additional loss if the host fails."""
+"""Time in seconds between two syncs of the file to the disk: a power failure loses that much."""
 
 _MESSAGE_HEAD_FIELDS: Final = [
     ("opcode", "u1"),
@@ -74,42 +77,44 @@ _MESSAGE_HEAD_FIELDS: Final = [
     ("log_time", "<u8"),
     ("publish_time", "<u8"),
 ]
-"""`MESSAGE_HEAD` as numpy fields."""
+"""NumPy fields of the head of an MCAP message record, in the order of `MESSAGE_HEAD_FORMAT`."""
 
-_CHANNELS: Final = {
+_CHANNEL_NUMBERS_AND_SCHEMAS: Final = {
     SAMPLE_TOPIC: (1, SAMPLE_SCHEMA),
     CONTROL_TOPIC: (2, CONTROL_SCHEMA),
     TIMING_TOPIC: (3, TIMING_SCHEMA),
     EVENT_TOPIC: (4, EVENT_SCHEMA),
     TOUCH_TOPIC: (5, TOUCH_SCHEMA),
 }
-"""Topic → number of the channel in the file, and name of its schema."""
+"""Topic → channel number in the file, and name of the channel's schema."""
 
 _MEDIA_TYPES: Final = {".toml": "application/toml", ".json": "application/json"}
-_URGENT: Final = ("error", "fatal")
+_URGENT_LEVELS: Final = ("error", "fatal")
 
 
 class _CountedFile(io.FileIO):
-    """A file that counts the bytes written to it."""
+    """Binary file that counts the bytes written to it."""
 
     written = 0
+    """Number of bytes written so far."""
 
     def write(self, data: Any, /) -> int:  # noqa: ANN401 - any bytes-like object
-        """Write and count."""
+        """Write bytes, and add their number to `written`."""
         count = super().write(data)
         self.written += count
         return count
 
 
 class SessionWriter:
-    """Writes one session, durably, to ``NAME.mcap.part`` and in the end to ``NAME.mcap``.
+    """Writes one session file: ``NAME.mcap.part`` while it is recorded, ``NAME.mcap`` at the end.
 
-    After `begin`, messages arrive in blocks. A chunk goes to the file with every 250th sample, and
-    the file to the disk once a second; data once written is never lost to a later failure.
+    After `begin`, messages arrive in blocks. A chunk is written to the file with every 250th
+    sample, and the file is synced to the disk once a second. A later failure does not destroy data
+    that was written before.
 
     Parameters
     ----------
-    path : the final name
+    path : final path of the session file
 
     Raises
     ------
@@ -131,10 +136,10 @@ class SessionWriter:
         self._event_count = 0
         self._start_utc_ns = 0
         self._mcap: McapWriter | None = None
-        self._synced_at = time.monotonic()
-        self._dirty = False
+        self._last_sync_s = time.monotonic()
+        self._is_sync_needed = False
         self._failed = False
-        with self._explained():
+        with self._io_errors_explained():
             try:
                 # Append mode, so that the end detects bytes that another program has removed.
                 flags = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_APPEND
@@ -145,8 +150,8 @@ class SessionWriter:
                     "interrupted. Choose another name or move that file away; nothing is "
                     "overwritten."
                 ) from None
-            self._raw = _CountedFile(descriptor, "wb")
-            self._stream = io.BufferedWriter(self._raw)
+            self._counted_file = _CountedFile(descriptor, "wb")
+            self._stream = io.BufferedWriter(self._counted_file)
             mark_as_written(descriptor)
             # Checked only now, to detect a writer that finishes in between.
             if os.path.lexists(path):
@@ -158,7 +163,8 @@ class SessionWriter:
                 )
 
     @contextlib.contextmanager
-    def _explained(self) -> Iterator[None]:
+    def _io_errors_explained(self) -> Iterator[None]:
+        """Convert an OSError of the enclosed code into a SessionError with advice."""
         try:
             yield
         except OSError as error:
@@ -175,83 +181,88 @@ class SessionWriter:
         segments: Mapping[str, tuple[int, int]],
         attachments: Mapping[str, bytes],
     ) -> None:
-        """Write the data known before the first tick.
+        """Write metadata, attachments and channels, which precede the first sample in the file.
 
         Parameters
         ----------
-        start_utc_ns : wall clock at tick 0, ns since the Unix epoch
-        metadata : the record ``session``; ``format_version`` and ``start_utc_ns`` are added
-        segments : name → first tick and end (exclusive): the record ``segments``
-        attachments : file name → contents
+        start_utc_ns : wall-clock time of tick 0, in nanoseconds since the Unix epoch
+        metadata : record ``session``; ``format_version`` and ``start_utc_ns`` are added
+        segments : record ``segments``: name → first tick and end tick (exclusive)
+        attachments : file name → file contents
         """
         if self._mcap is not None:
             raise RuntimeError("begin() was called twice")
         self._start_utc_ns = start_utc_ns
         self._chunk_samples = _chunk_samples(metadata)
-        with self._explained():
+        with self._io_errors_explained():
             mcap = McapWriter(self._stream, library=f"rigd {rigd.__version__}")
             session = {
                 **metadata,
                 "format_version": FORMAT_VERSION,
                 "start_utc_ns": str(start_utc_ns),
             }
-            ticks = _segment_texts(segments)
+            segments_record = _segments_record(segments)
             mcap.add_metadata("session", session)
-            mcap.add_metadata("segments", ticks)
+            mcap.add_metadata("segments", segments_record)
             for name, data in attachments.items():
                 media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
                 mcap.add_attachment(name, media_type, data, start_utc_ns)
-            mcap.declare(*_session_channels(protected_metadata(session, ticks)))
+            mcap.declare(*_session_channels(metadata_for_channel(session, segments_record)))
             self._mcap = mcap
             self._sync()
             fsync_directory(self.part.parent)
 
     def write_samples(self, block: Buffer) -> None:
-        """Append n × ``SAMPLE_SIZE`` bytes of packed samples (n may be 0)."""
-        arrived = self._checked(block, SAMPLE_SIZE)
+        """Append packed samples: a multiple of ``SAMPLE_SIZE`` bytes, possibly 0."""
+        remaining = self._checked_view(block, SAMPLE_SIZE)
         chunk_size = self._chunk_samples * SAMPLE_SIZE
-        with self._explained():
-            while arrived:
-                taken = chunk_size - len(self._samples)
-                self._samples += arrived[:taken]
-                arrived = arrived[taken:]
+        with self._io_errors_explained():
+            while remaining:
+                room = chunk_size - len(self._samples)
+                self._samples += remaining[:room]
+                remaining = remaining[room:]
                 if len(self._samples) == chunk_size:
                     self._write_chunk(everything=False)
             self._sync_when_due()
 
     def write_controls(self, block: Buffer) -> None:
-        """Append n × ``CONTROL_SIZE`` bytes of packed control messages (n may be 0).
+        """Append packed controller terms: a multiple of ``CONTROL_SIZE`` bytes, possibly 0.
 
-        They go into the same chunk as the samples of that time if written before these.
+        They go into the same chunk as the samples of the same time if they are written before those
+        samples.
         """
-        self._controls += self._checked(block, CONTROL_SIZE)
-        with self._explained():
+        self._controls += self._checked_view(block, CONTROL_SIZE)
+        with self._io_errors_explained():
             self._sync_when_due()
 
     def write_timings(self, block: Buffer) -> None:
-        """Append n × ``TIMING_SIZE`` bytes of packed ages, as `write_controls` does."""
-        self._timings += self._checked(block, TIMING_SIZE)
-        with self._explained():
+        """Append packed ages of readings: a multiple of ``TIMING_SIZE`` bytes, possibly 0.
+
+        They go into the same chunk as the samples of the same time if they are written before those
+        samples.
+        """
+        self._timings += self._checked_view(block, TIMING_SIZE)
+        with self._io_errors_explained():
             self._sync_when_due()
 
     def write_touches(self, block: Buffer) -> None:
-        """Append n × ``TOUCH_SIZE`` bytes of packed touches, which go into the current chunk."""
-        self._touches += self._checked(block, TOUCH_SIZE)
+        """Append packed touches, a multiple of ``TOUCH_SIZE`` bytes, to the current chunk."""
+        self._touches += self._checked_view(block, TOUCH_SIZE)
 
     def log(self, t_ns: int, level: str, message: str, name: str = "rigd") -> None:
-        """Record an event in the file.
+        """Record an event in the log of the session file.
 
-        It is written with the current chunk; an error or a fatal one at once, together with the
-        chunk so far.
+        The event is written with the current chunk. An event of level "error" or "fatal" is written
+        at once, together with all messages collected so far.
 
         Parameters
         ----------
-        t_ns : ns since the session start
+        t_ns : time of the event in nanoseconds since the session start
         level : "debug", "info", "warning", "error" or "fatal"
         message : text for the operator
-        name : process or part that logs it
+        name : process or component that logs the event
         """
-        self._begun()
+        self._require_writer()
         log_time = self._start_utc_ns + t_ns
         seconds, nanos = divmod(log_time, 10**9)
         event = event_class()(
@@ -261,8 +272,8 @@ class SessionWriter:
             name=name,
         )
         self._events.append((log_time, event.SerializeToString()))
-        if level in _URGENT:
-            with self._explained():
+        if level in _URGENT_LEVELS:
+            with self._io_errors_explained():
                 self._write_chunk(everything=True)
 
     def close(
@@ -270,28 +281,28 @@ class SessionWriter:
         outcome: Mapping[str, str],
         segments: Mapping[str, tuple[int, int]] = MappingProxyType({}),
     ) -> Path:
-        """Write the record ``outcome``, complete the file and give it its final name.
+        """Write the record ``outcome``, complete the file, and rename it to its final path.
 
         Parameters
         ----------
-        outcome : the record ``outcome``
-        segments : those that were unknown at the beginning, or have changed
+        outcome : record ``outcome``: how the session ended, with the counts of ticks
+        segments : segments that were unknown at the beginning, or that have changed
 
         Returns
         -------
-        The final name.
+        The final path.
 
         Raises
         ------
         SessionExistsError
-            If a file of that name has appeared meanwhile; the complete session then has the name
-            with ``.part``.
+            If another file with the final path was created during the session. The complete session
+            then remains in the ``.part`` file.
         """
-        mcap = self._begun()
-        with self._explained():
+        mcap = self._require_writer()
+        with self._io_errors_explained():
             self._write_chunk(everything=True)
             if segments:
-                mcap.add_metadata("segments", _segment_texts(segments))
+                mcap.add_metadata("segments", _segments_record(segments))
             mcap.add_metadata("outcome", outcome)
             mcap.finish()
             self._sync()
@@ -308,69 +319,73 @@ class SessionWriter:
         return self.path
 
     def abandon(self) -> Path | None:
-        """Write the received data and leave the ``.part`` file without an end.
+        """Write the received data, and close the ``.part`` file as incomplete.
 
-        If it was removed, its contents, which exist while it is open, are saved to the nearest
-        writable folder above.
+        If the file was deleted during the session, its contents are saved to the nearest writable
+        parent folder.
 
         Returns
         -------
-        Path of the contents; None if they could not be saved.
+        Path of the file with the contents, or None if they could not be saved.
 
         Raises
         ------
         SessionError
-            If the received data cannot be written; earlier data stays.
+            If the received data cannot be written. Data that was written before remains.
         """
         if self._stream.closed:
             return self.part
         try:
             if not self._failed:
-                with self._explained():
+                with self._io_errors_explained():
                     if self._mcap is not None:
                         self._write_chunk(everything=True)
                     self._stream.flush()
                     os.fsync(self._stream.fileno())
         finally:
-            saved = self._saved_path()
+            path_of_contents = self._path_of_contents()
             with contextlib.suppress(OSError):  # the failure to write was reported already
                 self._stream.close()
-        return saved
+        return path_of_contents
 
     def discard(self) -> None:
-        """Remove the ``.part`` of a session that was never begun."""
+        """Remove the empty ``.part`` file of a session that was not begun."""
         if self._mcap is not None:
             raise RuntimeError("a session that was begun is not discarded")
         self._stream.close()
-        with self._explained():
+        with self._io_errors_explained():
             self.part.unlink(missing_ok=True)
 
     def _check_part_file(self) -> None:
-        """Check that the file has its name and the length of the data written to it.
+        """Raise if the ``.part`` file was removed, moved, shortened or changed by another program.
 
-        Writing to a removed or shortened file would still succeed.
+        Writing to such a file would still succeed without an error.
         """
-        if not self._has_its_name():
+        if not self._is_part_in_place():
             raise SessionError(
                 f"{self.part} was removed or moved while it was recorded. Do not change the folder "
                 "of a running session."
             )
-        if os.fstat(self._stream.fileno()).st_size != self._raw.written:
+        if os.fstat(self._stream.fileno()).st_size != self._counted_file.written:
             raise SessionError(
                 f"{self.part} was shortened or written to by another program while it was "
                 "recorded. Do not change the files of a running session."
             )
 
-    def _has_its_name(self) -> bool:
+    def _is_part_in_place(self) -> bool:
+        """Return whether the path of the ``.part`` file still refers to the open file."""
         try:
             return os.path.samestat(self.part.stat(), os.fstat(self._stream.fileno()))
         except OSError:
             return False
 
-    def _saved_path(self) -> Path | None:
-        """Return the path of the contents, saving them elsewhere if the file was removed."""
+    def _path_of_contents(self) -> Path | None:
+        """Return the path of the contents, which are copied elsewhere if the file was deleted.
+
+        Returns None if they could not be saved.
+        """
         descriptor = self._stream.fileno()
-        if self._has_its_name():
+        if self._is_part_in_place():
             return self.part
         if os.fstat(descriptor).st_nlink:
             with contextlib.suppress(OSError):
@@ -383,7 +398,8 @@ class SessionWriter:
                 return copy
         return None
 
-    def _begun(self) -> McapWriter:
+    def _require_writer(self) -> McapWriter:
+        """Return the MCAP writer; raise if `begin` was not called or writing has failed."""
         if self._mcap is None:
             raise RuntimeError("begin() comes first")
         if self._failed:
@@ -391,8 +407,9 @@ class SessionWriter:
             raise SessionError(f"{self.part}: writing failed before, the recording ends there.")
         return self._mcap
 
-    def _checked(self, block: Buffer, size: int) -> memoryview:
-        self._begun()
+    def _checked_view(self, block: Buffer, size: int) -> memoryview:
+        """Return a view of the block; raise if its length is no multiple of `size` bytes."""
+        self._require_writer()
         view = memoryview(block).cast("B")
         if len(view) % size:
             raise ValueError(
@@ -401,20 +418,21 @@ class SessionWriter:
         return view
 
     def _write_chunk(self, *, everything: bool) -> None:
-        """Write the collected messages as a chunk.
+        """Write the collected messages as one chunk.
 
-        Controls and timings wait for the samples of the same time, unless `everything` is written.
+        Controller terms and ages of readings that are later than the last sample stay for the next
+        chunk, unless `everything` is True.
         """
-        mcap = self._begun()
+        mcap = self._require_writer()
         samples = np.frombuffer(self._samples, SAMPLE_WIRE_DTYPE)
         controls = np.frombuffer(self._controls, CONTROL_WIRE_DTYPE)
         timings = np.frombuffer(self._timings, TIMING_WIRE_DTYPE)
         if not everything:
             controls, timings = (
-                others[: np.searchsorted(others["t_ns"], samples["t_ns"][-1], side="right")]
-                for others in (controls, timings)
+                messages[: np.searchsorted(messages["t_ns"], samples["t_ns"][-1], side="right")]
+                for messages in (controls, timings)
             )
-        parts: list[bytes] = []
+        chunk_parts: list[bytes] = []
         indexes: dict[int, npt.NDArray[np.void]] = {}
         offset = 0
         for topic, wire in (
@@ -424,22 +442,22 @@ class SessionWriter:
             (TOUCH_TOPIC, np.frombuffer(self._touches, TOUCH_WIRE_DTYPE)),
         ):
             if len(wire):
-                channel, _ = _CHANNELS[topic]
-                records = _fixed_records(wire, channel, self._start_utc_ns)
-                parts.append(records.tobytes())
-                indexes[channel] = _fixed_index(records, offset)
+                channel, _ = _CHANNEL_NUMBERS_AND_SCHEMAS[topic]
+                records = _message_records(wire, channel, self._start_utc_ns)
+                chunk_parts.append(records.tobytes())
+                indexes[channel] = _message_index(records, offset)
                 offset += records.nbytes
         if self._events:
-            channel, _ = _CHANNELS[EVENT_TOPIC]
+            channel, _ = _CHANNEL_NUMBERS_AND_SCHEMAS[EVENT_TOPIC]
             events, indexes[channel] = _event_records(
                 self._events, channel, self._event_count, offset
             )
-            parts.append(events)
+            chunk_parts.append(events)
             self._event_count += len(self._events)
         if indexes:
-            mcap.add_chunk(b"".join(parts), indexes)
+            mcap.add_chunk(b"".join(chunk_parts), indexes)
             self._stream.flush()
-            self._dirty = True
+            self._is_sync_needed = True
         self._samples = bytearray()
         self._controls = self._controls[controls.nbytes :]
         self._timings = self._timings[timings.nbytes :]
@@ -447,21 +465,23 @@ class SessionWriter:
         self._events = []
 
     def _sync_when_due(self) -> None:
-        if self._dirty and time.monotonic() - self._synced_at >= SYNC_INTERVAL_S:
+        """Sync the file to the disk if it has changed and the last sync is a second ago."""
+        if self._is_sync_needed and time.monotonic() - self._last_sync_s >= SYNC_INTERVAL_S:
             self._sync()
             self._check_part_file()
 
     def _sync(self) -> None:
+        """Write all buffered bytes of the file to the disk."""
         self._stream.flush()
         os.fsync(self._stream.fileno())
-        self._synced_at = time.monotonic()
-        self._dirty = False
+        self._last_sync_s = time.monotonic()
+        self._is_sync_needed = False
 
 
-def _fixed_records(
+def _message_records(
     wire: npt.NDArray[np.void], channel: int, start_utc_ns: int
 ) -> npt.NDArray[np.void]:
-    """Put the head of an MCAP message record before each message (n,) of a wire dtype."""
+    """Return MCAP message records (n,) for messages (n,) of a wire dtype."""
     records = np.empty(wire.shape, [*_MESSAGE_HEAD_FIELDS, ("data", wire.dtype)])
     records["opcode"] = Opcode.MESSAGE
     records["length"] = records.dtype.itemsize - RECORD_HEAD_SIZE
@@ -473,7 +493,8 @@ def _fixed_records(
     return records
 
 
-def _fixed_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
+def _message_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
+    """Return the message index of records of equal length that begin at `offset` of a chunk."""
     index = np.empty(records.shape, INDEX_DTYPE)
     index["log_time"] = records["log_time"]
     index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
@@ -483,45 +504,51 @@ def _fixed_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.v
 def _event_records(
     events: Sequence[tuple[int, bytes]], channel: int, first_sequence: int, offset: int
 ) -> tuple[bytes, npt.NDArray[np.void]]:
-    """Return message records of events (log time, message), and their index."""
+    """Return the message records of events (log time in ns, message), and their message index."""
     records = b""
     index = np.empty(len(events), INDEX_DTYPE)
     for i, (log_time, data) in enumerate(events):
         index[i] = (log_time, offset + len(records))
-        length = MESSAGE_HEAD.size - RECORD_HEAD_SIZE + len(data)
-        records += MESSAGE_HEAD.pack(
+        length = MESSAGE_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(data)
+        records += MESSAGE_HEAD_FORMAT.pack(
             Opcode.MESSAGE, length, channel, first_sequence + i, log_time, log_time
         )
         records += data
     return records, index
 
 
-def _segment_texts(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
+def _segments_record(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
+    """Return the record ``segments``: name → "first,end" in ticks."""
     return {name: f"{first},{end}" for name, (first, end) in segments.items()}
 
 
 def _chunk_samples(metadata: Mapping[str, str]) -> int:
     """Return the number of samples per chunk: `CHUNK_SAMPLES`, or fewer at a low rate."""
     try:
-        in_time = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
+        samples_in_interval = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
     except (ValueError, OverflowError):
         return CHUNK_SAMPLES
-    return min(max(in_time, 1), CHUNK_SAMPLES)
+    return min(max(samples_in_interval, 1), CHUNK_SAMPLES)
 
 
 def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
-    """Return the channels of a session; that of the samples repeats the file's metadata."""
+    """Return schemas and channels of a session; the samples' channel repeats its metadata."""
     schemas, channels = [], []
-    for topic, (number, schema_name) in _CHANNELS.items():
+    for topic, (channel_number, schema_name) in _CHANNEL_NUMBERS_AND_SCHEMAS.items():
         schemas.append(
-            Schema(id=number, name=schema_name, encoding="protobuf", data=schema_data(schema_name))
+            Schema(
+                id=channel_number,
+                name=schema_name,
+                encoding="protobuf",
+                data=schema_data(schema_name),
+            )
         )
         channels.append(
             Channel(
-                id=number,
+                id=channel_number,
                 topic=topic,
                 message_encoding="protobuf",
-                schema_id=number,
+                schema_id=channel_number,
                 metadata=dict(metadata) if topic == SAMPLE_TOPIC else {},
             )
         )
@@ -530,11 +557,12 @@ def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[C
 
 # New files on the disk
 
-_COPY_BYTES: Final = 1 << 20
+_COPY_BLOCK_BYTES: Final = 1 << 20
+"""Number of bytes that `copy_new` reads at once."""
 
 
 def fsync_directory(path: Path) -> None:
-    """Sync the names in a folder to the disk."""
+    """Write the entries of a folder to the disk, so that a new or renamed file survives a crash."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -543,11 +571,14 @@ def fsync_directory(path: Path) -> None:
 
 
 def copy_new(descriptor: int, target: Path) -> None:
-    """Copy an open file, of any name, to a new file and to the disk."""
+    """Copy the contents of an open file to a new file, and sync that to the disk.
+
+    Raises FileExistsError if `target` exists.
+    """
     with target.open("xb") as copy:
         try:
             position = 0
-            while data := os.pread(descriptor, _COPY_BYTES, position):
+            while data := os.pread(descriptor, _COPY_BLOCK_BYTES, position):
                 copy.write(data)
                 position += len(data)
             copy.flush()
@@ -558,37 +589,42 @@ def copy_new(descriptor: int, target: Path) -> None:
 
 
 def rename_new(source: Path, target: Path) -> None:
-    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists.
+    """Rename a file without ever replacing another file.
 
     Parameters
     ----------
     source
-        The file.
+        Path of the file.
     target
-        Its new name, on the same disk.
+        New path on the same disk.
+
+    Raises
+    ------
+    FileExistsError
+        If `target` exists.
     """
     try:
         os.link(source, target)
     except OSError as error:
         if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
             raise
-        # A file system without hard links (FAT, some network drives): reserve the name, which
-        # fails if the name exists, and replace the empty file, which then is our own.
+        # A file system without hard links (FAT, some network drives): create an empty file, which
+        # fails if the name exists, and replace that file.
         os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
         try:
             source.replace(target)
         except OSError:
             with contextlib.suppress(OSError):
-                target.unlink()  # else it would keep the name from a recovery
+                target.unlink()  # the empty file would prevent a recovery to that name
             raise
     else:
         source.unlink()
 
 
 def mark_as_written(descriptor: int) -> None:
-    """Mark a file as being written while `descriptor` is open and its process lives.
+    """Mark an open file as being written until it is closed or this process ends.
 
-    Uses an advisory lock; a file system without locks has no mark.
+    The mark is an advisory lock. On a file system without locks the file is not marked.
     """
     if fcntl is not None:
         with contextlib.suppress(OSError):
@@ -596,7 +632,7 @@ def mark_as_written(descriptor: int) -> None:
 
 
 def is_being_written(path: Path) -> bool:
-    """Return whether a living process holds the mark of `mark_as_written`."""
+    """Return whether a running process is still writing a file, by the lock on it."""
     if fcntl is None:
         return False
     try:

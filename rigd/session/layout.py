@@ -38,10 +38,10 @@ SAMPLE_TYPES: Final[dict[str, str]] = {
     "lateness_ns": "fixed32",
     "work_ns": "fixed32",
 }
-"""Fields of ``rigd.Sample`` with their protobuf types; the first has number 1."""
+"""Field name → protobuf type, for the message ``rigd.Sample``, in the order of field numbers."""
 
 WRENCH_FIELDS: Final = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
-"""Fields of ``rigd.Sample`` with the wrench, in the order of the projections."""
+"""Fields of ``rigd.Sample`` with the three forces and three torques of the sensor."""
 
 CONTROL_TYPES: Final[dict[str, str]] = {
     "t_ns": "sfixed64",
@@ -53,7 +53,7 @@ CONTROL_TYPES: Final[dict[str, str]] = {
     "friction_nm": "double",
     "unlimited_torque_nm": "double",
 }
-"""Fields of ``rigd.Control`` with their protobuf types; the first has number 1."""
+"""Field name → protobuf type, for the message ``rigd.Control``, in the order of field numbers."""
 
 TIMING_TYPES: Final[dict[str, str]] = {
     "t_ns": "sfixed64",
@@ -61,7 +61,7 @@ TIMING_TYPES: Final[dict[str, str]] = {
     "angle_age_s": "double",
     "wrench_age_s": "double",
 }
-"""Fields of ``rigd.Timing`` with their protobuf types; the first has number 1."""
+"""Field name → protobuf type, for the message ``rigd.Timing``, in the order of field numbers."""
 
 TOUCH_TYPES: Final[dict[str, str]] = {
     "t_ns": "sfixed64",
@@ -74,49 +74,49 @@ TOUCH_TYPES: Final[dict[str, str]] = {
     "stiffness_std_n_per_m": "double",
     "kind": "fixed32",
 }
-"""Fields of ``rigd.Touch`` with their protobuf types; the first has number 1."""
+"""Field name → protobuf type, for the message ``rigd.Touch``, in the order of field numbers."""
 
 TOUCH_KINDS: Final = ("unknown", "rigid", "yielding", "moving", "knock")
-"""Names of the values 0…4 of its field ``kind``."""
+"""Kinds of obstacle that the beam touched: names of the values 0…4 of the field ``kind``."""
 
 _NUMPY_TYPES: Final = {"sfixed64": "<i8", "fixed32": "<u4", "double": "<f8"}
 _WIRE_TYPES: Final = {"sfixed64": 1, "fixed32": 5, "double": 1}  # of the protobuf encoding
 
 
 class Status(IntFlag):
-    """Bits of the field ``status``; the others are reserved."""
+    """Flags of a sample: bits of its field ``status``; the other bits are reserved."""
 
     TORQUE_SATURATED = 1
-    """The torque command was cut to the limit."""
+    """The torque command was reduced to the torque limit."""
     WRENCH_SATURATED = 2
     """At least one axis of the force-torque sensor was at the end of its range."""
     ANGLE_STALE = 4
-    """No new angle arrived in time; the last one is repeated."""
+    """No new angle arrived in time, so that the last angle is repeated."""
     WRENCH_STALE = 8
-    """No new wrench arrived in time; the last one is repeated."""
+    """No new wrench arrived in time, so that the last wrench is repeated."""
     AFTER_MISSED = 16
-    """First sample after ticks that the loop missed."""
+    """This is the first sample after ticks that the control loop missed."""
     AFTER_LOST = 32
-    """First sample after samples that were taken and could not be recorded."""
+    """This is the first sample after samples that were measured but could not be recorded."""
     LIMIT_WARNING = 64
-    """A limit of the profile is near or exceeded."""
+    """A limit of the profile is nearly reached or exceeded."""
     TORQUE_OFF = 128
     """The drive exerts no torque."""
     LATE = 256
-    """The tick woke late."""
+    """The control loop woke up late for this tick."""
     TOUCHED = 512
-    """The loop detected in this tick that the beam has met something."""
+    """In this tick the control loop detected that the beam touched an obstacle."""
 
 
 def field_tag(number: int, protobuf_type: str) -> int:
-    """Return the tag byte of field `number` (1–15) of a fixed-layout message.
+    """Return the protobuf tag byte that precedes a field of a fixed-layout message.
 
     Parameters
     ----------
     number
-        1 to 15.
+        Field number, from 1 to 15.
     protobuf_type
-        "sfixed64", "fixed32" or "double".
+        Type of the field: "sfixed64", "fixed32" or "double".
 
     Examples
     --------
@@ -128,41 +128,49 @@ def field_tag(number: int, protobuf_type: str) -> int:
 
 
 def _native_dtype(types: dict[str, str]) -> np.dtype[np.void]:
-    # Aligned: numpy's loops over a column are then as quick as over any strided array.
-    return np.dtype([(name, _NUMPY_TYPES[kind]) for name, kind in types.items()], align=True)
+    """Return the array type of a decoded message with the given fields and protobuf types."""
+    # Aligned: NumPy's loops over one field are then as fast as over any strided array.
+    return np.dtype(
+        [(name, _NUMPY_TYPES[protobuf_type]) for name, protobuf_type in types.items()], align=True
+    )
 
 
 def _wire_dtype(types: dict[str, str]) -> np.dtype[np.void]:
-    columns: list[tuple[str, str]] = []
-    for name, kind in types.items():
-        columns += [(f"tag_{name}", "u1"), (name, _NUMPY_TYPES[kind])]
-    return np.dtype(columns)
+    """Return the array type of an encoded message: each field after its tag byte ``tag_NAME``."""
+    fields: list[tuple[str, str]] = []
+    for name, protobuf_type in types.items():
+        fields += [(f"tag_{name}", "u1"), (name, _NUMPY_TYPES[protobuf_type])]
+    return np.dtype(fields)
 
 
 SAMPLE_FIELDS: Final = tuple(SAMPLE_TYPES)
 SAMPLE_DTYPE: Final = _native_dtype(SAMPLE_TYPES)
-"""A decoded sample."""
+"""Array type of a decoded sample."""
 SAMPLE_WIRE_DTYPE: Final = _wire_dtype(SAMPLE_TYPES)
-"""A sample in the file: each field after its tag byte ``tag_NAME``."""
+"""Array type of an encoded sample in the file: each field after its tag byte ``tag_NAME``."""
 SAMPLE_SIZE: Final = SAMPLE_WIRE_DTYPE.itemsize
+"""Length of an encoded sample in bytes."""
 
 CONTROL_DTYPE: Final = _native_dtype(CONTROL_TYPES)
-"""A decoded message of the controller's terms."""
+"""Array type of a decoded message with the controller's terms."""
 CONTROL_WIRE_DTYPE: Final = _wire_dtype(CONTROL_TYPES)
-"""A control message in the file: each field after its tag byte ``tag_NAME``."""
+"""Array type of an encoded message with the controller's terms: each field after its tag byte."""
 CONTROL_SIZE: Final = CONTROL_WIRE_DTYPE.itemsize
+"""Length of an encoded message with the controller's terms in bytes."""
 
 TIMING_DTYPE: Final = _native_dtype(TIMING_TYPES)
-"""A decoded message of the readings' ages."""
+"""Array type of a decoded message with the ages of the angle and wrench readings."""
 TIMING_WIRE_DTYPE: Final = _wire_dtype(TIMING_TYPES)
-"""A timing message in the file: each field after its tag byte ``tag_NAME``."""
+"""Array type of an encoded message with the readings' ages: each field after its tag byte."""
 TIMING_SIZE: Final = TIMING_WIRE_DTYPE.itemsize
+"""Length of an encoded message with the readings' ages in bytes."""
 
 TOUCH_DTYPE: Final = _native_dtype(TOUCH_TYPES)
-"""A decoded touch."""
+"""Array type of a decoded message with an estimated touch."""
 TOUCH_WIRE_DTYPE: Final = _wire_dtype(TOUCH_TYPES)
-"""A touch in the file: each field after its tag byte ``tag_NAME``."""
+"""Array type of an encoded message with an estimated touch: each field after its tag byte."""
 TOUCH_SIZE: Final = TOUCH_WIRE_DTYPE.itemsize
+"""Length of an encoded message with an estimated touch in bytes."""
 
 _pack_sample: Final = struct.Struct("<Bq BI" + "Bd" * 10 + "BI" * 3).pack_into
 _pack_control: Final = struct.Struct("<Bq BI" + "Bd" * 6).pack_into
@@ -188,29 +196,29 @@ def pack_sample_into(
     lateness_ns: int,
     work_ns: int,
 ) -> None:
-    """Write one sample of ``SAMPLE_SIZE`` bytes into `buffer` at `offset`.
+    """Encode one sample as ``SAMPLE_SIZE`` bytes of `buffer` from `offset`.
 
-    Called once a tick. `lateness_ns` and `work_ns` are clamped to 0…2³²−1 ns; any other value that
-    its field cannot hold raises ``struct.error``.
+    The control loop calls this once a tick. `lateness_ns` and `work_ns` are clamped to 0…2³²−1 ns.
+    Any other value outside its field's range raises ``struct.error``.
 
     Parameters
     ----------
     buffer
         Memory to write to.
     offset
-        Offset of the message in it, in bytes.
+        Position of the encoded sample in the buffer, in bytes.
     t_ns
-        Scheduled time of the tick since the session's start.
+        Scheduled time of the tick, in nanoseconds since the session start.
     tick
         Number of the tick.
     angle_reference_rad, angle_rad
-        Reference and measured angle.
+        Reference angle and measured angle.
     torque_command_nm, coupling_torque_nm
-        Torque commanded, and torque measured about the motor's axis.
+        Commanded motor torque, and measured torque about the motor's axis.
     fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm
-        Wrench in the sensor's frame, tared.
+        Tared wrench in the sensor's frame.
     status
-        Bits of `Status`.
+        Combined bits of `Status`.
     lateness_ns, work_ns
         Wake-up latency and execution time of the tick.
 
@@ -227,7 +235,7 @@ def pack_sample_into(
         lateness_ns = 0 if lateness_ns < 0 else 0xFFFFFFFF
     if not 0 <= work_ns <= 0xFFFFFFFF:
         work_ns = 0 if work_ns < 0 else 0xFFFFFFFF
-    # The tags are literals because this line takes a good part of the loop's own time.
+    # The tags are literals because this call takes a considerable part of the loop's own time.
     # fmt: off
     _pack_sample(
         buffer, offset,
@@ -252,22 +260,22 @@ def pack_control_into(
     friction_nm: float,
     unlimited_torque_nm: float,
 ) -> None:
-    """Write one control message of ``CONTROL_SIZE`` bytes into `buffer` at `offset`.
+    """Encode the controller's terms of one tick as ``CONTROL_SIZE`` bytes of `buffer`.
 
     Parameters
     ----------
     buffer
         Memory to write to.
     offset
-        Offset of the message in it, in bytes.
+        Position of the encoded message in the buffer, in bytes.
     t_ns
-        Scheduled time of the tick since the session's start.
+        Scheduled time of the tick, in nanoseconds since the session start.
     tick
         Number of the tick.
     proportional_nm, integral_nm, derivative_nm, feedforward_nm, friction_nm
-        Terms of the controller.
+        Torques of the controller's terms.
     unlimited_torque_nm
-        Their sum.
+        Sum of the torques before it is limited.
     """
     # fmt: off
     _pack_control(
@@ -287,20 +295,20 @@ def pack_timing_into(
     angle_age_s: float,
     wrench_age_s: float,
 ) -> None:
-    """Write one timing message of ``TIMING_SIZE`` bytes into `buffer` at `offset`.
+    """Encode the ages of one tick's readings as ``TIMING_SIZE`` bytes of `buffer`.
 
     Parameters
     ----------
     buffer
         Memory to write to.
     offset
-        Offset of the message in it, in bytes.
+        Position of the encoded message in the buffer, in bytes.
     t_ns
-        Scheduled time of the tick since the session's start.
+        Scheduled time of the tick, in nanoseconds since the session start.
     tick
         Number of the tick.
     angle_age_s, wrench_age_s
-        Age of each reading at its use.
+        Time from the measurement of the angle and of the wrench until the controller used them.
     """
     _pack_timing(buffer, offset, 0x09, t_ns, 0x15, tick, 0x19, angle_age_s, 0x21, wrench_age_s)
 
@@ -316,38 +324,41 @@ def pack_touch(
     stiffness_std_n_per_m: float,
     kind: str,
 ) -> bytes:
-    """Return one message of a touch, of ``TOUCH_SIZE`` bytes.
+    """Return the ``TOUCH_SIZE`` bytes that encode an estimated touch of the beam on an obstacle.
+
+    An unknown distance, force or stiffness is NaN.
 
     Parameters
     ----------
     t_ns
-        Time of the first contact since the session's start.
+        Time of the first contact, in nanoseconds since the session start.
     tick
-        Tick in which the loop detected it.
+        Tick in which the control loop detected the touch.
     x_m, x_std_m
-        Distance of the point from the motor's axis and its standard deviation; NaN, as for the
-        following, if unknown.
+        Distance of the contact point from the motor's axis, and its standard deviation.
     force_n, force_std_n
-        Peak of the contact force's magnitude.
+        Peak magnitude of the contact force, and its standard deviation.
     stiffness_n_per_m, stiffness_std_n_per_m
-        Stiffness of the obstacle.
+        Contact stiffness of the obstacle, and its standard deviation.
     kind
-        One of ``TOUCH_KINDS``; any other counts as unknown.
+        One of ``TOUCH_KINDS``; any other text is encoded as unknown.
     """
     values = (
         t_ns, tick, x_m, x_std_m, force_n, force_std_n, stiffness_n_per_m, stiffness_std_n_per_m,
         TOUCH_KINDS.index(kind) if kind in TOUCH_KINDS else 0,
     )  # fmt: skip
-    return _encode(dict(zip(TOUCH_TYPES, values, strict=True)), TOUCH_TYPES, TOUCH_WIRE_DTYPE)
+    return _encode_messages(
+        dict(zip(TOUCH_TYPES, values, strict=True)), TOUCH_TYPES, TOUCH_WIRE_DTYPE
+    )
 
 
 def encode_samples(columns: Mapping[str, npt.ArrayLike]) -> bytes:
-    """Encode samples in the fixed layout, for `decode_samples`.
+    """Return the encoded bytes of samples, in the fixed layout that `decode_samples` reads.
 
     Parameters
     ----------
     columns : mapping of str to array (n,)
-        Fields of a sample, ``tick`` among them; absent ones are 0.
+        Name of a sample field → values; ``tick`` is required, other absent fields are 0.
 
     Examples
     --------
@@ -355,112 +366,118 @@ def encode_samples(columns: Mapping[str, npt.ArrayLike]) -> bytes:
     >>> decode_samples(encode_samples({"tick": [0, 1], "angle_rad": [0.1, 0.2]}))["angle_rad"]
     array([0.1, 0.2])
     """
-    return _encode(columns, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE)
+    return _encode_messages(columns, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE)
 
 
-def _encode(
+def _encode_messages(
     columns: Mapping[str, npt.ArrayLike], types: dict[str, str], wire_dtype: np.dtype[np.void]
 ) -> bytes:
+    """Return messages encoded in the fixed layout, from field name → values (n,)."""
     wire = np.zeros(np.size(columns["tick"]), wire_dtype)
-    for number, (name, kind) in enumerate(types.items(), start=1):
-        wire[f"tag_{name}"] = field_tag(number, kind)
+    for number, (name, protobuf_type) in enumerate(types.items(), start=1):
+        wire[f"tag_{name}"] = field_tag(number, protobuf_type)
         if name in columns:
             wire[name] = columns[name]
     return wire.tobytes()
 
 
 def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.NDArray[np.bool_]:
-    """Return which messages have every tag of the fixed layout at its offset.
+    """Return a mask of the encoded messages that have every tag byte of the fixed layout.
 
     Parameters
     ----------
-    wire : array (n,) of a wire dtype
-    types : types of its fields, such as ``SAMPLE_TYPES``
+    wire : array (n,) of encoded messages, such as of ``SAMPLE_WIRE_DTYPE``
+    types : protobuf types of the fields, such as ``SAMPLE_TYPES``
 
     Returns
     -------
     array (n,) of bool
     """
-    offsets, tags = _tags(wire.dtype, tuple(types.items()))
+    offsets, tags = _tag_offsets_and_values(wire.dtype, tuple(types.items()))
     data = np.ascontiguousarray(wire).view(np.uint8).reshape(wire.size, wire.dtype.itemsize)
-    fixed: npt.NDArray[np.bool_] = (data[:, offsets] == tags).all(axis=1)
-    return fixed
+    is_fixed: npt.NDArray[np.bool_] = (data[:, offsets] == tags).all(axis=1)
+    return is_fixed
 
 
 @cache
-def _tags(
+def _tag_offsets_and_values(
     wire_dtype: np.dtype[np.void], types: tuple[tuple[str, str], ...]
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.uint8]]:
-    """Return offsets and values of the tag bytes of a message."""
+    """Return the offsets and the values of the tag bytes in an encoded message."""
     assert wire_dtype.fields is not None
     offsets = [wire_dtype.fields[f"tag_{name}"][1] for name, _ in types]
-    tags = [field_tag(number, kind) for number, (_, kind) in enumerate(types, start=1)]
+    tags = [
+        field_tag(number, protobuf_type) for number, (_, protobuf_type) in enumerate(types, start=1)
+    ]
     return np.array(offsets), np.array(tags, dtype=np.uint8)
 
 
 def to_native(wire: npt.NDArray[np.void], names: Iterable[str], out: npt.NDArray[np.void]) -> None:
-    """Copy fields of messages in file format into an array of decoded messages.
+    """Copy fields of encoded messages into an array of decoded messages.
 
     Parameters
     ----------
-    wire : array (n,) of a wire dtype
+    wire : array (n,) of encoded messages
     names
-        Fields to copy.
-    out : array (n,) of a decoded dtype
+        Names of the fields to copy.
+    out : array (n,) of decoded messages, which is written to
     """
     for name in names:
         out[name] = wire[name]
 
 
-def _decode(
+def _decode_messages(
     block: Buffer,
     types: dict[str, str],
     wire_dtype: np.dtype[np.void],
     dtype: np.dtype[np.void],
 ) -> npt.NDArray[np.void]:
+    """Return the decoded messages of a block of bytes; raise ValueError if a tag byte is wrong."""
     size = memoryview(block).nbytes
     if size % wire_dtype.itemsize:
         raise ValueError(
             f"a block of {size} bytes is not a whole number of {wire_dtype.itemsize}-byte messages"
         )
     wire = np.frombuffer(block, wire_dtype)
-    fixed = is_fixed_layout(wire, types)
-    if not fixed.all():
-        raise ValueError(f"message {int(np.argmin(fixed))} of the block is not of the fixed layout")
+    is_fixed = is_fixed_layout(wire, types)
+    if not is_fixed.all():
+        raise ValueError(
+            f"message {int(np.argmin(is_fixed))} of the block is not of the fixed layout"
+        )
     native = np.empty(wire.shape, dtype)
     to_native(wire, types, native)
     return native
 
 
 def decode_samples(block: Buffer) -> npt.NDArray[np.void]:
-    """Decode consecutive samples of the fixed layout.
+    """Return the samples that a block of bytes encodes in the fixed layout.
 
     Parameters
     ----------
-    block : bytes-like of n × ``SAMPLE_SIZE`` bytes
+    block : n × ``SAMPLE_SIZE`` bytes
 
     Returns
     -------
-    array (n,) of ``SAMPLE_DTYPE``, a copy
+    new array (n,) of ``SAMPLE_DTYPE``
 
     Raises
     ------
     ValueError
         If the length is not a multiple of ``SAMPLE_SIZE`` or a tag byte is not the expected one.
     """
-    return _decode(block, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, SAMPLE_DTYPE)
+    return _decode_messages(block, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, SAMPLE_DTYPE)
 
 
 def decode_controls(block: Buffer) -> npt.NDArray[np.void]:
-    """Decode consecutive control messages of the fixed layout, as `decode_samples` does."""
-    return _decode(block, CONTROL_TYPES, CONTROL_WIRE_DTYPE, CONTROL_DTYPE)
+    """Return the controller terms (n,) of ``CONTROL_DTYPE`` that a block of bytes encodes."""
+    return _decode_messages(block, CONTROL_TYPES, CONTROL_WIRE_DTYPE, CONTROL_DTYPE)
 
 
 def decode_timings(block: Buffer) -> npt.NDArray[np.void]:
-    """Decode consecutive timing messages of the fixed layout, as `decode_samples` does."""
-    return _decode(block, TIMING_TYPES, TIMING_WIRE_DTYPE, TIMING_DTYPE)
+    """Return the ages of readings (n,) of ``TIMING_DTYPE`` that a block of bytes encodes."""
+    return _decode_messages(block, TIMING_TYPES, TIMING_WIRE_DTYPE, TIMING_DTYPE)
 
 
 def decode_touches(block: Buffer) -> npt.NDArray[np.void]:
-    """Decode consecutive messages of touches of the fixed layout, as `decode_samples` does."""
-    return _decode(block, TOUCH_TYPES, TOUCH_WIRE_DTYPE, TOUCH_DTYPE)
+    """Return the estimated touches (n,) of ``TOUCH_DTYPE`` that a block of bytes encodes."""
+    return _decode_messages(block, TOUCH_TYPES, TOUCH_WIRE_DTYPE, TOUCH_DTYPE)

@@ -1,19 +1,20 @@
-"""Stream to the online fit, and its answers in words.
+"""Data stream from a running session to the online fit, and text for the fit's estimates.
 
 A process of rigd that watches a session starts ``python -m analysis.online`` and writes to its
 standard input:
 
-* one line of JSON, UTF-8: ``version`` (1), ``metadata`` and ``segments`` as `SessionWriter.begin`
-  takes them, and ``every_s``: time between two estimates without a request, null for none;
-* frames: one byte of kind, four bytes of length (little-endian), and as many bytes of content:
+* one line of JSON, UTF-8: ``version`` (1), ``metadata`` and ``segments`` as for
+  `SessionWriter.begin`, and ``every_s``: time between two estimates without a request, or null if
+  estimates are made on request only;
+* frames: one byte for the kind, four bytes for the length (little-endian), and the content:
 
   ======  ===========================================================================
   ``S``   consecutive samples in the format of session files (``SAMPLE_WIRE_DTYPE``)
   ``R``   JSON: `EstimateRequest`
   ======  ===========================================================================
 
-The end of the stream ends the program. It answers on its standard output, one line of JSON per
-estimate (docs/online_fit.md).
+The program ends at the end of the stream. It writes one line of JSON per estimate to its standard
+output (docs/online_fit.md).
 """
 
 import json
@@ -31,111 +32,119 @@ from rigd.session._validity import Validity
 from rigd.session.layout import Buffer, decode_samples
 from rigd.units import decimals, with_half_width
 
-_VERSION: Final = 1
-_HEAD: Final = struct.Struct("<cI")
-_SAMPLES: Final = b"S"
-_REQUEST: Final = b"R"
-_KG_MM2: Final = 1e6
-_LONGEST_LINE: Final = 1 << 20
-_LONGEST_FRAME: Final = 1 << 26
+_STREAM_VERSION: Final = 1
+"""Version of the stream's format."""
+_FRAME_HEAD_FORMAT: Final = struct.Struct("<cI")
+_SAMPLES_FRAME: Final = b"S"
+_REQUEST_FRAME: Final = b"R"
+_KG_MM2_PER_KG_M2: Final = 1e6
+"""Conversion factor from kg m² to kg mm²."""
+_MAX_FIRST_LINE_BYTES: Final = 1 << 20
+"""Maximum length of the stream's first line in bytes."""
+_MAX_FRAME_BYTES: Final = 1 << 26
+"""Maximum length of a frame's content in bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamStart:
-    """Metadata of a session that are known before its first sample."""
+    """First line of the stream: metadata that are known before the session's first sample."""
 
     metadata: dict[str, str]
-    """The record ``session`` of the future file."""
+    """Record ``session`` that the session file will contain."""
     segments: dict[str, tuple[int, int]]
-    """Name → first tick and end (exclusive), as planned."""
+    """Segment name → planned first tick and end tick (exclusive)."""
     every_s: float | None
-    """Time between two estimates without a request; None: on request only."""
+    """Time between two estimates without a request, or None for estimates on request only."""
 
 
 @dataclass(frozen=True, slots=True)
 class EstimateRequest:
-    """Request for an estimate from the samples so far."""
+    """Request to estimate the beam's parameters from the samples sent so far."""
 
     id: int
-    """Number that the answer repeats."""
+    """Identification number, which the line with the estimate repeats."""
     tick: int
-    """Samples from this tick on are left out."""
+    """First tick whose sample is not used for the estimate."""
     whole: bool
-    """Whether every structure is tried, as in `analyze`; else the freest one alone is fitted."""
+    """Whether all damping structures are fitted, as by `analyze`, or only the one with the most
+    parameters."""
     from_last: bool = False
-    """Whether the fit may start from the last such estimate, in a third of the time."""
+    """Whether the fit may start from the previous estimate, which takes a third of the time."""
 
 
 def write_start(stream: BinaryIO, start: StreamStart) -> None:
-    """Write the start of a stream: metadata and segments of the session.
+    """Write the first line of the online fit's input stream: the session's metadata.
 
     Parameters
     ----------
     stream
-        Standard input of the program.
+        Standard input of the fit program.
     start
-        The session.
+        Metadata and segments of the session.
     """
-    stream.write(json.dumps({"version": _VERSION, **asdict(start)}).encode() + b"\n")
+    stream.write(json.dumps({"version": _STREAM_VERSION, **asdict(start)}).encode() + b"\n")
     stream.flush()
 
 
 def write_samples(stream: BinaryIO, block: Buffer) -> None:
-    """Write consecutive samples to the stream.
+    """Write consecutive samples to the online fit's input stream, as one frame.
 
     Parameters
     ----------
     stream
-        Stream that was begun.
+        Standard input of the fit program, after `write_start`.
     block
-        n × ``SAMPLE_SIZE`` bytes, as `pack_sample_into` writes them.
+        Encoded samples: n × ``SAMPLE_SIZE`` bytes, as `pack_sample_into` writes them.
     """
-    _write(stream, _SAMPLES, block)
+    _write_frame(stream, _SAMPLES_FRAME, block)
 
 
 def write_request(stream: BinaryIO, request: EstimateRequest) -> None:
-    """Write a request for an estimate to the stream.
+    """Write a request for an estimate to the online fit's input stream, as one frame.
 
     Parameters
     ----------
     stream
-        Stream that was begun.
+        Standard input of the fit program, after `write_start`.
     request
-        The request; the samples before its tick have been sent.
+        The request. All samples before its tick must have been written.
     """
-    _write(stream, _REQUEST, json.dumps(asdict(request)).encode())
+    _write_frame(stream, _REQUEST_FRAME, json.dumps(asdict(request)).encode())
 
 
-def _write(stream: BinaryIO, kind: bytes, content: Buffer) -> None:
-    stream.write(_HEAD.pack(kind, memoryview(content).nbytes))
+def _write_frame(stream: BinaryIO, frame_kind: bytes, content: Buffer) -> None:
+    """Write a frame (kind, length, content) to the stream."""
+    stream.write(_FRAME_HEAD_FORMAT.pack(frame_kind, memoryview(content).nbytes))
     stream.write(content)
     stream.flush()
 
 
 def read_start(stream: BinaryIO) -> StreamStart:
-    """Read the start of a stream.
+    """Return the metadata in the first line of the online fit's input stream.
 
     Raises
     ------
     SessionError
-        It is not the beginning of such a stream.
+        If the line is not the beginning of such a stream, or is of another version.
     """
     try:
-        found = json.loads(stream.readline(_LONGEST_LINE))
-        if found["version"] != _VERSION:
-            raise _broken(f"it is of version {found['version']!r}, not {_VERSION}")
-        segments = found["segments"].items()
+        first_line = json.loads(stream.readline(_MAX_FIRST_LINE_BYTES))
+        if first_line["version"] != _STREAM_VERSION:
+            raise _stream_error(
+                f"it is of version {first_line['version']!r}, not {_STREAM_VERSION}"
+            )
+        segments = first_line["segments"].items()
         return StreamStart(
-            metadata={str(key): str(value) for key, value in found["metadata"].items()},
+            metadata={str(key): str(value) for key, value in first_line["metadata"].items()},
             segments={str(name): (int(first), int(end)) for name, (first, end) in segments},
-            every_s=None if found["every_s"] is None else float(found["every_s"]),
+            every_s=None if first_line["every_s"] is None else float(first_line["every_s"]),
         )
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
-        raise _broken(f"its first line is no description of a session ({error!r})") from None
+        raise _stream_error(f"its first line is no description of a session ({error!r})") from None
 
 
 def read_frames(stream: BinaryIO) -> Iterator[npt.NDArray[np.void] | EstimateRequest]:
-    """Read samples and requests until the stream ends.
+    """Yield blocks of samples and requests from the online fit's input stream until its end.
 
     Yields
     ------
@@ -144,46 +153,51 @@ def read_frames(stream: BinaryIO) -> Iterator[npt.NDArray[np.void] | EstimateReq
     Raises
     ------
     SessionError
-        If the data is not a frame, or ends within one.
+        If the data is not a frame, or ends within a frame.
     """
-    while head := stream.read(_HEAD.size):
-        if len(head) < _HEAD.size:
-            raise _broken("it ended within a frame")
-        kind, length = _HEAD.unpack(head)
-        if length > _LONGEST_FRAME:
-            raise _broken(f"a frame of {length} bytes")
+    while head := stream.read(_FRAME_HEAD_FORMAT.size):
+        if len(head) < _FRAME_HEAD_FORMAT.size:
+            raise _stream_error("it ended within a frame")
+        frame_kind, length = _FRAME_HEAD_FORMAT.unpack(head)
+        if length > _MAX_FRAME_BYTES:
+            raise _stream_error(f"a frame of {length} bytes")
         content = stream.read(length)
         if len(content) < length:
-            raise _broken("it ended within a frame")
+            raise _stream_error("it ended within a frame")
         try:
-            if kind == _SAMPLES:
+            if frame_kind == _SAMPLES_FRAME:
                 yield decode_samples(content)
-            elif kind == _REQUEST:
-                yield _request(json.loads(content))
+            elif frame_kind == _REQUEST_FRAME:
+                yield _parsed_request(json.loads(content))
             else:
-                raise _broken(f"a frame of unknown kind {kind!r}")
+                raise _stream_error(f"a frame of unknown kind {frame_kind!r}")
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
-            raise _broken(f"a frame that cannot be read ({error!r})") from None
+            raise _stream_error(f"a frame that cannot be read ({error!r})") from None
 
 
-def _request(found: Mapping[str, Any]) -> EstimateRequest:
+def _parsed_request(document: Mapping[str, Any]) -> EstimateRequest:
+    """Return the request for an estimate that a JSON object describes."""
     return EstimateRequest(
-        int(found["id"]), int(found["tick"]), bool(found["whole"]), bool(found["from_last"])
+        int(document["id"]),
+        int(document["tick"]),
+        bool(document["whole"]),
+        bool(document["from_last"]),
     )
 
 
-def _broken(what: str) -> SessionError:
+def _stream_error(what: str) -> SessionError:
+    """Return the error for an invalid stream; `what` describes the defect."""
     return SessionError(
         f"The stream of samples to the online fit is broken: {what}. It has to come from a program "
         "of the same version."
     )
 
 
-# Answers in words
+# Text for estimates
 
 
 def mode_line(mode: Mapping[str, Any]) -> str:
-    """Write one estimated mode.
+    """Return one line of text with frequency, damping and inertia of an estimated mode.
 
     Parameters
     ----------
@@ -206,30 +220,36 @@ def mode_line(mode: Mapping[str, Any]) -> str:
     inertia = mode.get("participation")
     if inertia is None:
         return text
-    shown = with_half_width(inertia["value"], inertia["interval_95"], _KG_MM2)
-    return f"{text}, inertia {shown} kg·mm²"
+    inertia_text = with_half_width(inertia["value"], inertia["interval_95"], _KG_MM2_PER_KG_M2)
+    return f"{text}, inertia {inertia_text} kg·mm²"
 
 
 def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> list[str]:
-    """Write an answer of the online fit in a few lines.
+    """Return lines of text that report an estimate of the online fit to the operator.
 
     Parameters
     ----------
     answer
-        Answer in the format of docs/online_fit.md.
+        Estimate in the format of docs/online_fit.md.
     before
-        The answer with which the modes are compared; None: no comparison.
+        Earlier estimate with which the modes are compared, or None for no comparison.
     """
-    found = [f"  {sentence}" for sentence in answer["findings"]]
+    findings = [f"  {sentence}" for sentence in answer["findings"]]
     if answer["problem"]:
-        return [f"After {answer['duration_s']:.1f} s: {answer['problem']}", *found]
+        return [f"After {answer['duration_s']:.1f} s: {answer['problem']}", *findings]
     validity = Validity.of_document(answer.get("validity")).short
-    head = f"± 95 %, statistical only; tip slope {validity}"
-    lines = [f"After {answer['duration_s']:.1f} s ({head}):"]
-    earlier = {mode["mode"]: mode for mode in (before or {}).get("modes", ()) if mode["shown"]}
+    heading = f"± 95 %, statistical only; tip slope {validity}"
+    lines = [f"After {answer['duration_s']:.1f} s ({heading}):"]
+    earlier_modes = {
+        mode["mode"]: mode for mode in (before or {}).get("modes", ()) if mode["shown"]
+    }
     for mode in answer["modes"]:
         if mode["shown"]:
-            change = _change(earlier[mode["mode"]], mode) if mode["mode"] in earlier else ""
+            change = (
+                _change_text(earlier_modes[mode["mode"]], mode)
+                if mode["mode"] in earlier_modes
+                else ""
+            )
             doubt = mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"]
             lines.append(f"  {mode_line(mode)}{change}{f' (doubtful: {doubt})' if doubt else ''}")
     unseen = unseen_modes(answer["modes"])
@@ -237,16 +257,18 @@ def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None =
         lines.append(f"  not visible so far: {unseen}")
     if uniform_beam := Validity.of_document(answer.get("validity")).uniform_beam:
         lines.append(f"  {uniform_beam.sentence}")
-    return [*lines, *found]
+    return [*lines, *findings]
 
 
 def unseen_modes(modes: Iterable[Mapping[str, Any]]) -> str:
-    """Name the modes that the record does not show so far; empty if it shows all.
+    """Return text that names the modes that are not visible in the record so far.
+
+    It is empty if the record shows all modes.
 
     Parameters
     ----------
     modes
-        Modes in the format of the online fit's answers.
+        Modes in the format of the online fit's estimates.
 
     Examples
     --------
@@ -258,10 +280,13 @@ def unseen_modes(modes: Iterable[Mapping[str, Any]]) -> str:
     return f"mode{'s' if len(unseen) > 1 else ''} {listed(unseen)}" if unseen else ""
 
 
-def _change(before: Mapping[str, Any], mode: Mapping[str, Any]) -> str:
+def _change_text(before: Mapping[str, Any], mode: Mapping[str, Any]) -> str:
+    """Return text with the change of a mode's frequency in Hz and of its damping in percent."""
     hz, damping = mode["frequency_hz"], mode["damping_ratio"]
     shift_hz = hz["value"] - before["frequency_hz"]["value"]
-    was = before["damping_ratio"]["value"]
+    earlier_damping = before["damping_ratio"]["value"]
     digits = decimals(hz["std"]) if hz["std"] else 4
-    relative = f", {100 * (damping['value'] / was - 1):+.2g} %" if was else ""
-    return f"; change {shift_hz:+.{digits}f} Hz{relative}"
+    relative_change = (
+        f", {100 * (damping['value'] / earlier_damping - 1):+.2g} %" if earlier_damping else ""
+    )
+    return f"; change {shift_hz:+.{digits}f} Hz{relative_change}"

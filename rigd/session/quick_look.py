@@ -1,8 +1,8 @@
-"""Quick looks: the reports that the analyzer writes next to session files, and their reader.
+"""Reader of quick looks, the short reports that the analyzer writes next to session files.
 
-docs/quick_look.md describes the files. Any user may have written such a file: its contents are
-checked here, once for the live view, the page, the library and the analyzer. The same checks apply
-to the fit in a session file.
+docs/quick_look.md describes the files. Since any user may have written such a file, its contents
+are checked here for the live view, the page, the library and the analyzer. The fit in a session
+file is checked in the same way.
 """
 
 import json
@@ -19,28 +19,31 @@ from rigd.units import finite_number
 Document = dict[str, Any]
 
 QUICK_LOOK_SUFFIX: Final = ".look.json"
-"""Ending of a quick look's file, instead of the session file's."""
+"""Suffix of a quick look's file, which replaces the suffix of the session file."""
 QUICK_LOOK_VERSION: Final = 1
-"""Version of the file's layout."""
+"""Version of the format of quick looks."""
 
-_MOST_BYTES: Final = 1 << 20
-_WITHOUT_WAITING: Final = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-"""Flags with which a pipe reads as empty; Windows has neither."""
-_MOST_MODES: Final = 20
-_MOST_CHARACTERS: Final = 1000
-_MOST_READ: Final = 200
-"""Most quick looks that are read to find the last one: some thousand would take seconds."""
-_TEXTS: Final = ("file", "session_id", "specimen", "excitation")
-_TIMES: Final = ("start_utc_ns", "made_utc_ns")
-_LINES: Final = ("flags", "text")
-_UNREADABLE: Final = (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError)
-_SOURCES: Final = ("modal", "beam")
-_CURVES: Final = ("frequency_hz", "magnitude", "phase_rad")
-_BAND: Final = ("magnitude_low_95", "magnitude_high_95")
+_MAX_FILE_BYTES: Final = 1 << 20
+"""Maximum length in bytes of a quick look that is read."""
+_NONBLOCKING_FLAGS: Final = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+"""Flags for opening a file without blocking: a pipe then reads as empty."""
+_MAX_MODES: Final = 20
+"""Maximum number of modes that are read from a document."""
+_MAX_TEXT_CHARACTERS: Final = 1000
+"""Maximum number of characters of a text that are read from a document."""
+_MAX_FILES_READ: Final = 200
+"""Maximum number of quick looks that are read to find the last one: a thousand take seconds."""
+_TEXT_KEYS: Final = ("file", "session_id", "specimen", "excitation")
+_TIME_KEYS: Final = ("start_utc_ns", "made_utc_ns")
+_LINE_LIST_KEYS: Final = ("flags", "text")
+_PARSING_ERRORS: Final = (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError)
+_MODE_SOURCES: Final = ("modal", "beam")
+_CURVE_KEYS: Final = ("frequency_hz", "magnitude", "phase_rad")
+_CONFIDENCE_BAND_KEYS: Final = ("magnitude_low_95", "magnitude_high_95")
 
 
 def quick_look_path(path: Path) -> Path:
-    """Return the path of a session's quick look, in the same folder as its file.
+    """Return the path of a session's quick look, which is in the folder of the session file.
 
     Examples
     --------
@@ -53,7 +56,7 @@ def quick_look_path(path: Path) -> Path:
 
 
 def read_quick_look(path: Path) -> Document | None:
-    """Read the file of a quick look.
+    """Read and check the file of a quick look.
 
     Parameters
     ----------
@@ -63,24 +66,30 @@ def read_quick_look(path: Path) -> Document | None:
     Returns
     -------
     dict or None
-        Document of docs/quick_look.md, with empty values for missing ones. All numbers are finite,
-        texts printable, `modes` the valid ones, and `response` and `model` None if invalid. None if
-        the file does not exist, cannot be read, or is of another version.
+        Document in the format of docs/quick_look.md, with empty values for missing keys. All
+        numbers are finite and all texts printable. ``modes`` contains valid modes only.
+        ``response`` and ``model`` are None if invalid. The result is None if the file does not
+        exist, cannot be read, or has another version.
     """
     try:
-        found = json.loads(_content(path), parse_constant=lambda _: None, parse_float=_parsed)
-        if found["version"] != QUICK_LOOK_VERSION:
+        document = json.loads(
+            _file_beginning(path), parse_constant=lambda _: None, parse_float=_finite_or_none
+        )
+        if document["version"] != QUICK_LOOK_VERSION:
             return None
-        return dict(found) | {
-            **{name: _text(found.get(name) or "") for name in _TEXTS},
-            **{name: int(found.get(name) or 0) for name in _TIMES},
-            "modes": modes_of(found.get("modes")),
-            "validity": Validity.of_document(found.get("validity")).as_json(),
-            "response": _response(found.get("response")),
-            "model": _curves(found.get("model"), (*_CURVES, *_BAND)),
-            **{name: [_text(line) for line in found.get(name) or []] for name in _LINES},
+        return dict(document) | {
+            **{name: _checked_text(document.get(name) or "") for name in _TEXT_KEYS},
+            **{name: int(document.get(name) or 0) for name in _TIME_KEYS},
+            "modes": modes_of(document.get("modes")),
+            "validity": Validity.of_document(document.get("validity")).as_json(),
+            "response": _valid_response(document.get("response")),
+            "model": _valid_curves(document.get("model"), (*_CURVE_KEYS, *_CONFIDENCE_BAND_KEYS)),
+            **{
+                name: [_checked_text(line) for line in document.get(name) or []]
+                for name in _LINE_LIST_KEYS
+            },
         }
-    except _UNREADABLE:
+    except _PARSING_ERRORS:
         return None
 
 
@@ -92,27 +101,28 @@ def last_quick_look(
     but: str = "",
     usable: Callable[[Document], object],
 ) -> tuple[Path, Document] | None:
-    """Find the quick look at the last session of a specimen.
+    """Return the last usable quick look at a session of a specimen.
 
     Parameters
     ----------
     folder
         Folder of the session files.
     specimen
-        Name of the specimen; empty: sessions that name none.
+        Name of the specimen, or empty for sessions that state no specimen.
     before_utc_ns
-        The session began before this time; None: at any time.
+        Only sessions that started before this time are considered; None for all sessions.
     but
-        Name of a session, without ending, to be left out.
+        File name, without suffix, of a session that is not considered.
     usable
-        Returns whether a quick look can be used, by its document.
+        Function that returns whether a quick look's document can be used.
 
     Returns
     -------
     tuple of Path and dict, or None
-        Path of the session file, and the quick look as `read_quick_look` returns it.
+        Path of the session file, and the quick look's document from `read_quick_look`; None if
+        there is no such session.
     """
-    for path in sorted(_newest(folder), key=_start_utc_ns, reverse=True):
+    for path in sorted(_newest_quick_looks(folder), key=_start_utc_ns, reverse=True):
         if (
             path.name != but + QUICK_LOOK_SUFFIX
             and (report := read_quick_look(path)) is not None
@@ -124,28 +134,32 @@ def last_quick_look(
     return None
 
 
-def _newest(folder: Path) -> list[Path]:
-    """Return the newest quick looks of a folder."""
-    made: list[tuple[float, Path]] = []
+def _newest_quick_looks(folder: Path) -> list[Path]:
+    """Return the paths of the 200 newest quick looks in a folder."""
+    times_and_paths: list[tuple[float, Path]] = []
     with suppress(OSError):
         for path in folder.glob(f"*{QUICK_LOOK_SUFFIX}"):
             with suppress(OSError):
-                made.append((path.stat().st_mtime, path))
-    return [path for _, path in sorted(made, reverse=True)[:_MOST_READ]]
+                times_and_paths.append((path.stat().st_mtime, path))
+    return [path for _, path in sorted(times_and_paths, reverse=True)[:_MAX_FILES_READ]]
 
 
 def _start_utc_ns(path: Path) -> int:
-    """Return the start of a quick look's session, six times faster than by checking the file."""
+    """Return the start time of a quick look's session in ns since the Unix epoch, or 0.
+
+    The file is not checked, which makes this six times faster than `read_quick_look`.
+    """
     try:
-        return int(json.loads(_content(path)).get("start_utc_ns") or 0)
-    except (*_UNREADABLE, AttributeError):
+        return int(json.loads(_file_beginning(path)).get("start_utc_ns") or 0)
+    except (*_PARSING_ERRORS, AttributeError):
         return 0
 
 
-def _content(path: Path) -> bytes:
-    descriptor = os.open(path, os.O_RDONLY | _WITHOUT_WAITING)
+def _file_beginning(path: Path) -> bytes:
+    """Return the first mebibyte of a file, without waiting if the file is a pipe."""
+    descriptor = os.open(path, os.O_RDONLY | _NONBLOCKING_FLAGS)
     with open(descriptor, "rb") as file:  # noqa: PTH123 - of a descriptor
-        return file.read(_MOST_BYTES)
+        return file.read(_MAX_FILE_BYTES)
 
 
 def modes_of(documents: object) -> list[Document]:
@@ -154,24 +168,27 @@ def modes_of(documents: object) -> list[Document]:
     Parameters
     ----------
     documents
-        Value of `modes` in any document.
+        Value of the key ``modes`` of a document from any source.
 
     Returns
     -------
     list of dict
-        ``mode`` (its number), ``shown`` (whether the record shows it), ``source`` ("modal", "beam"
-        or None), and ``frequency_hz``, ``damping_ratio`` and ``participation`` (kg m², or None),
-        each with ``value``, ``std``, ``interval_95`` and ``flag``; modes without finite numbers or
-        a positive frequency are left out.
+        For each mode: ``mode`` (its number), ``shown`` (whether the record shows it), ``source``
+        ("modal", "beam" or None), and ``frequency_hz``, ``damping_ratio`` and ``participation``
+        (kg m², or None), each with ``value``, ``std``, ``interval_95`` and ``flag``. Modes without
+        finite numbers or without a positive frequency are left out.
     """
-    return list(_modes(documents)) if isinstance(documents, list) else []
+    return list(_valid_modes(documents)) if isinstance(documents, list) else []
 
 
-def _modes(documents: list[object]) -> Iterator[Document]:
-    for index, mode in enumerate(documents[:_MOST_MODES], start=1):
+def _valid_modes(documents: list[object]) -> Iterator[Document]:
+    """Yield the valid modes of a list of any JSON values."""
+    for index, mode in enumerate(documents[:_MAX_MODES], start=1):
         if isinstance(mode, dict):
             number, shown = mode.get("mode", index), mode.get("shown") is not False
-            frequency, damping = (_quantity(mode.get(k)) for k in ("frequency_hz", "damping_ratio"))
+            frequency, damping = (
+                _valid_estimate(mode.get(k)) for k in ("frequency_hz", "damping_ratio")
+            )
             if (
                 type(number) is int
                 and frequency is not None
@@ -184,53 +201,54 @@ def _modes(documents: list[object]) -> Iterator[Document]:
                     "shown": shown,
                     "frequency_hz": frequency,
                     "damping_ratio": damping,
-                    "participation": _quantity(mode.get("participation")),
-                    "source": source if source in _SOURCES else None,
+                    "participation": _valid_estimate(mode.get("participation")),
+                    "source": source if source in _MODE_SOURCES else None,
                 }
 
 
 def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
-    """Return the fit of a record that was made during its session.
+    """Return the result of the fit that was made during a session, or None if there is none.
 
     Parameters
     ----------
     outcome
-        The record ``outcome`` of any file.
+        Record ``outcome`` of a session file from any source.
 
     Returns
     -------
     dict or None
-        ``duration_s`` of the fitted record, ``problem``, ``validity`` as of
-        `Validity.as_json`, ``modes`` as of `modes_of`,
-        ``parameters`` by name, ``findings``, and ``search`` of a session that ended when a
-        precision was reached: ``reason`` of its end, and ``targets`` with ``name``,
-        ``quantity``, ``mode``, ``value``, ``std`` and ``target_std``. None without a valid fit.
+        ``duration_s`` of the fitted record, ``problem``, ``validity`` from `Validity.as_json`,
+        ``modes`` from `modes_of`, ``parameters`` by name, and ``findings``. For a session that
+        ended when a precision was reached, ``search`` contains the ``reason`` of its end, and
+        ``targets`` with name, quantity, mode, value, and estimated and requested deviation.
     """
     try:
         text = (outcome or {})["fit"]
-        found = json.loads(text, parse_constant=lambda _: None, parse_float=_parsed)
-        duration_s = finite_number(found["duration_s"])
+        document = json.loads(text, parse_constant=lambda _: None, parse_float=_finite_or_none)
+        duration_s = finite_number(document["duration_s"])
         parameters = {
-            _text(name): _quantity(value) for name, value in found.get("parameters", {}).items()
+            _checked_text(name): _valid_estimate(value)
+            for name, value in document.get("parameters", {}).items()
         }
-        search = found.get("search") or {}
+        search = document.get("search") or {}
         return {
             "duration_s": max(duration_s or 0.0, 0.0),
-            "problem": _text(found.get("problem") or ""),
-            "validity": Validity.of_document(found.get("validity")).as_json(),
-            "modes": modes_of(found.get("modes")),
+            "problem": _checked_text(document.get("problem") or ""),
+            "validity": Validity.of_document(document.get("validity")).as_json(),
+            "modes": modes_of(document.get("modes")),
             "parameters": {name: value for name, value in parameters.items() if value is not None},
-            "findings": [_text(line) for line in found.get("findings") or []],
+            "findings": [_checked_text(line) for line in document.get("findings") or []],
             "search": {
-                "reason": _text(search.get("reason") or ""),
-                "targets": list(_targets(search.get("targets"))),
+                "reason": _checked_text(search.get("reason") or ""),
+                "targets": list(_valid_targets(search.get("targets"))),
             },
         }
-    except (*_UNREADABLE, AttributeError):
+    except (*_PARSING_ERRORS, AttributeError):
         return None
 
 
-def _targets(documents: object) -> Iterator[Document]:
+def _valid_targets(documents: object) -> Iterator[Document]:
+    """Yield the valid precision targets of any JSON value."""
     for target in documents if isinstance(documents, list) else ():
         if isinstance(target, dict):
             numbers = {
@@ -239,33 +257,36 @@ def _targets(documents: object) -> Iterator[Document]:
             if numbers["asked_std"] is not None:
                 mode = target.get("mode")
                 yield {
-                    "name": _text(target.get("name") or ""),
+                    "name": _checked_text(target.get("name") or ""),
                     # Older files have names only.
-                    "quantity": _text(target.get("quantity") or ""),
+                    "quantity": _checked_text(target.get("quantity") or ""),
                     "mode": mode if type(mode) is int else None,
                     **numbers,
                 }
 
 
-def _quantity(document: object) -> Document | None:
+def _valid_estimate(document: object) -> Document | None:
+    """Return an estimate with value, standard deviation and interval, or None if it is invalid."""
     if not isinstance(document, dict) or (value := finite_number(document.get("value"))) is None:
         return None
-    ends = document.get("interval_95")
+    bounds = document.get("interval_95")
     interval = (
-        [finite_number(end) for end in ends] if isinstance(ends, list) and len(ends) == 2 else None
+        [finite_number(end) for end in bounds]
+        if isinstance(bounds, list) and len(bounds) == 2
+        else None
     )
     flag = document.get("flag")
     return {
         "value": value,
         "std": finite_number(document.get("std")),
         "interval_95": None if interval is None or None in interval else interval,
-        "flag": _text(flag) if isinstance(flag, str) else None,
+        "flag": _checked_text(flag) if isinstance(flag, str) else None,
     }
 
 
-def _response(document: object) -> Document | None:
-    """Return a response with its coherence and resolution; None if it is invalid."""
-    curves = _curves(document, _CURVES)
+def _valid_response(document: object) -> Document | None:
+    """Return a frequency response with coherence and resolution, or None if it is invalid."""
+    curves = _valid_curves(document, _CURVE_KEYS)
     if curves is None or not isinstance(document, dict):
         return None
     coherence = _finite_numbers(document.get("coherence"))
@@ -276,8 +297,8 @@ def _response(document: object) -> Document | None:
     }
 
 
-def _curves(document: object, names: tuple[str, ...]) -> Document | None:
-    """Return curves of equal length above 0."""
+def _valid_curves(document: object, names: tuple[str, ...]) -> Document | None:
+    """Return lists of finite numbers by name, or None unless all have the same length above 0."""
     if not isinstance(document, dict):
         return None
     curves = {name: _finite_numbers(document.get(name)) for name in names}
@@ -288,16 +309,18 @@ def _curves(document: object, names: tuple[str, ...]) -> Document | None:
 
 
 def _finite_numbers(values: object) -> list[float]:
-    """Return the numbers; none at all if there is any other value."""
+    """Return a list of finite numbers, or an empty list if it contains any other value."""
     numbers = [finite_number(value) for value in values] if isinstance(values, list) else []
     return [] if None in numbers else numbers  # type: ignore[return-value]
 
 
-def _parsed(text: str) -> float | None:
+def _finite_or_none(text: str) -> float | None:
+    """Return the finite number that a text states, or None if it is infinite or NaN."""
     return finite_number(float(text))
 
 
-def _text(value: object) -> str:
+def _checked_text(value: object) -> str:
+    """Return a text without control characters, cut to 1000; raise TypeError if it is no text."""
     if not isinstance(value, str):
         raise TypeError
-    return printable(value, _MOST_CHARACTERS)
+    return printable(value, _MAX_TEXT_CHARACTERS)

@@ -1,6 +1,6 @@
-"""Metadata that users add to a session, such as ``temperature_c``: rules, and text in the file.
+"""Metadata that users add to a session, such as ``temperature_c``: rules and form in the file.
 
-The ending of a name is the unit: such a name has a finite number as value, any other a text.
+If the name ends in a unit, the value is a finite number. Otherwise the value is a text.
 """
 
 import re
@@ -11,54 +11,58 @@ from rigd.errors import UserError
 from rigd.units import finite_number, unit_of
 
 NOTES: Final = ("operator", "specimen", "note")
-"""Texts with separate options and keys."""
+"""Names of the texts that have options and keys of their own, and are not user metadata."""
 META_PREFIX: Final = "meta_"
-"""Prefix of the key in the record ``session``."""
+"""Prefix that user metadata have in their keys in the record ``session``."""
 
-_NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,39}")
-_MOST_NAMES: Final = 32
-_MOST_CHARACTERS: Final = 200
-_SHOWN: Final = 40
+_NAME_PATTERN: Final = re.compile(r"[a-z][a-z0-9_]{0,39}")
+"""Regular expression that an allowed name of user metadata matches."""
+_MAX_NAMES: Final = 32
+"""Maximum number of user metadata of a session."""
+_MAX_TEXT_CHARACTERS: Final = 200
+"""Maximum number of characters of a text that is a value of user metadata."""
+_MAX_SHOWN_CHARACTERS: Final = 40
+"""Maximum number of characters of a value in an error message."""
 
 
 class MetadataError(UserError, ValueError):
-    """Metadata of a session breaks a rule; the message names it, its value, and the remedy."""
+    """Raised if user metadata break a rule; the message states name, value and remedy."""
 
 
 def check_name(name: str) -> None:
-    """Check that a name is allowed for metadata.
+    """Raise if a name is not allowed for user metadata.
 
     Raises
     ------
     MetadataError
-        If it is not allowed.
+        If the name has forbidden characters, is too long, or has an option of its own.
     """
-    if not _NAME.fullmatch(name):
+    if not _NAME_PATTERN.fullmatch(name):
         raise MetadataError(
-            f"metadata {_shown(name)}: a name has lower-case letters, digits and _ only, begins "
-            "with a letter, and has at most 40 characters, such as temperature_c."
+            f"metadata {_shown_value(name)}: a name has lower-case letters, digits and _ only, "
+            "begins with a letter, and has at most 40 characters, such as temperature_c."
         )
     if name in NOTES:
         raise MetadataError(f"metadata {name}: has its own place; give it as {name} instead.")
 
 
-def metadata_keys(given: Mapping[str, object]) -> dict[str, str]:
-    """Check a user's metadata, and return it in the form of the record ``session``.
+def metadata_keys(values: Mapping[str, object]) -> dict[str, str]:
+    """Check user metadata, and return them as keys and texts for the record ``session``.
 
     Parameters
     ----------
-    given
-        Values by their names: numbers, or texts, also of numbers.
+    values
+        Name → value: a number, a number's text, or any other text.
 
     Returns
     -------
     dict of str to str
-        By ``meta_NAME``.
+        ``meta_NAME`` → text.
 
     Raises
     ------
     MetadataError
-        If there are too many, or a name or a value breaks a rule.
+        If there are too many names, or a name or a value breaks a rule.
 
     Examples
     --------
@@ -66,71 +70,77 @@ def metadata_keys(given: Mapping[str, object]) -> dict[str, str]:
     >>> metadata_keys({"temperature_c": "21.40", "batch": "B 7"})
     {'meta_temperature_c': '21.4', 'meta_batch': 'B 7'}
     """
-    if len(given) > _MOST_NAMES:
-        raise MetadataError(f"metadata: {len(given)} names are more than {_MOST_NAMES}.")
+    if len(values) > _MAX_NAMES:
+        raise MetadataError(f"metadata: {len(values)} names are more than {_MAX_NAMES}.")
     keys = {}
-    for name, value in given.items():
+    for name, value in values.items():
         check_name(name)
-        keys[META_PREFIX + name] = _number(name, value) if unit_of(name) else _text(name, value)
+        keys[META_PREFIX + name] = (
+            _number_text(name, value) if unit_of(name) else _checked_text(name, value)
+        )
     return keys
 
 
 def added_metadata(session: Mapping[str, str]) -> dict[str, float | str]:
-    """Return the metadata that users added to a session, by their names.
+    """Return the metadata that users added to a session, from its record ``session``.
 
     Parameters
     ----------
     session
-        The record ``session`` of any file.
+        Record ``session`` of a session file from any source.
 
     Returns
     -------
     dict of str to (float or str)
-        Numbers where the name ends in a unit and the text is a finite number.
+        Name → number if the name ends in a unit and the text is a finite number, else the text.
     """
-    added: dict[str, float | str] = {}
+    metadata: dict[str, float | str] = {}
     for key, text in session.items():
         if key.startswith(META_PREFIX):
             name = key.removeprefix(META_PREFIX)
-            number = _as_number(text) if unit_of(name) else None
-            added[name] = text if number is None else number
-    return added
+            number = _finite_or_none(text) if unit_of(name) else None
+            metadata[name] = text if number is None else number
+    return metadata
 
 
-def _number(name: str, value: object) -> str:
-    number = _as_number(value)
+def _number_text(name: str, value: object) -> str:
+    """Return the text of a number; raise MetadataError if the value is not a finite number."""
+    number = _finite_or_none(value)
     if number is None:
         raise MetadataError(
-            f"metadata {name} = {_shown(value)} is not a finite number; the name ends in a unit, "
-            f"so give a number in {unit_of(name)} with a decimal point, or choose another name."
+            f"metadata {name} = {_shown_value(value)} is not a finite number; the name ends in a "
+            f"unit, so give a number in {unit_of(name)} with a decimal point, or choose another "
+            "name."
         )
     return repr(number)
 
 
-def _as_number(value: object) -> float | None:
-    """Return a finite number from a number or its text; None if there is none."""
+def _finite_or_none(value: object) -> float | None:
+    """Return the finite number of a number or a text, or None if the value is something else."""
     try:
         return finite_number(float(value) if isinstance(value, str) else value)
     except ValueError:
         return None
 
 
-def _text(name: str, value: object) -> str:
+def _checked_text(name: str, value: object) -> str:
+    """Return a text of one line; raise MetadataError if the value is not such a text."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         value = str(value)
     if not (isinstance(value, str) and value.strip() and value.isprintable()):
         raise MetadataError(
-            f"metadata {name} = {_shown(value)} is not plain text of one line; give such a text or "
-            "a number."
+            f"metadata {name} = {_shown_value(value)} is not plain text of one line; give such a "
+            "text or a number."
         )
-    if len(value) > _MOST_CHARACTERS:
+    if len(value) > _MAX_TEXT_CHARACTERS:
         raise MetadataError(
-            f"metadata {name}: {len(value)} characters are more than {_MOST_CHARACTERS}; put long "
-            "texts into the note."
+            f"metadata {name}: {len(value)} characters are more than {_MAX_TEXT_CHARACTERS}; put "
+            "long texts into the note."
         )
     return value
 
 
-def _shown(value: object) -> str:
+def _shown_value(value: object) -> str:
+    """Return a value for an error message, cut to 40 characters."""
     text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+    return text if len(text) <= _MAX_SHOWN_CHARACTERS else f"{text[:_MAX_SHOWN_CHARACTERS]}…"

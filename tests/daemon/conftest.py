@@ -64,7 +64,7 @@ def stop_here(runtime_folder, rigd_here, monkeypatch):
 
     monkeypatch.setattr(stop_module, "own_sockets", sockets)
     monkeypatch.setattr(stop_module, "known_folders", lambda _: [runtime_folder / "rigd"])
-    monkeypatch.setattr(stop_module, "COMMON", runtime_folder / "common")
+    monkeypatch.setattr(stop_module, "GROUP_FOLDER", runtime_folder / "common")
 
     def run(*arguments, table=own_processes):
         monkeypatch.setattr(stop_module, "read_processes", table)

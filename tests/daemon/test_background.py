@@ -17,7 +17,7 @@ from rigd.runner.planning import excitation_for, plan_session
 CHIRP = {"excitation": "chirp", "parameters": {"duration_s": 5.0, "ring_down_s": 1.0}}
 LITTLE_MEMORY = """
 from rigd.daemon import background
-background._memory_limit = lambda: background._LEAST_BYTES
+background._memory_limit = lambda: background._MIN_MEMORY_BYTES
 background.main()
 """
 
@@ -125,7 +125,7 @@ def test_a_check_asks_no_device_and_keeps_a_start_waiting(operated, monkeypatch)
 
     async def look_first(job, perform=background.perform):
         asked.append(await operated.handle("start", **CHIRP))
-        await operated.service.watch()
+        await operated.service.check_connection()
         return await perform(job)
 
     monkeypatch.setattr(background, "perform", look_first)

@@ -68,7 +68,7 @@ def test_whoever_is_turned_away_asks_again(path, answer):
 
 
 def test_whoever_is_turned_away_for_long_is_told(path, answer, monkeypatch):
-    monkeypatch.setattr(client_module, "_CROWD_PATIENCE_S", 0.0)
+    monkeypatch.setattr(client_module, "_TOO_MANY_CLIENTS_TIMEOUT_S", 0.0)
     answer(CROWDED, CROWDED)
     with Client(path) as client, pytest.raises(RefusedByDaemonError, match="too many"):
         client.ask("start")
@@ -133,7 +133,7 @@ def deaf(path):
 def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(
     path, deaf, monkeypatch
 ):
-    monkeypatch.setattr(client_module, "_STOP_PATIENCE_S", 1.0)
+    monkeypatch.setattr(client_module, "_STOP_TIMEOUT_S", 1.0)
     process = deaf()
     with pytest.raises(DaemonGoneError) as raised:
         stop_session(path)
@@ -147,8 +147,8 @@ def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(
 
 @pytest.mark.process
 def test_a_process_that_does_not_know_the_signal_is_not_ended_by_it(path, deaf, monkeypatch):
-    monkeypatch.setattr(client_module, "_STOP_PATIENCE_S", 1.0)
-    monkeypatch.setattr(client_module, "_END_PATIENCE_S", 0.1)
+    monkeypatch.setattr(client_module, "_STOP_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(client_module, "_PROCESS_END_TIMEOUT_S", 0.1)
     process = deaf(handles=False)
     with pytest.raises(DaemonGoneError) as raised:
         stop_session(path)
@@ -170,7 +170,7 @@ def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
         "Its control process, which alone moves the motor, has ended"
         in client_module.describe_remains(ended, os.getuid())
     )
-    monkeypatch.setattr(client_module, "_END_PATIENCE_S", 0.3)
+    monkeypatch.setattr(client_module, "_PROCESS_END_TIMEOUT_S", 0.3)
     control = subprocess.Popen(
         [sys.executable, "-m", "rigd.engine.control_process", str(ended)],
         stdin=subprocess.PIPE,
@@ -232,7 +232,7 @@ def test_the_end_is_waited_for_until_it_is_seen(path, last):
 
 def test_an_end_that_a_crowd_or_a_silent_daemon_hides_is_not_told(path, monkeypatch):
     """Not seen is not seen: neither that the session has ended, nor that it goes on."""
-    monkeypatch.setattr(client_module, "_PAUSE_S", 0.01)
+    monkeypatch.setattr(client_module, "_RETRY_PAUSE_S", 0.01)
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
     listener.listen(5)

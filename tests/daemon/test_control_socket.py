@@ -141,7 +141,7 @@ def test_one_that_shuts_its_side_down_is_answered_and_let_go(served):
 
 
 def test_nothing_that_clients_do_harms_a_running_session(served, monkeypatch):
-    monkeypatch.setattr(server, "_MOST_UNREAD", 65_536)
+    monkeypatch.setattr(server, "_MAX_UNREAD_BYTES", 65_536)
 
     async def scenario(served):
         operator = await served.connect()
@@ -171,7 +171,7 @@ def test_nothing_that_clients_do_harms_a_running_session(served, monkeypatch):
         for _ in range(2000):
             served.server.publish({"event": "message", "text": "x" * 1000})
         await asyncio.sleep(0.01)
-        assert all(not client.watching for client in served.server._clients)
+        assert all(not client.is_subscribed for client in served.server._clients)
 
         status = await (await served.connect()).ask({"command": "status"})
         assert status["state"] == "running"
@@ -201,13 +201,15 @@ def test_a_thousand_connections_leave_room_for_a_stop(served):
         before = descriptors()
         told = most = 0
         for _ in range(20):
-            links = [socket.socket(socket.AF_UNIX) for _ in range(server.MOST_SILENT + 10)]
+            links = [
+                socket.socket(socket.AF_UNIX) for _ in range(server.MAX_PENDING_CONNECTIONS + 10)
+            ]
             for link in links:
                 link.setblocking(False)
                 await join_queue(link, served.path)
             await asyncio.sleep(0.01)
-            assert len(served.server._clients) <= server.MOST_CLIENTS
-            assert len(served.server._silent) <= server.MOST_SILENT
+            assert len(served.server._clients) <= server.MAX_CLIENTS
+            assert len(served.server._pending_connections) <= server.MAX_PENDING_CONNECTIONS
             # Some are on their way out, and a session has its files.
             most = max(most, descriptors() - len(links))
             for link in links:
@@ -215,7 +217,7 @@ def test_a_thousand_connections_leave_room_for_a_stop(served):
                     told += b"too many clients" in link.recv(1000)
                 link.close()
         assert told > 0
-        assert most <= before + server.MOST_SILENT + server.MOST_CLIENTS
+        assert most <= before + server.MAX_PENDING_CONNECTIONS + server.MAX_CLIENTS
         assert (await operator.ask({"command": "status"}))["state"] == "running"
         assert (await (await served.connect()).ask({"command": "stop"}))["stopping"]
         await served.until("ready")
@@ -225,7 +227,7 @@ def test_a_thousand_connections_leave_room_for_a_stop(served):
 
 
 def test_a_stop_is_obeyed_where_there_is_no_room_left(served, monkeypatch):
-    monkeypatch.setattr(server, "MOST_CLIENTS", 5)
+    monkeypatch.setattr(server, "MAX_CLIENTS", 5)
 
     async def scenario(served):
         assert (await (await served.connect()).ask(LONG))["ok"]
@@ -252,20 +254,20 @@ def test_the_crowd_of_one_process_pushes_out_nobody_else(served, monkeypatch):
             silent.peer = replace(silent.peer, pid=1)
         return silent
 
-    introduce = served.server._introduced
-    monkeypatch.setattr(served.server, "_introduced", introduced)
+    introduce = served.server._identified_connection
+    monkeypatch.setattr(served.server, "_identified_connection", introduced)
 
     async def scenario(served):
         slow = await served.connect()
         await slow.send(b'{"command":')
-        while not served.server._silent:
+        while not served.server._pending_connections:
             await asyncio.sleep(0.001)
-        for _ in range(3 * server.MOST_SILENT):
+        for _ in range(3 * server.MAX_PENDING_CONNECTIONS):
             crowd.append(socket.socket(socket.AF_UNIX))
             crowd[-1].setblocking(False)
             await join_queue(crowd[-1], served.path)
         await asyncio.sleep(0.05)
-        assert len(served.server._silent) == server.MOST_SILENT
+        assert len(served.server._pending_connections) == server.MAX_PENDING_CONNECTIONS
         assert b"too many clients" in crowd[0].recv(1000)
         assert (await slow.ask(b'"status"}\n'))["state"] == "ready"
         for link in crowd:
@@ -276,9 +278,9 @@ def test_the_crowd_of_one_process_pushes_out_nobody_else(served, monkeypatch):
 
 def test_there_is_room_for_those_who_ask_beside_those_who_watch(served):
     async def scenario(served):
-        watchers = [await served.connect() for _ in range(server.MOST_CLIENTS)]
+        watchers = [await served.connect() for _ in range(server.MAX_CLIENTS)]
         replies = [await watcher.ask({"command": "watch"}) for watcher in watchers]
-        assert sum(reply["ok"] for reply in replies) == server.MOST_WATCHERS
+        assert sum(reply["ok"] for reply in replies) == server.MAX_SUBSCRIBERS
         assert (await (await served.connect()).ask({"command": "status"}))["ok"]
 
     served.run(scenario)
@@ -362,7 +364,7 @@ def test_a_folder_that_there_cannot_be_is_refused_with_the_remedy(tmp_path):
 
 
 def test_daemons_are_found(runtime_folder, monkeypatch):
-    monkeypatch.setattr(address, "COMMON", runtime_folder / "common")
+    monkeypatch.setattr(address, "GROUP_FOLDER", runtime_folder / "common")
     with pytest.raises(AddressError, match="rigd serve"):
         find(None)
     with (
@@ -388,7 +390,7 @@ def test_daemons_are_found(runtime_folder, monkeypatch):
 
 
 def test_signals_go_to_those_who_asked_for_them(served, monkeypatch):
-    monkeypatch.setattr(signal_blocks, "_ABANDONED_S", 1e9)  # however slow the computer is
+    monkeypatch.setattr(signal_blocks, "_ABANDONED_AFTER_S", 1e9)  # however slow the computer is
 
     async def scenario(served):
         telling = asyncio.create_task(served.operated.service.stream_signals())

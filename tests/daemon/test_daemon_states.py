@@ -210,9 +210,9 @@ def test_what_leads_nowhere(path, wrong):
     told = []
     machine = DaemonStateMachine(told.append)
     for state in path:
-        machine.move(state, "test")
+        machine.change_to(state, "test")
     with pytest.raises(IllegalTransitionError):
-        machine.move(wrong, "test")
+        machine.change_to(wrong, "test")
     assert machine.state is (path[-1] if path else DaemonState.IDLE)
     assert len(told) == len(path)
 
@@ -222,8 +222,8 @@ def test_the_history_is_bounded_and_knows_since_when():
     machine = DaemonStateMachine(utc_ns=lambda: next(clock))
     assert machine.since_utc_ns == 0
     for _ in range(100):
-        machine.move(DaemonState.READY, "in")
-        machine.move(DaemonState.IDLE, "out")
+        machine.change_to(DaemonState.READY, "in")
+        machine.change_to(DaemonState.IDLE, "out")
     assert len(machine.history) == 50
     assert machine.since_utc_ns == 200
     assert machine.history[-1].reason == machine.reason == "out"

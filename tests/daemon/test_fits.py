@@ -18,7 +18,7 @@ def told():
     request = b'{"command": "start", "excitation": "chirp", "watch_fit": true}'
     series, events = ServedSeries(1, parse_request(request), running=True), []
     reporter = SeriesReporter(series, events.append, lambda: True)
-    reporter.begins(1, Path("1.mcap"))
+    reporter.on_start(1, Path("1.mcap"))
     return series, reporter, events
 
 
@@ -33,7 +33,7 @@ def result(**members):
 def shown(told, fit):
     """What clients are told of a fit, as it stands in the status."""
     series, reporter, _ = told
-    reporter.update(SessionProgress(Phase.RUNNING, 9, 0, 0, (fit,)), [])
+    reporter.on_progress(SessionProgress(Phase.RUNNING, 9, 0, 0, (fit,)), [])
     return series.as_document()["fit"]
 
 
@@ -56,7 +56,7 @@ def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
     assert series.as_document()["fit"] is None
     row = LogEvent(0, "info", "  8.0 s 0.910 ± 0.010 %", notable=True)
     fits = (online_fit(6.0, 2.0), online_fit(8.0))
-    reporter.update(SessionProgress(Phase.RUNNING, 9, 0, 0, fits), [row])
+    reporter.on_progress(SessionProgress(Phase.RUNNING, 9, 0, 0, fits), [row])
     assert [event["event"] for event in events] == ["message", "fit", "fit"]
     assert events[0]["notable"]
     assert [event["duration_s"] for event in events[1:]] == [6.0, 8.0]
@@ -67,20 +67,20 @@ def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
     # The result has nothing that was for the moment only, and says how a search ended.
     final = online_fit(9.0, search=False) | {"search": {"reason": "Reached.", "pieces": []}}
     del final["text"]
-    reporter.ended(result(fit=final), look_follows=True)
+    reporter.on_result(result(fit=final), look_follows=True)
     assert events[-1]["fit"]["search"] == {"reason": "Reached."}
     assert events[-1]["look_follows"]
     document = series.as_document()
     assert document["fit"]["text"] == fits[-1]["text"]
     assert document["fit"]["duration_s"] == 9.0
     assert "fit" not in document["sessions"][0]
-    reporter.begins(2, Path("2.mcap"))
+    reporter.on_start(2, Path("2.mcap"))
     assert series.as_document()["fit"] is None
 
 
 def test_a_session_without_fits_is_told_as_before(told):
     series, reporter, events = told
-    reporter.ended(result(), look_follows=False)
+    reporter.on_result(result(), look_follows=False)
     assert "fit" not in events[-1]
     assert not events[-1]["look_follows"]
     assert series.as_document()["fit"] is None
@@ -91,7 +91,7 @@ def test_a_session_without_fits_is_told_as_before(told):
 )
 def test_how_a_session_ended_is_one_message_of_its_level(told, outcome, level):
     _, reporter, events = told
-    reporter.ended(result(outcome=outcome), look_follows=False)
+    reporter.on_result(result(outcome=outcome), look_follows=False)
     message, session = events
     assert (message["level"], message["session"]) == (level, session["number"])
     assert message["text"].startswith(f"{outcome.capitalize()}: ")

@@ -9,22 +9,22 @@ pytestmark = pytest.mark.process
 
 FLOOD = """
 import logging
-from rigd.daemon._log import NAME, Log
+from rigd.daemon._log import LOGGER_NAME, DaemonLog
 
-with Log():
+with DaemonLog():
     for number in range(20_000):
-        logging.getLogger(NAME).info("line %d %s", number, "x" * 100)
+        logging.getLogger(LOGGER_NAME).info("line %d %s", number, "x" * 100)
 print("through")
 """
 A_FEW = """
 import logging
 from rigd.daemon import _log as log
-from rigd.daemon._log import NAME, Log
+from rigd.daemon._log import LOGGER_NAME, DaemonLog
 
-log._FLUSH_S = 60.0  # the machine may stand still for longer than a daemon would wait
-with Log():
+log._FLUSH_TIMEOUT_S = 60.0  # the machine may stand still for longer than a daemon would wait
+with DaemonLog():
     for number in range(5):
-        logging.getLogger(NAME).warning("line %d", number)
+        logging.getLogger(LOGGER_NAME).warning("line %d", number)
 """
 
 

@@ -27,7 +27,7 @@ STATUS = {
 
 @pytest.fixture
 def serve(runtime_folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(_page, "_PAUSE_S", 0.05)
+    monkeypatch.setattr(_page, "_RESTART_PAUSE_S", 0.05)
     started = []
 
     def serve(port=None):
@@ -75,7 +75,7 @@ def test_the_page_is_found_by_its_user_and_ends_with_the_daemon(serve, runtime_f
 
 
 def test_a_page_that_is_killed_comes_back_at_its_place_and_is_given_up_at_last(serve, monkeypatch):
-    monkeypatch.setattr(_page, "_MOST_STARTS", 2)
+    monkeypatch.setattr(_page, "_MAX_SHORT_STARTS", 2)
     page = serve()
     address = found()
     first = page._process.pid
@@ -104,8 +104,8 @@ def test_only_starts_that_do_not_last_are_counted(serve, monkeypatch):
     clock, ran = Clock(), []
     lasted_s = iter([1.0, 1.0, 1.0, 1.0, 60.0, 1.0, 3600.0])
     monkeypatch.setattr(_page, "time", clock)
-    monkeypatch.setattr(_page, "_PAUSE_S", 0.0)
-    monkeypatch.setattr(_page.PageProcess, "_run", run)
+    monkeypatch.setattr(_page, "_RESTART_PAUSE_S", 0.0)
+    monkeypatch.setattr(_page.PageProcess, "_run_process", run)
     page = serve()
     page._thread.join(30.0)
     assert not page._thread.is_alive()
@@ -114,7 +114,7 @@ def test_only_starts_that_do_not_last_are_counted(serve, monkeypatch):
 
 @pytest.mark.further  # as test_page_server.py
 def test_a_port_that_is_taken_is_said_if_it_was_asked_for(serve, monkeypatch, caplog):
-    monkeypatch.setattr(_page, "_MOST_STARTS", 1)
+    monkeypatch.setattr(_page, "_MAX_SHORT_STARTS", 1)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         page = serve(port)
@@ -139,8 +139,8 @@ server.run_page()
 
 
 def test_a_page_that_fails_ends_and_its_reason_is_logged(serve, monkeypatch, caplog):
-    monkeypatch.setattr(_page, "_MOST_STARTS", 1)
-    monkeypatch.setattr(_page, "_PROGRAM", ("-c", FAILING))
+    monkeypatch.setattr(_page, "_MAX_SHORT_STARTS", 1)
+    monkeypatch.setattr(_page, "_PAGE_SERVER_ARGUMENTS", ("-c", FAILING))
     page = serve()
     page._thread.join(60.0)
     assert not page._thread.is_alive()

@@ -425,7 +425,7 @@ def test_a_start_that_waits_for_the_devices_is_stopped_by_a_stop(operate):
     async def ask():
         opening = asyncio.create_task(operated.service.open())
         await asyncio.sleep(0)
-        started = asyncio.create_task(operated.service.handle(parse_request(line), operated.peer))
+        started = asyncio.create_task(operated.service.execute(parse_request(line), operated.peer))
         await asyncio.sleep(0)
         assert await operated.handle("stop", peer=OTHER) == {"stopping": False}
         with pytest.raises(CommandError, match="stopped before it began"):
@@ -472,7 +472,7 @@ def test_a_reset_does_not_connect_what_is_being_closed(operated):
 
 def test_a_session_whose_daemon_hears_nobody_is_given_no_sign_of_life(operated, monkeypatch):
     heard = iter([True, True, False])
-    monkeypatch.setattr(operated.service, "_listens", lambda: next(heard, False))
+    monkeypatch.setattr(operated.service, "_can_receive_stop", lambda: next(heard, False))
     beats = []
     operated.world.countdown = 1200
     operated.world.then = lambda _: beats.append(shared_state(operated)[StateField.SUPERVISOR_BEAT])

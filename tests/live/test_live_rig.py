@@ -28,8 +28,8 @@ pytestmark = pytest.mark.process
 @pytest.fixture
 def rig(write_profile, runtime_folder, monkeypatch):
     # How long its start takes is the machine's affair: what is asked for is what it shows then.
-    monkeypatch.setattr(live_view, "_PATIENCE_S", 60.0)
-    monkeypatch.setattr(live_view, "_BEGIN_PATIENCE_S", 60.0)
+    monkeypatch.setattr(live_view, "_ADDRESS_TIMEOUT_S", 60.0)
+    monkeypatch.setattr(live_view, "_SHOW_TIMEOUT_S", 60.0)
     rig = Rig(load_profile(str(write_profile("sim"))), fast=True, live=True)
     rig.connect()
     yield rig
@@ -100,7 +100,7 @@ def test_a_view_that_does_not_begin_holds_no_stop_up(rig, order):
     began_s = time.monotonic()
     told = rig.show(order("held up"), stop)
     assert stop.requested
-    assert time.monotonic() - began_s < live_view._PATIENCE_S
+    assert time.monotonic() - began_s < live_view._ADDRESS_TIMEOUT_S
     assert told.startswith("The live view is still starting")
 
 
@@ -208,7 +208,7 @@ class StillGroup:
         self.channels = SimpleNamespace(specs=None, shared_state=shared_state, rings=())
         self.started = 0
 
-    def fresh(self, process):
+    def idle_process(self, process):
         self.started += 1
 
     def __getitem__(self, process):
@@ -223,7 +223,7 @@ def test_one_that_is_only_starting_has_time_on_a_busy_computer(monkeypatch, hear
     monkeypatch.setattr(live_view.time, "monotonic", lambda: now_s[0])
     group = StillGroup()
     view = live_view.LiveView(group, "rig")
-    view._answered = heard
+    view._has_address = heard
     while group.started == 1:
         now_s[0] += 0.1
         view.check()

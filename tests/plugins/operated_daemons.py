@@ -257,7 +257,7 @@ class ThreadGroup(ProcessGroup):
     def _start(self, process):
         main = control.main if process is CONTROL else recorder.main
         self._children[process] = ThreadChild(process.name, main, self.world)
-        self._used.discard(process)
+        self._processes_with_job.discard(process)
 
 
 class QuietStop(StopRequest):
@@ -299,7 +299,7 @@ class Operated:
         line = json.dumps({"command": command, **fields}).encode()
         request = parse_request(line)
         try:
-            reply = await self.service.handle(request, peer or self.peer)
+            reply = await self.service.execute(request, peer or self.peer)
         except CommandError as error:
             return error
         while self.state in ("running", "stopping") and command == "start":
@@ -309,7 +309,7 @@ class Operated:
     def meanwhile(self, command, **fields):
         """Ask from another thread, while a session runs."""
         line = json.dumps({"command": command, **fields}).encode()
-        handled = self.service.handle(parse_request(line), self.peer)
+        handled = self.service.execute(parse_request(line), self.peer)
         try:
             return asyncio.run_coroutine_threadsafe(handled, self.loop).result(30.0)
         except CommandError as error:
@@ -320,7 +320,7 @@ class Operated:
         return self
 
     def watch(self):
-        self.loop.run_until_complete(self.service.watch())
+        self.loop.run_until_complete(self.service.check_connection())
 
     def close(self):
         self.loop.run_until_complete(self.service.close("the test is over"))

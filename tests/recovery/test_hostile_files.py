@@ -77,7 +77,7 @@ def test_what_is_not_shown_is_said(hostile, tmp_path):
     shown = sum(line.startswith("key") for line in info.lines())
     assert shown > 500
     assert f"… and {20_000 - shown} more keys not shown" in text
-    assert info.as_dict()["left_out"] == info.left_out
+    assert info.as_dict()["left_out"] == info.omission_texts
 
 
 def test_a_log_of_too_much_is_cut_and_counted(hostile, tmp_path):
@@ -91,9 +91,11 @@ def test_a_log_of_too_much_is_cut_and_counted(hostile, tmp_path):
     session = read_session(path)
     assert session.events[0].message.endswith("bytes, not read)")
     assert session.events[1].message == "line 0"
-    assert len(session.events) + session.events_left_out == 120_001
+    assert len(session.events) + session.omitted_event_count == 120_001
     shown = describe(path)
-    assert f"… and {120_001 - len(shown.events)} more messages of the log" in shown.left_out[0]
+    assert (
+        f"… and {120_001 - len(shown.events)} more messages of the log" in shown.omission_texts[0]
+    )
 
 
 def test_samples_in_another_order_of_fields_are_read_as_they_are(hostile, tmp_path):

@@ -46,7 +46,7 @@ def test_reason_and_result_agree(ended, std, reached, reason):
     found = fit.finish(9000, lambda: None)["search"]
     assert found["reached"] is reached
     assert found["reason"].startswith(reason)
-    assert (fit.shortcoming == "") == reached
+    assert (fit.unmet_reason == "") == reached
 
 
 STOPPED = {StateField.STOP: Stop.OPERATOR}
@@ -71,7 +71,7 @@ NOT_A_NUMBER = of_whole_record(float("nan"))
     ],
 )  # fmt: skip
 def test_no_answer_of_the_whole_record_is_not_a_no(told, board, reached, words, monkeypatch):
-    monkeypatch.setattr("rigd.runner._online_fit._STOP_PATIENCE_S", 0.0)
+    monkeypatch.setattr("rigd.runner._online_fit._STOPPED_FIT_TIMEOUT_S", 0.0)
     group = MagicMock()
     group.channels.shared_state.__getitem__.side_effect = lambda word: board.get(word, 0)
 
@@ -87,7 +87,7 @@ def test_no_answer_of_the_whole_record_is_not_a_no(told, board, reached, words, 
     fit.begin(MagicMock())
     found = fit.finish(9000, lambda: None)["search"]
     assert found["reached"] is reached
-    assert found["reason"] == fit.shortcoming
-    assert all(each in fit.shortcoming for each in words), fit.shortcoming
-    assert "So far: ." not in fit.shortcoming
-    assert fit.shortcoming.count("was killed.") <= 1
+    assert found["reason"] == fit.unmet_reason
+    assert all(each in fit.unmet_reason for each in words), fit.unmet_reason
+    assert "So far: ." not in fit.unmet_reason
+    assert fit.unmet_reason.count("was killed.") <= 1

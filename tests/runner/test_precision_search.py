@@ -15,7 +15,7 @@ from rigd.excitation.targets import Precision, parse_target
 from rigd.profile import load_profile
 from rigd.runner._precision_search import (
     ExcitationPlanner,
-    in_words,
+    estimates_text,
     target_estimates,
     targets_json,
 )
@@ -94,11 +94,11 @@ class Bench:
         self.search = ExcitationPlanner(excitation.search, profile, self.writer)
 
     def told(self, share, held=0, before=None, **more):
-        document = answer(self.profile, self.search.due + held, share, **more)
-        return list(self.search.decide(document, held, held if before is None else before))
+        document = answer(self.profile, self.search.due_tick + held, share, **more)
+        return list(self.search.plan_next(document, held, held if before is None else before))
 
     def problem(self, text="Nothing is excited yet."):
-        return list(self.search.decide({"tick": self.search.due, "problem": text}, 0, 0))
+        return list(self.search.plan_next({"tick": self.search.due_tick, "problem": text}, 0, 0))
 
 
 def test_a_search_may_state_the_uniformity_of_the_beam():
@@ -145,11 +145,11 @@ def bench(profile):
 
 def test_a_piece_follows_where_more_is_to_be_known(bench):
     planned = bench.writer.ticks
-    assert bench.search.due == planned - 500  # the end of the scan, not that of the pause
+    assert bench.search.due_tick == planned - 500  # the end of the scan, not that of the pause
     fit, piece = bench.told(ON_THE_WAY)
     assert isinstance(fit, FitReport)
     assert isinstance(piece, PlannedSegment)
-    assert bench.search.due == planned
+    assert bench.search.due_tick == planned
     assert bench.writer.ticks - planned == round(RATE_HZ * piece.document["duration_s"])
     assert bench.shared_state[StateField.PLANNED] == bench.writer.ticks
     assert not bench.search.may_be_last
@@ -166,14 +166,14 @@ def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench):
         *_, last = bench.told(CERTAIN)
         assert bench.writer.ticks < 60 * RATE_HZ
     assert isinstance(last, FitReport | PlannedSegment)
-    assert bench.search.due == bench.writer.ticks >= planned + 500
+    assert bench.search.due_tick == bench.writer.ticks >= planned + 500
     _, end = bench.told(CERTAIN)
     assert isinstance(end, SearchEnded)
     assert end.reached
     assert end.reason.startswith("Reached: damping of mode 1 0.00")
     assert end.segments["scan"] == (1000, 6000)
     assert end.segments["piece_1"][0] == 6500
-    assert bench.search.due is None
+    assert bench.search.due_tick is None
 
 
 def test_before_the_first_judgement_all_structures_are_fitted_to_what_there_is(
@@ -190,7 +190,7 @@ def test_before_the_first_judgement_all_structures_are_fitted_to_what_there_is(
         bench.told(CERTAIN)
     assert not bench.search.needs_early_fit
     bench.told(CERTAIN)
-    assert bench.search.due is None
+    assert bench.search.due_tick is None
     assert not bench.search.needs_early_fit
 
 
@@ -221,7 +221,7 @@ def test_a_record_that_stays_doubtful_is_given_up_with_its_findings(bench):
 def test_ticks_that_were_held_shift_what_follows(bench):
     bench.told(ON_THE_WAY)
     bench.told(ON_THE_WAY, held=300)
-    end = bench.search.ended(9000, 300, bench.writer.ticks)
+    end = bench.search.end_of_record(9000, 300, bench.writer.ticks)
     first, last = end.segments["piece_1"]
     assert first == 6800
     assert last > first
@@ -232,7 +232,7 @@ def test_ticks_that_were_held_after_a_piece_do_not_shift_it(bench):
     """As where a decision takes longer than what is planned: the scan was played at once."""
     bench.told(ON_THE_WAY, held=1200, before=0)
     bench.told(ON_THE_WAY, held=2000, before=1700)
-    segments = bench.search.ended(14000, 2050, bench.writer.ticks).segments
+    segments = bench.search.end_of_record(14000, 2050, bench.writer.ticks).segments
     assert segments["scan"] == (1000, 6000)
     assert segments["sweep"][0] == 1000
     first, end = segments["piece_1"]
@@ -241,12 +241,12 @@ def test_ticks_that_were_held_after_a_piece_do_not_shift_it(bench):
 
 
 def test_a_piece_that_was_not_begun_is_no_segment(bench):
-    assert bench.search.is_begun(0)
+    assert bench.search.has_last_segment_begun(0)
     bench.told(ON_THE_WAY)
-    place = bench.search.due
-    assert bench.search.is_begun(bench.writer.ticks)
-    assert not bench.search.is_begun(0)
-    segments = bench.search.ended(place + 400, 0, 0).segments
+    place = bench.search.due_tick
+    assert bench.search.has_last_segment_begun(bench.writer.ticks)
+    assert not bench.search.has_last_segment_begun(0)
+    segments = bench.search.end_of_record(place + 400, 0, 0).segments
     assert segments.keys() == {"scan", "sweep"}
 
 
@@ -306,11 +306,11 @@ def test_damping_that_is_absent_cannot_be_told(profile):
     bench = Bench(profile, "zeta 15%")
     ends = []
     while not ends:
-        document = answer(profile, bench.search.due, ON_THE_WAY)
+        document = answer(profile, bench.search.due_tick, ON_THE_WAY)
         document["plant"]["damping"] |= {"zeta": 0.0}
         document["covariance"]["names"].remove("zeta")
         document["parameters"] = {}
-        found = bench.search.decide(document, 0, 0)
+        found = bench.search.plan_next(document, 0, 0)
         ends = [m for m in found if isinstance(m, SearchEnded)]
     assert ends[0].reason.startswith("Out of reach: internal damping is absent")
 
@@ -318,10 +318,10 @@ def test_damping_that_is_absent_cannot_be_told(profile):
 def test_an_absent_mode_is_not_stated(profile):
     (found,) = target_estimates(answer(profile, 1, CERTAIN), [parse_target("damping", "7:1%")])
     assert found.ratio == np.inf
-    assert in_words([found]) == "damping of mode 7: no such mode was found in the band"
+    assert estimates_text([found]) == "damping of mode 7: no such mode was found in the band"
     none = answer(profile, 1, CERTAIN) | {"modes": []}
     (found,) = target_estimates(none, [parse_target("frequency", "1%")])
-    assert in_words([found]) == "frequency of any mode: no such mode was found in the band"
+    assert estimates_text([found]) == "frequency of any mode: no such mode was found in the band"
 
 
 def test_a_flag_on_what_is_asked_never_counts_as_reached(profile, quick_pauses):
@@ -329,10 +329,10 @@ def test_a_flag_on_what_is_asked_never_counts_as_reached(profile, quick_pauses):
     bench = Bench(profile, "damping 1%")
     ends = []
     while not ends:
-        document = answer(profile, bench.search.due, CERTAIN)
+        document = answer(profile, bench.search.due_tick, CERTAIN)
         damping = document["modes"][1]["damping_ratio"]
         damping["flag"] = "part of the record is unexplained"
-        told = list(bench.search.decide(document, 0, 0))
+        told = list(bench.search.plan_next(document, 0, 0))
         ends = [m for m in told if isinstance(m, SearchEnded)]
     assert not ends[0].reached
     assert "damping of mode 2: part of the record is unexplained" in ends[0].reason
@@ -341,9 +341,9 @@ def test_a_flag_on_what_is_asked_never_counts_as_reached(profile, quick_pauses):
 def test_modes_that_are_not_those_of_a_uniform_beam_are_excited_where_they_are(profile):
     """Each by a stiffness of its own: the design drives them at their frequencies."""
     bench = Bench(profile, "damping 2:0.1%", at_most_s=40.0)
-    document = answer(profile, bench.search.due, ON_THE_WAY)
+    document = answer(profile, bench.search.due_tick, ON_THE_WAY)
     document["plant"]["stiffness_offsets"] = [0.04, 0.0]
-    *_, piece = bench.search.decide(document, 0, 0)
+    *_, piece = bench.search.plan_next(document, 0, 0)
     bands_hz = [
         (float(low) + float(high)) / 2 for low, high in re.findall(r"([\d.]+)–([\d.]+)", piece.name)
     ]

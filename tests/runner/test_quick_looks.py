@@ -52,7 +52,7 @@ def started():
 def looks(tmp_path, monkeypatch, started):
     (tmp_path / "look_program.py").write_text(PROGRAM)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(quick_looks, "_PROGRAM", "look_program")
+    monkeypatch.setattr(quick_looks, "_QUICK_LOOK_MODULE", "look_program")
     told = []
     looks = QuickLooks(told.append)
     looks.told = told
@@ -71,9 +71,9 @@ def done(looks):
     return looks.told
 
 
-def spent_s(looks):
+def run_time_s(looks):
     looks.poll()
-    return looks.spent_s
+    return looks.run_time_s
 
 
 def test_sessions_are_looked_at_one_after_the_other(looks, tmp_path, started):
@@ -107,7 +107,7 @@ def test_a_look_that_fails_says_why(looks, tmp_path, name, error):
 def test_none_runs_beside_a_session(looks, tmp_path, started):
     looks.begin(tmp_path / "waits.mcap")
     (pid,) = started()
-    with looks.held():
+    with looks.suspended():
         assert eventually(lambda: state_of(Path(f"/proc/{pid}")) == "T")
         (tmp_path / "waits.go").touch()
         looks.begin(tmp_path / "next.mcap")
@@ -120,9 +120,9 @@ def test_none_runs_beside_a_session(looks, tmp_path, started):
 
 
 def test_one_that_hangs_is_killed_and_not_for_the_time_of_a_session(looks, tmp_path, monkeypatch):
-    monkeypatch.setattr(quick_looks, "_LONGEST_S", 0.4)
+    monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.4)
     looks.begin(tmp_path / "hangs.mcap")
-    with looks.held():
+    with looks.suspended():
         time.sleep(0.5)
     looks.poll()
     assert looks.told == []
@@ -131,14 +131,14 @@ def test_one_that_hangs_is_killed_and_not_for_the_time_of_a_session(looks, tmp_p
 
 
 def test_the_wait_for_a_processor_does_not_count(looks, tmp_path, monkeypatch):
-    monkeypatch.setattr(quick_looks, "_LONGEST_S", 0.05)
+    monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.05)
     used_s = 0.0
     monkeypatch.setattr(quick_looks, "processor_use", lambda _: (True, used_s))
     looks.begin(tmp_path / "waits.mcap")
     for _ in range(3):
         time.sleep(0.05)
         looks.poll()
-    assert (looks.busy, looks.told, looks.spent_s) == (True, [], 0.0)
+    assert (looks.busy, looks.told, looks.run_time_s) == (True, [], 0.0)
     used_s = 0.06
     time.sleep(0.06)
     looks.poll()
@@ -158,8 +158,8 @@ def test_what_a_process_does_with_the_processors():
 
 
 def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeypatch):
-    monkeypatch.setattr(quick_looks, "_LONGEST_S", 0.05)
-    monkeypatch.setattr(quick_looks, "_END_S", 0.05)
+    monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.05)
+    monkeypatch.setattr(quick_looks, "_KILL_TIMEOUT_S", 0.05)
     # As on a busy computer, it has no time to end in; at last it is killed, lest a failure hang.
     monkeypatch.setattr(subprocess.Popen, "kill", lambda _: None)
     for end in (looks.poll, looks.close):
@@ -167,14 +167,14 @@ def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeyp
         process = looks._process
         late = threading.Timer(5.0, process.send_signal, (signal.SIGKILL,))
         late.start()
-        assert eventually(lambda: spent_s(looks) >= 0.05)
+        assert eventually(lambda: run_time_s(looks) >= 0.05)
         end()
         assert looks.told == []
         assert process.poll() is None
         late.cancel()
         process.send_signal(signal.SIGKILL)
         if end == looks.poll:
-            with looks.held():  # nor does a session
+            with looks.suspended():  # nor does a session
                 looks.poll()
             (told,) = done(looks)
             assert told.error == "it took longer than 0.05 s."

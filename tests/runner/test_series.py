@@ -70,8 +70,8 @@ def test_a_series_ends_with_the_first_session_that_does_not_go_well(make_series)
     first, second = (order.path for order in rig.orders)
     assert first.stem.endswith("-hold-01")
     assert watcher.told == [
-        ("begins", 1, first), ("shown", "Live view: there"), ("ended", WELL, UNSEEN),
-        ("begins", 2, second), ("shown", "Live view: there"), ("ended", bad, UNSEEN),
+        ("on_start", 1, first), ("on_live_view", "Live view: there"), ("on_result", WELL, UNSEEN),
+        ("on_start", 2, second), ("on_live_view", "Live view: there"), ("on_result", bad, UNSEEN),
     ]  # fmt: skip
 
 
@@ -145,7 +145,7 @@ class Looks:
         self.left -= 1
 
     @contextlib.contextmanager
-    def held(self):
+    def suspended(self):
         self.told.append("held")
         yield
         self.told.append("let go")
@@ -168,11 +168,11 @@ def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_serie
     looks = Looks(watcher.told)
     series = make_series(repeat=3)
     series.run(Watched(*results, stopped), StopRequest(), watcher, live=False, quick_looks=looks)
-    session = ["held", "run", "let go", "ended"]
+    session = ["held", "run", "let go", "on_result"]
     pause = ["look", "watch", "watch", "watch"]
     told = [each if isinstance(each, str) else each[0] for each in watcher.told]
-    assert told == ["begins", *session, *pause] * 2 + ["begins", *session]
-    ends = [each[-1] for each in watcher.told if each[0] == "ended"]
+    assert told == ["on_start", *session, *pause] * 2 + ["on_start", *session]
+    ends = [each[-1] for each in watcher.told if each[0] == "on_result"]
     assert ends == [("look_follows", True), ("look_follows", True), UNSEEN]
 
 
@@ -189,7 +189,7 @@ def test_a_stop_ends_the_wait_for_a_quick_look(make_series):
     result = replace(WELL, path=Path("a-01.mcap"))
     make_series(repeat=3).run(Stopped(result), stop, watcher, live=False, quick_looks=looks)
     told = [each if isinstance(each, str) else each[0] for each in watcher.told]
-    assert told == ["begins", "held", "let go", "ended", "look", "watch"]
+    assert told == ["on_start", "held", "let go", "on_result", "look", "watch"]
 
 
 @pytest.mark.process
@@ -199,7 +199,7 @@ def test_no_quick_look_at_a_move_is_begun_and_none_announced(tmp_path):
     recorded, looks = replace(WELL, path=Path("a.mcap")), Looks(watcher.told)
     series = Series(profile, replace(excitation, stays=True), tmp_path / "out")
     series.run(Rig(recorded), StopRequest(), watcher, live=False, quick_looks=looks)
-    assert watcher.told[-2:] == ["let go", ("ended", recorded, UNSEEN)]
+    assert watcher.told[-2:] == ["let go", ("on_result", recorded, UNSEEN)]
 
 
 def test_a_plan_is_told_with_its_limits_from_a_document_as_well(make_series):
@@ -244,7 +244,7 @@ def test_progress_alone_has_the_line_drawn_anew_some_times_a_second(monkeypatch)
     line, drawn, now_s = ProgressLine(), [], 0.0
     with monkeypatch.context() as patched:
         patched.setattr("rigd.runner._console.time.monotonic", lambda: now_s)
-        patched.setattr(line._changed, "set", lambda: drawn.append(now_s))
+        patched.setattr(line._has_changed, "set", lambda: drawn.append(now_s))
         for tick in range(1000):
             now_s = tick / 1000
             line.update(Phase.RUNNING, tick, 1000, missed=0, late=0)

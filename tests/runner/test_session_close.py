@@ -10,7 +10,7 @@ from shipped_profile import load_shipped
 from rigd.engine.messages import Closed, Connected, Finished
 from rigd.excitation import hold
 from rigd.runner.request import Order
-from rigd.runner.session import SessionFailedError, SessionRun, always
+from rigd.runner.session import SessionFailedError, SessionRun, can_always_receive_stop
 
 KILLED = "The fit process was killed by signal 9."
 STOPPED = "Stopped by the operator."
@@ -21,7 +21,7 @@ COUNTS = {"scheduled": 1200, "missed": 0, "late": 0, "stale_angles": 0, "stale_w
 def close():
     """Close a session whose fit process failed, or did not; with a file, or without."""
 
-    def closed(finished, failure, shortcoming="", *, recorded=True, slow=lambda poll: poll):
+    def closed(finished, failure, unmet_reason="", *, recorded=True, slow=lambda poll: poll):
         profile = load_shipped("sim")
         order = Order(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
         group = MagicMock()
@@ -30,8 +30,10 @@ def close():
             oldest=0, written=0, capacity=16, record_size=1, buffer=bytes(1000)
         )
         connected = Connected({}, {}, {"clock": "virtual"}, simulated=True)
-        session = SessionRun(order, group, connected, None, lambda *_: None, always)
-        session._fit = MagicMock(failure=failure, shortcoming=shortcoming, segments={})
+        session = SessionRun(
+            order, group, connected, None, lambda *_: None, can_always_receive_stop
+        )
+        session._fit = MagicMock(failure=failure, unmet_reason=unmet_reason, segments={})
         session._fit.finish.return_value = {}
         session._fit.poll.return_value = []
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.engine import Ring, shared_memory_fd
-from rigd.runner.status import SignalWatch
+from rigd.runner.status import SignalStatisticsReader
 from rigd.session.layout import SAMPLE_SIZE, pack_sample_into
 
 
@@ -28,11 +28,11 @@ def put(ring, ticks, *, error_rad=0.0, coupling_nm=0.0, command_nm=0.0, lateness
 
 
 def test_nothing_is_told_before_the_first_sample(ring):
-    assert SignalWatch(1000.0).poll(ring) is None
+    assert SignalStatisticsReader(1000.0).poll(ring) is None
 
 
 def test_the_figures_are_of_the_last_second_and_the_peaks_of_the_record(ring):
-    watch = SignalWatch(1000.0)
+    watch = SignalStatisticsReader(1000.0)
     watch.poll(ring)
     put(ring, range(100), error_rad=-0.02, coupling_nm=-0.5, command_nm=0.3, lateness_ns=10**6)
     assert watch.poll(ring)().lateness_p50_us == 1000.0
@@ -52,7 +52,7 @@ def test_the_figures_are_of_the_last_second_and_the_peaks_of_the_record(ring):
 
 
 def test_another_record_begins_anew_and_missed_ticks_cost_rate(ring):
-    watch = SignalWatch(1000.0)
+    watch = SignalStatisticsReader(1000.0)
     watch.poll(ring)
     put(ring, range(1000), error_rad=0.5)
     put(ring, np.delete(np.arange(1000), np.arange(100, 200)).tolist(), error_rad=0.1)

@@ -18,7 +18,7 @@ class Group(dict):
         self.channels = SimpleNamespace(specs=None, samples=SimpleNamespace(written=0))
         self.child = SimpleNamespace(start=lambda _: None, messages=messages)
 
-    def fresh(self, _):
+    def idle_process(self, _):
         return self.child
 
     def __getitem__(self, _):
@@ -43,7 +43,7 @@ def test_a_stop_does_not_wait_for_a_process_that_prepares():
     ("messages", "words"), [([TouchReady()], []), ([], ["was not ready within 0 s. Touches are"])]
 )
 def test_the_session_waits_until_it_is_ready_or_late(monkeypatch, messages, words):
-    monkeypatch.setattr("rigd.runner._process_group._PREPARING_S", 0.0)
+    monkeypatch.setattr("rigd.runner._process_group._READY_TIMEOUT_S", 0.0)
     touches = estimates(lambda _: messages)
     touches.await_ready(lambda: True)
     told = [event.message for event in touches.poll()]
@@ -52,7 +52,7 @@ def test_the_session_waits_until_it_is_ready_or_late(monkeypatch, messages, word
 
 
 def test_a_first_estimate_that_no_better_one_followed_is_called_that(monkeypatch):
-    monkeypatch.setattr("rigd.runner._touch_search._LAST_PATIENCE_S", 0.0)
+    monkeypatch.setattr("rigd.runner._touch_search._FINAL_ESTIMATES_TIMEOUT_S", 0.0)
     x = {"value": 0.6, "std": 0.01, "interval_95": [0.58, 0.62]}
     told = [TouchReport(1, 900, True, {"x_m": x}), TouchReport(2, 2900, False, {"x_m": x})]
     touches = estimates(lambda _: told)

@@ -69,7 +69,7 @@ def test_the_limits_are_those_of_the_code():
     assert f"of more than {limits.MAX_DECODED_BYTES >> 10} KiB" in DOCUMENT
     assert f"more than {limits.MAX_STEPS // 10**6} million runs" in DOCUMENT
     assert f"more than {limits.MAX_SINGLE_MESSAGES // 1000} 000 samples" in DOCUMENT
-    assert f"up to {limits.MAX_SURVEYED / 1e6:g} million samples" in DOCUMENT
+    assert f"up to {limits.MAX_SAMPLES_WITHOUT_SIGNALS / 1e6:g} million samples" in DOCUMENT
     assert f"up to {limits.MAX_SAMPLES / 1e6:g} million samples" in DOCUMENT
 
 

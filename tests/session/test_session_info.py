@@ -48,7 +48,7 @@ def test_a_trimmed_copy_is_not_complete(kit, tmp_path, stated):
     assert "it was trimmed" in text
     assert ("600 of the 900 samples" if stated else "Samples of rest and sweep") in text
     assert "ticks 100 to 399" in text
-    assert info.as_dict()["absent"] == info.absent
+    assert info.as_dict()["absent"] == info.missing_samples_text
 
 
 def test_a_whole_one_lacks_nothing(kit, tmp_path):
@@ -57,7 +57,7 @@ def test_a_whole_one_lacks_nothing(kit, tmp_path):
     writer.write_samples(kit.packed(kit.make_samples(900)))
     counts = {"recorded": "900", "scheduled": "900", "missed": "0", "late": "0", "lost": "0"}
     info = describe(writer.close(kit.OUTCOME | counts))
-    assert info.absent == ""
+    assert info.missing_samples_text == ""
     assert any(
         line.endswith("Complete: 900 of 900 samples, 0 missed, 0 late") for line in info.lines()
     )

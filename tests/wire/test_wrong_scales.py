@@ -23,18 +23,18 @@ class Told:
         self.texts = []
         self.stop = stop
 
-    def begins(self, number, path):
+    def on_start(self, number, path):
         pass
 
-    def says(self, level, text):
+    def on_message(self, level, text):
         self.texts.append(f"{level}: {text}")
         if self.stop is not None:
             self.stop.request()
 
-    def update(self, progress, events):
+    def on_progress(self, progress, events):
         pass
 
-    def ended(self, result, *, look_follows):
+    def on_result(self, result, *, look_follows):
         pass
 
 
