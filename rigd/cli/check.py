@@ -74,9 +74,9 @@ def _report(rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
         typer.echo(json.dumps(document, ensure_ascii=False))
     else:
         from rigd.checks import ACCEPTABLE
-        from rigd.checks.rows import OF_A_RIG, OF_AN_EDS, CheckResult, print_table
+        from rigd.checks.rows import RIG_CONSEQUENCES, EDS_CONSEQUENCES, CheckResult, print_table
 
-        print_table(rows, OF_AN_EDS if on_paper else OF_A_RIG)
+        print_table(rows, EDS_CONSEQUENCES if on_paper else RIG_CONSEQUENCES)
         failed = {row.name for row in rows if row.verdict is CheckResult.FAIL}
         if failed and failed.issubset(ACCEPTABLE) and not on_paper:
             accepted = " ".join(f"--accept {name}" for name in ACCEPTABLE if name in failed)
