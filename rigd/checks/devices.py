@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from rigd.checks.rows import CheckResult, CheckRow, grade, key_label, format_value
+from rigd.checks.rows import CheckResult, CheckRow, format_value, grade, key_label
 from rigd.devices import ActuationTarget, actuation_target, open_devices
 from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import WATCHDOG, Watchdog

@@ -377,8 +377,8 @@ def travel_rows(profile: Profile) -> Iterator[CheckRow]:
             _TRAVEL_GROUP,
             f"{worst}{failure.what}",
             f"{_format_angle(travel.total_rad)}: {_format_angle(travel.driven_rad)} in the "
-            f"{failure.duration_s * 1e3:g} ms {failure.ended_by}, {_format_angle(travel.coasting_rad)} "
-            "coasting",
+            f"{failure.duration_s * 1e3:g} ms {failure.ended_by}, "
+            f"{_format_angle(travel.coasting_rad)} coasting",
             bound,
             grade(fail=too_far),
             detail.strip(),

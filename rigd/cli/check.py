@@ -74,7 +74,7 @@ def _report(rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
         typer.echo(json.dumps(document, ensure_ascii=False))
     else:
         from rigd.checks import ACCEPTABLE
-        from rigd.checks.rows import RIG_CONSEQUENCES, EDS_CONSEQUENCES, CheckResult, print_table
+        from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, CheckResult, print_table
 
         print_table(rows, EDS_CONSEQUENCES if on_paper else RIG_CONSEQUENCES)
         failed = {row.name for row in rows if row.verdict is CheckResult.FAIL}

@@ -142,14 +142,16 @@ def new(
     check_new(output)
     draft = Draft(base, read_eds(eds), output)
     write_new(output, _ask_for_values(draft) if is_terminal() else draft.text())
-    for doubt in draft.doubts:
+    for doubt in draft.remarks:
         typer.echo(f"Note: {doubt}", err=True)
-    missing = draft.unanswered()
-    lacks = [finding.accept for finding in draft.unaccepted()]
+    missing = draft.unanswered_questions()
+    lacks = [finding.accept for finding in draft.unaccepted_findings()]
     if missing or lacks:
         typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
     for question in missing:
-        typer.echo(f"  {question.key} = {draft.shown(question.key)}: {question.text}", err=True)
+        typer.echo(
+            f"  {question.key} = {draft.value_text(question.key)}: {question.text}", err=True
+        )
     if lacks:
         typer.echo(
             f"  cia402.accept_without: {', '.join(lacks)}: what the drive lacks; rigd refuses it "
@@ -191,7 +193,7 @@ def _ask_for_acceptance(draft: "Draft") -> None:
     """Ask for each missing feature of the drive whether it is accepted; Enter means no."""
     declined: set[str] = set()
     # One answer may imply another: without a watchdog its reaction is irrelevant.
-    while lacks := [each for each in draft.unaccepted() if each.accept not in declined]:
+    while lacks := [each for each in draft.unaccepted_findings() if each.accept not in declined]:
         typer.echo(lacks[0].sentence, err=True)
         name = lacks[0].accept
         if typer.confirm(f"Run it without ({name})?", default=False, err=True):
@@ -203,7 +205,7 @@ def _ask_for_acceptance(draft: "Draft") -> None:
 def _ask(draft: "Draft", key: str, text: str) -> None:
     """Ask until the answer is a valid value of the key."""
     while True:
-        given = typer.prompt(text, default=draft.shown(key), err=True)
+        given = typer.prompt(text, default=draft.value_text(key), err=True)
         try:
             draft.answer(key, given.strip())
             return
