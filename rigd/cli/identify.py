@@ -136,7 +136,7 @@ def _run_sessions(
     controller is too slow for the estimate.
     """
     stop, group = start_processes(live=False)
-    from rigd.identification import cautious, tuned
+    from rigd.identification import with_cautious_controller, with_tuned_controller
     from rigd.identification.experiments import multisine_session, speeds_session, trial_session
     from rigd.runner import ProcessGroup, run_in_foreground
     from rigd.runtime import ignore
@@ -170,11 +170,11 @@ def _run_sessions(
         return path
 
     try:
-        trial = run(trial_session, cautious, 0, group)
+        trial = run(trial_session, with_cautious_controller, 0, group)
         estimate = _estimate([trial], profile_name)[0]
 
         def tune(profile: "Profile") -> "Profile":
-            return tuned(profile, estimate)
+            return with_tuned_controller(profile, estimate)
 
         return [
             run(session, tune, number, ProcessGroup(live=False))

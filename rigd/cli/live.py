@@ -319,4 +319,4 @@ def _serve(recording: Path, scratch: Path, path: Path) -> None:
             f"{path.name} is shown there until Ctrl-C. {tunnel_advice(page.address)}", err=True
         )
         page.wait()
-        fail(f"The Rerun server ended: {page.program.last_words}.", EXIT_FAILED)
+        fail(f"The Rerun server ended: {page.program.last_log_lines}.", EXIT_FAILED)

@@ -80,7 +80,7 @@ def test_a_session_that_begins_while_the_server_is_frozen_is_shown_when_it_goes_
 ):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(
-        producer, first="from rigd.live import publisher; publisher._WAITING_S = 1.0"
+        producer, first="from rigd.live import publisher; publisher._MAX_QUEUED_S = 1.0"
     )
     server = publisher.server_pid
     os.kill(server, signal.SIGSTOP)
