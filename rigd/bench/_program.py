@@ -73,7 +73,7 @@ class Results:
     @property
     def highest_rate_hz(self) -> float | None:
         """Highest rate in Hz at which nearly all ticks ran in time, or None if there is none."""
-        held_rates = [one.rate_hz for one in self.search if one.held_rates >= HELD_FRACTION]
+        held_rates = [one.rate_hz for one in self.search if one.held >= HELD_FRACTION]
         return max(held_rates, default=None)
 
     @property
@@ -183,7 +183,7 @@ class Bench:
             if not LOWEST_HZ <= rate_hz <= HIGHEST_HZ:
                 return
             attempt = self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz)
-            if attempt.held_rates < HELD_FRACTION:
+            if attempt.held < HELD_FRACTION:
                 attempt = max(attempt, self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz), key=_merit)
             results.search.append(attempt)
             if _holds(attempt) is not upwards:
@@ -273,7 +273,7 @@ def cores_without_loop(granted: dict[str, str]) -> set[int]:
 
 
 def _merit(one: LoopMeasurement) -> tuple[bool, float]:
-    return one.held_rates >= HELD_FRACTION, one.held_between_stalls
+    return one.held >= HELD_FRACTION, one.held_between_stalls
 
 
 def _holds(one: LoopMeasurement) -> bool:
