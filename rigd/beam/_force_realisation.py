@@ -118,9 +118,7 @@ def realise_force(
     check_order(damping)
     x = np.append(output_at_m, force_at_m) / beam.length_m
     poles, residues = _modal_poles_and_residues(beam, damping, x, highest_rad_s)
-    if poles.size == _MAX_MODES and -poles[-1].real_rows < _RESONANT_DAMPING_RATIO * np.abs(
-        poles[-1]
-    ):
+    if poles.size == _MAX_MODES and -poles[-1].real < _RESONANT_DAMPING_RATIO * np.abs(poles[-1]):
         # The next modes resonate and are not included.
         highest_rad_s = min(highest_rad_s, float(np.abs(poles[-1])) / _MODES_UP_TO_FACTOR)
 
@@ -161,8 +159,8 @@ def realise_force(
     for i in range(exact.shape[1]):
         weighted, target = columns * weights[:, i, None], remainder[:, i] * weights[:, i]
         fitted[i] = np.linalg.lstsq(
-            np.concatenate([weighted.real_rows, weighted.imag]),
-            np.concatenate([target.real_rows, target.imag]),
+            np.concatenate([weighted.real, weighted.imag]),
+            np.concatenate([target.real, target.imag]),
             rcond=_SINGULAR_VALUE_CUTOFF,
         )[0]
 
@@ -170,7 +168,7 @@ def realise_force(
     n = pairs + real_poles.size
     a, b = np.zeros((n, n)), np.ones(n)
     first_rows = np.arange(0, pairs, 2)
-    a[first_rows, first_rows] = a[first_rows + 1, first_rows + 1] = poles.real_rows
+    a[first_rows, first_rows] = a[first_rows + 1, first_rows + 1] = poles.real
     a[first_rows, first_rows + 1] = poles.imag
     a[first_rows + 1, first_rows] = -poles.imag
     b[first_rows + 1] = 0.0
@@ -179,7 +177,7 @@ def realise_force(
     b[real_rows] = -real_poles
     rows = np.empty((exact.shape[1], n))
     # The first of a pair's states is the real part of z, the second minus its imaginary part.
-    rows[:, first_rows], rows[:, first_rows + 1] = 2 * residues.real_rows, 2 * residues.imag
+    rows[:, first_rows], rows[:, first_rows + 1] = 2 * residues.real, 2 * residues.imag
     rows[:, pairs:] = fitted[:, :-1]
     return ForceRealisation(a, poles.size, b, rows, fitted[:, -1])
 
@@ -215,7 +213,7 @@ def _modal_poles_and_residues(
     z = clamped_free_eigenvalues(_MAX_MODES)
     poles = poles_for_eigenvalues(z, beam, damping)[:, 0]
     magnitude = np.abs(poles)  # not a number where there is none: then False below
-    selected = (poles.imag > 0) & (-poles.real_rows < _HEAVY_DAMPING_RATIO * magnitude)
+    selected = (poles.imag > 0) & (-poles.real < _HEAVY_DAMPING_RATIO * magnitude)
     selected &= magnitude < _MODES_UP_TO_FACTOR * highest_rad_s
     poles, z = poles[selected], z[selected]
     numbers = np.flatnonzero(selected) + 1

@@ -273,14 +273,17 @@ def cores_without_loop(granted: dict[str, str]) -> set[int]:
 
 
 def _merit(one: LoopMeasurement) -> tuple[bool, float]:
+    """Return the sort key that is largest for the best measurement at a rate."""
     return one.held >= HELD_FRACTION, one.held_between_stalls
 
 
 def _holds(one: LoopMeasurement) -> bool:
+    """Return whether nearly all ticks outside of stalls ran within their periods."""
     return one.held_between_stalls >= HELD_FRACTION
 
 
 def _median(values: list[float]) -> float:
+    """Return the median of at least one value."""
     ordered = sorted(values)
     half = len(ordered) // 2
     return ordered[half] if len(ordered) % 2 else (ordered[half - 1] + ordered[half]) / 2

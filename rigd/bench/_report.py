@@ -141,7 +141,7 @@ def _table(rows: list[LoopMeasurement]) -> Iterator[str]:
 def _search_table(search: list[LoopMeasurement]) -> Iterator[str]:
     """Yield the lines of the table of rates."""
     yield (
-        f"{'':>10}{'held, %':>9}{'but stalls':>12}{'stalls':>8}{'latency p99, µs':>14}"
+        f"{'':>10}{'held, %':>9}{'but stalls':>12}{'stalls':>8}{'late p99, µs':>14}"
         f"{'exec p99, µs':>14}{'CPU, %':>8}"
     )
     for each in sorted(search, key=lambda each: each.rate_hz):

@@ -1,4 +1,4 @@
-"""``rigd identify``: parameters of the rig from dedicated sessions."""
+"""Command ``rigd identify``: estimates of the rig's parameters from dedicated sessions."""
 
 import json
 from pathlib import Path
@@ -130,7 +130,7 @@ def _run_sessions(
     hardware: bool,
     quiet_stdout: bool,
 ) -> list[Path]:
-    """Run the trial and both sessions, and return the files of the two sessions.
+    """Run the trial and the two sessions for the estimate, and return the files of these two.
 
     An incomplete session ends the command. The file of the trial is not returned, because its
     controller is too slow for the estimate.
@@ -185,6 +185,7 @@ def _run_sessions(
 
 
 def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
+    """Estimate the motor from session files, and propose values for the profile."""
     from rigd.identification import propose, read_recording
     from rigd.identification.estimate import estimate_motor
 

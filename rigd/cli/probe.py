@@ -1,4 +1,4 @@
-"""``rigd probe``: a small move that verifies scales and signs of motor, encoder and sensor."""
+"""Command ``rigd probe``: a small move that verifies scales and signs of the rig."""
 
 import json
 from functools import partial

@@ -1,4 +1,4 @@
-"""``rigd profiles``: list, show and copy profiles, and write a new one from a drive's EDS file."""
+"""Command ``rigd profiles``: list, show and copy profiles, or write one from an EDS file."""
 
 import sys
 from pathlib import Path
@@ -142,19 +142,19 @@ def new(
     check_new(output)
     draft = Draft(base, read_eds(eds), output)
     write_new(output, _ask_for_values(draft) if is_terminal() else draft.text())
-    for doubt in draft.remarks:
-        typer.echo(f"Note: {doubt}", err=True)
+    for remark in draft.remarks:
+        typer.echo(f"Note: {remark}", err=True)
     missing = draft.unanswered_questions()
-    lacks = [finding.accept for finding in draft.unaccepted_findings()]
-    if missing or lacks:
+    missing_features = [finding.accept for finding in draft.unaccepted_findings()]
+    if missing or missing_features:
         typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
     for question in missing:
         typer.echo(
             f"  {question.key} = {draft.value_text(question.key)}: {question.text}", err=True
         )
-    if lacks:
+    if missing_features:
         typer.echo(
-            f"  cia402.accept_without: {', '.join(lacks)}: what the drive lacks; rigd refuses it "
+            f"  cia402.accept_without: {', '.join(missing_features)}: what the drive lacks; rigd refuses it "
             "until you accept each by its name",
             err=True,
         )
@@ -162,12 +162,12 @@ def new(
 
 
 def is_terminal() -> bool:
-    """Return whether the command can ask the user."""
+    """Return whether standard input is a terminal, on which the user can answer questions."""
     return sys.stdin.isatty()
 
 
 def _ask_for_values(draft: "Draft") -> str:
-    """Ask for the values that no file states until the profile is valid; return its text."""
+    """Ask for values that no file states until the profile is valid, and return its text."""
     from rigd.profile import ProfileError
 
     typer.echo(
@@ -176,7 +176,7 @@ def _ask_for_values(draft: "Draft") -> str:
     try:
         while True:
             for question in draft.questions():
-                _ask(draft, question.key, question.text)
+                _ask_for_value(draft, question.key, question.text)
             try:
                 draft.text()
             except ProfileError as error:
@@ -190,20 +190,22 @@ def _ask_for_values(draft: "Draft") -> str:
 
 
 def _ask_for_acceptance(draft: "Draft") -> None:
-    """Ask for each missing feature of the drive whether it is accepted; Enter means no."""
+    """Ask the user whether to accept each missing feature of the drive; Enter means no."""
     declined: set[str] = set()
     # One answer may imply another: without a watchdog its reaction is irrelevant.
-    while lacks := [each for each in draft.unaccepted_findings() if each.accept not in declined]:
-        typer.echo(lacks[0].sentence, err=True)
-        name = lacks[0].accept
+    while missing_features := [
+        each for each in draft.unaccepted_findings() if each.accept not in declined
+    ]:
+        typer.echo(missing_features[0].sentence, err=True)
+        name = missing_features[0].accept
         if typer.confirm(f"Run it without ({name})?", default=False, err=True):
             draft.accept(name)
         else:
             declined.add(name)
 
 
-def _ask(draft: "Draft", key: str, text: str) -> None:
-    """Ask until the answer is a valid value of the key."""
+def _ask_for_value(draft: "Draft", key: str, text: str) -> None:
+    """Ask the user for the value of a key until the answer is valid."""
     while True:
         given = typer.prompt(text, default=draft.value_text(key), err=True)
         try:

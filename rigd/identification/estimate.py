@@ -185,9 +185,7 @@ def _fit_equation(
     `hold_scale` the commanded torque counts as the true one.
     """
     unknowns = ZERO_INDEX + 1 + max(stack.session for stack in stacks)
-    free = (
-        np.arange(unknowns) != SCALE_INDEX if hold_scale else np.complete(unknowns, fill_value=True)
-    )
+    free = np.arange(unknowns) != SCALE_INDEX if hold_scale else np.full(unknowns, fill_value=True)
     delay_s, scale = timing.actuation_delay_s + timing.angle_delay_s, 1.0
     weights: list[Real] = []
     for _ in range(_MAX_ITERATIONS):
