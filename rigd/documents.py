@@ -14,9 +14,9 @@ from typing import Any, Final
 from rigd.runtime import open_plain_file
 from rigd.text_table import decode_text
 
-MOST_TOML_BYTES: Final = 250_000
+MAX_TOML_BYTES: Final = 250_000
 """Largest size of a TOML file in bytes."""
-MOST_JSON_BYTES: Final = 12_000_000
+MAX_JSON_BYTES: Final = 12_000_000
 """Largest size of a JSON file in bytes; the worst document takes thirty times as much memory."""
 _MAX_ENTRIES: Final = 3000
 """Largest number of keys and elements of a TOML document; a profile has 150."""
@@ -32,7 +32,7 @@ class DocumentError(ValueError):
     """A document cannot be read; the message is a clause that follows the file's name."""
 
 
-def read_text(path: Path, most_bytes: int = MOST_TOML_BYTES) -> str:
+def read_text(path: Path, most_bytes: int = MAX_TOML_BYTES) -> str:
     """Return the text of a user's file of limited size.
 
     Parameters
@@ -70,8 +70,8 @@ def parse_toml(text: str) -> dict[str, Any]:
         If the text is not TOML, is nested too deeply, or is larger than a document written by a
         person.
     """
-    if len(text) > MOST_TOML_BYTES:
-        raise DocumentError(f"has more than {MOST_TOML_BYTES} characters; shorten it")
+    if len(text) > MAX_TOML_BYTES:
+        raise DocumentError(f"has more than {MAX_TOML_BYTES} characters; shorten it")
     if any(len(line) > _MAX_LINE_CHARACTERS for line in text.splitlines()):
         raise DocumentError(
             f"has a line of more than {_MAX_LINE_CHARACTERS} characters; shorten it"
@@ -88,7 +88,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     return document
 
 
-def read_json(path: Path, most_bytes: int = MOST_JSON_BYTES) -> Any:  # noqa: ANN401 - any JSON value
+def read_json(path: Path, most_bytes: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN401 - any JSON value
     """Read a JSON file of limited size, and return its value.
 
     Parameters

@@ -30,9 +30,9 @@ class _Parameter:
 
     unit: str = ""
     """Unit of the parameter, or "" for a dimensionless one."""
-    least: float = 0.0
+    lower_limit: float = 0.0
     """Smallest valid value."""
-    below: float = inf
+    upper_limit: float = inf
     """Upper limit, which valid values do not reach."""
     effect: str = ""
     """Description of the effect, or "" for parameters of a uniform beam with ideal channels."""
@@ -49,14 +49,14 @@ _FILTER_ADVICE: Final = (  # Advice if the analysis found a low-pass filter
     "record again and analyze that session"
 )
 _PARAMETERS: Final[Mapping[str, _Parameter]] = {
-    "zeta": _Parameter("s^alpha", below=1.0),
-    "alpha": _Parameter(below=2.0),
+    "zeta": _Parameter("s^alpha", upper_limit=1.0),
+    "alpha": _Parameter(upper_limit=2.0),
     "gamma": _Parameter("s^lambda/m⁴"),
-    "lambda": _Parameter(below=2.0),
+    "lambda": _Parameter(upper_limit=2.0),
     "density_over_stiffness": _Parameter("s²/m⁴"),
     "bending_stiffness_n_m2": _Parameter("N·m²"),
     "tool_inertia_kg_m2": _Parameter("kg·m²"),
-    "delay_s": _Parameter("s", least=-inf),
+    "delay_s": _Parameter("s", lower_limit=-inf),
     "tip_mass_kg": _Parameter(
         "kg", effect="a mass at the tip", remedy="take it off, and record and analyze again"
     ),
@@ -66,8 +66,8 @@ _PARAMETERS: Final[Mapping[str, _Parameter]] = {
         remedy="tighten or stiffen the clamp, and record and analyze again",
     ),
     _OFFSET_PREFIX: _Parameter(
-        least=-0.9,
-        below=10.0,
+        lower_limit=-0.9,
+        upper_limit=10.0,
         effect="a mode whose stiffness is not that of a uniform beam",
         remedy="look for an added mass or a section that varies, and record and analyze again",
     ),
@@ -78,8 +78,8 @@ _PARAMETERS: Final[Mapping[str, _Parameter]] = {
         "s", effect="a low-pass filter of the torque", remedy=_FILTER_ADVICE
     ),
     "clock_rate_difference": _Parameter(
-        least=-1.0,
-        below=1.0,
+        lower_limit=-1.0,
+        upper_limit=1.0,
         effect="clocks of different rates",
         remedy="sample angle and torque by one clock, and record and analyze again",
     ),
@@ -229,21 +229,21 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         use does not take into account, or if a required number is flagged.
     """
     path = Path(path)
-    where, headline, refused = _read_headline(path)
+    label, headline, refused = _read_headline(path)
     if refused and not use.modes:
         raise IdentifiedBeamError(
-            f"{where}.validity.uniform_beam: {refused}, and {use.name} relies on a uniform beam; "
+            f"{label}.validity.uniform_beam: {refused}, and {use.name} relies on a uniform beam; "
             "remove what makes it differ (a mass, a soft clamp, an axis that is not plumb), and "
             "record and analyze again, or leave out --model."
         )
-    _require_known_findings(where, headline.get("named"), use)
+    _require_known_findings(label, headline.get("named"), use)
     source = headline
     if not refused and isinstance(exact := headline.get("exact_geometry"), dict):
-        where, source = f"{where}.exact_geometry", exact
+        label, source = f"{label}.exact_geometry", exact
     parameters = source.get("parameters")
     if not isinstance(parameters, dict):
-        raise IdentifiedBeamError(f"{where}.parameters is missing; {_ADVICE}.")
-    values = parameter_values(where, parameters)
+        raise IdentifiedBeamError(f"{label}.parameters is missing; {_ADVICE}.")
+    values = parameter_values(label, parameters)
     if refused:
         # Effective values of a uniform beam do not describe the rig: the modes replace them.
         values = {
@@ -251,13 +251,13 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
             for n, v in values.items()
             if _parameter_key(n) not in (_OFFSET_PREFIX, *_END_PARAMETERS)
         }
-    _require_known_effects(where, values, use)
+    _require_known_effects(label, values, use)
     std = {}
     for name in values:
         deviation = (
             _standard_deviation(parameters[name])
             if refused
-            else _required_deviation(where, name, parameters[name], use)
+            else _required_deviation(label, name, parameters[name], use)
         )
         if deviation is not None:
             std[name] = deviation
@@ -275,14 +275,14 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         std=std,
         tip_mass_kg=values.get("tip_mass_kg", 0.0),
         root_compliance_rad_per_nm=values.get("root_compliance_rad_per_nm", 0.0),
-        stiffness_offsets=_stiffness_offsets(where, values),
-        mode_uncertainty=_mode_uncertainty(where, source.get("modes")),
+        stiffness_offsets=_stiffness_offsets(label, values),
+        mode_uncertainty=_mode_uncertainty(label, source.get("modes")),
     )
-    return _with_observed_modes(where, found, headline.get("modes"), refused) if refused else found
+    return _with_observed_modes(label, found, headline.get("modes"), refused) if refused else found
 
 
 def _with_observed_modes(
-    where: str, found: IdentifiedBeam, modes: object, refused: str
+    label: str, found: IdentifiedBeam, modes: object, refused: str
 ) -> IdentifiedBeam:
     """Return the beam after its modes are replaced by the observed ones.
 
@@ -304,13 +304,13 @@ def _with_observed_modes(
         observed.append((hz, ratio, inertia))
     if not observed:
         raise IdentifiedBeamError(
-            f"{where}.modes: {refused}, and no mode is shown without a flag that could take its "
+            f"{label}.modes: {refused}, and no mode is shown without a flag that could take its "
             "place; record a session that shows more modes and analyze it, or leave out --model."
         )
     try:
         offset_beam = found.loaded_beam.with_frequencies([hz for hz, _, _ in observed])
     except ValueError as error:
-        raise IdentifiedBeamError(f"{where}.parameters: {error} Leave out --model.") from None
+        raise IdentifiedBeamError(f"{label}.parameters: {error} Leave out --model.") from None
     beam, inertia = offset_beam.beam, observed[0][2]
     if inertia and inertia > 0:
         scale = inertia / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
@@ -335,11 +335,11 @@ def _read_headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
     The reason is "" if a uniform beam can be used.
     """
     document: Any = read_document(path)
-    where, headline = select_headline(path, document)
+    label, headline = select_headline(path, document)
     # A single record of a campaign can exclude a uniform beam.
     pooled = headline.get("file", "") is None
     headlines = filter(_is_json_object, document["headlines"]) if pooled else [headline]
-    return where, headline, next(filter(None, map(_uniform_beam_refusal, headlines)), "")
+    return label, headline, next(filter(None, map(_uniform_beam_refusal, headlines)), "")
 
 
 def _is_json_object(entry: object) -> bool:
@@ -397,20 +397,20 @@ def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any
 def _uniform_beam_refusal(headline: Mapping[str, Any]) -> str:
     """Return why a uniform beam does not predict the modes of a record, or "" if it may."""
     validity = headline.get("validity")
-    test = validity.get("uniform_beam") if isinstance(validity, dict) else None
-    if not isinstance(test, dict) or test.get("status") != "refused":
+    uniform_beam_test = validity.get("uniform_beam") if isinstance(validity, dict) else None
+    if not isinstance(uniform_beam_test, dict) or uniform_beam_test.get("status") != "refused":
         return ""
-    p_value = finite_number(test.get("p_value"))
+    p_value = finite_number(uniform_beam_test.get("p_value"))
     p = "" if p_value is None else f" (p = {p_value:.1g})"
     return f"a uniform beam does not predict the modes that the record shows{p}"
 
 
-def parameter_values(where: str, parameters: Mapping[str, Any]) -> dict[str, float]:
+def parameter_values(label: str, parameters: Mapping[str, Any]) -> dict[str, float]:
     """Return the values of a headline's parameters, after a check of their ranges.
 
     Parameters
     ----------
-    where
+    label
         Name of the headline in messages.
     parameters
         Object ``parameters`` of the headline.
@@ -420,11 +420,11 @@ def parameter_values(where: str, parameters: Mapping[str, Any]) -> dict[str, flo
     IdentifiedBeamError
         If a parameter is unknown or out of range, or a required parameter is missing.
     """
-    values = {name: _parameter_value(where, name, entry) for name, entry in parameters.items()}
+    values = {name: _parameter_value(label, name, entry) for name, entry in parameters.items()}
     for name in _REQUIRED_PARAMETERS:
         if name not in values:
             raise IdentifiedBeamError(
-                f"{where}.parameters.{name} is missing; take the document of an analysis that "
+                f"{label}.parameters.{name} is missing; take the document of an analysis that "
                 "found it (analyze session.mcap --json model.json)."
             )
     return values
@@ -459,32 +459,36 @@ def _parameter_key(name: str) -> str:
     )
 
 
-def _parameter_value(where: str, name: str, entry: object) -> float:
+def _parameter_value(label: str, name: str, entry: object) -> float:
     """Return the value of a parameter, or raise if it is unknown or outside its range."""
     known = _PARAMETERS.get(_parameter_key(name))
     if known is None or name == _OFFSET_PREFIX:
         raise IdentifiedBeamError(
-            f"{where}.parameters.{name[:60]!r} is not known to this version, so what it changes "
+            f"{label}.parameters.{name[:60]!r} is not known to this version, so what it changes "
             "cannot be taken into account; update rigd, or do without this document."
         )
     given = entry.get("value") if isinstance(entry, dict) else None
     value = finite_number(given)
-    in_range = value is not None and known.least <= value < known.below and is_usable_size(value)
+    in_range = (
+        value is not None
+        and known.lower_limit <= value < known.upper_limit
+        and is_usable_size(value)
+    )
     if value is not None and in_range and (value > 0.0 or name not in _REQUIRED_PARAMETERS):
         return value
     bound = "any size"
-    if known.least > -inf:
-        bound = "more than 0" if name in _REQUIRED_PARAMETERS else f"{known.least:g} or more"
-    if known.below < inf:
-        bound += f" below {known.below:g}"
+    if known.lower_limit > -inf:
+        bound = "more than 0" if name in _REQUIRED_PARAMETERS else f"{known.lower_limit:g} or more"
+    if known.upper_limit < inf:
+        bound += f" below {known.upper_limit:g}"
     unit = f" {known.unit}" if known.unit else ""
     raise IdentifiedBeamError(
-        f"{where}.parameters.{name}.value = {json.dumps(given, default=str)[:60]} "
+        f"{label}.parameters.{name}.value = {json.dumps(given, default=str)[:60]} "
         f"must be a number of {bound}{unit}; {_ADVICE}."
     )
 
 
-def _require_known_effects(where: str, values: Mapping[str, float], use: Use) -> None:
+def _require_known_effects(label: str, values: Mapping[str, float], use: Use) -> None:
     """Raise if the analysis found an effect that the use does not take into account."""
     for name, value in values.items():
         known = _PARAMETERS[_parameter_key(name)]
@@ -496,29 +500,29 @@ def _require_known_effects(where: str, values: Mapping[str, float], use: Use) ->
         )
         unit = f" {known.unit}" if known.unit else ""
         raise IdentifiedBeamError(
-            f"{where}.parameters.{name}.value = {value:.4g}{unit}: the analysis found "
+            f"{label}.parameters.{name}.value = {value:.4g}{unit}: the analysis found "
             f"{known.effect}, which {use.name} does not take into account; {remedy}."
         )
     if values.get("tip_mass_kg") and any(
         values[n] for n in values if _parameter_key(n) == _OFFSET_PREFIX
     ):
         raise IdentifiedBeamError(
-            f"{where}.parameters: tip_mass_kg and {_OFFSET_PREFIX}… together are not defined; take "
+            f"{label}.parameters: tip_mass_kg and {_OFFSET_PREFIX}… together are not defined; take "
             "the document of an analysis that found one of them."
         )
 
 
-def _require_known_findings(where: str, named: object, use: Use) -> None:
+def _require_known_findings(label: str, named: object, use: Use) -> None:
     """Raise if the analysis has a finding whose effect no parameter describes."""
     for number, what, sentence in findings_without_parameter(named):
         raise IdentifiedBeamError(
-            f"{where}.named[{number}]: {what}, which {use.name} does not take into "
+            f"{label}.named[{number}]: {what}, which {use.name} does not take into "
             f"account ({sentence}); remove its cause, and record and analyze again, or "
             "leave out --model."
         )
 
 
-def _required_deviation(where: str, name: str, entry: Mapping[str, Any], use: Use) -> float | None:
+def _required_deviation(label: str, name: str, entry: Mapping[str, Any], use: Use) -> float | None:
     """Return the standard deviation of a parameter, or None if it is unknown.
 
     Raises if the parameter is flagged and the use relies on it.
@@ -536,7 +540,7 @@ def _required_deviation(where: str, name: str, entry: Mapping[str, Any], use: Us
     if _parameter_key(name) not in use.certain and (deviation is not None or covered_by_modes):
         return deviation
     raise IdentifiedBeamError(
-        f"{where}.parameters.{name} is flagged ({str(flag)[:100]}), and {use.name} relies on it; "
+        f"{label}.parameters.{name} is flagged ({str(flag)[:100]}), and {use.name} relies on it; "
         "record a session that shows more modes or is longer and analyze it, or leave out --model."
     )
 
@@ -554,7 +558,7 @@ def _standard_deviation(entry: Mapping[str, Any]) -> float | None:
     return std if std is not None and std > 0 else None
 
 
-def _stiffness_offsets(where: str, values: Mapping[str, float]) -> tuple[float, ...]:
+def _stiffness_offsets(label: str, values: Mapping[str, float]) -> tuple[float, ...]:
     """Return the relative stiffness offsets of modes 2, 3, … up to the last one in the document."""
     found = {
         int(n[len(_OFFSET_PREFIX) :]): value
@@ -565,13 +569,13 @@ def _stiffness_offsets(where: str, values: Mapping[str, float]) -> tuple[float, 
     if sorted(found) != list(modes):
         given = ", ".join(map(str, sorted(found)))
         raise IdentifiedBeamError(
-            f"{where}.parameters: {_OFFSET_PREFIX}… are those of modes {given}, but must be those "
+            f"{label}.parameters: {_OFFSET_PREFIX}… are those of modes {given}, but must be those "
             f"of modes 2 to {modes[-1]}; {_ADVICE}."
         )
     return tuple(found[mode] for mode in modes)
 
 
-def _mode_uncertainty(where: str, modes: object) -> tuple[float, ...]:
+def _mode_uncertainty(label: str, modes: object) -> tuple[float, ...]:
     """Return the relative standard uncertainty of the pole of each mode in the document."""
     found: list[float] = []
     for number, entry in enumerate(modes if isinstance(modes, Sequence) else [], start=1):
@@ -583,7 +587,7 @@ def _mode_uncertainty(where: str, modes: object) -> tuple[float, ...]:
         value_hz = finite_number(hz.get("value"))
         if not value_hz or not ratio or given.get("mode") != number:
             raise IdentifiedBeamError(
-                f"{where}.modes[{number - 1}] is not mode {number} with frequency_hz and "
+                f"{label}.modes[{number - 1}] is not mode {number} with frequency_hz and "
                 f"damping_ratio; {_ADVICE}."
             )
         found.append(hypot(_mode_deviation(hz) / value_hz, _mode_deviation(ratio)))

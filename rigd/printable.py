@@ -24,7 +24,7 @@ _BAR_STYLES: Final = {"bar.complete": "cyan", "bar.finished": "green", "bar.puls
 """Styles of a progress bar; the default red is reserved for alarms."""
 
 
-def printable(text: str, most: int | None = None) -> str:
+def printable(text: str, max_characters: int | None = None) -> str:
     """Return a text in which characters that a terminal would interpret are replaced.
 
     Control characters, line breaks and all other unprintable characters are each replaced by
@@ -34,10 +34,10 @@ def printable(text: str, most: int | None = None) -> str:
     ----------
     text
         Text from a file, a device, or a path.
-    most
+    max_characters
         Largest number of characters, or None for all; an ellipsis replaces the others.
     """
-    shown = text[:most]
+    shown = text[:max_characters]
     if not shown.isprintable():
         shown = "".join(c if c.isprintable() else UNPRINTABLE for c in shown)
     return shown if len(shown) == len(text) else f"{shown}…"

@@ -26,7 +26,7 @@ _HOMOTOPY_STEP_COUNTS = (8, 64)
 
 The larger number is used for beams for which the smaller one loses a pole."""
 
-CLOSE_BY = 0.05
+SAME_ROOT_TOLERANCE = 0.05
 """Relative distance from the expected root up to which a found root is taken for the same mode.
 
 Neighbouring modes differ by much more."""
@@ -261,8 +261,8 @@ def poles_for_eigenvalues(
         Parameters of the exact model.
     near_rad_s
         Expected roots in the upper half plane, shape (m,). If all are within the relative distance
-        `CLOSE_BY` of the roots, the roots are found from them, ten times faster than from those of
-        the undamped beam.
+        `SAME_ROOT_TOLERANCE` of the roots, the roots are found from them, ten times faster than
+        from those of the undamped beam.
     """
     omega_squared = (z / beam.length_m) ** 4 / beam.density_over_stiffness
     external_coefficient = damping.gamma / beam.density_over_stiffness
@@ -275,7 +275,7 @@ def poles_for_eigenvalues(
     if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
         start = np.log(near_rad_s)
         found = _newton(start, omega_squared, external_coefficient, damping.zeta, damping)
-        if bool((np.abs(found - start) < CLOSE_BY).all()):
+        if bool((np.abs(found - start) < SAME_ROOT_TOLERANCE).all()):
             upper = np.exp(found)
             return np.stack([upper, upper.conj()], axis=1)
     for steps in _HOMOTOPY_STEP_COUNTS:

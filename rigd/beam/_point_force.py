@@ -282,9 +282,9 @@ class _ExponentialSolution:
             axis=1,
         )
         distance = np.abs(x - at)
-        side = np.where(x > at, -1.0, 1.0)  # the sign of each derivative of exp(-b r)
-        direct = (side * b) ** order * decaying_amplitude * np.exp(-b * distance) + (
-            side * c
+        derivative_sign = np.where(x > at, -1.0, 1.0)  # the sign of each derivative of exp(-b r)
+        direct = (derivative_sign * b) ** order * decaying_amplitude * np.exp(-b * distance) + (
+            derivative_sign * c
         ) ** order * other_amplitude * np.exp(-c * distance)
         coefficients = -self._inverse @ at_ends
         return direct + self._weighted_sum(coefficients, x, order)

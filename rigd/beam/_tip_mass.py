@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from rigd.beam._model import Beam, Damping
 from rigd.beam._modes import (
-    CLOSE_BY,
+    SAME_ROOT_TOLERANCE,
     clamped_free_eigenvalues,
     poles_for_eigenvalues,
     root_shear_ratio,
@@ -41,10 +41,10 @@ Complex = NDArray[np.complex128]
 
 _SERIES_LIMIT = 40.0
 """Magnitude of q below which power series replace the closed form, which cancels there."""
-_POWERS = (-4.0) ** np.arange(10)
+_POWERS_OF_MINUS_FOUR = (-4.0) ** np.arange(10)
 _SERIES_COEFFICIENTS = np.array(
     [
-        [scale * _POWERS[k] / math.factorial(4 * k + last) for k in range(10)]
+        [scale * _POWERS_OF_MINUS_FOUR[k] / math.factorial(4 * k + last) for k in range(10)]
         for scale, last in ((1.0, 0), (4.0, 3), (4.0, 2), (2.0, 1))
     ]
 ).T
@@ -257,14 +257,14 @@ class LoadedBeam:
             If one of these modes of the beam does not oscillate.
         """
         z = clamped_free_eigenvalues(len(frequency_hz))
-        wanted_rad_s = 2 * math.pi * np.array(frequency_hz)
+        target_rad_s = 2 * math.pi * np.array(frequency_hz)
         found = LoadedBeam(self.beam, self.damping)
         stiffness = np.ones(z.size)
         for _ in range(2):  # damping shifts the frequencies a little
-            own_rad_s = found.poles(z)[:, 0].imag
-            if not bool((own_rad_s > 0).all()):
+            present_rad_s = found.poles(z)[:, 0].imag
+            if not bool((present_rad_s > 0).all()):
                 raise ValueError("A mode of the beam does not oscillate.")
-            stiffness *= (wanted_rad_s / own_rad_s) ** 2
+            stiffness *= (target_rad_s / present_rad_s) ** 2
             density_kg_per_m = self.beam.density_kg_per_m / float(stiffness[0])
             found = LoadedBeam(
                 replace(self.beam, density_kg_per_m=density_kg_per_m),
@@ -364,10 +364,12 @@ class LoadedBeam:
         for index, offset in enumerate(self.stiffness_offsets, start=1):
             # Mode i contributes -p b / (c k⁴ (1 + d) + p); b is its part of a rigid rotation.
             k4, turn = (z[index] / tip) ** 4, 2 * (-1) ** index * tip / z[index] ** 2
-            more = inertial * turn * elastic * k4 * offset
-            more = more / ((elastic * k4 + inertial) * (elastic * k4 * (1 + offset) + inertial))
-            displacement = displacement + 2 * more
-            slope = slope + tip_slopes[index] * more
+            offset_term = inertial * turn * elastic * k4 * offset
+            offset_term = offset_term / (
+                (elastic * k4 + inertial) * (elastic * k4 * (1 + offset) + inertial)
+            )
+            displacement = displacement + 2 * offset_term
+            slope = slope + tip_slopes[index] * offset_term
         if self.tip_mass_kg:
             tip_force = self._tip_force_per_angle(s, grid)
             displacement = displacement + grid.per_force(tip, tip) * tip_force
@@ -476,7 +478,7 @@ class LoadedBeam:
         """
         if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
             found = self._newton(near_rad_s, _CLOSE_START_TOLERANCE, zeros=False)
-            if bool((np.abs(found / near_rad_s - 1) < CLOSE_BY).all()):
+            if bool((np.abs(found / near_rad_s - 1) < SAME_ROOT_TOLERANCE).all()):
                 return np.column_stack([found, found.conj()])
         return self._followed_roots(z, zeros=False)
 
@@ -501,8 +503,8 @@ class LoadedBeam:
             z = z.copy()
             z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
         found = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
-        rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
-        if rigid and not (zeros and offsets.any()):
+        is_rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
+        if is_rigid and not (zeros and offsets.any()):
             return found
         has_root = ~np.isnan(found[:, 0])
         # One of a conjugate pair suffices; without oscillation both have to be found.
@@ -511,12 +513,14 @@ class LoadedBeam:
         current = np.concatenate([found[has_root][:, 0], second_real_poles])
         current *= 1 - _START_POLE_DISTANCE  # G is infinite at an undamped pole
         # Relative to the beam's own values: a change that moves the poles little needs few steps.
-        change = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
+        relative_change = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
         stiffness_nm_per_rad = self.beam.bending_stiffness_n_m2 / self.beam.length_m
-        change = max(change, self.root_compliance_rad_per_nm * stiffness_nm_per_rad)
+        relative_change = max(
+            relative_change, self.root_compliance_rad_per_nm * stiffness_nm_per_rad
+        )
         if zeros:
-            change = max(change, float(np.abs(offsets).max(initial=0.0)))
-        steps = min(max(math.ceil(change / _CHANGE_PER_STEP), 2), _MAX_HOMOTOPY_STEPS)
+            relative_change = max(relative_change, float(np.abs(offsets).max(initial=0.0)))
+        steps = min(max(math.ceil(relative_change / _CHANGE_PER_STEP), 2), _MAX_HOMOTOPY_STEPS)
         previous = current
         for step in range(1, steps + 1):
             fraction = step / steps
@@ -582,8 +586,8 @@ def _response_functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]
 def _scaled_functions(q: Complex) -> tuple[Complex, Complex, Complex]:
     """Return F, U and z² B at large `q`, computed from decaying exponentials only."""
     # F, U and B are real functions of q: values below the real axis mirror those above it.
-    below = q.imag < 0
-    z = np.sqrt(np.sqrt(np.where(below, q.conj(), q)))
+    lower_half_plane = q.imag < 0
+    z = np.sqrt(np.sqrt(np.where(lower_half_plane, q.conj(), q)))
     decay, turn = np.exp(-z), np.exp(1j * z)
     a, b = decay * decay, turn * turn
     reciprocal = 1 / (4 * decay * turn + (1 + a) * (1 + b))
@@ -593,5 +597,5 @@ def _scaled_functions(q: Complex) -> tuple[Complex, Complex, Complex]:
         2j * z**2 * (1 - a) * (1 - b) * reciprocal,
         z**3 * (sine + cosine) * reciprocal,
     )
-    first, second, third = (np.where(below, values.conj(), values) for values in found)
+    first, second, third = (np.where(lower_half_plane, values.conj(), values) for values in found)
     return first, second, third

@@ -353,10 +353,10 @@ def _select_poles(pairs: Complex) -> NDArray[np.bool_]:
     mode_indices = np.flatnonzero(oscillating)
     upper = pairs[mode_indices, 0]
     within_band = np.abs(upper) < 2 * np.pi * _FIT_BAND_HZ[1]
-    light = within_band | (-upper.real < _HEAVY_DAMPING_RATIO * np.abs(upper))
-    mode_indices, upper = mode_indices[light], upper[light]
-    beyond = np.flatnonzero(upper.imag > 2 * np.pi * _HIGHEST_MODE_HZ)
-    mode_indices = mode_indices[: beyond[0] + 1] if beyond.size else mode_indices
+    lightly_damped = within_band | (-upper.real < _HEAVY_DAMPING_RATIO * np.abs(upper))
+    mode_indices, upper = mode_indices[lightly_damped], upper[lightly_damped]
+    above_band = np.flatnonzero(upper.imag > 2 * np.pi * _HIGHEST_MODE_HZ)
+    mode_indices = mode_indices[: above_band[0] + 1] if above_band.size else mode_indices
     selected = ~oscillating[:, None] & (np.abs(pairs) < 2 * np.pi * _HIGHEST_MODE_HZ)
     selected[mode_indices] = True
     return selected
@@ -408,15 +408,17 @@ def _fit_coefficients(columns: Complex, target: Complex) -> Real:
     scale = np.linalg.norm(matrix, axis=0)
     q, r = np.linalg.qr(matrix / scale)
     rotated = q.T @ np.concatenate([target.real, target.imag])
-    free = np.arange(matrix.shape[1])
+    free_columns = np.arange(matrix.shape[1])
     while True:
         solution = np.zeros(matrix.shape[1])
-        solution[free] = np.linalg.lstsq(r[:, free], rotated, rcond=_SINGULAR_VALUE_CUTOFF)[0]
+        solution[free_columns] = np.linalg.lstsq(
+            r[:, free_columns], rotated, rcond=_SINGULAR_VALUE_CUTOFF
+        )[0]
         direct = solution[-3:]
         if (direct >= 0).all():
             scaled: Real = solution / scale
             return scaled
-        free = free[free != matrix.shape[1] - 3 + np.argmin(direct)]
+        free_columns = free_columns[free_columns != matrix.shape[1] - 3 + np.argmin(direct)]
 
 
 def _relative_error(

@@ -124,17 +124,19 @@ def tip_motion(
     # Block by block and without copies: these arrays have the record's length.
     for start in range(0, s.size, _BLOCK_POINTS):
         block_slice = slice(start, start + _BLOCK_POINTS)
-        turned = deflection[block_slice].copy()
-        root: Complex = turned  # turns like the motor, except for a compliant clamp
+        angle_spectrum = deflection[block_slice].copy()
+        root: Complex = angle_spectrum  # turns like the motor, except for a compliant clamp
         if loaded.is_uniform_cantilever:
-            displaced, slope = tip_response(beam, damping, s[block_slice])
-            displaced -= beam.length_m
+            tip_displacement, slope = tip_response(beam, damping, s[block_slice])
+            tip_displacement -= beam.length_m
             slope -= 1
         else:
-            displaced, slope = loaded.tip_response(s[block_slice])
-            root = turned * (1 - root_compliance_rad_per_nm * loaded.transfer(s[block_slice]))
-        deflection[block_slice] = displaced * turned
-        tip_slope[block_slice] = slope * turned
+            tip_displacement, slope = loaded.tip_response(s[block_slice])
+            root = angle_spectrum * (
+                1 - root_compliance_rad_per_nm * loaded.transfer(s[block_slice])
+            )
+        deflection[block_slice] = tip_displacement * angle_spectrum
+        tip_slope[block_slice] = slope * angle_spectrum
         tip_speed[block_slice] = s[block_slice] * (deflection[block_slice] + beam.length_m * root)
     del s
 
@@ -175,17 +177,17 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     z = beam.length_m * np.sqrt(np.sqrt(fourth))
     # Numerators and denominator over exp(z - j sign z): nothing overflows.
     sign = np.where(z.imag < 0, -1.0, 1.0)
-    turn, fade = np.exp(1j * sign * z), np.exp(-z)
-    a, b = fade * fade, turn * turn
-    reciprocal = 1 / (4 * turn * fade + (1 + b) * (1 + a))
-    sines = 2 * turn * (1 - a) + 2j * sign * fade * (1 - b)
-    cosines = 2 * turn * (1 + a) + 2 * fade * (1 + b)
+    turn, decay = np.exp(1j * sign * z), np.exp(-z)
+    a, b = decay * decay, turn * turn
+    reciprocal = 1 / (4 * turn * decay + (1 + b) * (1 + a))
+    sines = 2 * turn * (1 - a) + 2j * sign * decay * (1 - b)
+    cosines = 2 * turn * (1 + a) + 2 * decay * (1 + b)
     displacement: Complex = beam.length_m * sines * reciprocal / z
     slope: Complex = cosines * reciprocal
     return displacement, slope
 
 
-def _fast_fft_length(least: int) -> int:
-    """Return a length of at least `least`, at most an eighth more, whose FFT is fast."""
-    unit = 1 << max(0, least.bit_length() - 4)
-    return -(-least // unit) * unit
+def _fast_fft_length(min_length: int) -> int:
+    """Return a length of at least `min_length`, at most an eighth more, whose FFT is fast."""
+    unit = 1 << max(0, min_length.bit_length() - 4)
+    return -(-min_length // unit) * unit

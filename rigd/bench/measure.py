@@ -135,8 +135,8 @@ class LoopMeasurement:
     def held_between_stalls(self) -> float:
         """Fraction of scheduled ticks outside of stalls that were run within their periods."""
         stalls_us = self.lateness_us[self.lateness_us >= STALL_US]
-        passed = min(self.missed, int(np.floor(stalls_us * (self.rate_hz * 1e-6)).sum()))
-        return 1.0 - (self.missed - passed) / (self.scheduled - passed)
+        stalled_ticks = min(self.missed, int(np.floor(stalls_us * (self.rate_hz * 1e-6)).sum()))
+        return 1.0 - (self.missed - stalled_ticks) / (self.scheduled - stalled_ticks)
 
     @property
     def stalls(self) -> int:
@@ -173,8 +173,8 @@ def wake_ups_us(samples: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np
     """
     ticks: npt.NDArray[np.int64] = samples["tick"].astype(np.int64)
     missed = np.diff(ticks, prepend=-1) - 1
-    late_us: npt.NDArray[np.float64] = samples["lateness_ns"] * 1e-3 + missed * (1e6 / rate_hz)
-    return late_us
+    latency_us: npt.NDArray[np.float64] = samples["lateness_ns"] * 1e-3 + missed * (1e6 / rate_hz)
+    return latency_us
 
 
 def record_measurement(
@@ -223,7 +223,7 @@ def pool_measurements(name: str, parts: list[LoopMeasurement]) -> LoopMeasuremen
     parts
         Measurements at one rate, at least one.
     """
-    costs = [part.cpu_percent for part in parts if part.cpu_percent is not None]
+    cpu_loads = [part.cpu_percent for part in parts if part.cpu_percent is not None]
     faults = [part.page_faults for part in parts if part.page_faults is not None]
     return LoopMeasurement(
         name,
@@ -232,6 +232,6 @@ def pool_measurements(name: str, parts: list[LoopMeasurement]) -> LoopMeasuremen
         np.concatenate([part.work_us for part in parts]),
         sum(part.scheduled for part in parts),
         sum(part.missed for part in parts),
-        sum(costs) / len(costs) if costs else None,
+        sum(cpu_loads) / len(cpu_loads) if cpu_loads else None,
         sum(faults) if faults else None,
     )

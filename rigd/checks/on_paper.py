@@ -204,7 +204,7 @@ class Travel:
 
 @lru_cache(maxsize=64)
 def worst_travel(
-    rig: RigParameters, limits: Limits, blind_s: float, max_speed_rad_s: float = inf
+    rig: RigParameters, limits: Limits, torque_on_s: float, max_speed_rad_s: float = inf
 ) -> Travel:
     """Return the longest stopping distance that the limits allow while nothing controls the shaft.
 
@@ -212,7 +212,7 @@ def worst_travel(
     ----------
     rig, limits
         Parameters and limits of the profile.
-    blind_s
+    torque_on_s
         Time for which the torque remains on; infinite if nothing removes it.
     max_speed_rad_s
         Speed above which the drive itself exerts no torque.
@@ -222,14 +222,14 @@ def worst_travel(
     The beam acts in the worst way: it does not brake the motor while the torque is on, and it turns
     with the shaft like a rigid body afterwards.
     """
-    if isinf(blind_s):
+    if isinf(torque_on_s):
         return Travel(inf, inf)
     motor, beam = rig.motor, rig.beam
     without_beam_kg_m2 = motor.inertia_kg_m2 + rig.sensor.tool_inertia_kg_m2
     with_beam_kg_m2 = without_beam_kg_m2 + beam.density_kg_per_m * beam.length_m**3 / 3
     speed_rad_s = limits.velocity_rad_s
     driven_rad = 0.0
-    steps = round(blind_s / _TIME_STEP_S)
+    steps = round(torque_on_s / _TIME_STEP_S)
     for step in range(steps):
         torque_nm = motor.peak_torque_nm - _friction_nm(rig, speed_rad_s)
         faster_rad_s = max(0.0, speed_rad_s + torque_nm / without_beam_kg_m2 * _TIME_STEP_S)
@@ -337,8 +337,8 @@ def travel_rows(profile: Profile) -> Iterator[CheckRow]:
     failures = _uncontrolled_failures(profile)
     margin_rad = limits.stop_angle_rad - limits.angle_rad
     bound = f"at most {margin_rad:.2f} rad (limits.stop_angle_rad - limits.angle_rad)"
-    unbounded = isinf(drive.watchdog_s)
-    if unbounded:
+    has_no_bound = isinf(drive.watchdog_s)
+    if has_no_bound:
         failures = tuple(failure for failure in failures if not isinf(failure.duration_s))
         yield CheckRow(
             _TRAVEL_GROUP,
@@ -359,7 +359,7 @@ def travel_rows(profile: Profile) -> Iterator[CheckRow]:
         detail = ""
         if number == longest:
             unlimited = worst_travel(rig, limits, failure.duration_s)
-            detail = "" if unbounded else f"Travel: the worst is {failure.what}. "
+            detail = "" if has_no_bound else f"Travel: the worst is {failure.what}. "
             detail += (
                 f"It relies on the drive's own speed limit of {drive.max_speed_rad_s:g} rad/s "
                 f"(object 6080); without it, it would be {_format_angle(unlimited.total_rad)}."
@@ -372,7 +372,7 @@ def travel_rows(profile: Profile) -> Iterator[CheckRow]:
                 f" Travel {failure.what}: lower {failure.key}, cia402.max_speed_rad_s, "
                 "limits.velocity_rad_s or limits.angle_rad."
             )
-        worst = "worst, " if number == longest and not unbounded else ""
+        worst = "worst, " if number == longest and not has_no_bound else ""
         yield CheckRow(
             _TRAVEL_GROUP,
             f"{worst}{failure.what}",

@@ -147,7 +147,7 @@ def _start_advice(profile: str | None) -> str:
     """Return the advice for the operator if no live view is running."""
     from rigd.daemon.client import daemons
 
-    of_rig = "" if profile is None else f" of the rig {profile}"
+    rig_text = "" if profile is None else f" of the rig {profile}"
     name = profile or "NAME"
     for rig, has_view in daemons().items():
         if profile not in (None, rig):
@@ -162,8 +162,8 @@ def _start_advice(profile: str | None) -> str:
             f"with rigd serve --profile {rig} --live."
         )
     return (
-        f"No live view{of_rig} is running. Start one with rigd run chirp --profile {name} --live, "
-        f"or with rigd serve --profile {name} --live; rigd live --wait waits for it."
+        f"No live view{rig_text} is running. Start one with rigd run chirp --profile {name} "
+        f"--live, or with rigd serve --profile {name} --live; rigd live --wait waits for it."
     )
 
 
@@ -243,14 +243,14 @@ def replay(
         return
     if not web and not has_screen():
         _check_displayable(path)  # the same files are valid for a window and for other outputs
-        elsewhere = (
+        file_advice = (
             "the file can be opened elsewhere"
             if path.suffix == SUFFIX
             else f"--save OUT{SUFFIX} writes a file that can be opened elsewhere"
         )
         fail(
             "There is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set). "
-            f"rigd replay {path} --web prints an address for a browser; {elsewhere}.",
+            f"rigd replay {path} --web prints an address for a browser; {file_advice}.",
             EXIT_FAILED,
         )
     with interrupted_by_end_signals(), scratch_folder() as scratch:

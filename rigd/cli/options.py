@@ -174,14 +174,14 @@ def session_notes(
     for option, text in notes.items():
         if not text.isprintable():
             fail(f"--{option} {text!r}: must be a single line of plain text.", EXIT_WRONG_USE)
-    added: dict[str, str] = {}
+    metadata: dict[str, str] = {}
     for given in meta or []:
         name, equals, value = given.partition("=")
-        if not equals or name in added:
-            wrong = "is given twice" if equals else "must be NAME=VALUE (temperature_c=21.4)"
-            fail(f"--meta {given!r}: {wrong}.", EXIT_WRONG_USE)
-        added[name] = value
-    return {name: text for name, text in notes.items() if text} | metadata_keys(added)
+        if not equals or name in metadata:
+            problem = "is given twice" if equals else "must be NAME=VALUE (temperature_c=21.4)"
+            fail(f"--meta {given!r}: {problem}.", EXIT_WRONG_USE)
+        metadata[name] = value
+    return {name: text for name, text in notes.items() if text} | metadata_keys(metadata)
 
 
 def profile_named(name: str) -> "Profile":

@@ -154,8 +154,8 @@ def new(
         )
     if missing_features:
         typer.echo(
-            f"  cia402.accept_without: {', '.join(missing_features)}: what the drive lacks; rigd refuses it "
-            "until you accept each by its name",
+            f"  cia402.accept_without: {', '.join(missing_features)}: what the drive lacks; rigd "
+            "refuses it until you accept each by its name",
             err=True,
         )
     typer.echo(f"{output}: written. Next: rigd check --profile {output}")

@@ -116,8 +116,8 @@ def _add_subcommand(app: typer.Typer, perform: Callable[..., None], parameters: 
     command.__annotations__ = {p.name: p.annotation for p in (*own_parameters, *common_parameters)}
     text = (parameters.__doc__ or "").replace("rigd run", f"rigd {app.info.name}")
     # Otherwise the angle -0.3 would be read as an option.
-    settings = {"ignore_unknown_options": True} if kind in ("move", "touch") else None
-    app.command(kind, help=text, context_settings=settings)(command)
+    command_settings = {"ignore_unknown_options": True} if kind in ("move", "touch") else None
+    app.command(kind, help=text, context_settings=command_settings)(command)
 
 
 def run_sessions(

@@ -11,11 +11,11 @@ from rigd.identification.experiments import (
     HIGHEST_FREQUENCY_HZ,
     MULTISINE,
     SPEEDS,
-    lay_out_passes,
-    read_layout,
+    passes_of_schedule,
+    read_schedule,
 )
 from rigd.session import Session, read_session, sample_digests
-from rigd.session.layout import Status
+from rigd.session.schedule import Status
 
 _UNUSABLE_STATUS = int(
     Status.ANGLE_STALE | Status.WRENCH_STALE | Status.WRENCH_SATURATED | Status.TORQUE_OFF
@@ -111,8 +111,8 @@ def _passes(
     session: Session, session_number: int, rate_hz: float
 ) -> tuple[list[PassReadings], int]:
     """Return the usable windows of a session, and the number of its passes."""
-    layout = read_layout(session.metadata)
-    if layout is None:
+    schedule = read_schedule(session.metadata)
+    if schedule is None:
         raise MotorEstimateError(
             f"{session.path}: was not recorded by rigd identify motor, so its passes are unknown; "
             "give the files that it wrote."
@@ -121,7 +121,7 @@ def _passes(
     samples = session.samples
     ticks = samples["tick"].astype(np.int64)
     is_unusable = (samples["status"] & _UNUSABLE_STATUS) != 0
-    passes = lay_out_passes(layout, rate_hz)
+    passes = passes_of_schedule(schedule, rate_hz)
     windows = []
     for speed_pass in passes:
         first, end = np.searchsorted(ticks, (speed_pass.first, speed_pass.end)).tolist()

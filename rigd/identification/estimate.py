@@ -277,7 +277,7 @@ def _finish_fit(
 
     # Each stack's part in the variance, from the scatter of its repeats' effects on the solution.
     parts, degrees = [], []
-    squares, terms = 0.0, 0
+    squares, term_count = 0.0, 0
     departure_nm = 0.0
     for row, weight, residual in zip(rows, weights, residuals, strict=True):
         repeats = len(row.y)
@@ -287,7 +287,7 @@ def _finish_fit(
         degrees.append(repeats - 1)
         mean_residual = residual.mean(axis=0)
         squares += float(np.sum(weight * np.abs(mean_residual) ** 2))
-        terms += mean_residual.size
+        term_count += mean_residual.size
         constant = abs(row.x[0, 0, COULOMB_INDEX])
         departure_nm = max(departure_nm, abs(float(mean_residual[0].real)) / float(constant))
     parts_of_variance = np.array(parts)
@@ -295,7 +295,7 @@ def _finish_fit(
     degrees_of_freedom = variance**2 / np.sum(
         parts_of_variance**2 / np.array(degrees)[:, None], axis=0
     )
-    misfit = squares / max(1.0, terms - 0.5 * free_indices.size)
+    misfit = squares / max(1.0, term_count - 0.5 * free_indices.size)
     widening = _STD_MARGIN * _student_factor(degrees_of_freedom) * sqrt(max(1.0, misfit))
 
     values, stds = solution.copy(), np.zeros(free.size)
@@ -443,8 +443,8 @@ def estimate_motor(
             f"The fit ends at an inertia of {inertia:.3g} kg·m²: the record does not show the "
             "motor's own motion. Check sensor.projection, encoder.delay_s and sensor.delay_s."
         )
-    jump = tool_inertia_kg_m2 / (inertia + tool_inertia_kg_m2)
-    jump_std_s = jump / timing.rate_hz / sqrt(12.0)
+    torque_jump_fraction = tool_inertia_kg_m2 / (inertia + tool_inertia_kg_m2)
+    jump_std_s = torque_jump_fraction / timing.rate_hz / sqrt(12.0)
     return MotorEstimate(
         inertia_kg_m2=MotorQuantity(inertia, float(stds[INERTIA_INDEX])),
         viscous_nm_s_per_rad=MotorQuantity(
@@ -482,15 +482,16 @@ def _group_repeats(windows: Sequence[PassReadings], given: int) -> list[_MotionR
     groups: dict[Hashable, list[PassReadings]] = {}
     for window in windows:
         groups.setdefault(window.key, []).append(window)
-    complete = [group for group in groups.values() if len(group) >= LEAST_REPEATS]
-    if {np.sign(group[0].speed_rad_s) for group in complete} != {1.0, -1.0}:
+    complete_groups = [group for group in groups.values() if len(group) >= LEAST_REPEATS]
+    if {np.sign(group[0].speed_rad_s) for group in complete_groups} != {1.0, -1.0}:
         raise MotorEstimateError(
             f"Of {given} passes {len(windows)} can be used, and that is too few: it takes at least "
             f"{LEAST_REPEATS} of the same kind in both directions, without gaps and without a "
             "standstill."
         )
     sessions = {
-        number: index for index, number in enumerate(sorted({g[0].session for g in complete}))
+        number: index
+        for index, number in enumerate(sorted({g[0].session for g in complete_groups}))
     }
     return [
         _MotionRepeats(
@@ -501,5 +502,5 @@ def _group_repeats(windows: Sequence[PassReadings], given: int) -> list[_MotionR
             group[0].top_hz,
             sessions[group[0].session],
         )
-        for group in complete
+        for group in complete_groups
     ]

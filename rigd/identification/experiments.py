@@ -105,26 +105,27 @@ class SpeedPass:
     """Index of the pass's cycle, from 0."""
 
 
-def lay_out_passes(layout: PassSchedule, rate_hz: float) -> list[SpeedPass]:
+def passes_of_schedule(schedule: PassSchedule, rate_hz: float) -> list[SpeedPass]:
     """Return the evaluated windows of a session's passes in their order.
 
     Parameters
     ----------
-    layout
+    schedule
         Schedule of the session.
     rate_hz
         Rate of the samples.
     """
-    turn, settle, window = (
-        round(time_s * rate_hz) for time_s in (layout.turn_s, layout.settle_s, layout.window_s)
+    turn_ticks, settle_ticks, window = (
+        round(time_s * rate_hz)
+        for time_s in (schedule.turn_s, schedule.settle_s, schedule.window_s)
     )
-    tick = round(layout.rest_s * rate_hz) + round(layout.approach_s * rate_hz)
+    tick = round(schedule.rest_s * rate_hz) + round(schedule.approach_s * rate_hz)
     passes = []
-    for cycle in range(layout.cycles):
-        for speed in layout.speeds_rad_s:
-            for signed in (speed, -speed):
-                tick += turn + settle
-                passes.append(SpeedPass(tick, tick + window, signed, cycle))
+    for cycle in range(schedule.cycles):
+        for speed in schedule.speeds_rad_s:
+            for signed_speed in (speed, -speed):
+                tick += turn_ticks + settle_ticks
+                passes.append(SpeedPass(tick, tick + window, signed_speed, cycle))
                 tick += window
     return passes
 
@@ -176,9 +177,9 @@ def _multisine_excitation(
     """Return the excitation `TRIAL` or `MULTISINE`: passes with a multisine."""
     limit_nm = _torque_limit(profile, torque_percent)
     loop = close_loop(profile.loop_model())
-    layout = _fit_schedule(kind, (1.0,), profile, stroke_rad)
-    passes_rad = _passes_reference(layout, profile)
-    multisine = _multisine(layout, loop, _SPEED_MODULATION[kind])
+    schedule = _fit_schedule(kind, (1.0,), profile, stroke_rad)
+    passes_rad = _passes_reference(schedule, profile)
+    multisine = _multisine(schedule, loop, _SPEED_MODULATION[kind])
     passes_nm = _peak_torque(loop, passes_rad)
     peak_nm = _peak_torque(loop, passes_rad + multisine)
     fraction = 1.0
@@ -193,7 +194,7 @@ def _multisine_excitation(
             f"{_rounded_percent(profile, needed_nm)} % or a shorter --stroke-rad."
         )
     return _checked_excitation(
-        kind, layout, profile, loop, passes_rad + fraction * multisine, torque_percent, stroke_rad
+        kind, schedule, profile, loop, passes_rad + fraction * multisine, torque_percent, stroke_rad
     )
 
 
@@ -216,8 +217,8 @@ def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float
     """
     limit_nm = _torque_limit(profile, torque_percent)
     loop = close_loop(profile.loop_model())
-    layout = _fit_schedule(SPEEDS, _RELATIVE_SPEEDS, profile, stroke_rad)
-    reference = _passes_reference(layout, profile)
+    schedule = _fit_schedule(SPEEDS, _RELATIVE_SPEEDS, profile, stroke_rad)
+    reference = _passes_reference(schedule, profile)
     peak_nm = _peak_torque(loop, reference)
     if peak_nm > limit_nm:
         raise ExcitationError(
@@ -225,10 +226,12 @@ def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float
             f"{limit_nm:.3g} N·m are allowed; allow at least "
             f"{_rounded_percent(profile, peak_nm)} % or a shorter --stroke-rad."
         )
-    return _checked_excitation(SPEEDS, layout, profile, loop, reference, torque_percent, stroke_rad)
+    return _checked_excitation(
+        SPEEDS, schedule, profile, loop, reference, torque_percent, stroke_rad
+    )
 
 
-def read_layout(metadata: Mapping[str, str]) -> PassSchedule | None:
+def read_schedule(metadata: Mapping[str, str]) -> PassSchedule | None:
     """Return the schedule in the metadata of a session, or None for any other excitation."""
     if metadata.get("excitation") not in HIGHEST_FREQUENCY_HZ:
         return None
@@ -282,17 +285,18 @@ def _fit_schedule(
     return PassSchedule(tuple(fraction * speed for fraction in relative_speeds), cycles)
 
 
-def _passes_path(layout: PassSchedule, rate_hz: float) -> Real:
+def _passes_path(schedule: PassSchedule, rate_hz: float) -> Real:
     """Return the angle in rad during all passes; it begins at 0 at the end of the approach."""
-    turn, settle, window = (
-        round(time_s * rate_hz) for time_s in (layout.turn_s, layout.settle_s, layout.window_s)
+    turn_ticks, settle_ticks, window = (
+        round(time_s * rate_hz)
+        for time_s in (schedule.turn_s, schedule.settle_s, schedule.window_s)
     )
-    change = _smooth_rise(np.arange(turn) / turn)
+    change = _smooth_rise(np.arange(turn_ticks) / turn_ticks)
     segments: list[Real] = []
     previous = 0.0
-    for speed in [s for v in layout.speeds_rad_s for s in (v, -v)] * layout.cycles:
+    for speed in [s for v in schedule.speeds_rad_s for s in (v, -v)] * schedule.cycles:
         segments.append(previous + (speed - previous) * change)
-        segments.append(np.full(settle + window, speed))
+        segments.append(np.full(settle_ticks + window, speed))
         previous = speed
     segments.append(previous * (1.0 - change))
     speeds = np.concatenate(segments)
@@ -300,32 +304,32 @@ def _passes_path(layout: PassSchedule, rate_hz: float) -> Real:
     return path
 
 
-def _passes_reference(layout: PassSchedule, profile: Profile) -> Real:
+def _passes_reference(schedule: PassSchedule, profile: Profile) -> Real:
     """Return the reference angle in rad without a multisine: rest, approach, passes, end."""
     rate_hz = profile.rig.rate_hz
-    path = _passes_path(layout, rate_hz)
+    path = _passes_path(schedule, rate_hz)
     path -= 0.5 * (path.max() + path.min())
-    rest, approach, end = (
-        round(time_s * rate_hz) for time_s in (layout.rest_s, layout.approach_s, layout.end_s)
+    rest_ticks, approach_ticks, end = (
+        round(time_s * rate_hz) for time_s in (schedule.rest_s, schedule.approach_s, schedule.end_s)
     )
-    approach_rad = path[0] * _smooth_rise(np.arange(approach) / approach)
-    reference = np.concatenate([np.zeros(rest), approach_rad, path, np.full(end, path[-1])])
-    _add_offsets(reference, layout, profile)
+    approach_rad = path[0] * _smooth_rise(np.arange(approach_ticks) / approach_ticks)
+    reference = np.concatenate([np.zeros(rest_ticks), approach_rad, path, np.full(end, path[-1])])
+    _add_offsets(reference, schedule, profile)
     return reference
 
 
-def _add_offsets(reference: Real, layout: PassSchedule, profile: Profile) -> None:
+def _add_offsets(reference: Real, schedule: PassSchedule, profile: Profile) -> None:
     """Add to each cycle of a reference its own offset of some encoder steps.
 
     The offset changes in the turn before the cycle.
     """
     rate_hz = profile.rig.rate_hz
-    turn = round(layout.turn_s * rate_hz)
-    previous = round((layout.turn_s + layout.settle_s) * rate_hz)
-    change = _smooth_rise(np.arange(turn) / turn)
+    turn_ticks = round(schedule.turn_s * rate_hz)
+    previous = round((schedule.turn_s + schedule.settle_s) * rate_hz)
+    change = _smooth_rise(np.arange(turn_ticks) / turn_ticks)
     offset = 0.0
     last_cycle = -1
-    for speed_pass in lay_out_passes(layout, rate_hz):
+    for speed_pass in passes_of_schedule(schedule, rate_hz):
         if speed_pass.cycle == last_cycle:
             continue
         last_cycle = speed_pass.cycle
@@ -333,19 +337,19 @@ def _add_offsets(reference: Real, layout: PassSchedule, profile: Profile) -> Non
         next_offset = (
             _OFFSET_STEPS * profile.rig.encoder.resolution_rad * (fraction - floor(fraction) - 0.5)
         )
-        start = speed_pass.first - previous
-        reference[start : start + turn] += (next_offset - offset) * change
-        reference[start + turn :] += next_offset - offset
+        first_sample = speed_pass.first - previous
+        reference[first_sample : first_sample + turn_ticks] += (next_offset - offset) * change
+        reference[first_sample + turn_ticks :] += next_offset - offset
         offset = next_offset
 
 
-def _multisine(layout: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
+def _multisine(schedule: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
     """Return the reference angle in rad of the multisine alone.
 
     The response of the loop to it changes the speed of the passes by the fraction `modulation`.
     """
     rate_hz = loop.model.rate_hz
-    window = round(layout.window_s * rate_hz)
+    window = round(schedule.window_s * rate_hz)
     step_hz = rate_hz / window
     numbers = np.arange(
         ceil(_MULTISINE_BAND_HZ[0] / step_hz), floor(_MULTISINE_BAND_HZ[1] / step_hz) + 1
@@ -355,22 +359,22 @@ def _multisine(layout: PassSchedule, loop: ClosedLoop, modulation: float) -> Rea
     speed = np.zeros(window // 2 + 1, dtype=complex)
     speed[numbers] = np.exp(1j * phase)
     peak = float(np.max(np.abs(np.fft.irfft(speed, window))))
-    speed *= modulation * layout.speeds_rad_s[0] / peak
+    speed *= modulation * schedule.speeds_rad_s[0] / peak
     spectrum = np.zeros_like(speed)
     spectrum[numbers] = speed[numbers] / (2j * pi * frequency_hz) / loop.response(frequency_hz)
     period = np.fft.irfft(spectrum, window)
 
-    turn, settle = round(layout.turn_s * rate_hz), round(layout.settle_s * rate_hz)
-    half = turn // 2
-    rise = _smooth_rise(np.arange(half) / half)
-    envelope = np.concatenate([rise, np.ones(settle + window), 1.0 - rise])
-    windowed = np.resize(np.roll(period, half + settle), envelope.size) * envelope
-    passes = lay_out_passes(layout, rate_hz)
-    total = passes[-1].end + turn + round(layout.end_s * rate_hz)
-    reference = np.zeros(total)
+    turn_ticks, settle_ticks = round(schedule.turn_s * rate_hz), round(schedule.settle_s * rate_hz)
+    half_turn_ticks = turn_ticks // 2
+    rise = _smooth_rise(np.arange(half_turn_ticks) / half_turn_ticks)
+    envelope = np.concatenate([rise, np.ones(settle_ticks + window), 1.0 - rise])
+    windowed = np.resize(np.roll(period, half_turn_ticks + settle_ticks), envelope.size) * envelope
+    passes = passes_of_schedule(schedule, rate_hz)
+    sample_count = passes[-1].end + turn_ticks + round(schedule.end_s * rate_hz)
+    reference = np.zeros(sample_count)
     for speed_pass in passes:
-        start = speed_pass.first - settle - half
-        reference[start : start + windowed.size] += windowed
+        first_sample = speed_pass.first - settle_ticks - half_turn_ticks
+        reference[first_sample : first_sample + windowed.size] += windowed
     return reference
 
 
@@ -389,7 +393,7 @@ def _peak_torque(loop: ClosedLoop, reference: Real) -> float:
 
 def _checked_excitation(
     kind: str,
-    layout: PassSchedule,
+    schedule: PassSchedule,
     profile: Profile,
     loop: ClosedLoop,
     reference: Real,
@@ -405,11 +409,11 @@ def _checked_excitation(
         )
     rate_hz = profile.rig.rate_hz
     reference.flags.writeable = False
-    rest = round(layout.rest_s * rate_hz)
-    end = reference.size - round(layout.end_s * rate_hz)
+    rest_ticks = round(schedule.rest_s * rate_hz)
+    end = reference.size - round(schedule.end_s * rate_hz)
     parameters = {
-        **asdict(layout),
-        "speeds_rad_s": " ".join(repr(speed) for speed in layout.speeds_rad_s),
+        **asdict(schedule),
+        "speeds_rad_s": " ".join(repr(speed) for speed in schedule.speeds_rad_s),
         "torque_percent": torque_percent,
         "stroke_rad": stroke_rad,
         # Settings of the controller, which differ from the profile's file after the trial.
@@ -418,5 +422,9 @@ def _checked_excitation(
         "control_pole_rad_s": profile.control.pole_rad_s,
         "control_feedforward_gain": profile.control.feedforward_gain,
     }
-    segments = {"rest": (0, rest), "sweep": (rest, end), "ring_down": (end, reference.size)}
+    segments = {
+        "rest": (0, rest_ticks),
+        "sweep": (rest_ticks, end),
+        "ring_down": (end, reference.size),
+    }
     return Excitation(kind, parameters, rate_hz, reference, segments)

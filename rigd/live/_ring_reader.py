@@ -75,7 +75,7 @@ class SessionRecordReader:
         self.t_ns = 0
         self.read_duration_s = 0.0
         self._rate_hz = session.subject.rate_hz
-        self._seen = seen
+        self._seen_samples = seen
         self._readers = {
             topic: _RingReader(ring, first, seen if topic is SAMPLE else 0)
             for topic, ring, first in zip(TOPICS, channels.rings, session.begins, strict=True)
@@ -117,7 +117,7 @@ class SessionRecordReader:
             drawings += scene.samples(samples)
             self.t_ns = int(samples["t_ns"][-1])
             count += len(samples)
-            first_shown += min(len(samples), max(0, self.next - self._seen))
+            first_shown += min(len(samples), max(0, self.next - self._seen_samples))
         self.read_duration_s = count / self._rate_hz
         return NewDrawings(notes, drawings, first_shown)
 
@@ -133,13 +133,13 @@ class _RingReader:
         self._ring = ring
         # Overwritten records that an earlier publisher showed do not count as dropped.
         self._observer = Observer(ring, max(first, min(seen, ring.oldest)))
-        self._damaged = 0
+        self._damaged_records = 0
         self.end: int | None = None
 
     @property
     def dropped(self) -> int:
         """Number of records that were overwritten before they were read."""
-        return self._observer.dropped + self._damaged
+        return self._observer.dropped + self._damaged_records
 
     @property
     def next(self) -> int:
@@ -165,4 +165,4 @@ class _RingReader:
             try:
                 yield decode(block)
             except ValueError:  # overwritten while it was copied
-                self._damaged += len(block) // self._ring.record_size
+                self._damaged_records += len(block) // self._ring.record_size

@@ -53,7 +53,7 @@ class RerunServer:
 
     def __init__(self, rig: str) -> None:
         self.address: LiveAddress | None = None
-        self._announced: LiveAddress | None = None
+        self._announced_address: LiveAddress | None = None
         self._rig = rig
         self._grpc_port = free_port(GRPC_PORT)
         self._page = serve_page(lambda: self.address, lambda: self._program.page_port)
@@ -123,9 +123,9 @@ class RerunServer:
         """End the server and delete the file with its address."""
         self._program.kill()
         self._page.close()
-        if self._announced is not None:
+        if self._announced_address is not None:
             with suppress(OSError):  # readers of the file notice that its process has ended
-                withdraw(self._announced)
+                withdraw(self._announced_address)
 
     def _replace(self) -> None:
         """Start another server, if possible on the same port for viewers and tunnels.
@@ -154,15 +154,15 @@ class RerunServer:
     def _announce(self) -> None:
         """Store the address of the server, and write it to its file."""
         self._grpc_port = self._program.grpc_port
-        self.address = self._announced = LiveAddress.of_this_process(
+        self.address = self._announced_address = LiveAddress.of_this_process(
             self._rig, self._grpc_port, self._page.port, time.time_ns()
         )
         with suppress(OSError):  # the view works nevertheless
             announce(self.address)
 
 
-def free_port(wanted: int) -> int:
-    """Return the port `wanted` if no process listens on it, otherwise 0.
+def free_port(preferred_port: int) -> int:
+    """Return the port `preferred_port` if no process listens on it, otherwise 0.
 
     For port 0 the system chooses a free port. Rerun's program cannot check the port itself: it may
     mistake a listener for another Rerun server.
@@ -171,7 +171,7 @@ def free_port(wanted: int) -> int:
         # Connections of a server that has just ended do not count.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((LOOPBACK, wanted))
+            probe.bind((LOOPBACK, preferred_port))
         except OSError:
             return 0
-    return wanted
+    return preferred_port

@@ -273,9 +273,11 @@ def _switch_server(control_url: str, url: str, done: list[bool]) -> None:
     try:
         client = ViewerClient.connect(control_url)
         state = client.get_state()
-        earlier = [r.store_id for r in state.recordings if r.store_id != state.active_recording]
-        if earlier:
-            client.close(store_ids=earlier)
+        earlier_recordings = [
+            r.store_id for r in state.recordings if r.store_id != state.active_recording
+        ]
+        if earlier_recordings:
+            client.close(store_ids=earlier_recordings)
         with contextlib.suppress(ConnectionError):  # the viewer received nothing from this server
             client.close(url)
         client.open(url)

@@ -106,30 +106,30 @@ class _Publisher:
         self._channels = channels
         self._server_program = server_program
         self._drawing_stream = DrawingStream(server_program)
-        self._shown: _ShownSession | None = None
-        self._last: LastResponse | None = None
+        self._shown_session: _ShownSession | None = None
+        self._last_response: LastResponse | None = None
         self._announced_server: int | None = None
 
     def serve(self) -> None:
         """Show sessions until the supervisor has ended or closes the standard input."""
         while self._parent.alive():
             _arm_watchdog()
-            self._step()
+            self._show_new_records()
             try:
                 message = self._parent.poll(self._pause_s)
             except EOFError:
                 break
             match message:
                 case LiveSession():
-                    self._begin(message)
+                    self._begin_session(message)
                 case LiveTouches(touches):
-                    if self._shown is not None:
-                        self._shown.show_touches(touches)
+                    if self._shown_session is not None:
+                        self._shown_session.show_touches(touches)
                 case LiveFit(fit):
-                    if self._shown is not None:
-                        self._shown.show_fit(fit)
+                    if self._shown_session is not None:
+                        self._shown_session.show_fit(fit)
                 case LiveEnd():
-                    self._finish(message)
+                    self._finish_session(message)
         self._show_orphaned()
 
     def linger(self, linger_s: float) -> None:
@@ -140,57 +140,61 @@ class _Publisher:
         end = max(earliest_end, time.monotonic() + linger_s)
         while time.monotonic() < (end if self._parent.alive() else earliest_end):
             _arm_watchdog()
-            self._step()
+            self._show_new_records()
             time.sleep(_SEND_PERIOD_S)
 
     @property
     def _pause_s(self) -> float:
         """Seconds to wait for a message of the supervisor before the next step."""
-        shown = self._shown
+        shown = self._shown_session
         if shown is not None and not shown.has_ended:
             # In a session that runs faster than real time, records would accumulate.
             return _SEND_PERIOD_S if shown.reader.read_duration_s < _CATCH_UP_S else 0.0
-        waits = self._drawing_stream.stalled or (shown is not None and bool(shown.backlog))
-        return _SEND_PERIOD_S if waits else _IDLE_PERIOD_S
+        must_wait = self._drawing_stream.stalled or (shown is not None and bool(shown.backlog))
+        return _SEND_PERIOD_S if must_wait else _IDLE_PERIOD_S
 
-    def _begin(self, session: LiveSession) -> None:
+    def _begin_session(self, session: LiveSession) -> None:
         """Show a new session, after the end of the previous one."""
-        self._finish(LiveEnd(session.begins))
-        if self._shown is not None:
-            self._last = self._shown.reader.scene.last_response or self._last
-        self._shown = _ShownSession(session, self._channels, last_response(session, self._last))
+        self._finish_session(LiveEnd(session.begins))
+        if self._shown_session is not None:
+            self._last_response = (
+                self._shown_session.reader.scene.last_response or self._last_response
+            )
+        self._shown_session = _ShownSession(
+            session, self._channels, last_response(session, self._last_response)
+        )
         self._server_program.count_session()
-        self._drawing_stream.begin(session.recording_id, self._shown.reader.scene.frame)
-        self._step()
+        self._drawing_stream.begin(session.recording_id, self._shown_session.reader.scene.frame)
+        self._show_new_records()
         self._parent.send(LiveShown(session.recording_id))
 
-    def _finish(self, end: LiveEnd) -> None:
+    def _finish_session(self, end: LiveEnd) -> None:
         """Show the end of the present session, unless it has been shown already."""
-        if self._shown is not None and not self._shown.has_ended:
-            self._shown.finish(end)
-            self._step()
+        if self._shown_session is not None and not self._shown_session.has_ended:
+            self._shown_session.finish(end)
+            self._show_new_records()
 
     def _show_orphaned(self) -> None:
         """Show a session whose supervisor has ended until its torque is off."""
-        shown, shared_state = self._shown, self._channels.shared_state
+        shown, shared_state = self._shown_session, self._channels.shared_state
         if shown is None or shown.has_ended:
             return
         shown.supervisor_lost = True
         end = time.monotonic() + _MAX_ORPHANED_S
         while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < end:
             _arm_watchdog()
-            self._step()
+            self._show_new_records()
             time.sleep(_SEND_PERIOD_S)
-        self._finish(LiveEnd(tuple(ring.written for ring in self._channels.rings)))
+        self._finish_session(LiveEnd(tuple(ring.written for ring in self._channels.rings)))
 
-    def _step(self) -> None:
+    def _show_new_records(self) -> None:
         """Show the new records of the session, and count those that cannot be shown."""
         self._channels.shared_state.beat(StateField.LIVE_BEAT)
-        if self._shown is not None:
-            self._shown.queue_new_records()
+        if self._shown_session is not None:
+            self._shown_session.queue_new_records()
         before = self._drawing_stream.connections
-        if self._drawing_stream.ready() and self._shown is not None:
-            self._shown.send(
+        if self._drawing_stream.ready() and self._shown_session is not None:
+            self._shown_session.send(
                 self._drawing_stream, connected=self._drawing_stream.connections != before
             )
         self._announce_address()
@@ -216,15 +220,15 @@ class _ShownSession:
         self.has_ended = False
         self.supervisor_lost = False
         self._health_reader = HealthReader(channels)
-        self._states = StateWatch(channels)
-        self._unsent = 0
+        self._state_watch = StateWatch(channels)
+        self._unsent_samples = 0
         folder, name = session.folder, session.subject.name
         self._quick_look_path = None if folder is None else quick_look_path(folder / f"{name}.mcap")
 
     @property
     def dropped(self) -> int:
         """Number of the session's samples that could not be shown."""
-        dropped = self.reader.dropped + self.backlog.dropped + self._unsent
+        dropped = self.reader.dropped + self.backlog.dropped + self._unsent_samples
         return self._dropped_before + dropped
 
     def queue_new_records(self) -> None:
@@ -238,7 +242,7 @@ class _ShownSession:
         if self._health_reader.is_due(now_s):
             health = self._health_reader.read(now_s, self.dropped)
             drawings += self.reader.scene.health(self.reader.t_ns, health)
-        state = SUPERVISOR_LOST if self.supervisor_lost else self._states.read(now_s)
+        state = SUPERVISOR_LOST if self.supervisor_lost else self._state_watch.read(now_s)
         drawings += self.reader.scene.state(self.reader.t_ns, state)
         self.backlog.put_required(new_drawings.notes)
         self.backlog.put(drawings, new_drawings.samples)
@@ -304,7 +308,7 @@ class _ShownSession:
         if self.backlog:
             drawings, samples = self.backlog.take()
             if not drawing_stream.send(drawings):
-                self._unsent += samples
+                self._unsent_samples += samples
             if not self.has_ended:
                 self._store_counts()
 
@@ -344,14 +348,14 @@ class Backlog:
         self._max_samples = max_samples
         self._queue: collections.deque[tuple[list[Drawing], int]] = collections.deque()
         self.samples = 0
-        self._required: collections.deque[Drawing] = collections.deque(
+        self._required_drawings: collections.deque[Drawing] = collections.deque(
             maxlen=_MAX_REQUIRED_DRAWINGS
         )
         self.dropped = 0
 
     def __bool__(self) -> bool:
         """Return whether any drawings are queued."""
-        return bool(self._queue or self._required)
+        return bool(self._queue or self._required_drawings)
 
     def put(self, drawings: "list[Drawing]", samples: int) -> None:
         """Queue drawings, and drop the oldest ones if there are too many samples.
@@ -373,17 +377,17 @@ class Backlog:
 
     def put_required(self, drawings: "Iterable[Drawing]") -> None:
         """Queue drawings that must not be dropped, such as events."""
-        self._required.extend(drawings)
+        self._required_drawings.extend(drawings)
 
     def drop_required(self) -> None:
         """Remove the drawings of `put_required`, which the frame of a new connection contains."""
-        self._required.clear()
+        self._required_drawings.clear()
 
     def take(self) -> "tuple[list[Drawing], int]":
         """Return all queued drawings and the number of samples they show, and clear the queue."""
-        drawings = [*self._required, *(draw for batch, _ in self._queue for draw in batch)]
+        drawings = [*self._required_drawings, *(draw for batch, _ in self._queue for draw in batch)]
         samples, self.samples = self.samples, 0
-        self._required.clear()
+        self._required_drawings.clear()
         self._queue.clear()
         return drawings, samples
 

@@ -32,9 +32,9 @@ from rigd.profile._schema import (
     SECTIONS,
     SOURCES,
     TEXT_KEYS,
-    fields_of,
     is_number,
     key_types,
+    section_fields,
 )
 from rigd.safety.limits import BUFFERED_S
 from rigd.session.user_metadata import NOTES, MetadataError, check_name
@@ -118,23 +118,23 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             f"name = {_text(values['name'])} is not fit for file names; take letters, digits, "
             "spaces and . _ - only, at most 64, and begin with a letter or digit."
         )
-    rated, peak = values["motor.rated_torque_nm"], values["motor.peak_torque_nm"]
-    if peak < rated:
+    rated_nm, peak_nm = values["motor.rated_torque_nm"], values["motor.peak_torque_nm"]
+    if peak_nm < rated_nm:
         yield (
-            f"motor.peak_torque_nm = {peak:g} N·m is below motor.rated_torque_nm = {rated:g} N·m; "
-            "the peak is at least the rated torque."
+            f"motor.peak_torque_nm = {peak_nm:g} N·m is below motor.rated_torque_nm = "
+            f"{rated_nm:g} N·m; the peak is at least the rated torque."
         )
-    continuous = values["motor.continuous_torque_nm"]
-    if peak >= rated and continuous > peak:
+    continuous_nm = values["motor.continuous_torque_nm"]
+    if peak_nm >= rated_nm and continuous_nm > peak_nm:
         yield (
-            f"motor.continuous_torque_nm = {continuous:g} N·m is above motor.peak_torque_nm = "
-            f"{peak:g} N·m; continuous torque must not exceed peak torque."
+            f"motor.continuous_torque_nm = {continuous_nm:g} N·m is above motor.peak_torque_nm = "
+            f"{peak_nm:g} N·m; continuous torque must not exceed peak torque."
         )
     limit_nm = values["limits.torque_command_nm"]
-    if limit_nm < peak:
+    if limit_nm < peak_nm:
         yield (
-            f"limits.torque_command_nm = {limit_nm:g} N·m is below motor.peak_torque_nm = {peak:g} "
-            "N·m, where commands saturate; the controller's command limit must be higher."
+            f"limits.torque_command_nm = {limit_nm:g} N·m is below motor.peak_torque_nm = "
+            f"{peak_nm:g} N·m, where commands saturate; the controller's command limit must be higher."
         )
     angle, stop = values["limits.angle_rad"], values["limits.stop_angle_rad"]
     if stop <= angle:
@@ -145,10 +145,10 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     yield from _unreachable_limits(values)
     yield from _drag_contradictions(values)
     yield from _hum_contradictions(values)
-    warning, drift = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
-    if drift < warning:
+    warning, drift_limit_nm = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
+    if drift_limit_nm < warning:
         yield (
-            f"limits.tare_drift_nm = {drift:g} N·m, which ends a session, is below "
+            f"limits.tare_drift_nm = {drift_limit_nm:g} N·m, which ends a session, is below "
             f"session.tare_drift_nm = {warning:g} N·m, which warns; it must be the greater one."
         )
     yield from first_mode_contradictions(values)
@@ -420,7 +420,7 @@ def _section_problems(values: Mapping[str, Any]) -> Iterator[str]:
     present = {
         section
         for section in {name for names in DEVICE_SECTIONS.values() for name in names}
-        if any(key in values for key, _ in fields_of(section))
+        if any(key in values for key, _ in section_fields(section))
     }
     for section in sorted(needed - present):
         yield (
@@ -522,7 +522,7 @@ def _delay_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     reply_s = period_s if values.get("acquisition.mode") == "previous_tick" else 0.0
     wrench_s, wrench_cause = reply_s, "the reply of the previous tick"
     if "ati_serial.port" in values:
-        serial = AtiSerial(**{field: values[key] for key, field in fields_of("ati_serial")})
+        serial = AtiSerial(**{field: values[key] for key, field in section_fields("ati_serial")})
         wrench_s = serial.filter_delay_s(values["rig.rate_hz"])
         wrench_cause = "the filter of the sensor's records"
     delivery_s = period_s if values.get("cia402.torque_delivery") == "at_sync" else 0.0

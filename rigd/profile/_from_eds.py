@@ -201,18 +201,20 @@ class Draft:
 
     def questions(self) -> list[Question]:
         """Return all questions to the operator about this drive."""
-        additional = (_OWN_WATCHDOG_QUESTION,) if WATCHDOG in self._missing_feature_names() else ()
+        additional_questions = (
+            (_OWN_WATCHDOG_QUESTION,) if WATCHDOG in self._missing_feature_names() else ()
+        )
         absent = set() if self._eds.get(RATED_TORQUE) else {"cia402.rated_torque_unit_nm"}
-        return [each for each in (*QUESTIONS, *additional) if each.key not in absent]
+        return [each for each in (*QUESTIONS, *additional_questions) if each.key not in absent]
 
     def unanswered_questions(self) -> list[Question]:
         """Return the questions whose key is unknown or still has the value of the base profile."""
-        answered = {
+        answered_keys = {
             key
             for key, setting in self._settings.items()
             if setting.reason != _OTHER_DRIVE_COMMENT and setting.source != UNKNOWN
         }
-        return [each for each in self.questions() if each.key not in answered]
+        return [each for each in self.questions() if each.key not in answered_keys]
 
     def text(self) -> str:
         """Return the text of the finished profile.
@@ -228,7 +230,7 @@ class Draft:
 
     def _text_without_head(self) -> str:
         """Return the text of the profile with its settings, but without the new head."""
-        marked = [
+        marked_settings = [
             Setting(
                 question.key,
                 self._value(question.key),
@@ -237,7 +239,7 @@ class Draft:
             )
             for question in self.unanswered_questions()
         ]
-        settings = [*self._settings.values(), *marked, *self._acceptance()]
+        settings = [*self._settings.values(), *marked_settings, *self._acceptance()]
         return with_settings(self._base.text, settings)
 
     def _acceptance(self) -> Iterator[Setting]:

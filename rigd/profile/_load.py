@@ -28,10 +28,10 @@ from rigd.profile._schema import (
     SOURCES,
     UNKNOWN,
     Profile,
-    defaults,
-    fields_of,
     is_number,
+    key_defaults,
     key_types,
+    section_fields,
 )
 
 
@@ -306,7 +306,7 @@ def _validation_model(absent: frozenset[str], unknown: frozenset[str]) -> type[B
     A model for each section would be slow to build.
     """
     definitions: dict[str, Any] = {
-        f"key_{index}": (annotation, Field(default=defaults().get(key, ...), alias=key))
+        f"key_{index}": (annotation, Field(default=key_defaults().get(key, ...), alias=key))
         for index, (key, annotation) in enumerate(key_types().items())
         if key.rpartition(".")[0] not in absent and key not in unknown
     }
@@ -316,4 +316,4 @@ def _validation_model(absent: frozenset[str], unknown: frozenset[str]) -> type[B
 
 def _build_section(sections: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
     """Return the dataclass of a section with its validated values."""
-    return SECTIONS[sections](**{field: values[key] for key, field in fields_of(sections)})
+    return SECTIONS[sections](**{field: values[key] for key, field in section_fields(sections)})

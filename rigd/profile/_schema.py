@@ -185,17 +185,17 @@ UNKNOWN = "unknown"
 def key_types() -> dict[str, Any]:
     """Return the type of each key's value, by the dotted keys of a profile.
 
-    A profile must have all keys except those of :func:`defaults`.
+    A profile must have all keys except those of :func:`key_defaults`.
     """
     types: dict[str, Any] = dict.fromkeys(TEXT_KEYS, Annotated[str, MinLen(1)])
     for section, cls in SECTIONS.items():
         hints = get_type_hints(cls, include_extras=True)
-        types |= {key: hints[field] for key, field in fields_of(section)}
+        types |= {key: hints[field] for key, field in section_fields(section)}
     return types
 
 
 @cache
-def defaults() -> dict[str, Any]:
+def key_defaults() -> dict[str, Any]:
     """Return the default value of each optional key, by the dotted keys of a profile.
 
     Other defaults of the dataclasses are not used: for example, a delay that is not stated is
@@ -218,7 +218,7 @@ def is_number(annotation: Any) -> bool:  # noqa: ANN401
     return annotation not in (str, bool) and get_origin(annotation) is not Literal
 
 
-def fields_of(section: str) -> list[tuple[str, str]]:
+def section_fields(section: str) -> list[tuple[str, str]]:
     """Return each dotted key of a section with the name of its dataclass field."""
     # A trailing underscore distinguishes the name of a field from a Python keyword.
     names = [field.name for field in fields(SECTIONS[section])]

@@ -22,7 +22,7 @@ from rigd.profile._schema import (
     Profile,
     ScaleUncertainty,
     Specimen,
-    fields_of,
+    section_fields,
 )
 from rigd.units import suffix_of, unit_of
 
@@ -86,12 +86,12 @@ def load_specimen(path: Path) -> Specimen:
         problems.extend(diagnostics.first_mode_contradictions(values))
     if problems:
         raise problems_error(path, problems)
-    beam = BeamSection(**{field: values[key] for key, field in fields_of(_BEAM_SECTION)})
+    beam = BeamSection(**{field: values[key] for key, field in section_fields(_BEAM_SECTION)})
     damping = None
     if _DAMPING_SECTION in sections:
-        damping = Damping(**{field: values[key] for key, field in fields_of(_DAMPING_SECTION)})
+        damping = Damping(**{field: values[key] for key, field in section_fields(_DAMPING_SECTION)})
     uncertainty = ScaleUncertainty(
-        **{field: values[key] for key, field in fields_of(_UNCERTAINTY_SECTION)}
+        **{field: values[key] for key, field in section_fields(_UNCERTAINTY_SECTION)}
     )
     return Specimen(
         path.stem, path, text, beam.uniform, damping, uncertainty, note, beam.tip_mass_kg

@@ -110,23 +110,23 @@ class EncoderWatch:
         "_count",
         "_coupling_nm2",
         "_decay",
-        "_errors",
+        "_delayed_commands_nm",
+        "_error_sums",
         "_half_period_ticks",
         "_inertia_kg_m2",
         "_irregular_ticks",
         "_min_test_ticks",
         "_next_test_tick",
         "_noise_nm",
-        "_pending",
         "_prediction",
         "_rate_hz",
-        "_repeats",
+        "_repeat_ticks",
         "_resolution_rad",
-        "_scales",
+        "_scale_watch",
         "_standstill_count",
         "_test_start_rad",
         "_test_step_nm",
-        "_torques",
+        "_torque_history",
         "_windows",
         "test_nm",
         "tests",
@@ -144,7 +144,7 @@ class EncoderWatch:
         scales: ScaleWatch | None = None,
     ) -> None:
         self._prediction = prediction
-        self._scales = scales
+        self._scale_watch = scales
         self._rate_hz = rate_hz
         self._resolution_rad = resolution_rad
         self._inertia_kg_m2 = inertia_kg_m2
@@ -163,11 +163,11 @@ class EncoderWatch:
         self._decay = 1.0 / (_RMS_TIME_CONSTANT_S * rate_hz)
         history_ticks = lengths[-1] + 2
         # Cumulative sums: the difference of two gives the mean over a window.
-        self._torques: deque[tuple[float, float]] = deque(maxlen=history_ticks)
-        self._errors: deque[float] = deque(maxlen=history_ticks)
+        self._torque_history: deque[tuple[float, float]] = deque(maxlen=history_ticks)
+        self._error_sums: deque[float] = deque(maxlen=history_ticks)
         self._angles: deque[float] = deque(maxlen=SPEED_TICKS + WINDOW_TICKS + 1)
-        self._repeats: deque[int] = deque(maxlen=_MAX_REPEATS)
-        self._pending: deque[float] = deque(maxlen=delay_ticks)
+        self._repeat_ticks: deque[int] = deque(maxlen=_MAX_REPEATS)
+        self._delayed_commands_nm: deque[float] = deque(maxlen=delay_ticks)
         self.test_nm = 0.0
         self._test_step_nm = 0.0
         self._test_start_rad = 0.0
@@ -187,15 +187,21 @@ class EncoderWatch:
         if self._prediction is not None:
             self._prediction.reset(angle_rad)
         self._noise_nm = noise_nm
-        for history in (self._torques, self._errors, self._angles, self._repeats, self._pending):
+        for history in (
+            self._torque_history,
+            self._error_sums,
+            self._angles,
+            self._repeat_ticks,
+            self._delayed_commands_nm,
+        ):
             history.clear()
-        self._torques.extend([(0.0, 0.0)] * 2)
-        self._errors.append(0.0)
+        self._torque_history.extend([(0.0, 0.0)] * 2)
+        self._error_sums.append(0.0)
         self._angles.append(angle_rad)
-        self._pending.extend([0.0] * (self._pending.maxlen or 0))
+        self._delayed_commands_nm.extend([0.0] * (self._delayed_commands_nm.maxlen or 0))
         self._coupling_nm2 = 0.0
-        if self._scales is not None:
-            self._scales.reset()
+        if self._scale_watch is not None:
+            self._scale_watch.reset()
         self._standstill_count = self._count = self._next_test_tick = 0
         self._irregular_ticks = 0
         self.tests = 0
@@ -221,16 +227,16 @@ class EncoderWatch:
             Evidence of a failed encoder, or None. With a violation `test_nm` must be ignored.
         """
         prediction = self._prediction
-        pending = self._pending
+        pending = self._delayed_commands_nm
         pending.append(sent_nm)
         motor_nm = pending[0]
         if not fresh:
             self.skip(1, angle_rad)
             return None
         error_nm = 0.0 if prediction is None else prediction.step(angle_rad, coupling_nm)
-        net, motor = self._torques[-1]
-        self._torques.append((net + motor_nm - coupling_nm, motor + motor_nm))
-        self._errors.append(self._errors[-1] + error_nm)
+        net, motor = self._torque_history[-1]
+        self._torque_history.append((net + motor_nm - coupling_nm, motor + motor_nm))
+        self._error_sums.append(self._error_sums[-1] + error_nm)
         self._coupling_nm2 += self._decay * (coupling_nm * coupling_nm - self._coupling_nm2)
         self._count += 1
         angles = self._angles
@@ -239,8 +245,8 @@ class EncoderWatch:
         angles.append(angle_rad)
         if self._irregular_ticks:
             self._irregular_ticks -= 1
-        elif self._count % WINDOW_TICKS == 0 and self._scales is not None:
-            violation = self._compare_scales(self._scales)
+        elif self._count % WINDOW_TICKS == 0 and self._scale_watch is not None:
+            violation = self._compare_scales(self._scale_watch)
             if violation is not None:
                 return violation
         if moved_rad:
@@ -283,13 +289,13 @@ class EncoderWatch:
         angle_rad
             Last angle that was read.
         """
-        net, motor = self._torques[-1]
-        error = self._errors[-1]
+        net, motor = self._torque_history[-1]
+        error = self._error_sums[-1]
         for _ in range(ticks):
             if self._prediction is not None:
                 self._prediction.skip(angle_rad)
-            self._torques.append((net, motor))
-            self._errors.append(error)
+            self._torque_history.append((net, motor))
+            self._error_sums.append(error)
         self._standstill_count = 0
         self._irregular_ticks = self._angles.maxlen or 0
 
@@ -328,7 +334,7 @@ class EncoderWatch:
             or not moved_rad
         ):
             return None
-        ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._torques) - 2)
+        ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._torque_history) - 2)
         net, motor = self._torque_sums(ticks)
         per_tick_nm = _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
         needed_nm = per_tick_nm * self._rate_hz**2 / _STANDSTILL_TICKS_AT_STOP
@@ -356,7 +362,7 @@ class EncoderWatch:
 
     def _compare_coupling_torque(self, ticks: int) -> None:
         """Start a test of the encoder if the beam's torque differs from its prediction."""
-        errors, noise_nm = self._errors, self._noise_nm
+        errors, noise_nm = self._error_sums, self._noise_nm
         error_nm = (errors[-1] - errors[-1 - ticks]) / ticks
         vibration_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
         significant_nm = max(
@@ -382,11 +388,14 @@ class EncoderWatch:
         angles = self._angles
         if len(angles) < SPEED_TICKS:
             return None
-        before_rad = angles[-3] - angles[-4]
+        previous_movement_rad = angles[-3] - angles[-4]
         least_rad = _MIN_REPEAT_STEPS * self._resolution_rad
-        if moved_rad * before_rad <= 0.0 or min(abs(moved_rad), abs(before_rad)) < least_rad:
+        if (
+            moved_rad * previous_movement_rad <= 0.0
+            or min(abs(moved_rad), abs(previous_movement_rad)) < least_rad
+        ):
             return None
-        repeats = self._repeats
+        repeats = self._repeat_ticks
         repeats.append(self._count)
         if len(repeats) < _MAX_REPEATS or self._count - repeats[0] >= _REPEAT_WINDOW_TICKS:
             return None
@@ -394,14 +403,17 @@ class EncoderWatch:
 
     def _compare_scales(self, scales: ScaleWatch) -> Violation | None:
         """Pass acceleration and net torque over the last `WINDOW_TICKS` to the scale watch."""
-        angles, torques = self._angles, self._torques
+        angles, torques = self._angles, self._torque_history
         n = WINDOW_TICKS
         if len(angles) < n + SPEED_TICKS + 1 or len(torques) < n + SPEED_TICKS + 3:
             return None
-        now_rad = angles[-1] - angles[-1 - SPEED_TICKS]
-        before_rad = angles[-1 - n] - angles[-1 - n - SPEED_TICKS]
+        recent_movement_rad = angles[-1] - angles[-1 - SPEED_TICKS]
+        previous_movement_rad = angles[-1 - n] - angles[-1 - n - SPEED_TICKS]
         least_rad = _MIN_SCALE_STEPS * self._resolution_rad
-        if now_rad * before_rad <= 0.0 or min(abs(now_rad), abs(before_rad)) < least_rad:
+        if (
+            recent_movement_rad * previous_movement_rad <= 0.0
+            or min(abs(recent_movement_rad), abs(previous_movement_rad)) < least_rad
+        ):
             return None
         # Weighted like the difference of two mean speeds, the torques match the acceleration.
         net = motor = 0.0
@@ -411,8 +423,12 @@ class EncoderWatch:
             for first in (torques[-1 - j - n], torques[-2 - j - n]):
                 net, motor = net - first[0], motor - first[1]
         net, motor = net / (2 * SPEED_TICKS * n), motor / (2 * SPEED_TICKS * n)
-        acceleration_rad_s2 = (now_rad - before_rad) * self._rate_hz**2 / (SPEED_TICKS * n)
-        speed_rad_s = (now_rad + before_rad) * self._rate_hz / (2 * SPEED_TICKS)
+        acceleration_rad_s2 = (
+            (recent_movement_rad - previous_movement_rad) * self._rate_hz**2 / (SPEED_TICKS * n)
+        )
+        speed_rad_s = (
+            (recent_movement_rad + previous_movement_rad) * self._rate_hz / (2 * SPEED_TICKS)
+        )
         return scales.add(acceleration_rad_s2, speed_rad_s, motor - net, net)
 
     def _torque_sums(self, ticks: int) -> tuple[float, float]:
@@ -420,8 +436,8 @@ class EncoderWatch:
 
         The present tick is excluded: its torque turns the shaft from now on.
         """
-        net, motor = self._torques[-2]
-        net_before, motor_before = self._torques[-2 - ticks]
+        net, motor = self._torque_history[-2]
+        net_before, motor_before = self._torque_history[-2 - ticks]
         return net - net_before, motor - motor_before
 
     def _end_test(self) -> None:

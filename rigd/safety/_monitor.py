@@ -14,7 +14,7 @@ FRACTION_WINDOW_S = 10.0
 
 With a shorter time one early burst would be a fault."""
 
-REARM_S = 1.0
+WARNING_REARM_S = 1.0
 """Time in seconds for which a channel must be below its warning level before the next warning."""
 
 _NO_JUMP_CHECK_TICKS = 3
@@ -70,27 +70,27 @@ class LimitWatch:
     __slots__ = (
         "_angle_warning",
         "_continuous_nm",
-        "_elapsed",
+        "_elapsed_ticks",
         "_error_warning",
         "_fraction_near",
         "_fraction_window",
         "_heat_nm2",
         "_jump_rad",
         "_jump_warning",
+        "_last_missed_check",
         "_last_slow_check_ns",
         "_last_warnings",
         "_limits",
-        "_missed_at_check",
-        "_missed_lately",
         "_notices",
         "_peak_nm",
         "_per_tick2_rad",
         "_previous_angle_rad",
-        "_previous_elapsed",
+        "_previous_elapsed_ticks",
         "_previous_moved_rad",
         "_rate_hz",
         "_rearm_checks",
-        "_saturated",
+        "_recently_missed",
+        "_saturated_ticks",
         "_second_last_moved_rad",
         "_slow_checks",
         "_slow_value_near",
@@ -138,7 +138,7 @@ class LimitWatch:
             _warning_fraction("wrench range") * w for w in self._wrench_limits
         )
         self._fraction_window = FRACTION_WINDOW_S * rate_hz
-        self._rearm_checks = max(1, round(REARM_S * rate_hz / SLOW_CHECK_TICKS))
+        self._rearm_checks = max(1, round(WARNING_REARM_S * rate_hz / SLOW_CHECK_TICKS))
         self._heat_nm2 = 0.0
         self._last_slow_check_ns: int | None = None
         self._slow_checks = 0
@@ -166,22 +166,22 @@ class LimitWatch:
         """
         self._previous_angle_rad = angle_rad
         self._previous_moved_rad = self._second_last_moved_rad = 0.0
-        self._previous_elapsed = self._elapsed = 1
+        self._previous_elapsed_ticks = self._elapsed_ticks = 1
         self._stale_angles = 0
         self._stale_wrenches = 0
-        self._saturated = 0
+        self._saturated_ticks = 0
         self._ticks_without_jump_check = 0
-        self._missed_lately = self._missed_at_check = 0
+        self._recently_missed = self._last_missed_check = 0
         self._fraction_near = False
         self._slow_value_near = False
         self.warning = False
 
     def skip(self, missed: int) -> None:
         """Register missed ticks, over which the next check computes the speed."""
-        self._elapsed += missed
+        self._elapsed_ticks += missed
         if missed:
-            self._missed_lately = missed + (self._missed_lately if self.after_missed else 0)
-            self._missed_at_check = self._slow_checks
+            self._recently_missed = missed + (self._recently_missed if self.after_missed else 0)
+            self._last_missed_check = self._slow_checks
 
     @property
     def after_missed(self) -> str:
@@ -189,8 +189,8 @@ class LimitWatch:
 
         It counts ticks missed within the last 64 to 128 ticks.
         """
-        missed = self._missed_lately
-        if not missed or self._slow_checks - self._missed_at_check > 1:
+        missed = self._recently_missed
+        if not missed or self._slow_checks - self._last_missed_check > 1:
             return ""
         ticks = "1 missed tick" if missed == 1 else f"{missed} missed ticks"
         if missed < _MIN_STALL_S * self._rate_hz:
@@ -232,7 +232,7 @@ class LimitWatch:
         w0, w1, w2, w3, w4, w5 = self._wrench_warnings
         fx, fy, fz, tx, ty, tz = wrench
         if (
-            self._elapsed == 1
+            self._elapsed_ticks == 1
             and -a < angle_rad < a
             and -e < reference_rad - angle_rad < e
             and -v < moved < v
@@ -248,7 +248,7 @@ class LimitWatch:
             self._previous_angle_rad = angle_rad
             self._second_last_moved_rad = before
             self._previous_moved_rad = moved
-            self._previous_elapsed = 1
+            self._previous_elapsed_ticks = 1
             self._ticks_without_jump_check = 0
             self.warning = self._slow_value_near
             return None
@@ -285,7 +285,7 @@ class LimitWatch:
         )
         if angle_stale:
             # The movement of the next new angle includes this tick.
-            self._elapsed += 1
+            self._elapsed_ticks += 1
         else:
             checked_values += self._speed_and_jump(angle_rad)
         return self._assess(checked_values)
@@ -295,13 +295,13 @@ class LimitWatch:
 
         `angle_rad` is the new angle, with which the next one is compared.
         """
-        elapsed, before_rad = self._elapsed, self._previous_moved_rad
+        elapsed, before_rad = self._elapsed_ticks, self._previous_moved_rad
         moved_rad = angle_rad - self._previous_angle_rad
         speed_rad_s = moved_rad * self._rate_hz / elapsed
         # One latch of the encoder may be late by most of a period and the next one not: the time
         # between them is longer or shorter by that much.
         max_jump_rad = (
-            self._per_tick2_rad * elapsed * (elapsed + self._previous_elapsed) / 2
+            self._per_tick2_rad * elapsed * (elapsed + self._previous_elapsed_ticks) / 2
             + self._jump_rad
             + abs(before_rad)
             + abs(self._second_last_moved_rad)
@@ -313,7 +313,7 @@ class LimitWatch:
             self._ticks_without_jump_check -= 1
         self._previous_angle_rad = angle_rad
         self._second_last_moved_rad, self._previous_moved_rad = before_rad, moved_rad / elapsed
-        self._previous_elapsed, self._elapsed = elapsed, 1
+        self._previous_elapsed_ticks, self._elapsed_ticks = elapsed, 1
         limit_rad_s = self._limits.velocity_rad_s
         near_rad_s = _warning_fraction("velocity") * limit_rad_s
         checked_values: list[_CheckedValue] = [
@@ -342,7 +342,7 @@ class LimitWatch:
         """
         self._stale_angles = self._stale_angles + 1 if angle_stale else 0
         self._stale_wrenches = self._stale_wrenches + 1 if wrench_stale else 0
-        self._saturated = self._saturated + 1 if saturated else 0
+        self._saturated_ticks = self._saturated_ticks + 1 if saturated else 0
         if self._fraction_near:  # set by an old wrench, for which `_check_in_detail` is not called
             self._fraction_near, self.warning = False, True
         limits = self._limits
@@ -351,7 +351,7 @@ class LimitWatch:
                 _checked_value("stale angle", self._stale_angles, limits.stale_ticks_in_a_row),
                 _checked_value("stale wrench", self._stale_wrenches, limits.stale_ticks_in_a_row),
                 _checked_value(
-                    "gauge saturation", self._saturated, limits.saturated_ticks_in_a_row
+                    "gauge saturation", self._saturated_ticks, limits.saturated_ticks_in_a_row
                 ),
             )
         )

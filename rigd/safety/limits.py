@@ -15,7 +15,7 @@ from rigd.beam.tip import SMALL_SLOPE_RAD
 
 Positive = Annotated[float, Gt(0)]
 """Type of a number above 0."""
-BelowAll = Annotated[float, Gt(0), Lt(100)]
+PercentageBelow100 = Annotated[float, Gt(0), Lt(100)]
 """Type of a percentage above 0 and below 100."""
 
 BUFFERED_S = 16.0
@@ -57,7 +57,7 @@ class Limits:
     """Consecutive ticks for which an old angle or wrench may replace a missing one."""
     missed_ticks_in_a_row: Annotated[int, Ge(1)]
     """Consecutive ticks that the loop may miss."""
-    missed_percent: BelowAll
+    missed_percent: PercentageBelow100
     """Largest percentage of missed ticks in the ticks scheduled so far, of at least ten seconds."""
     tare_drift_nm: Positive
     """Largest change of the coupling torque's zero in a session, or since the previous session."""
@@ -75,7 +75,7 @@ class Limits:
 
     The inverse ratio has the same limit. The ratio is 1 if all scales of encoder and motor are
     right."""
-    stale_percent: BelowAll = field(default=1.0, metadata={"optional": True})
+    stale_percent: PercentageBelow100 = field(default=1.0, metadata={"optional": True})
     """Largest percentage of old angles, and of old wrenches, in the ticks scheduled so far.
 
     It is counted as for `missed_percent`. ``analyze`` accepts no record with more than 1 %."""

@@ -113,8 +113,10 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
     )
     delay_ticks = max(0, round(rig.command_delay_s * rig.rate_hz))
     command = np.concatenate([np.zeros(delay_ticks), move.torques_nm])[: angle.size]
-    moving: NDArray[np.bool_] = np.abs(speed) > _MIN_SPEED_FRACTION * max_speed
-    found = _fit_motor_equation(smooth(command), acceleration, speed, beam_nm, moving, window.size)
+    is_moving: NDArray[np.bool_] = np.abs(speed) > _MIN_SPEED_FRACTION * max_speed
+    found = _fit_motor_equation(
+        smooth(command), acceleration, speed, beam_nm, is_moving, window.size
+    )
     scale, scale_std, inertia, inertia_std, coulomb, viscous = found
     if ratio and ratio_std and scale and scale_std and inertia and inertia_std:
         # Both uncertainties enter the fitted torque of the beam.
@@ -151,7 +153,7 @@ def _coupling_ratio(
 
     Returns the ratio, its standard deviation, and the fitted coupling torque without noise.
     """
-    best: tuple[float, float, float, Real] | None = None
+    best_fit: tuple[float, float, float, Real] | None = None
     for beam_nm in _beam_torques(rig, angle):
         expected = np.convolve(beam_nm, window, "valid")
         squares = float(expected @ expected)
@@ -159,11 +161,11 @@ def _coupling_ratio(
             continue
         ratio = float(expected @ measured) / squares
         residual = float(np.sum((measured - ratio * expected) ** 2))
-        if best is None or residual < best[0]:
+        if best_fit is None or residual < best_fit[0]:
             # Smoothed samples within a window are not independent.
             variance = residual / expected.size * _samples_per_independent_one(window) / squares
-            best = residual, ratio, sqrt(variance), ratio * expected
-    return (None, None, np.zeros_like(measured)) if best is None else best[1:]
+            best_fit = residual, ratio, sqrt(variance), ratio * expected
+    return (None, None, np.zeros_like(measured)) if best_fit is None else best_fit[1:]
 
 
 def _samples_per_independent_one(window: Real) -> float:
@@ -203,7 +205,7 @@ def _fit_motor_equation(
     acceleration: Real,
     speed: Real,
     beam_nm: Real,
-    moving: NDArray[np.bool_],
+    is_moving: NDArray[np.bool_],
     window_ticks: float,
 ) -> tuple[float | None, ...]:
     """Fit the motor's equation of motion to the samples in which the shaft moves.
@@ -211,7 +213,7 @@ def _fit_motor_equation(
     Returns the torque scale and its standard deviation, the inertia and its standard deviation,
     Coulomb and viscous friction. All are None if they cannot be estimated.
     """
-    columns = np.stack([beam_nm, acceleration, np.sign(speed), speed], axis=1)[moving]
+    columns = np.stack([beam_nm, acceleration, np.sign(speed), speed], axis=1)[is_moving]
     size = np.linalg.norm(columns, axis=0)
     if len(columns) < 2 * _MIN_SAMPLES or not size.all():
         return (None,) * 6
@@ -220,8 +222,8 @@ def _fit_motor_equation(
     if np.linalg.cond(normal) > _MAX_CONDITION_NUMBER:
         return (None,) * 6
     inverse = np.linalg.inv(normal)
-    solution = inverse @ (columns.T @ command[moving])
-    residual = command[moving] - columns @ solution
+    solution = inverse @ (columns.T @ command[is_moving])
+    residual = command[is_moving] - columns @ solution
     variance = float(residual @ residual) / len(residual) * window_ticks * np.diag(inverse)
     per_scale, inertia, coulomb, viscous = (solution / size).tolist()
     per_scale_std, inertia_std = (np.sqrt(variance) / size)[:2].tolist()

@@ -282,7 +282,7 @@ class ProbingMove:
         self._plan = plan
         self._start_rad = start_rad
         self._period_s = 1.0 / rate_hz
-        self._follower = BeamFollower(rig)
+        self._beam_follower = BeamFollower(rig)
         inertia = rig.inertia_kg_m2 + rig.beam.inertia_kg_m2 + rig.tool_inertia_kg_m2
         bandwidth = min(_BANDWIDTH_RAD_S, 0.05 * rate_hz)
         self._gain = inertia * bandwidth
@@ -290,23 +290,23 @@ class ProbingMove:
         self._speed_ticks = max(2, round(_SPEED_WINDOW_S * rate_hz))
         self._filter_gain = 1.0 / (1.0 + _COMPARISON_TIME_CONSTANT_S * rate_hz)
         self._min_difference_nm = max(_MIN_DIFFERENCE_NM, _MIN_DIFFERENCE_STDS * torque_noise_nm)
-        self._moved_rad = max(_MIN_MOVEMENT_STEPS * rig.resolution_rad, _MIN_MOVEMENT_RAD)
+        self._min_movement_rad = max(_MIN_MOVEMENT_STEPS * rig.resolution_rad, _MIN_MOVEMENT_RAD)
         first_side = -1.0 if start_rad > 0.0 else 1.0
         self._strokes = [
             (side * first_side, speed)
             for speed in (plan.speed_rad_s, plan.fast_rad_s)
             for side in (1.0, -1.0)
         ]
-        self._stroke = 0
+        self._stroke_index = 0
         self._stroke_start_rad = 0.0
-        self._moving_since: int | None = None
+        self._moving_since_tick: int | None = None
         self._stroke_start = 0
         self._integral_nm = 0.0
         self._stroke_torque_nm = 0.0
         self._torque_nm = 0.0
         self._smooth_coupling_nm = self._smooth_beam_nm = 0.0
         self._recent_beam_nm = 0.0
-        self._beam_squares = self._products = 0.0
+        self._beam_squares = self._beam_coupling_products = 0.0
         self.end: ProbeEnd | None = None
         self.missed = 0
         self.angles_rad: list[float] = []
@@ -354,11 +354,11 @@ class ProbingMove:
 
     def _compare_coupling_torque(self, angle_rad: float, coupling_nm: float) -> None:
         """End the move if the measured coupling torque differs too much from the beam's torque."""
-        beam_nm = self._follower.step(angle_rad)
+        beam_nm = self._beam_follower.step(angle_rad)
         self._smooth_beam_nm += self._filter_gain * (beam_nm - self._smooth_beam_nm)
         self._smooth_coupling_nm += self._filter_gain * (coupling_nm - self._smooth_coupling_nm)
         self._beam_squares += self._smooth_beam_nm**2
-        self._products += self._smooth_beam_nm * self._smooth_coupling_nm
+        self._beam_coupling_products += self._smooth_beam_nm * self._smooth_coupling_nm
         # The tolerance uses the largest torque of the last third of a second, since the torque is
         # small at zero crossings.
         decay = 1.0 - 3.0 * self._period_s
@@ -395,11 +395,11 @@ class ProbingMove:
 
     def _stroke_torque(self, angle_rad: float) -> float:
         """Return the torque of the present stroke in N·m."""
-        side, speed = self._strokes[self._stroke]
+        side, speed = self._strokes[self._stroke_index]
         plan = self._plan
-        if self._moving_since is None:
+        if self._moving_since_tick is None:
             return self._breakaway_torque(side, side * (angle_rad - self._stroke_start_rad))
-        elapsed_s = (self._tick_count - self._moving_since) * self._period_s
+        elapsed_s = (self._tick_count - self._moving_since_tick) * self._period_s
         speed_fraction = _smooth_step(elapsed_s / _SPEED_RAMP_S) - _smooth_step(
             (elapsed_s - plan.cruise_s) / _SPEED_RAMP_S
         )
@@ -411,11 +411,11 @@ class ProbingMove:
 
     def _breakaway_torque(self, side: float, moved_rad: float) -> float:
         """Return the torque in N·m before the shaft moves, which rises from tick to tick."""
-        if moved_rad < -self._moved_rad and self._stroke == 0:
+        if moved_rad < -self._min_movement_rad and self._stroke_index == 0:
             self.end = ProbeEnd.REVERSED
             return 0.0
-        if moved_rad > self._moved_rad:
-            self._moving_since = self._tick_count
+        if moved_rad > self._min_movement_rad:
+            self._moving_since_tick = self._tick_count
             return self._integral_nm
         self._integral_nm += side * self._plan.torque_rise_nm_per_s * self._period_s
         if abs(self._integral_nm) > self._plan.torque_limit_nm:
@@ -429,21 +429,21 @@ class ProbingMove:
         The move ends after the last stroke, or if the coupling torque differs too much from the
         beam's torque in the strokes so far.
         """
-        self._stroke += 1
-        ratio = self._products / self._beam_squares if self._beam_squares else inf
-        if self._stroke == len(self._strokes):
+        self._stroke_index += 1
+        ratio = self._beam_coupling_products / self._beam_squares if self._beam_squares else inf
+        if self._stroke_index == len(self._strokes):
             self.end = ProbeEnd.COMPLETE
         elif not _COUPLING_RATIO_BAND[0] < ratio < _COUPLING_RATIO_BAND[1]:
             self.end = ProbeEnd.PULLED
         if self.end is not None:
             return 0.0
-        self._stroke_start_rad, self._moving_since, self._stroke_start = (
+        self._stroke_start_rad, self._moving_since_tick, self._stroke_start = (
             angle_rad,
             None,
             self._tick_count,
         )
         self._integral_nm = (
-            self._strokes[self._stroke][0] * _INITIAL_TORQUE_FRACTION * self._stroke_torque_nm
+            self._strokes[self._stroke_index][0] * _INITIAL_TORQUE_FRACTION * self._stroke_torque_nm
         )
         return self._integral_nm
 

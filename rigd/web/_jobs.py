@@ -192,14 +192,14 @@ class Jobs:
         )
         give_way(process.pid)
         communication = asyncio.create_task(process.communicate())
-        stopped = False
+        suspended = False
         try:
             while not communication.done():
                 if job.dropped:
                     raise JobError("A session has begun.")
-                if self.paused is not stopped:
-                    stopped = self.paused
-                    _signal_group(process.pid, signal.SIGSTOP if stopped else signal.SIGCONT)
+                if self.paused is not suspended:
+                    suspended = self.paused
+                    _signal_group(process.pid, signal.SIGSTOP if suspended else signal.SIGCONT)
                 await asyncio.wait((communication,), timeout=_POLL_PERIOD_S)
             _, stderr = communication.result()
         finally:

@@ -28,8 +28,8 @@ from rigd.web._access import ICON, LIVE, Connections, WebAccess, read_json_objec
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
 from rigd.web._link import BusyError, DaemonError, DaemonLink
-from rigd.web._live import Pages
-from rigd.web._signals import Block, SessionResponse, Strips, nominal_document
+from rigd.web._live_messages import Pages
+from rigd.web._signals import SessionResponse, SignalBlock, SignalEnvelopes, nominal_document
 
 Document = dict[str, Any]
 
@@ -81,16 +81,16 @@ class OperatorPageServer:
         self._stopping = ThreadPoolExecutor(_MAX_STOPS, "stop")
         self._link = DaemonLink(self._socket, self._process_message, self._report_loss)
         self._excitations = dict(_excitations())
-        self._nominal = self._nominal_message(job)
+        self._nominal_response = self._nominal_message(job)
         self._specimens: list[str] = []
         self._status: Document | None = None
-        self._lost: Document | None = None
-        self._gauges: Document | None = None
-        self._strips = Strips()
+        self._lost_message: Document | None = None
+        self._gauges_message: Document | None = None
+        self._envelopes = SignalEnvelopes()
         self._session: str | None = None
         self._response: SessionResponse | None = None
         self._shown: Document | None = None
-        self._last: Document | None = None
+        self._last_response: Document | None = None
         self._searches: set[asyncio.Task[None]] = set()
 
     def application(self) -> web.Application:
@@ -101,10 +101,10 @@ class OperatorPageServer:
         application.on_response_prepare.append(self._access.add_security_headers)
         application.add_routes(
             [
-                web.get("/", self._static),
-                web.get("/static/{name}", self._static),
-                web.get(ICON, self._static),
-                web.get(LIVE, self._live),
+                web.get("/", self._static_file),
+                web.get("/static/{name}", self._static_file),
+                web.get(ICON, self._static_file),
+                web.get(LIVE, self._live_messages),
                 web.post("/api/command", self._command),
                 *self._library.routes(),
             ]
@@ -123,7 +123,7 @@ class OperatorPageServer:
 
     # Requests
 
-    async def _static(self, request: web.Request) -> web.StreamResponse:
+    async def _static_file(self, request: web.Request) -> web.StreamResponse:
         """Send a static file of the page."""
         name = request.match_info.get(
             "name", "index.html" if request.path == "/" else "favicon.svg"
@@ -134,9 +134,9 @@ class OperatorPageServer:
         headers = {"Cross-Origin-Resource-Policy": "cross-origin"}
         return web.FileResponse(path, headers=headers if request.path == ICON else None)
 
-    async def _live(self, request: web.Request) -> web.StreamResponse:
+    async def _live_messages(self, request: web.Request) -> web.StreamResponse:
         """Send live messages to a page until it is closed."""
-        hello = {
+        hello_message = {
             "type": "hello",
             "profile": self._job["profile"],
             "description": self._job["description"],
@@ -148,8 +148,14 @@ class OperatorPageServer:
             "units": dict(UNITS),
         }
         first_messages = (
-            *(hello, self._lost, self._status, self._gauges, self._strips.last()),
-            *(self._nominal, self._last, self._shown),
+            *(
+                hello_message,
+                self._lost_message,
+                self._status,
+                self._gauges_message,
+                self._envelopes.last(),
+            ),
+            *(self._nominal_response, self._last_response, self._shown),
         )
         return await self.pages.serve(request, filter(None, first_messages), self._stop_for_page)
 
@@ -196,8 +202,8 @@ class OperatorPageServer:
 
     def _process_message(self, message: Document) -> None:
         """Process a message of the daemon, and send its content to the open pages."""
-        if self._lost is not None:
-            self._lost = None
+        if self._lost_message is not None:
+            self._lost_message = None
             self._link.request_status()
         event = message.get("event")
         if event is None:
@@ -233,9 +239,9 @@ class OperatorPageServer:
     def _prepare_session(self, path: str, series: Document) -> None:
         """Prepare the frequency responses that the pages show during a new session."""
         plan, rate_hz = series["plan"], self._job["rate_hz"]
-        self._nominal = self._nominal_message(plan)
+        self._nominal_response = self._nominal_message(plan)
         first, end = sweep_of(plan["segments"])
-        self._shown = self._last = None
+        self._shown = self._last_response = None
         self._response = None
         if series["excitation"] != "hold":
             self._response = SessionResponse(
@@ -251,7 +257,7 @@ class OperatorPageServer:
                     self._job["torque_delay_s"],
                 )
             )
-        self.pages.send(self._nominal)  # the pages then clear the other responses
+        self.pages.send(self._nominal_response)  # the pages then clear the other responses
         specimen = str(series["notes"].get("specimen", ""))
         self._start_search(self._find_last(specimen, Path(path).stem))
 
@@ -263,20 +269,24 @@ class OperatorPageServer:
     def _process_signals(self, event: Document) -> None:
         """Send a block of signals and the gauges to the open pages."""
         if event["count"]:
-            block = Block.of_event(event)
-            self.pages.send(self._strips.feed(block))
+            block = SignalBlock.of_event(event)
+            self.pages.send(self._envelopes.feed(block))
             if self._response is not None:
                 self._response.feed(block)
         if event["gauges"] is not None:
             frequency_hz = event["frequency_hz"]
-            self._gauges = {"type": "gauges", **event["gauges"], "frequency_hz": frequency_hz}
-            self.pages.send(self._gauges)
+            self._gauges_message = {
+                "type": "gauges",
+                **event["gauges"],
+                "frequency_hz": frequency_hz,
+            }
+            self.pages.send(self._gauges_message)
 
     def _report_loss(self, reason: str) -> None:
         """Report to the open pages that the daemon cannot be reached, with the reason."""
-        if self._lost is None or self._lost["reason"] != reason:
-            self._lost = {"type": "lost", "reason": reason}
-            self.pages.send(self._lost)
+        if self._lost_message is None or self._lost_message["reason"] != reason:
+            self._lost_message = {"type": "lost", "reason": reason}
+            self.pages.send(self._lost_message)
         self._status = None
 
     async def _send_responses(self) -> None:
@@ -297,14 +307,14 @@ class OperatorPageServer:
     async def _find_specimens(self) -> None:
         """Update the names of specimens that the page suggests."""
         with suppress(OSError, ValueError):
-            used = await self._library.specimens()
-            self._specimens = list(dict.fromkeys([*used, *specimen_files()]))
+            recorded_specimens = await self._library.specimens()
+            self._specimens = list(dict.fromkeys([*recorded_specimens, *specimen_files()]))
 
     async def _find_last(self, specimen: str, but: str) -> None:
         """Send the response of the specimen's last session, except `but`, to the open pages."""
         with suppress(OSError, ValueError):
-            self._last = await self._library.last_response(specimen, but)
-            self.pages.send(self._last)
+            self._last_response = await self._library.last_response(specimen, but)
+            self.pages.send(self._last_response)
 
 
 def _excitations() -> Iterator[tuple[str, list[Document]]]:
@@ -332,8 +342,8 @@ def _descriptions(text: str) -> dict[str, str]:
     section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", text, re.DOTALL | re.MULTILINE)
     entries = re.findall(r"^(\S.*)\n((?: +.*\n?)+)", section[1], re.MULTILINE) if section else []
     return {
-        name.strip(): " ".join(words.split())
-        for names, words in entries
+        name.strip(): " ".join(description.split())
+        for names, description in entries
         for name in names.split(",")
     }
 

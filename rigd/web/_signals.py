@@ -20,7 +20,7 @@ from rigd.view.frequency_charts import LAST_HZ, SweepResponse, nominal_response,
 Document = dict[str, Any]
 Real = npt.NDArray[np.float64]
 
-STRIP_S: Final = 0.05
+ENVELOPE_POINT_S: Final = 0.05
 """Duration in seconds of each point of an envelope."""
 _STORED_DURATION_S: Final = 10.0
 """Seconds of the envelopes that are stored for new pages."""
@@ -46,7 +46,7 @@ _SAMPLE_TYPE: Final = np.dtype(  # Type of the samples that the frequency respon
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class SignalBlock:
     """Block of the daemon's signals at consecutive ticks."""
 
     first_tick: int
@@ -57,7 +57,7 @@ class Block:
     """Angle (rad), its reference (rad) and coupling torque (N·m), shape (3, n); NaN if unknown."""
 
     @classmethod
-    def of_event(cls, event: Mapping[str, Any]) -> "Block":
+    def of_event(cls, event: Mapping[str, Any]) -> "SignalBlock":
         """Decode the block of signals in the daemon's event ``signals``."""
         data = b"".join(base64.b64decode(event[name]) for name in _SIGNAL_NAMES)
         values = np.frombuffer(data, dtype="<f4").reshape(len(_SIGNAL_NAMES), -1).astype(np.float64)
@@ -67,7 +67,7 @@ class Block:
 # Strips
 
 
-class Strips:
+class SignalEnvelopes:
     """Computes and stores the envelopes of angle, reference and torque over the last 10 s.
 
     Each point of an envelope has the extremes within 0.05 s.
@@ -75,7 +75,7 @@ class Strips:
 
     def __init__(self) -> None:
         self._points: deque[tuple[float | None, ...]] = deque(
-            maxlen=round(_STORED_DURATION_S / STRIP_S)
+            maxlen=round(_STORED_DURATION_S / ENVELOPE_POINT_S)
         )
         self._next_point = 0
         """Index of the next point since the start of the session."""
@@ -84,9 +84,9 @@ class Strips:
         self._next_tick = 0
         """Tick that is expected next."""
 
-    def feed(self, block: Block) -> Document | None:
+    def feed(self, block: SignalBlock) -> Document | None:
         """Add a block, and return the message with the points that it completes, or None."""
-        ticks = max(1, round(STRIP_S * block.rate_hz))
+        ticks = max(1, round(ENVELOPE_POINT_S * block.rate_hz))
         values = block.values
         missing = block.first_tick - self._next_tick
         if missing < 0 or missing > _STORED_DURATION_S * block.rate_hz:
@@ -127,8 +127,8 @@ def _envelope_message(first: int, points: list[tuple[float | None, ...]]) -> Doc
     columns = zip(*points, strict=True)
     return {
         "type": "strip",
-        "t0_s": round(first * STRIP_S, 3),
-        "dt_s": STRIP_S,
+        "t0_s": round(first * ENVELOPE_POINT_S, 3),
+        "dt_s": ENVELOPE_POINT_S,
         **{name: list(column) for name, column in zip(names, columns, strict=True)},
     }
 
@@ -154,11 +154,11 @@ class SessionResponse:
         self._subject = subject
         self._sweep = SweepResponse(subject, LAST_HZ, every=_BIN_STEP)
         self._thinning: Thinning | None = None
-        self._queued_blocks: list[Block] = []
+        self._queued_blocks: list[SignalBlock] = []
         self._has_new_data = False
         self._reached_hz = 0.0
 
-    def feed(self, block: Block) -> None:
+    def feed(self, block: SignalBlock) -> None:
         """Add a block of signals; its unknown values are ignored."""
         self._queued_blocks.append(block)
         if len(self._queued_blocks) >= _BLOCKS_PER_UPDATE:

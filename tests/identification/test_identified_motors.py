@@ -17,9 +17,9 @@ from rigd.identification import with_cautious_controller, with_tuned_controller
 from rigd.identification.estimate import PassReadings, Timing, estimate_motor
 from rigd.identification.experiments import (
     HIGHEST_FREQUENCY_HZ,
-    lay_out_passes,
     multisine_session,
-    read_layout,
+    passes_of_schedule,
+    read_schedule,
     speeds_session,
     trial_session,
 )
@@ -114,7 +114,7 @@ def as_text(excitation):
 
 
 def windows_of(excitation, signals, session):
-    layout = read_layout(as_text(excitation))
+    layout = read_schedule(as_text(excitation))
     return [
         PassReadings(
             *(signal[run.first : run.end] for signal in signals),
@@ -123,7 +123,7 @@ def windows_of(excitation, signals, session):
             session,
             (session, run.speed_rad_s),
         )
-        for run in lay_out_passes(layout, excitation.rate_hz)
+        for run in passes_of_schedule(layout, excitation.rate_hz)
     ]
 
 
