@@ -15,7 +15,7 @@ from rigd.identification.experiments import (
     read_schedule,
 )
 from rigd.session import Session, read_session, sample_digests
-from rigd.session.schedule import Status
+from rigd.session.layout import Status
 
 _UNUSABLE_STATUS = int(
     Status.ANGLE_STALE | Status.WRENCH_STALE | Status.WRENCH_SATURATED | Status.TORQUE_OFF

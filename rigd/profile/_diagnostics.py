@@ -134,7 +134,8 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     if limit_nm < peak_nm:
         yield (
             f"limits.torque_command_nm = {limit_nm:g} N·m is below motor.peak_torque_nm = "
-            f"{peak_nm:g} N·m, where commands saturate; the controller's command limit must be higher."
+            f"{peak_nm:g} N·m, where commands saturate; the controller's command limit must be "
+            "higher."
         )
     angle, stop = values["limits.angle_rad"], values["limits.stop_angle_rad"]
     if stop <= angle:

@@ -28,8 +28,8 @@ from rigd.web._access import ICON, LIVE, Connections, WebAccess, read_json_objec
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
 from rigd.web._link import BusyError, DaemonError, DaemonLink
-from rigd.web._live_messages import Pages
-from rigd.web._signals import SessionResponse, SignalBlock, SignalEnvelopes, nominal_document
+from rigd.web._live import Pages
+from rigd.web._signals import PageSignalBlock, SessionResponse, SignalEnvelopes, nominal_document
 
 Document = dict[str, Any]
 
@@ -269,7 +269,7 @@ class OperatorPageServer:
     def _process_signals(self, event: Document) -> None:
         """Send a block of signals and the gauges to the open pages."""
         if event["count"]:
-            block = SignalBlock.of_event(event)
+            block = PageSignalBlock.of_event(event)
             self.pages.send(self._envelopes.feed(block))
             if self._response is not None:
                 self._response.feed(block)

@@ -46,7 +46,7 @@ _SAMPLE_TYPE: Final = np.dtype(  # Type of the samples that the frequency respon
 
 
 @dataclass(frozen=True, slots=True)
-class SignalBlock:
+class PageSignalBlock:
     """Block of the daemon's signals at consecutive ticks."""
 
     first_tick: int
@@ -57,7 +57,7 @@ class SignalBlock:
     """Angle (rad), its reference (rad) and coupling torque (N·m), shape (3, n); NaN if unknown."""
 
     @classmethod
-    def of_event(cls, event: Mapping[str, Any]) -> "SignalBlock":
+    def of_event(cls, event: Mapping[str, Any]) -> "PageSignalBlock":
         """Decode the block of signals in the daemon's event ``signals``."""
         data = b"".join(base64.b64decode(event[name]) for name in _SIGNAL_NAMES)
         values = np.frombuffer(data, dtype="<f4").reshape(len(_SIGNAL_NAMES), -1).astype(np.float64)
@@ -84,7 +84,7 @@ class SignalEnvelopes:
         self._next_tick = 0
         """Tick that is expected next."""
 
-    def feed(self, block: SignalBlock) -> Document | None:
+    def feed(self, block: PageSignalBlock) -> Document | None:
         """Add a block, and return the message with the points that it completes, or None."""
         ticks = max(1, round(ENVELOPE_POINT_S * block.rate_hz))
         values = block.values
@@ -154,11 +154,11 @@ class SessionResponse:
         self._subject = subject
         self._sweep = SweepResponse(subject, LAST_HZ, every=_BIN_STEP)
         self._thinning: Thinning | None = None
-        self._queued_blocks: list[SignalBlock] = []
+        self._queued_blocks: list[PageSignalBlock] = []
         self._has_new_data = False
         self._reached_hz = 0.0
 
-    def feed(self, block: SignalBlock) -> None:
+    def feed(self, block: PageSignalBlock) -> None:
         """Add a block of signals; its unknown values are ignored."""
         self._queued_blocks.append(block)
         if len(self._queued_blocks) >= _BLOCKS_PER_UPDATE:

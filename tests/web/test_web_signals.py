@@ -8,7 +8,7 @@ import pytest
 
 from rigd.beam import Beam, Damping, transfer
 from rigd.view import Subject
-from rigd.web._signals import SessionResponse, SignalBlock, SignalEnvelopes, nominal_document
+from rigd.web._signals import PageSignalBlock, SessionResponse, SignalEnvelopes, nominal_document
 
 RATE_HZ = 1000.0
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
@@ -18,7 +18,7 @@ def block(first, angle, reference=None, torque=None):
     angle = np.asarray(angle, dtype=float)
     reference = angle if reference is None else np.asarray(reference, dtype=float)
     torque = -angle if torque is None else np.asarray(torque, dtype=float)
-    return SignalBlock(first, RATE_HZ, np.stack((angle, reference, torque)))
+    return PageSignalBlock(first, RATE_HZ, np.stack((angle, reference, torque)))
 
 
 def test_a_block_is_what_the_event_tells():
@@ -26,7 +26,7 @@ def test_a_block_is_what_the_event_tells():
         name: base64.b64encode(np.array([k, np.nan], dtype="<f4").tobytes()).decode()
         for k, name in enumerate(("angle_rad", "angle_reference_rad", "coupling_torque_nm"))
     }
-    found = SignalBlock.of_event(told | {"first_tick": 7, "rate_hz": RATE_HZ})
+    found = PageSignalBlock.of_event(told | {"first_tick": 7, "rate_hz": RATE_HZ})
     assert (found.first_tick, found.values[:, 0].tolist()) == (7, [0.0, 1.0, 2.0])
     assert np.isnan(found.values[0, 1])
 
