@@ -451,7 +451,7 @@ def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
 
 
 def _parameter_key(name: str) -> str:
-    """Return a parameter's key in `_PARAMETERS`: its name, for an offset without the mode."""
+    """Return the key of a parameter in `_PARAMETERS`; that of an offset lacks the mode's number."""
     return (
         _OFFSET_PREFIX
         if name.startswith(_OFFSET_PREFIX) and name[len(_OFFSET_PREFIX) :].isdecimal()

@@ -140,7 +140,7 @@ class TransferGrid:
         self._parts = [slice(i, i + _BLOCK_POINTS) for i in range(0, points.size, _BLOCK_POINTS)]
 
     def evaluate(self, beam: Beam, damping: Damping) -> Complex:
-        """Return the coupling torque per motor angle in N·m/rad at the grid's s, in its shape.
+        """Return the coupling torque per motor angle in N·m/rad at all s of the grid.
 
         Parameters
         ----------

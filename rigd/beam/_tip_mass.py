@@ -56,7 +56,9 @@ The first column is ``1 + cos z cosh z``, the others are the numerators of F, U 
 _MAX_HOMOTOPY_STEPS = 12
 """Largest number of steps in which the tip mass and the clamp's compliance grow from zero."""
 _CHANGE_PER_STEP = 0.02
-"""Change in one such step, relative to the mass and compliance of the beam itself."""
+"""Growth of tip mass and compliance in one step while poles are followed.
+
+It is relative to the mass and the compliance of the beam itself."""
 _MAX_NEWTON_STEPS = 60
 """Largest number of Newton's iterations."""
 _NEWTON_TOLERANCE = 1e-10
@@ -72,7 +74,9 @@ _MAX_ROOT_TO_START_RATIO = 10.0
 _START_POLE_DISTANCE = 1e-7
 """Relative distance of the first starts from the poles, where G of an undamped beam is infinite."""
 _POLE_DISTANCE = 1e-8
-"""Relative distance from a pole at which G and its derivatives replace those at the pole.
+"""Relative distance from a pole at which the response and its derivatives are evaluated.
+
+At the pole itself of a rigidly clamped beam they are infinite.
 
 It is the square root of the rounding error relative to G there."""
 

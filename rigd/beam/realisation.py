@@ -139,7 +139,7 @@ def state_output(
     inertial: bool,
     small: float = 0.0,
 ) -> StateOutput:
-    """Fit a response of the beam, such as its base shear, as an output of its realisation.
+    """Fit another response of the beam, such as its base shear, to the states of a realisation.
 
     Parameters
     ----------

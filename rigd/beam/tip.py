@@ -30,9 +30,9 @@ from the linear ones by fractions of that size, the accuracy of a careful sessio
 _EXTENSION_FACTOR = 1.125
 """Length of the extended record relative to the record."""
 _DECAY_EXPONENT = 7.0
-"""Exponent by which the weighting of the Fourier transform has decayed at its end.
+"""Exponent of the decay of the weighting by which the record is multiplied before its FFT.
 
-It suppresses the wrap-around."""
+The weighting suppresses the wrap-around."""
 _BLOCK_POINTS = 1 << 15
 """Number of frequencies evaluated at once: those of an hour at 1 kHz would take a gigabyte."""
 

@@ -72,7 +72,7 @@ class Results:
 
     @property
     def highest_rate_hz(self) -> float | None:
-        """Highest rate in Hz at which nearly all ticks ran in time, or None if there is none."""
+        """Highest measured rate in Hz at which nearly all ticks ran in time, or None."""
         held_rates = [one.rate_hz for one in self.search if one.held >= HELD_FRACTION]
         return max(held_rates, default=None)
 

@@ -195,7 +195,7 @@ def _figures(values: npt.NDArray[np.float64]) -> dict[str, float]:
 _FIRST_US, _LAST_US = 1.0, 100_000.0
 """Lowest edge above 0 and highest edge of the histogram's bins, in µs."""
 _DECADE_STEPS = (1.0, 2.0, 5.0)
-"""Edges of the bins in each decade, relative to its beginning."""
+"""Edges of the histogram's bins within a decade, relative to the beginning of the decade."""
 _LABEL_WIDTH = 18
 """Width of the bins' labels in characters."""
 _BAR_WIDTH = 20

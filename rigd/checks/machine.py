@@ -141,7 +141,7 @@ _CLOCK_SOURCE_FILE = Path("sys/devices/system/clocksource/clocksource0/current_c
 _RUNTIME_FILE = Path("proc/sys/kernel/sched_rt_runtime_us")
 """File with the microseconds of each period that real-time processes may use."""
 _PERIOD_FILE = Path("proc/sys/kernel/sched_rt_period_us")
-"""File with the length of that period in microseconds."""
+"""File with the period in microseconds in which the kernel limits real-time processes."""
 _REALTIME_KERNEL_FILE = Path("sys/kernel/realtime")
 """File that contains 1 on a real-time kernel."""
 _TIMEX_SIZE = 512

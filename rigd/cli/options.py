@@ -185,7 +185,10 @@ def session_notes(
 
 
 def profile_named(name: str) -> "Profile":
-    """Load a profile by its name or file; its slow modules are imported only when it is called."""
+    """Load a profile by its name or file.
+
+    The slow modules of profiles are imported in the function, for a quick start of other commands.
+    """
     from rigd.profile import load_profile
 
     return load_profile(name)

@@ -22,7 +22,7 @@ _STATE_STYLES = {  # Style of each state of the daemon
 _MAX_SHOWN_TRANSITIONS = 4
 """Number of the daemon's last changes of state that are shown."""
 _BUSY_PERCENT = 80.0
-"""Bus load in per cent above which it is highlighted."""
+"""Load of the CAN bus in per cent above which the load is highlighted."""
 
 
 def print_status(status: dict[str, Any]) -> None:

@@ -321,7 +321,7 @@ LEAST_REPEATS = 4
 _MIN_SPEED_FRACTION = 0.1
 """Fraction of the nominal speed below which the shaft may have stood still."""
 _HALF_SPEED_WINDOW_S = 0.01
-"""Half the time in seconds over which this speed is measured."""
+"""Half the time in seconds over which the shaft's speed is measured to detect a standstill."""
 _MAX_SCALE_STD = 0.05
 """Largest standard deviation of an estimated torque scale: the accuracy of a datasheet's value."""
 _PLAUSIBLE_SCALES = (0.5, 2.0)

@@ -136,7 +136,7 @@ class RerunProgram:
         self._process.wait()
 
     def _wait_for_log(self) -> None:
-        """Wait for further log lines, of an ended program for all of them."""
+        """Wait a moment for further log lines, or until the log of an ended program is complete."""
         # After the end of the program the thread reads the log to its end.
         self._reader.join(timeout=_LOG_WAIT_S if self.running else _LAST_LOG_WAIT_S)
 

@@ -83,7 +83,7 @@ class RerunServer:
         return self.address
 
     def poll(self) -> bool:
-        """Restart the server if it has ended, and return whether it is in operation."""
+        """Restart the server if it has ended, and return whether a server accepts connections."""
         program = self._program
         if program.running and program.grpc_port and program.page_port:
             if self.address is None:

@@ -325,7 +325,9 @@ def _arm_watchdog() -> None:
 # Queue of drawings
 
 _MAX_REQUIRED_DRAWINGS: Final = 1000
-"""Largest number of queued drawings that must not be dropped; the oldest beyond it are dropped."""
+"""Largest number of queued events and other required drawings.
+
+Only beyond it the oldest of them are dropped."""
 
 
 class Backlog:

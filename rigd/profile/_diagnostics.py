@@ -63,7 +63,7 @@ _FIRST_MODE_BAND_HZ = 0.1, 100.0
 _PER_MILLE_LIMIT = 32.767
 """Largest ratio of torque to rated torque that the 16 bits of object 6071 can hold."""
 _ROUNDING_S = 1e-9
-"""Rounding error in seconds by which a delay may be below its smallest value."""
+"""Largest rounding error in seconds of a stated delay."""
 _PARALLEL_TOLERANCE = 1e-6
 """Squared sine of the angle between two projections below which they count as parallel."""
 _MAX_VALUE_CHARACTERS = 200

@@ -29,7 +29,7 @@ _TORQUE_LIMIT_NAME = re.compile(
 _MANUFACTURER_INDICES = range(0x2000, 0x6000)
 """Indices of manufacturer-specific CANopen objects."""
 _MAX_NAMED_OBJECTS = 4
-"""Largest number of such objects in a comment."""
+"""Largest number of manufacturer-specific objects that a comment names."""
 
 
 class UnusableDriveError(FailureError, ValueError):

@@ -1,4 +1,4 @@
-"""Schema of a profile: its sections and their keys, and settings without another module."""
+"""Schema of a profile: sections, keys and sources, and the settings that this module declares."""
 
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields

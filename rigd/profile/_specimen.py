@@ -33,11 +33,11 @@ _DAMPING_SECTION: Final = "beam.damping"
 _UNCERTAINTY_SECTION: Final = "uncertainty"
 """Name of the section with the uncertainties."""
 _RIG_UNCERTAINTY_KEY: Final = "uncertainty.torque_scale_percent"
-"""Key of that section that belongs to the rig and not to a specimen."""
+"""Key of the uncertainties that belongs to the rig and not to a specimen."""
 _NOTE_KEY: Final = "note"
 """Key of the free text."""
 _MAX_BYTES: Final = 16_384
-"""Largest size of a specimen file in bytes, since each session sends it through a pipe."""
+"""Largest size of a specimen file in bytes, which each session sends through a pipe."""
 
 
 def load_specimen(path: Path) -> Specimen:

@@ -23,7 +23,7 @@ _NO_JUMP_CHECK_TICKS = 3
 The encoder is latched at irregular times then."""
 
 _MIN_STALL_S = 0.005
-"""Shortest stall of the loop in seconds that is reported as the cause of a violation after it."""
+"""Shortest stall of the loop in seconds that is reported as the cause of a later violation."""
 
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 """Names of the force-torque sensor's axes in messages."""
@@ -408,7 +408,10 @@ class LimitWatch:
         return 100.0 * ticks / max(scheduled, self._fraction_window)
 
     def _assess_fraction(self, *checked_values: _CheckedValue) -> Violation | None:
-        """Return the worst violation by a percentage, and flag the next sample if one is near."""
+        """Return the worst violation by a percentage.
+
+        The next sample is flagged if a percentage is near its limit.
+        """
         before, self.warning = self.warning, False
         violation = self._assess(checked_values)
         # The next sample is flagged.
@@ -505,7 +508,10 @@ class LimitWatch:
         return None
 
     def _violation_with_cause(self, checked: _CheckedValue) -> Violation:
-        """Return the violation by a value, with a stall of the computer as its cause if any."""
+        """Return the violation of a limit; its advice names a stall of the computer as the cause.
+
+        Without a stall the advice is that of the interlock.
+        """
         violation, missed = _violation(checked, warns=False), self.after_missed
         if not missed or not BY_NAME[checked[0]].follows_missed_ticks:
             return violation

@@ -17,7 +17,9 @@ import numpy as np
 from rigd.safety.limits import BY_NAME, Violation
 
 WINDOW_TICKS = 8
-"""Length of a window in ticks: distance of the two mean speeds that give its acceleration."""
+"""Length of a window in ticks, from the first mean speed to the second one.
+
+The difference of the two gives the acceleration."""
 SPEED_TICKS = 4
 """Number of ticks over which a mean speed is computed."""
 _TORQUE_ERROR_STD = 0.25

@@ -27,7 +27,9 @@ _COUNT_TICKS = 256
 _MIN_EXCESS_FRACTION = 0.1
 """Smallest excess of the fraction of repeated readings over that at the tare that is a fault."""
 _SIGNIFICANT_STDS = 8.0
-"""Standard deviations by which that fraction must exceed its value at the tare to be a fault."""
+"""Excess of the fraction of repeated readings over that at the tare that is a fault.
+
+It is in standard deviations of a fraction that is counted over `_COUNT_TICKS`."""
 _MAX_FRACTION_LIMIT = 0.45
 """Largest limit of the fraction of repeated readings that is checked.
 
@@ -89,7 +91,7 @@ class SensorWatch:
         self._warned_channels: set[str] = set()
 
     def finish_learning(self) -> Violation | None:
-        """Derive the limits of identical readings from those at rest, and check these.
+        """Derive the limits of identical readings from the readings at rest, and check the sensor.
 
         Returns
         -------

@@ -142,7 +142,7 @@ class Violation:
 
 
 class Checked(Enum):
-    """Process that checks an interlock, and how often."""
+    """Process that checks an interlock, and the times of its checks."""
 
     TICK = "loop, every tick"
     SLOW_CHECK = "loop, every 64 ticks"

@@ -12,11 +12,12 @@ from rigd.safety.probing_move import ProbedRig, ProbeEnd, ProbingMove
 Real = NDArray[np.float64]
 
 RATIO_BAND = (0.7, 1.42)
-"""Smallest and largest accepted ratio of a measured value to that of the profile.
+"""Smallest and largest accepted ratio of a measured scale or inertia to the profile's value.
 
 They are half-way between 25 %, which is usual, and 50 % too much or too little."""
 WARNING_BAND = (0.8, 1.25)
-"""Smallest and largest ratio of a measured value to that of the profile without a warning."""
+"""Ratios of a measured scale or inertia to the profile's value outside of which there is a warning.
+"""
 
 _FREQUENCY_FACTORS = tuple(float(x) for x in np.linspace(0.9, 1.1, 21))
 """Candidate factors by which the beam's frequencies are multiplied in the estimate.
@@ -31,9 +32,9 @@ _MIN_SAMPLES = 50
 _WINDOW_CUTOFF_HZ = 100.0
 """Frequency in Hz above which the smoothing window passes nothing."""
 _DECAY_EXPONENT = 12.0
-"""Exponent by which the weighting of the Fourier transform has decayed at its end.
+"""Exponent of the decay of the weighting by which the angle is multiplied before its FFT.
 
-It suppresses the wrap-around."""
+The weighting suppresses the wrap-around."""
 _MAX_CONDITION_NUMBER = 1e6
 """Largest condition number of the normal equations that gives an estimate."""
 _MAX_RELATIVE_STD = 0.1
@@ -169,7 +170,7 @@ def _coupling_ratio(
 
 
 def _samples_per_independent_one(window: Real) -> float:
-    """Return how many samples of smoothed white noise contain as much as one independent sample."""
+    """Return the number of smoothed samples that count as one independent sample of white noise."""
     return 1.0 / float(window @ window)
 
 

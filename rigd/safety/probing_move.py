@@ -91,7 +91,7 @@ class BeamFollower:
         self._angle_rad = 0.0
 
     def step(self, angle_rad: float) -> float:
-        """Return the beam's coupling torque in N·m after one more tick.
+        """Advance the beam by a tick with a new angle, and return its coupling torque in N·m.
 
         Parameters
         ----------
@@ -231,16 +231,20 @@ _MIN_MOVEMENT_RAD = 2e-4
 _MIN_DIFFERENCE_NM = 8e-3
 """Smallest difference in N·m between coupling torque and beam's torque that ends the move."""
 _MIN_DIFFERENCE_STDS = 2.0
-"""Smallest such difference, in standard deviations of the coupling torque at rest."""
+"""Smallest difference between coupling torque and beam's torque that ends the move.
+
+It is in standard deviations of the coupling torque at rest."""
 _MIN_DIFFERENCE_FRACTION = 0.6
-"""Smallest such difference, as a fraction of the beam's torque."""
+"""Smallest difference between coupling torque and beam's torque that ends the move.
+
+It is a fraction of the largest recent torque of the beam."""
 _FROZEN_ENCODER_S = 0.025
 """Time in seconds without a new angle after which the encoder counts as frozen if the beam pulls.
 """
 _STROKE_PAUSE_S = 0.15
 """Pause in seconds after a stroke."""
 _MAX_STROKE_S = 5.0
-"""Longest time in seconds for a stroke; a sound one takes less."""
+"""Time in seconds after which a stroke ends the move; strokes of a sound rig take less."""
 _INITIAL_TORQUE_FRACTION = 0.7
 """Torque at which a stroke begins, as a fraction of that needed in the stroke before."""
 _COUPLING_RATIO_BAND = 0.5, 2.0
@@ -394,7 +398,7 @@ class ProbingMove:
         return round(duration_s / self._period_s)
 
     def _stroke_torque(self, angle_rad: float) -> float:
-        """Return the torque of the present stroke in N·m."""
+        """Return the torque in N·m that this tick of the present stroke requires."""
         side, speed = self._strokes[self._stroke_index]
         plan = self._plan
         if self._moving_since_tick is None:

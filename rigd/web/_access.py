@@ -210,7 +210,7 @@ def _host_name_of(host: str) -> str:
 
 
 class Connections:
-    """Limits the number of connections and the time for which they may send no request.
+    """Limits the number of connections and the time until their first request.
 
     Attributes
     ----------

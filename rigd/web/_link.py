@@ -31,7 +31,7 @@ _MAX_LINE_BYTES: Final = 1 << 20
 _CROWDED_ATTEMPTS: Final = 20
 """Number of attempts to connect while the daemon has too many clients."""
 _CROWDED_PAUSE_S: Final = 0.1
-"""Pause in seconds between these attempts."""
+"""Pause in seconds between attempts to connect while the daemon has too many clients."""
 
 
 class DaemonError(Exception):
@@ -85,7 +85,7 @@ class DaemonLink:
             await asyncio.sleep(_RECONNECT_PAUSE_S)
 
     def request_status(self) -> None:
-        """Request the daemon's status soon, because it has changed."""
+        """Make the next request of the daemon's status at once, since the status has changed."""
         self._status_requested.set()
 
     def register_stop(self) -> None:
@@ -189,7 +189,7 @@ class DaemonLink:
             writer.close()
 
     def _process_message(self, line: bytes) -> None:
-        """Process one message of the daemon."""
+        """Decode a line of the daemon, and pass events and status replies to `on_message`."""
         if not line:
             raise DaemonError(_NO_DAEMON_MESSAGE)
         self._last_received_s, self._silent = time.monotonic(), False
@@ -232,7 +232,7 @@ class DaemonLink:
             self._release_control()
 
     def _release_control(self) -> None:
-        """Release the control of the rig by closing the connection that has it."""
+        """Close the connection that controls the rig, so that others can control it."""
         control_connection, self._control_connection = self._control_connection, None
         if control_connection is not None:
             control_connection[1].close()

@@ -201,7 +201,7 @@ class OperatorPageServer:
     # Messages of the daemon
 
     def _process_message(self, message: Document) -> None:
-        """Process a message of the daemon, and send its content to the open pages."""
+        """Send the content of a daemon's message to the open pages, and update the page's state."""
         if self._lost_message is not None:
             self._lost_message = None
             self._link.request_status()
