@@ -117,7 +117,7 @@ def _require_small_document(document: Mapping[str, Any]) -> None:
     entries = 0
     level: list[Any] = [document]
     for _ in range(_MAX_DEPTH):
-        level = [each for part in level for each in _children(part)]
+        level = [each for parent in level for each in _children(parent)]
         entries += len(level)
         if entries > _MAX_ENTRIES:
             raise DocumentError(f"has more than {_MAX_ENTRIES} keys and numbers; shorten it")

@@ -262,7 +262,7 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         if deviation is not None:
             std[name] = deviation
     density_over_stiffness, stiffness = (values[name] for name in _REQUIRED_PARAMETERS)
-    found = IdentifiedBeam(
+    identified = IdentifiedBeam(
         beam=Beam(length_m, density_over_stiffness * stiffness, stiffness),
         damping=Damping(
             zeta=values.get("zeta", 0.0),
@@ -278,7 +278,11 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         stiffness_offsets=_stiffness_offsets(label, values),
         mode_uncertainty=_mode_uncertainty(label, source.get("modes")),
     )
-    return _with_observed_modes(label, found, headline.get("modes"), refused) if refused else found
+    return (
+        _with_observed_modes(label, identified, headline.get("modes"), refused)
+        if refused
+        else identified
+    )
 
 
 def _with_observed_modes(
@@ -323,8 +327,10 @@ def _with_observed_modes(
     poles = found.loaded_beam.poles(clamped_free_eigenvalues(len(observed)))[:, 0]
     # The difference between the damping of the beam and of the modes counts as uncertainty.
     uncertainty = (
-        hypot(own, abs(ratio + pole.real / abs(pole)))
-        for own, (_, ratio, _), pole in zip(found.mode_uncertainty, observed, poles, strict=False)
+        hypot(parameter_std, abs(ratio + pole.real / abs(pole)))
+        for parameter_std, (_, ratio, _), pole in zip(
+            found.mode_uncertainty, observed, poles, strict=False
+        )
     )
     return replace(found, mode_uncertainty=tuple(uncertainty))
 
@@ -386,9 +392,9 @@ def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any
     headlines = document.get("headlines") if isinstance(document, dict) else None
     if not isinstance(headlines, list):
         headlines = []
-    found = [(k, each) for k, each in enumerate(headlines) if isinstance(each, dict)]
-    pooled = [(k, each) for k, each in found if each.get("file", "") is None]
-    index, headline = next(iter(pooled + found), (0, {}))
+    numbered_headlines = [(k, each) for k, each in enumerate(headlines) if isinstance(each, dict)]
+    pooled = [(k, each) for k, each in numbered_headlines if each.get("file", "") is None]
+    index, headline = next(iter(pooled + numbered_headlines), (0, {}))
     if not isinstance(headline.get("parameters"), dict):
         raise IdentifiedBeamError(f"{path}: has no headlines[0].parameters; {_ADVICE}.")
     return f"{path}: headlines[{index}]", headline
@@ -441,13 +447,13 @@ def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
     named
         List ``named`` of a headline.
     """
-    found = []
+    findings = []
     for number, entry in enumerate(named if isinstance(named, list) else []):
-        given = entry if isinstance(entry, dict) else {}
-        what = given.get("what")
-        if what not in _FINDINGS_IN_ESTIMATES and what not in _FINDINGS_IN_PARAMETERS:
-            found.append((number, str(what)[:60], str(given.get("sentence"))[:200]))
-    return found
+        finding = entry if isinstance(entry, dict) else {}
+        kind = finding.get("what")
+        if kind not in _FINDINGS_IN_ESTIMATES and kind not in _FINDINGS_IN_PARAMETERS:
+            findings.append((number, str(kind)[:60], str(finding.get("sentence"))[:200]))
+    return findings
 
 
 def _parameter_key(name: str) -> str:
@@ -461,29 +467,31 @@ def _parameter_key(name: str) -> str:
 
 def _parameter_value(label: str, name: str, entry: object) -> float:
     """Return the value of a parameter, or raise if it is unknown or outside its range."""
-    known = _PARAMETERS.get(_parameter_key(name))
-    if known is None or name == _OFFSET_PREFIX:
+    definition = _PARAMETERS.get(_parameter_key(name))
+    if definition is None or name == _OFFSET_PREFIX:
         raise IdentifiedBeamError(
             f"{label}.parameters.{name[:60]!r} is not known to this version, so what it changes "
             "cannot be taken into account; update rigd, or do without this document."
         )
-    given = entry.get("value") if isinstance(entry, dict) else None
-    value = finite_number(given)
+    stated_value = entry.get("value") if isinstance(entry, dict) else None
+    value = finite_number(stated_value)
     in_range = (
         value is not None
-        and known.lower_limit <= value < known.upper_limit
+        and definition.lower_limit <= value < definition.upper_limit
         and is_usable_size(value)
     )
     if value is not None and in_range and (value > 0.0 or name not in _REQUIRED_PARAMETERS):
         return value
     bound = "any size"
-    if known.lower_limit > -inf:
-        bound = "more than 0" if name in _REQUIRED_PARAMETERS else f"{known.lower_limit:g} or more"
-    if known.upper_limit < inf:
-        bound += f" below {known.upper_limit:g}"
-    unit = f" {known.unit}" if known.unit else ""
+    if definition.lower_limit > -inf:
+        bound = (
+            "more than 0" if name in _REQUIRED_PARAMETERS else f"{definition.lower_limit:g} or more"
+        )
+    if definition.upper_limit < inf:
+        bound += f" below {definition.upper_limit:g}"
+    unit = f" {definition.unit}" if definition.unit else ""
     raise IdentifiedBeamError(
-        f"{label}.parameters.{name}.value = {json.dumps(given, default=str)[:60]} "
+        f"{label}.parameters.{name}.value = {json.dumps(stated_value, default=str)[:60]} "
         f"must be a number of {bound}{unit}; {_ADVICE}."
     )
 
@@ -491,17 +499,17 @@ def _parameter_value(label: str, name: str, entry: object) -> float:
 def _require_known_effects(label: str, values: Mapping[str, float], use: Use) -> None:
     """Raise if the analysis found an effect that the use does not take into account."""
     for name, value in values.items():
-        known = _PARAMETERS[_parameter_key(name)]
-        if not known.effect or not value or _parameter_key(name) in use.effects:
+        definition = _PARAMETERS[_parameter_key(name)]
+        if not definition.effect or not value or _parameter_key(name) in use.effects:
             continue
         corner_hz = 0.0 if "filter" not in name else 1.0 / (2.0 * pi * value)
-        remedy = known.remedy.format(
+        remedy = definition.remedy.format(
             corner_hz=corner_hz, order=2 if name.startswith("second") else 1
         )
-        unit = f" {known.unit}" if known.unit else ""
+        unit = f" {definition.unit}" if definition.unit else ""
         raise IdentifiedBeamError(
             f"{label}.parameters.{name}.value = {value:.4g}{unit}: the analysis found "
-            f"{known.effect}, which {use.name} does not take into account; {remedy}."
+            f"{definition.effect}, which {use.name} does not take into account; {remedy}."
         )
     if values.get("tip_mass_kg") and any(
         values[n] for n in values if _parameter_key(n) == _OFFSET_PREFIX
@@ -514,9 +522,9 @@ def _require_known_effects(label: str, values: Mapping[str, float], use: Use) ->
 
 def _require_known_findings(label: str, named: object, use: Use) -> None:
     """Raise if the analysis has a finding whose effect no parameter describes."""
-    for number, what, sentence in findings_without_parameter(named):
+    for number, kind, sentence in findings_without_parameter(named):
         raise IdentifiedBeamError(
-            f"{label}.named[{number}]: {what}, which {use.name} does not take into "
+            f"{label}.named[{number}]: {kind}, which {use.name} does not take into "
             f"account ({sentence}); remove its cause, and record and analyze again, or "
             "leave out --model."
         )
@@ -560,38 +568,38 @@ def _standard_deviation(entry: Mapping[str, Any]) -> float | None:
 
 def _stiffness_offsets(label: str, values: Mapping[str, float]) -> tuple[float, ...]:
     """Return the relative stiffness offsets of modes 2, 3, … up to the last one in the document."""
-    found = {
+    offset_by_mode = {
         int(n[len(_OFFSET_PREFIX) :]): value
         for n, value in values.items()
         if _parameter_key(n) == _OFFSET_PREFIX
     }
-    modes = range(2, 2 + len(found))
-    if sorted(found) != list(modes):
-        given = ", ".join(map(str, sorted(found)))
+    modes = range(2, 2 + len(offset_by_mode))
+    if sorted(offset_by_mode) != list(modes):
+        given_modes = ", ".join(map(str, sorted(offset_by_mode)))
         raise IdentifiedBeamError(
-            f"{label}.parameters: {_OFFSET_PREFIX}… are those of modes {given}, but must be those "
-            f"of modes 2 to {modes[-1]}; {_ADVICE}."
+            f"{label}.parameters: {_OFFSET_PREFIX}… are those of modes {given_modes}, but must be "
+            f"those of modes 2 to {modes[-1]}; {_ADVICE}."
         )
-    return tuple(found[mode] for mode in modes)
+    return tuple(offset_by_mode[mode] for mode in modes)
 
 
 def _mode_uncertainty(label: str, modes: object) -> tuple[float, ...]:
     """Return the relative standard uncertainty of the pole of each mode in the document."""
-    found: list[float] = []
+    uncertainties: list[float] = []
     for number, entry in enumerate(modes if isinstance(modes, Sequence) else [], start=1):
-        given = entry if isinstance(entry, dict) else {}
+        mode_object = entry if isinstance(entry, dict) else {}
         hz, ratio = (
-            of if isinstance(of := given.get(name), dict) else {}
+            of if isinstance(of := mode_object.get(name), dict) else {}
             for name in ("frequency_hz", "damping_ratio")
         )
         value_hz = finite_number(hz.get("value"))
-        if not value_hz or not ratio or given.get("mode") != number:
+        if not value_hz or not ratio or mode_object.get("mode") != number:
             raise IdentifiedBeamError(
                 f"{label}.modes[{number - 1}] is not mode {number} with frequency_hz and "
                 f"damping_ratio; {_ADVICE}."
             )
-        found.append(hypot(_mode_deviation(hz) / value_hz, _mode_deviation(ratio)))
-    return tuple(found)
+        uncertainties.append(hypot(_mode_deviation(hz) / value_hz, _mode_deviation(ratio)))
+    return tuple(uncertainties)
 
 
 def _mode_deviation(entry: Mapping[str, Any]) -> float:

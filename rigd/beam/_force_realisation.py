@@ -122,10 +122,16 @@ def realise_force(
         # The next modes resonate and are not included.
         highest_rad_s = min(highest_rad_s, float(np.abs(poles[-1])) / _MODES_UP_TO_FACTOR)
 
-    low, high = _SLOWEST_POLE_RAD_S / 300, highest_rad_s
-    s = 1j * np.geomspace(low, high, int(_POINTS_PER_DECADE * np.log10(high / low)))
+    lowest_fit_rad_s, highest_fit_rad_s = _SLOWEST_POLE_RAD_S / 300, highest_rad_s
+    s = 1j * np.geomspace(
+        lowest_fit_rad_s,
+        highest_fit_rad_s,
+        int(_POINTS_PER_DECADE * np.log10(highest_fit_rad_s / lowest_fit_rad_s)),
+    )
     s = s[np.abs(s[:, None] - poles).min(axis=1, initial=np.inf) > 1e-6 * np.abs(s)]
-    tail = np.geomspace(high, _TAIL_UP_TO_FACTOR * high, _POINTS_PER_DECADE) * np.exp(0.25j * np.pi)
+    tail = np.geomspace(
+        highest_fit_rad_s, _TAIL_UP_TO_FACTOR * highest_fit_rad_s, _POINTS_PER_DECADE
+    ) * np.exp(0.25j * np.pi)
     emphasis = np.append(np.ones(s.size), np.full(tail.size, _TAIL_WEIGHT))
     s = np.append(s, tail)
     grid = PointForceGrid(s, beam, damping)
@@ -139,7 +145,8 @@ def realise_force(
     # Real poles at fixed frequencies, whatever the highest frequency is.
     real_pole_count = (
         ceil(
-            _REAL_POLES_PER_DECADE * np.log10(_REAL_POLES_UP_TO_FACTOR * high / _SLOWEST_POLE_RAD_S)
+            _REAL_POLES_PER_DECADE
+            * np.log10(_REAL_POLES_UP_TO_FACTOR * highest_fit_rad_s / _SLOWEST_POLE_RAD_S)
         )
         + 1
     )

@@ -326,10 +326,10 @@ def _scaled_form(q: Complex) -> tuple[Complex, Complex]:
     z_squared = _root_in_first_quadrant(q.real, np.abs(q.imag))
     z = _root_in_first_quadrant(z_squared.real, z_squared.imag)
     decay = np.exp(-z)
-    turn = np.exp(1j * z)
-    e = decay * turn
+    rotation = np.exp(1j * z)
+    e = decay * rotation
     a = np.multiply(decay, decay, out=decay)
-    b = np.multiply(turn, turn, out=turn)
+    b = np.multiply(rotation, rotation, out=rotation)
     sum_, ab = a + b, a * b
     even_part = 1 + ab
     f = (1j - 1) * (1 - ab) + (1j + 1) * (a - b)

@@ -235,13 +235,13 @@ def poles(beam: Beam, damping: Damping, n: int) -> Complex:
     [[-0.013 +16.047j -0.013 -16.047j]
      [-0.506+100.563j -0.506-100.563j]]
     """
-    found = poles_for_eigenvalues(clamped_free_eigenvalues(n), beam, damping)
-    missing = np.flatnonzero(np.isnan(found[:, 0]))
-    if missing.size:
+    pole_pairs = poles_for_eigenvalues(clamped_free_eigenvalues(n), beam, damping)
+    without_pole = np.flatnonzero(np.isnan(pole_pairs[:, 0]))
+    if without_pole.size:
         raise ArithmeticError(
-            f"Mode {missing[0] + 1} has no pole on the principal sheet with {damping}."
+            f"Mode {without_pole[0] + 1} has no pole on the principal sheet with {damping}."
         )
-    return found
+    return pole_pairs
 
 
 def poles_for_eigenvalues(
@@ -274,9 +274,9 @@ def poles_for_eigenvalues(
         )
     if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
         start = np.log(near_rad_s)
-        found = _newton(start, omega_squared, external_coefficient, damping.zeta, damping)
-        if bool((np.abs(found - start) < SAME_ROOT_TOLERANCE).all()):
-            upper = np.exp(found)
+        log_poles = _newton(start, omega_squared, external_coefficient, damping.zeta, damping)
+        if bool((np.abs(log_poles - start) < SAME_ROOT_TOLERANCE).all()):
+            upper = np.exp(log_poles)
             return np.stack([upper, upper.conj()], axis=1)
     for steps in _HOMOTOPY_STEP_COUNTS:
         upper = _poles_by_continuation(omega_squared, external_coefficient, damping, steps)
@@ -362,10 +362,10 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
     2.554 Hz, damping ratio 0.04%
     16.011 Hz, damping ratio 0.22%
     """
-    found = []
+    mode_list = []
     for i, (first, second) in enumerate(poles(beam, damping, n)):
         natural = float(np.sqrt((first * second).real))
-        found.append(
+        mode_list.append(
             Mode(
                 number=i + 1,
                 poles_rad_s=(complex(first), complex(second)),
@@ -374,7 +374,7 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
                 damping_ratio=float((-first - second).real / (2 * natural)),
             )
         )
-    return tuple(found)
+    return tuple(mode_list)
 
 
 def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
@@ -383,9 +383,9 @@ def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
     first = half + np.sqrt((half * half - omega_squared).astype(np.complex128))
     second = first.conj()
     over_damped = half * half > omega_squared
-    fast = half - np.sqrt(np.maximum(half * half - omega_squared, 0.0))
-    second[over_damped] = fast[over_damped]
-    first[over_damped] = omega_squared[over_damped] / fast[over_damped]  # no cancellation
+    fast_poles = half - np.sqrt(np.maximum(half * half - omega_squared, 0.0))
+    second[over_damped] = fast_poles[over_damped]
+    first[over_damped] = omega_squared[over_damped] / fast_poles[over_damped]  # no cancellation
     return np.stack([first, second], axis=1)
 
 
@@ -417,8 +417,8 @@ def _poles_by_search(omega_squared: Real, external_coefficient: float, damping: 
     starts: Complex = np.add.outer(1j * angles, np.linspace(-6, 6, 49)).ravel()
     log_s: Complex = 0.5 * np.log(omega_squared)[:, None] + starts
     log_s = _newton(log_s, omega_squared[:, None], external_coefficient, damping.zeta, damping)
-    found = ~np.isnan(log_s)
-    first = np.argmax(found, axis=1)[:, None]
+    converged = ~np.isnan(log_s)
+    first = np.argmax(converged, axis=1)[:, None]
     poles: Complex = np.exp(np.take_along_axis(log_s, first, axis=1)[:, 0])
     return poles
 

@@ -244,14 +244,14 @@ class _ExponentialSolution:
         self._b = root[:, None]
         self._kappa = np.where(root.imag > 0, -1j, 1j)[:, None]  # so that Re c >= 0
         decay = np.exp(-root * length_m)
-        turn = np.exp(-root * self._kappa[:, 0] * length_m)
-        one, kappa = np.ones_like(root), self._kappa[:, 0]
+        rotation = np.exp(-root * self._kappa[:, 0] * length_m)
+        ones, kappa = np.ones_like(root), self._kappa[:, 0]
         # y(0), y'(0)/b, y''(L)/b², y'''(L)/b³ of the four functions: c² = -b².
         rows = [
-            [one, decay, one, turn],
-            [-one, decay, -kappa, kappa * turn],
-            [decay, one, -turn, -one],
-            [-decay, one, kappa * turn, -kappa],
+            [ones, decay, ones, rotation],
+            [-ones, decay, -kappa, kappa * rotation],
+            [decay, ones, -rotation, -ones],
+            [-decay, ones, kappa * rotation, -kappa],
         ]
         self._inverse = np.linalg.inv(np.moveaxis(np.array(rows), -1, 0)).astype(np.complex128)
 

@@ -133,7 +133,7 @@ def loaded_response(
 
 
 def _add_stiffness_offsets(
-    found: LoadedResponse,
+    uniform_response: LoadedResponse,
     elastic: Complex,
     inertial: Complex,
     beam: Beam,
@@ -152,10 +152,10 @@ def _add_stiffness_offsets(
         by_elastic += weight * inertial**2 * (stiffer * offset_mode**2 - uniform**2)
         by_inertial += weight * elastic**2 * k4 * ((stiffer * offset_mode) ** 2 - uniform**2)
     return replace(
-        found,
-        response=found.response + total,
-        by_elastic=found.by_elastic + by_elastic,
-        by_inertial=found.by_inertial + by_inertial,
+        uniform_response,
+        response=uniform_response.response + total,
+        by_elastic=uniform_response.by_elastic + by_elastic,
+        by_inertial=uniform_response.by_inertial + by_inertial,
     )
 
 
@@ -196,17 +196,17 @@ def differentiated_response(
     s_lambda = np.exp(damping.lambda_ * log_s).astype(np.complex128)
     inertia = beam.density_over_stiffness * s_squared
     elastic, inertial = 1 + damping.zeta * s_alpha, inertia + damping.gamma * s_lambda
-    found = loaded_response(s_squared, elastic, inertial, beam, tip_mass_kg)
+    response = loaded_response(s_squared, elastic, inertial, beam, tip_mass_kg)
     if stiffness_offsets:
-        found = _add_stiffness_offsets(found, elastic, inertial, beam, stiffness_offsets)
-    return found, {
-        "zeta": lambda: found.by_elastic * s_alpha,
-        "alpha": lambda: found.by_elastic * (damping.zeta * log_s * s_alpha),
-        "gamma": lambda: found.by_inertial * s_lambda,
-        "lambda": lambda: found.by_inertial * (damping.gamma * log_s * s_lambda),
-        "ln_density_over_stiffness": lambda: found.by_inertial * inertia,
-        "ln_stiffness": lambda: found.response - tip_mass_kg * found.by_mass,
-        "tip_mass_kg": lambda: found.by_mass,
+        response = _add_stiffness_offsets(response, elastic, inertial, beam, stiffness_offsets)
+    return response, {
+        "zeta": lambda: response.by_elastic * s_alpha,
+        "alpha": lambda: response.by_elastic * (damping.zeta * log_s * s_alpha),
+        "gamma": lambda: response.by_inertial * s_lambda,
+        "lambda": lambda: response.by_inertial * (damping.gamma * log_s * s_lambda),
+        "ln_density_over_stiffness": lambda: response.by_inertial * inertia,
+        "ln_stiffness": lambda: response.response - tip_mass_kg * response.by_mass,
+        "tip_mass_kg": lambda: response.by_mass,
     }
 
 
@@ -262,20 +262,20 @@ class LoadedBeam:
         """
         z = clamped_free_eigenvalues(len(frequency_hz))
         target_rad_s = 2 * math.pi * np.array(frequency_hz)
-        found = LoadedBeam(self.beam, self.damping)
+        offset_beam = LoadedBeam(self.beam, self.damping)
         stiffness = np.ones(z.size)
         for _ in range(2):  # damping shifts the frequencies a little
-            present_rad_s = found.poles(z)[:, 0].imag
+            present_rad_s = offset_beam.poles(z)[:, 0].imag
             if not bool((present_rad_s > 0).all()):
                 raise ValueError("A mode of the beam does not oscillate.")
             stiffness *= (target_rad_s / present_rad_s) ** 2
             density_kg_per_m = self.beam.density_kg_per_m / float(stiffness[0])
-            found = LoadedBeam(
+            offset_beam = LoadedBeam(
                 replace(self.beam, density_kg_per_m=density_kg_per_m),
                 self.damping,
                 stiffness_offsets=tuple((stiffness[1:] / stiffness[0] - 1).tolist()),
             )
-        return found
+        return offset_beam
 
     def transfer(self, s: Complex) -> Complex:
         """Return the coupling torque per motor angle in N·m/rad, in the shape of `s` (not 0)."""
@@ -367,8 +367,8 @@ class LoadedBeam:
         tip_slopes = 2 * z * root_shear_ratio(z.size) / tip
         for index, offset in enumerate(self.stiffness_offsets, start=1):
             # Mode i contributes -p b / (c k⁴ (1 + d) + p); b is its part of a rigid rotation.
-            k4, turn = (z[index] / tip) ** 4, 2 * (-1) ** index * tip / z[index] ** 2
-            offset_term = inertial * turn * elastic * k4 * offset
+            k4, rotation_part = (z[index] / tip) ** 4, 2 * (-1) ** index * tip / z[index] ** 2
+            offset_term = inertial * rotation_part * elastic * k4 * offset
             offset_term = offset_term / (
                 (elastic * k4 + inertial) * (elastic * k4 * (1 + offset) + inertial)
             )
@@ -405,10 +405,12 @@ class LoadedBeam:
     def rigid_clamp_response(self, s: Complex) -> LoadedResponse:
         """Return the response at `s` (rad/s) that the beam would have on a rigid clamp."""
         elastic, inertial = self.elastic_and_inertial_factors(s)
-        found = loaded_response(s * s, elastic, inertial, self.beam, self.tip_mass_kg)
+        response = loaded_response(s * s, elastic, inertial, self.beam, self.tip_mass_kg)
         if not any(self.stiffness_offsets):
-            return found
-        return _add_stiffness_offsets(found, elastic, inertial, self.beam, self.stiffness_offsets)
+            return response
+        return _add_stiffness_offsets(
+            response, elastic, inertial, self.beam, self.stiffness_offsets
+        )
 
     def residues(self, poles_rad_s: Complex) -> Complex:
         """Return the residues of the coupling torque per angular acceleration at poles.
@@ -481,9 +483,9 @@ class LoadedBeam:
             could not be followed.
         """
         if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
-            found = self._newton(near_rad_s, _CLOSE_START_TOLERANCE, zeros=False)
-            if bool((np.abs(found / near_rad_s - 1) < SAME_ROOT_TOLERANCE).all()):
-                return np.column_stack([found, found.conj()])
+            upper_poles = self._newton(near_rad_s, _CLOSE_START_TOLERANCE, zeros=False)
+            if bool((np.abs(upper_poles / near_rad_s - 1) < SAME_ROOT_TOLERANCE).all()):
+                return np.column_stack([upper_poles, upper_poles.conj()])
         return self._followed_roots(z, zeros=False)
 
     def zeros(self, z: Real) -> Complex:
@@ -506,15 +508,15 @@ class LoadedBeam:
             # On a rigid clamp the poles are exactly those of the stiffness k⁴ (1 + d).
             z = z.copy()
             z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
-        found = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
+        roots = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
         is_rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
         if is_rigid and not (zeros and offsets.any()):
-            return found
-        has_root = ~np.isnan(found[:, 0])
+            return roots
+        has_root = ~np.isnan(roots[:, 0])
         # One of a conjugate pair suffices; without oscillation both have to be found.
-        oscillating = found[has_root][:, 0].imag != 0
-        second_real_poles = found[has_root][~oscillating][:, 1]
-        current = np.concatenate([found[has_root][:, 0], second_real_poles])
+        oscillating = roots[has_root][:, 0].imag != 0
+        second_real_poles = roots[has_root][~oscillating][:, 1]
+        current = np.concatenate([roots[has_root][:, 0], second_real_poles])
         current *= 1 - _START_POLE_DISTANCE  # G is infinite at an undamped pole
         # Relative to the beam's own values: a change that moves the poles little needs few steps.
         relative_change = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
@@ -546,8 +548,8 @@ class LoadedBeam:
         first = current[: oscillating.size]
         second = first.conj()
         second[~oscillating] = current[oscillating.size :]
-        found[has_root] = np.column_stack([first, second])
-        return found
+        roots[has_root] = np.column_stack([first, second])
+        return roots
 
     def _newton(self, s: Complex, tolerance: float, *, zeros: bool) -> Complex:
         """Return the roots of ``1/G + kappa``, or with `zeros` of G, that Newton's method finds.
@@ -565,10 +567,10 @@ class LoadedBeam:
                 if not np.nanmax(np.abs(step / s), initial=0.0) > tolerance:
                     break
             # Far from any root every step is short, too.
-            found = (np.abs(step) < max(tolerance, 1e-9) * np.abs(s)) & (
+            converged = (np.abs(step) < max(tolerance, 1e-9) * np.abs(s)) & (
                 np.abs(s) < _MAX_ROOT_TO_START_RATIO * np.abs(start)
             )
-            return np.where(found, s, np.nan + 0j)
+            return np.where(converged, s, np.nan + 0j)
 
 
 def _response_functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]:
@@ -592,14 +594,16 @@ def _scaled_functions(q: Complex) -> tuple[Complex, Complex, Complex]:
     # F, U and B are real functions of q: values below the real axis mirror those above it.
     lower_half_plane = q.imag < 0
     z = np.sqrt(np.sqrt(np.where(lower_half_plane, q.conj(), q)))
-    decay, turn = np.exp(-z), np.exp(1j * z)
-    a, b = decay * decay, turn * turn
-    reciprocal = 1 / (4 * decay * turn + (1 + a) * (1 + b))
+    decay, rotation = np.exp(-z), np.exp(1j * z)
+    a, b = decay * decay, rotation * rotation
+    reciprocal = 1 / (4 * decay * rotation + (1 + a) * (1 + b))
     sine, cosine = 1j * (1 - b) * (1 + a), (1 + b) * (1 - a)
-    found = (
+    functions = (
         z * (sine - cosine) * reciprocal,
         2j * z**2 * (1 - a) * (1 - b) * reciprocal,
         z**3 * (sine + cosine) * reciprocal,
     )
-    first, second, third = (np.where(lower_half_plane, values.conj(), values) for values in found)
+    first, second, third = (
+        np.where(lower_half_plane, values.conj(), values) for values in functions
+    )
     return first, second, third

@@ -378,11 +378,16 @@ def _fit_grid(poles_and_zeros: Complex) -> tuple[Real, Real]:
 
     The grid covers the fit's band, where it is dense near `poles_and_zeros`, and both tails.
     """
-    low, high = _FIT_BAND_HZ
-    band = np.concatenate([np.geomspace(low, high, 200), _grid_around(poles_and_zeros, 10)])
-    band = band[(band >= low) & (band <= high)]
+    lowest_hz, highest_hz = _FIT_BAND_HZ
+    band = np.concatenate(
+        [np.geomspace(lowest_hz, highest_hz, 200), _grid_around(poles_and_zeros, 10)]
+    )
+    band = band[(band >= lowest_hz) & (band <= highest_hz)]
     tails = np.concatenate(
-        [np.geomspace(_TAIL_BAND_HZ[0], low, 25), np.geomspace(high, _TAIL_BAND_HZ[1], 25)]
+        [
+            np.geomspace(_TAIL_BAND_HZ[0], lowest_hz, 25),
+            np.geomspace(highest_hz, _TAIL_BAND_HZ[1], 25),
+        ]
     )
     frequency = np.concatenate([band, tails])
     weight = np.concatenate([np.ones(band.size), np.full(tails.size, _TAIL_WEIGHT)])
@@ -425,10 +430,12 @@ def _relative_error(
     loaded: LoadedBeam, poles: Complex, zeros: Complex, coefficients: Real
 ) -> float:
     """Return the realisation's largest relative error on a grid denser than that of the fit."""
-    low, high = ERROR_BAND_HZ
+    lowest_hz, highest_hz = ERROR_BAND_HZ
     poles_and_zeros = np.concatenate([poles[poles.imag > 0], zeros])
-    frequency = np.concatenate([np.geomspace(low, high, 1200), _grid_around(poles_and_zeros, 34)])
-    omega = 2 * np.pi * frequency[(frequency >= low) & (frequency <= high)]
+    frequency = np.concatenate(
+        [np.geomspace(lowest_hz, highest_hz, 1200), _grid_around(poles_and_zeros, 34)]
+    )
+    omega = 2 * np.pi * frequency[(frequency >= lowest_hz) & (frequency <= highest_hz)]
     s = 1j * omega[_far_from_landmarks(omega, poles, zeros)]
     exact = _exact_transfer(loaded, s)
     return float(np.max(np.abs(_basis_functions(s, poles) @ coefficients / exact - 1)))

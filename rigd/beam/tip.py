@@ -177,11 +177,11 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     z = beam.length_m * np.sqrt(np.sqrt(fourth))
     # Numerators and denominator over exp(z - j sign z): nothing overflows.
     sign = np.where(z.imag < 0, -1.0, 1.0)
-    turn, decay = np.exp(1j * sign * z), np.exp(-z)
-    a, b = decay * decay, turn * turn
-    reciprocal = 1 / (4 * turn * decay + (1 + b) * (1 + a))
-    sines = 2 * turn * (1 - a) + 2j * sign * decay * (1 - b)
-    cosines = 2 * turn * (1 + a) + 2 * decay * (1 + b)
+    rotation, decay = np.exp(1j * sign * z), np.exp(-z)
+    a, b = decay * decay, rotation * rotation
+    reciprocal = 1 / (4 * rotation * decay + (1 + b) * (1 + a))
+    sines = 2 * rotation * (1 - a) + 2j * sign * decay * (1 - b)
+    cosines = 2 * rotation * (1 + a) + 2 * decay * (1 + b)
     displacement: Complex = beam.length_m * sines * reciprocal / z
     slope: Complex = cosines * reciprocal
     return displacement, slope

@@ -73,13 +73,15 @@ class Results:
     @property
     def highest_rate_hz(self) -> float | None:
         """Highest measured rate in Hz at which nearly all ticks ran in time, or None."""
-        held_rates = [one.rate_hz for one in self.search if one.held >= HELD_FRACTION]
+        held_rates = [
+            measured.rate_hz for measured in self.search if measured.held >= HELD_FRACTION
+        ]
         return max(held_rates, default=None)
 
     @property
     def highest_rate_between_stalls_hz(self) -> float | None:
         """Highest rate in Hz at which nearly all ticks outside of stalls ran in time, or None."""
-        held_rates = [one.rate_hz for one in self.search if _holds(one)]
+        held_rates = [measured.rate_hz for measured in self.search if _holds(measured)]
         return max(held_rates, default=None)
 
     def ratios(self) -> tuple[float, float] | None:
@@ -240,9 +242,9 @@ class Bench:
         except (OSError, subprocess.SubprocessError, ValueError) as error:
             raise loops.LoopError(f"The real-time settings cannot be tried ({error}).") from error
 
-    def _register_start(self, what: str) -> None:
+    def _register_start(self, name: str) -> None:
         """Register the start of a measurement for the progress."""
-        self._present_name = what
+        self._present_name = name
         duration_s = self._seconds + loops.OVERHEAD_S
         self._remaining_s = max(0.0, self._remaining_s - duration_s)
         self._present_end_s = time.monotonic() + duration_s
@@ -272,14 +274,14 @@ def cores_without_loop(granted: dict[str, str]) -> set[int]:
     return allowed - {loop_core(granted)} or allowed
 
 
-def _merit(one: LoopMeasurement) -> tuple[bool, float]:
+def _merit(measured: LoopMeasurement) -> tuple[bool, float]:
     """Return the sort key that is largest for the best measurement at a rate."""
-    return one.held >= HELD_FRACTION, one.held_between_stalls
+    return measured.held >= HELD_FRACTION, measured.held_between_stalls
 
 
-def _holds(one: LoopMeasurement) -> bool:
+def _holds(measured: LoopMeasurement) -> bool:
     """Return whether nearly all ticks outside of stalls ran within their periods."""
-    return one.held_between_stalls >= HELD_FRACTION
+    return measured.held_between_stalls >= HELD_FRACTION
 
 
 def _median(values: list[float]) -> float:

@@ -215,8 +215,8 @@ def edges_us() -> list[float]:
 
 def counts_of(delays_us: npt.NDArray[np.float64]) -> list[int]:
     """Return the number of delays in each bin of the histogram."""
-    found = np.searchsorted(edges_us(), delays_us, side="right") - 1
-    counts: list[int] = np.bincount(found, minlength=len(edges_us())).tolist()
+    bin_indices = np.searchsorted(edges_us(), delays_us, side="right") - 1
+    counts: list[int] = np.bincount(bin_indices, minlength=len(edges_us())).tolist()
     return counts
 
 
@@ -227,15 +227,15 @@ def histogram_lines(columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> l
     the logarithm of its count, so that rare delays are visible.
     """
     bin_counts = [counts_of(delays_us) for _, delays_us in columns]
-    used = [
+    used_bins = [
         index for index in range(len(edges_us())) if any(counts[index] for counts in bin_counts)
     ]
-    if not used:
+    if not used_bins:
         return []
     longest = max(max(counts) for counts in bin_counts)
     header = " " * (_LABEL_WIDTH + 3) + "".join(f"{name:<{_BAR_WIDTH + 9}}" for name, _ in columns)
     lines = [header.rstrip()]
-    for index in range(used[0], used[-1] + 1):
+    for index in range(used_bins[0], used_bins[-1] + 1):
         bars = (f"{_bar(counts[index], longest)}{counts[index]:>7}  " for counts in bin_counts)
         lines.append(f"{_label(index):>{_LABEL_WIDTH}}   {''.join(bars)}".rstrip())
     return lines

@@ -214,8 +214,8 @@ def _check_name(name: str) -> None:
 
 def _failure_text(row: CheckRow) -> str:
     """Return the finding of a failed row and its remedy as text for the operator."""
-    wanted = f" (wanted: {row.wanted})" if row.wanted else ""
-    return f"{row.group}, {row.what}: {row.found.rstrip('.')}{wanted}. {row.detail}".strip()
+    requirement = f" (wanted: {row.wanted})" if row.wanted else ""
+    return f"{row.group}, {row.what}: {row.found.rstrip('.')}{requirement}. {row.detail}".strip()
 
 
 def _refusal(failed: FailedCheck) -> str:

@@ -108,18 +108,18 @@ def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[CheckRow]:
     )
     accepted = capabilities.accepted
     for row in capabilities.lacks:
-        missing = row.accept in accepted
+        is_accepted = row.accept in accepted
         substitute = f"stands in: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
         if row.accept == WATCHDOG:
             substitute = f"stands in: {watchdog.value}" if watchdog is not Watchdog.NONE else ""
-        acceptance = f'accepted by cia402.accept_without "{row.accept}"' if missing else ""
+        acceptance = f'accepted by cia402.accept_without "{row.accept}"' if is_accepted else ""
         yield CheckRow(
             "drive",
             f"object {row.address} ({row.name})",
             "; ".join(("absent or not usable", *filter(None, (acceptance, substitute)))),
             "",
-            CheckResult.WARNING if missing else CheckResult.OK,
-            f"{row.name}: {row.sentence}" if missing else "",
+            CheckResult.WARNING if is_accepted else CheckResult.OK,
+            f"{row.name}: {row.sentence}" if is_accepted else "",
         )
     for text in capabilities.assigned:
         yield CheckRow("drive", "object set", text, "read back", CheckResult.OK)
@@ -339,18 +339,18 @@ def _exchange_rows(
         saturated += sensor.wrench_saturated
 
     yield _reply_row(profile, delays_ms, target)
-    for what, missing in (
+    for what, missing_count in (
         ("angles missing", missing_angles),
         ("wrenches missing", missing_wrenches),
     ):
         verdict = grade(
-            fail=missing > _MISSING_FRACTION_FAILURE * EXCHANGE_TICKS,
-            warn=missing > _MISSING_FRACTION_WARNING * EXCHANGE_TICKS,
+            fail=missing_count > _MISSING_FRACTION_FAILURE * EXCHANGE_TICKS,
+            warn=missing_count > _MISSING_FRACTION_WARNING * EXCHANGE_TICKS,
         )
         yield CheckRow(
             _EXCHANGE_GROUP,
             what,
-            f"{missing} of {EXCHANGE_TICKS} ticks",
+            f"{missing_count} of {EXCHANGE_TICKS} ticks",
             f"at most {100 * _MISSING_FRACTION_WARNING:.0f} %",
             verdict,
         )
@@ -399,17 +399,17 @@ def _probing_rows(profile: Profile, target: ActuationTarget) -> Iterator[CheckRo
     """Yield the row on whether scales and signs are known or need a probing move."""
     if target is ActuationTarget.SIMULATED:
         return
-    missing = [key for key in MEASURED if profile.sources.get(key) != "measured"]
-    if not missing:
+    not_measured = [key for key in MEASURED if profile.sources.get(key) != "measured"]
+    if not not_measured:
         found, verdict = "motor and encoder are measured", CheckResult.OK
     else:
         found = "scales and signs: verified by the probing move before the first session"
         verdict = CheckResult.SKIPPED
     detail = (
-        f"Probing move: sessions begin with it because {', '.join(missing)} "
-        f"{'is' if len(missing) == 1 else 'are'} not measured; rigd probe makes it by itself "
+        f"Probing move: sessions begin with it because {', '.join(not_measured)} "
+        f"{'is' if len(not_measured) == 1 else 'are'} not measured; rigd probe makes it by itself "
         "(docs/safety.md)."
-        if missing
+        if not_measured
         else ""
     )
     yield CheckRow("drive", "probing move", found, "", verdict, detail)

@@ -257,16 +257,16 @@ def _governor_row(root: Path) -> CheckRow:
         _read_or_empty(path)
         for path in sorted((root / _CPU_FOLDER).glob("cpu[0-9]*/cpufreq/scaling_governor"))
     }
-    slow = bool(governors - {"performance"})
+    is_slow = bool(governors - {"performance"})
     return CheckRow(
         _COMPUTER_GROUP,
         "frequency governor",
         ", ".join(sorted(governors)) or "none: the frequency is not this system's",
         "performance",
-        grade(fail=False, warn=slow),
+        grade(fail=False, warn=is_slow),
         "Frequency governor: an idle core slows down and takes longer for the next tick; "
         "cpupower frequency-set -g performance."
-        if slow
+        if is_slow
         else "",
     )
 
@@ -275,15 +275,15 @@ def _clock_row(root: Path) -> CheckRow:
     """Return the row on the kernel's clock source."""
     source = _read_or_empty(root / _CLOCK_SOURCE_FILE)
     # Architectures other than x86 have a fast counter of their own.
-    fast = source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
+    is_fast = source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
     return CheckRow(
         _COMPUTER_GROUP,
         "clock source",
         source or "unknown",
         "tsc",
-        grade(fail=False, warn=not fast),
+        grade(fail=False, warn=not is_fast),
         ""
-        if fast
+        if is_fast
         else "Clock source: reading the time costs a microsecond each; the kernel log says why it "
         "does not trust the processor's counter (dmesg | grep -i tsc).",
     )

@@ -185,8 +185,8 @@ def _run_bench(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: f
         Status("preparing", console=console) as status,
     ):
 
-        def on_progress(what: str, remaining_s: float) -> None:
-            status.update(f"{what}; {remaining_s // 60:.0f}:{remaining_s % 60:02.0f} left")
+        def on_progress(name: str, remaining_s: float) -> None:
+            status.update(f"{name}; {remaining_s // 60:.0f}:{remaining_s % 60:02.0f} left")
 
         bench = Bench(
             profile, rate_hz=rate_hz, seconds=seconds, spin_us=spin_us, on_progress=on_progress

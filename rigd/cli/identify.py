@@ -107,15 +107,15 @@ def motor(
             hardware=hardware,
             quiet_stdout=as_json,
         )
-    _, found = _estimate(files, profile)
+    _, proposal = _estimate(files, profile)
     if as_json:
-        document = {"files": [str(path) for path in files], **found.as_dict()}
+        document = {"files": [str(path) for path in files], **proposal.as_dict()}
         typer.echo(json.dumps(document))
         return
-    typer.echo("\n".join(["", *found.table(), ""]))
-    for note in found.notes:
+    typer.echo("\n".join(["", *proposal.table(), ""]))
+    for note in proposal.notes:
         typer.echo(f"Note: {note}")
-    typer.echo("\n".join(["", "For the profile:", "", *found.toml()]))
+    typer.echo("\n".join(["", "For the profile:", "", *proposal.toml()]))
 
 
 def _run_sessions(

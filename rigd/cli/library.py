@@ -112,27 +112,27 @@ def specimens() -> None:
 
     for name, path in specimen_files().items():
         try:
-            found = load_specimen(path)
+            loaded = load_specimen(path)
         except ProfileError as error:
             text = f"cannot be used: {str(error).splitlines()[0]}"
         else:
-            beam = found.beam
+            beam = loaded.beam
             text = (
                 f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
-                f"{beam.bending_stiffness_n_m2:g} N·m²{found.note and f', {found.note}'} ({path})"
+                f"{beam.bending_stiffness_n_m2:g} N·m²{loaded.note and f', {loaded.note}'} ({path})"
             )
         typer.echo(readable_message(f"{name}: {text}"))
 
 
 def _sessions_of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
     """Return the sessions whose modes are known; several specimens end the command."""
-    found = [row for row in rows if row.modes]
-    specimens = sorted({row.specimen for row in found})
+    with_modes = [row for row in rows if row.modes]
+    specimens = sorted({row.specimen for row in with_modes})
     if len(specimens) > 1:
         names = ", ".join(repr(name) if name else "none" for name in specimens)
         fail(f"--trend: the sessions are of several specimens ({names}); name one by --specimen.",
              EXIT_WRONG_USE)  # fmt: skip
-    return found
+    return with_modes
 
 
 def _local_start(row: "SessionRow") -> str:
@@ -203,8 +203,8 @@ def _uniform_beam_text(row: "SessionRow") -> str:
     """Return in short whether a uniform beam predicts a session's modes; "" if it is unknown."""
     from rigd.session import Validity
 
-    found = Validity.of_document(row.validity).uniform_beam
-    return "" if found is None or not row.modes else found.short
+    check_result = Validity.of_document(row.validity).uniform_beam
+    return "" if check_result is None or not row.modes else check_result.short
 
 
 # Trend
@@ -218,7 +218,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     for number, trend in enumerate(trends, start=1):
         if number > 1:
             yield ""
-        low, high = _frequency_limits(trend)
+        lowest_hz, highest_hz = _frequency_limits(trend)
         yield from _table(
             (
                 *(f"mode {number}", "frequency (Hz)", "change", "damping (%)", "change", ""),
@@ -231,7 +231,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
                     _change_text(point.frequency_change, trend.points[0].frequency_hz["value"]),
                     _quantity_text(point.damping_ratio, 100),
                     _change_text(point.damping_change, trend.points[0].damping_ratio["value"]),
-                    _interval_plot(point, low, high),
+                    _interval_plot(point, lowest_hz, highest_hz),
                     _validity_text(point.row),
                     printable(point.row.path.name),
                 )
@@ -256,14 +256,17 @@ def _frequency_limits(trend: "ModeTrend") -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def _interval_plot(point: "TrendPoint", low: float, high: float) -> str:
+def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> str:
     """Return a line that shows a session's frequency interval between the plot's limits in Hz."""
-    if high <= low:
+    if highest_hz <= lowest_hz:
         return ""
 
     def column_of(frequency_hz: float) -> int:
         return min(
-            max(round((frequency_hz - low) / (high - low) * (_PLOT_WIDTH - 1)), 0), _PLOT_WIDTH - 1
+            max(
+                round((frequency_hz - lowest_hz) / (highest_hz - lowest_hz) * (_PLOT_WIDTH - 1)), 0
+            ),
+            _PLOT_WIDTH - 1,
         )
 
     value = point.frequency_hz["value"]
@@ -306,15 +309,15 @@ def info(
     failed = False
     for number, path in enumerate(paths):
         try:
-            found = describe(path)
+            description = describe(path)
         except SessionError as error:
             failed = True
             complain(str(error))
             documents.append({"path": str(path), "error": str(error)})
         else:
-            documents.append(found.as_dict())
+            documents.append(description.as_dict())
             if not as_json:
-                typer.echo(("\n" if number else "") + "\n".join(found.lines()))
+                typer.echo(("\n" if number else "") + "\n".join(description.lines()))
     if as_json and not (failed and len(paths) == 1):
         typer.echo(json.dumps(documents[0] if len(paths) == 1 else {"files": documents}))
     if failed:

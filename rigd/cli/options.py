@@ -175,11 +175,11 @@ def session_notes(
         if not text.isprintable():
             fail(f"--{option} {text!r}: must be a single line of plain text.", EXIT_WRONG_USE)
     metadata: dict[str, str] = {}
-    for given in meta or []:
-        name, equals, value = given.partition("=")
+    for option_value in meta or []:
+        name, equals, value = option_value.partition("=")
         if not equals or name in metadata:
             problem = "is given twice" if equals else "must be NAME=VALUE (temperature_c=21.4)"
-            fail(f"--meta {given!r}: {problem}.", EXIT_WRONG_USE)
+            fail(f"--meta {option_value!r}: {problem}.", EXIT_WRONG_USE)
         metadata[name] = value
     return {name: text for name, text in notes.items() if text} | metadata_keys(metadata)
 

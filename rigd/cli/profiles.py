@@ -52,12 +52,12 @@ def list_profiles() -> None:
     """
     from rigd.profile import ProfileError, load_profile, profile_files
 
-    for name, (used, *hidden) in profile_files().items():
+    for name, (used_file, *hidden) in profile_files().items():
         try:
-            description = load_profile(used.path).description
+            description = load_profile(used_file.path).description
         except ProfileError as error:
             description = f"cannot be used: {str(error).splitlines()[0]}"
-        typer.echo(printable(f"{name}: {description} ({used.path}, {used.origin})"))
+        typer.echo(printable(f"{name}: {description} ({used_file.path}, {used_file.origin})"))
         for other in hidden:
             typer.echo(printable(f"  hides {other.path} ({other.origin})"))
 
@@ -100,18 +100,18 @@ def copy(
             "copy into this folder by --here.",
             EXIT_FAILED,
         )
-    stem = new_name or profile.path.stem
-    if Path(stem).name != stem or stem.endswith(".toml"):
-        fail(f"{stem}: is a path; a copy has a name only, without .toml.", EXIT_WRONG_USE)
-    path = folder / f"{stem}.toml"
+    file_stem = new_name or profile.path.stem
+    if Path(file_stem).name != file_stem or file_stem.endswith(".toml"):
+        fail(f"{file_stem}: is a path; a copy has a name only, without .toml.", EXIT_WRONG_USE)
+    path = folder / f"{file_stem}.toml"
     copy_profile(profile, path, new_name)
-    files = profile_files()[stem]
+    files = profile_files()[file_stem]
     position = [file.path.resolve() for file in files].index(path.resolve())
     if position:
         typer.echo(f"Note: {files[0].path} ({files[0].origin}) hides it here.", err=True)
     for other in files[position + 1 :]:
         typer.echo(f"Note: it hides {other.path} ({other.origin}).", err=True)
-    typer.echo(f"{path}: written. Next: edit it, then rigd check --profile {stem}")
+    typer.echo(f"{path}: written. Next: edit it, then rigd check --profile {file_stem}")
 
 
 @profiles_app.command()
@@ -144,11 +144,11 @@ def new(
     write_new(output, _ask_for_values(draft) if is_terminal() else draft.text())
     for remark in draft.remarks:
         typer.echo(f"Note: {remark}", err=True)
-    missing = draft.unanswered_questions()
+    unanswered = draft.unanswered_questions()
     missing_features = [finding.accept for finding in draft.unaccepted_findings()]
-    if missing or missing_features:
+    if unanswered or missing_features:
         typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
-    for question in missing:
+    for question in unanswered:
         typer.echo(
             f"  {question.key} = {draft.value_text(question.key)}: {question.text}", err=True
         )
@@ -207,9 +207,9 @@ def _ask_for_acceptance(draft: "Draft") -> None:
 def _ask_for_value(draft: "Draft", key: str, text: str) -> None:
     """Ask the user for the value of a key until the answer is valid."""
     while True:
-        given = typer.prompt(text, default=draft.value_text(key), err=True)
+        reply = typer.prompt(text, default=draft.value_text(key), err=True)
         try:
-            draft.answer(key, given.strip())
+            draft.answer(key, reply.strip())
             return
         except ValueError as error:
             typer.echo(f"{key}: {error}.", err=True)

@@ -104,8 +104,10 @@ def _add_subcommand(app: typer.Typer, perform: Callable[..., None], parameters: 
         common_options = {
             parameter.name: options.pop(parameter.name) for parameter in common_parameters
         }
-        given = {name: value for name, value in parameters(**options).items() if value is not None}
-        perform(kind, given, **common_options)
+        given_parameters = {
+            name: value for name, value in parameters(**options).items() if value is not None
+        }
+        perform(kind, given_parameters, **common_options)
 
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [

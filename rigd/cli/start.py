@@ -77,7 +77,9 @@ def start_processes(
     stop = StopRequest()
     stop.catch()
     try:
-        extra_processes = [process for process, wanted in ((TOUCH, touch), (FIT, fit)) if wanted]
+        extra_processes = [
+            process for process, is_needed in ((TOUCH, touch), (FIT, fit)) if is_needed
+        ]
         return stop, ProcessGroup(live=live, also=extra_processes)
     except OSError as error:
         fail(
@@ -181,11 +183,11 @@ class _Interrupts:
     def caught(cls) -> Iterator["_Interrupts"]:
         """Count Ctrl-C within this context instead of raising KeyboardInterrupt."""
         interrupts = cls()
-        before = signal.signal(signal.SIGINT, lambda *_: interrupts.note())
+        previous_handler = signal.signal(signal.SIGINT, lambda *_: interrupts.note())
         try:
             yield interrupts
         finally:
-            signal.signal(signal.SIGINT, before)
+            signal.signal(signal.SIGINT, previous_handler)
 
     def note(self) -> None:
         """Count one Ctrl-C."""
@@ -201,7 +203,7 @@ def _follow_series(
     from rigd.runner.quick_looks import QuickLook
 
     stop_sent = False
-    done = 0
+    ended_sessions = 0
     awaited_quick_looks: set[str] = set()
     quick_look_paths: dict[str, str] = {}
     fits: dict[str, Any] = {}
@@ -223,7 +225,7 @@ def _follow_series(
             event = client.event(_EVENT_TIMEOUT_S) or {}
             match event.get("event"):
                 # No bar between two sessions, where it would mix with the printed path.
-                case "progress" if event["session"] > done:
+                case "progress" if event["session"] > ended_sessions:
                     progress_line.update(
                         Phase[event["phase"].upper()],
                         event["tick"],
@@ -250,7 +252,7 @@ def _follow_series(
                             awaited_quick_looks.add(event["path"])
                         if "fit" in event:
                             fits[event["path"]] = event["fit"]
-                    progress_line, done = ProgressLine(), event["number"]
+                    progress_line, ended_sessions = ProgressLine(), event["number"]
                 case "quick_look" if event["path"] in awaited_quick_looks:
                     awaited_quick_looks.discard(event["path"])
                     quick_look = QuickLook.of_event(event)

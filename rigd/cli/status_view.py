@@ -106,12 +106,12 @@ def progress_text(progress: dict[str, Any]) -> str:
 
 def _series_text(series: dict[str, Any]) -> str:
     """Return a line on a running or ended series of sessions."""
-    what = f"{series['excitation']} {series['session']} of {series['repeat']}"
+    title = f"{series['excitation']} {series['session']} of {series['repeat']}"
     if series["running"]:
-        return f"{what}: {series['path'] or 'being planned'}"
-    done = [session for session in series["sessions"] if session["outcome"] == "complete"]
+        return f"{title}: {series['path'] or 'being planned'}"
+    complete = [session for session in series["sessions"] if session["outcome"] == "complete"]
     why = f" ({series['reason']})" if series["reason"] else ""
-    return f"{what}, ended: {len(done)} complete{why}"
+    return f"{title}, ended: {len(complete)} complete{why}"
 
 
 def _empty_table(title: str, *columns: str) -> Table:
@@ -173,10 +173,10 @@ def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     if signals is not None:
         # The expected rate of the samples is that of the loop.
         expected_hz = max(topic["expected_hz"] or 0.0 for topic in rig["topics"])
-        slow = signals["rate_hz"] < 0.999 * expected_hz
-        yield "rate", f"{signals['rate_hz']:.1f} Hz", "yellow" if slow else ""
-        late = f"{signals['lateness_p50_us']:.0f}, {signals['lateness_p99_us']:.0f} µs"
-        yield "wake-up latency p50, p99", late, ""
+        is_slow = signals["rate_hz"] < 0.999 * expected_hz
+        yield "rate", f"{signals['rate_hz']:.1f} Hz", "yellow" if is_slow else ""
+        latency_text = f"{signals['lateness_p50_us']:.0f}, {signals['lateness_p99_us']:.0f} µs"
+        yield "wake-up latency p50, p99", latency_text, ""
         yield "execution time p99", f"{signals['work_p99_us']:.0f} µs", ""
     lost = f"{health['missed']}, {health['late']}, {health['lost']}"
     style = "bold red" if health["lost"] else "yellow" if health["missed"] else ""

@@ -214,7 +214,7 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
     """
     rig = profile.rig
     motor = rig.motor
-    found: list[tuple[str, MotorQuantity, float]] = [
+    compared: list[tuple[str, MotorQuantity, float]] = [
         ("motor.inertia_kg_m2", estimate.inertia_kg_m2, motor.inertia_kg_m2),
         (
             "motor.viscous_nm_s_per_rad",
@@ -238,15 +238,15 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
         # It converts the drive's own rated torque for the comparison: both change by one factor.
         unit_nm = rig.cia402.rated_torque_unit_nm
         key = "cia402.rated_torque_unit_nm"
-        found.append((key, _scaled(unit_nm, estimate.torque_scale), unit_nm))
+        compared.append((key, _scaled(unit_nm, estimate.torque_scale), unit_nm))
     torque_at_sync = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
-    least = {"actuation.delay_s": 1 / rig.rate_hz} if torque_at_sync else {}
+    smallest_values = {"actuation.delay_s": 1 / rig.rate_hz} if torque_at_sync else {}
     rows = tuple(
-        ProposalRow(*row, profile.sources.get(row[0], "assumed"), least.get(row[0], 0.0))
-        for row in found
+        ProposalRow(*row, profile.sources.get(row[0], "assumed"), smallest_values.get(row[0], 0.0))
+        for row in compared
     )
     notes = _notes(estimate, profile, unusable)
-    if any(row.is_below_least for row in rows if row.key in least):
+    if any(row.is_below_least for row in rows if row.key in smallest_values):
         notes.append(
             "The torque acts before the next SYNC: this drive takes it on arrival, whatever the "
             'type of its RPDO. Set cia402.torque_delivery = "on_arrival" together with the delay.'

@@ -78,7 +78,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
                     "give each session once."
                 )
         digests[path] = digest
-        found = (
+        rig_data = (
             Timing(
                 session.number("rate_hz"),
                 session.number("angle_delay_s", 0.0),
@@ -88,13 +88,13 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
             session.number("tool_inertia_kg_m2", 0.0),
         )
         if first is None:
-            first = found
-        if found != first:
+            first = rig_data
+        if rig_data != first:
             raise MotorEstimateError(
                 f"{path}: its rate, delays or tool inertia are not those of {paths[0]}; give "
                 "sessions of one rig."
             )
-        usable, expected = _passes(session, session_number, found[0].rate_hz)
+        usable, expected = _passes(session, session_number, rig_data[0].rate_hz)
         windows += usable
         unusable += expected - len(usable)
     if first is None:
@@ -117,7 +117,7 @@ def _passes(
             f"{session.path}: was not recorded by rigd identify motor, so its passes are unknown; "
             "give the files that it wrote."
         )
-    kind = session.metadata["excitation"]
+    excitation = session.metadata["excitation"]
     samples = session.samples
     ticks = samples["tick"].astype(np.int64)
     is_unusable = (samples["status"] & _UNUSABLE_STATUS) != 0
@@ -134,7 +134,7 @@ def _passes(
                 torque_command_nm=window["torque_command_nm"],
                 coupling_torque_nm=window["coupling_torque_nm"],
                 speed_rad_s=speed_pass.speed_rad_s,
-                top_hz=HIGHEST_FREQUENCY_HZ[kind],
+                top_hz=HIGHEST_FREQUENCY_HZ[excitation],
                 session=session_number,
                 key=(session_number, speed_pass.speed_rad_s),
             )

@@ -276,21 +276,21 @@ def _finish_fit(
     inverse = np.linalg.inv(normal)
 
     # Each stack's part in the variance, from the scatter of its repeats' effects on the solution.
-    parts, degrees = [], []
+    variance_parts, degrees = [], []
     squares, term_count = 0.0, 0
     departure_nm = 0.0
     for row, weight, residual in zip(rows, weights, residuals, strict=True):
         repeats = len(row.y)
         mean = row.x[..., free_indices].mean(axis=0)
         effects = np.einsum("mp,m,rm->rp", mean.conj(), weight, residual).real @ inverse
-        parts.append(effects.var(axis=0, ddof=1) / repeats)
+        variance_parts.append(effects.var(axis=0, ddof=1) / repeats)
         degrees.append(repeats - 1)
         mean_residual = residual.mean(axis=0)
         squares += float(np.sum(weight * np.abs(mean_residual) ** 2))
         term_count += mean_residual.size
         constant = abs(row.x[0, 0, COULOMB_INDEX])
         departure_nm = max(departure_nm, abs(float(mean_residual[0].real)) / float(constant))
-    parts_of_variance = np.array(parts)
+    parts_of_variance = np.array(variance_parts)
     variance = parts_of_variance.sum(axis=0)
     degrees_of_freedom = variance**2 / np.sum(
         parts_of_variance**2 / np.array(degrees)[:, None], axis=0
@@ -422,21 +422,21 @@ def estimate_motor(
     """
     moving = [window for window in windows if _moves_throughout(window, timing.rate_hz)]
     stacks = _group_repeats(moving, len(windows))
-    found = _fit_equation(stacks, timing, hold_scale=False)
+    fit = _fit_equation(stacks, timing, hold_scale=False)
     scale_known = (
-        found is not None
-        and found.stds[SCALE_INDEX] < _MAX_SCALE_STD
-        and _PLAUSIBLE_SCALES[0] < found.values[SCALE_INDEX] < _PLAUSIBLE_SCALES[1]
+        fit is not None
+        and fit.stds[SCALE_INDEX] < _MAX_SCALE_STD
+        and _PLAUSIBLE_SCALES[0] < fit.values[SCALE_INDEX] < _PLAUSIBLE_SCALES[1]
     )
     if not scale_known:
-        found = _fit_equation(stacks, timing, hold_scale=True)
-    if found is None:
+        fit = _fit_equation(stacks, timing, hold_scale=True)
+    if fit is None:
         raise MotorEstimateError(
             "The motor's data are not identifiable from the record: the fit does not converge. "
             "Check actuation.delay_s of the profile, from which the search begins, and the "
             "record."
         )
-    values, stds = found.values, found.stds
+    values, stds = fit.values, fit.stds
     inertia = float(values[INERTIA_INDEX])
     if inertia <= 0.0:
         raise MotorEstimateError(
@@ -460,8 +460,8 @@ def estimate_motor(
         ),
         windows=len(moving),
         dropped=len(windows) - len(moving),
-        misfit=found.misfit,
-        friction_departure_nm=found.friction_departure_nm,
+        misfit=fit.misfit,
+        friction_departure_nm=fit.friction_departure_nm,
     )
 
 
@@ -474,10 +474,10 @@ def _moves_throughout(window: PassReadings, rate_hz: float) -> bool:
     return bool(np.min(forward_speed) > _MIN_SPEED_FRACTION * abs(window.speed_rad_s))
 
 
-def _group_repeats(windows: Sequence[PassReadings], given: int) -> list[_MotionRepeats]:
+def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_MotionRepeats]:
     """Group windows into stacks of repeats, or raise MotorEstimateError if there are too few.
 
-    `given` is the number of windows before those with a standstill were removed.
+    `window_count` is the number of windows before those with a standstill were removed.
     """
     groups: dict[Hashable, list[PassReadings]] = {}
     for window in windows:
@@ -485,8 +485,8 @@ def _group_repeats(windows: Sequence[PassReadings], given: int) -> list[_MotionR
     complete_groups = [group for group in groups.values() if len(group) >= LEAST_REPEATS]
     if {np.sign(group[0].speed_rad_s) for group in complete_groups} != {1.0, -1.0}:
         raise MotorEstimateError(
-            f"Of {given} passes {len(windows)} can be used, and that is too few: it takes at least "
-            f"{LEAST_REPEATS} of the same kind in both directions, without gaps and without a "
+            f"Of {window_count} passes {len(windows)} can be used, and that is too few: it takes "
+            f"at least {LEAST_REPEATS} of the same kind in both directions, without gaps and without a "
             "standstill."
         )
     sessions = {

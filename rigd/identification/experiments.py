@@ -172,14 +172,14 @@ def multisine_session(profile: Profile, *, torque_percent: float, stroke_rad: fl
 
 
 def _multisine_excitation(
-    kind: str, profile: Profile, torque_percent: float, stroke_rad: float
+    excitation_name: str, profile: Profile, torque_percent: float, stroke_rad: float
 ) -> Excitation:
     """Return the excitation `TRIAL` or `MULTISINE`: passes with a multisine."""
     limit_nm = _torque_limit(profile, torque_percent)
     loop = close_loop(profile.loop_model())
-    schedule = _fit_schedule(kind, (1.0,), profile, stroke_rad)
+    schedule = _fit_schedule(excitation_name, (1.0,), profile, stroke_rad)
     passes_rad = _passes_reference(schedule, profile)
-    multisine = _multisine(schedule, loop, _SPEED_MODULATION[kind])
+    multisine = _multisine(schedule, loop, _SPEED_MODULATION[excitation_name])
     passes_nm = _peak_torque(loop, passes_rad)
     peak_nm = _peak_torque(loop, passes_rad + multisine)
     fraction = 1.0
@@ -194,7 +194,13 @@ def _multisine_excitation(
             f"{_rounded_percent(profile, needed_nm)} % or a shorter --stroke-rad."
         )
     return _checked_excitation(
-        kind, schedule, profile, loop, passes_rad + fraction * multisine, torque_percent, stroke_rad
+        excitation_name,
+        schedule,
+        profile,
+        loop,
+        passes_rad + fraction * multisine,
+        torque_percent,
+        stroke_rad,
     )
 
 
@@ -263,7 +269,7 @@ def _rounded_percent(profile: Profile, torque_nm: float) -> int:
 
 
 def _fit_schedule(
-    kind: str, relative_speeds: tuple[float, ...], profile: Profile, stroke_rad: float
+    excitation_name: str, relative_speeds: tuple[float, ...], profile: Profile, stroke_rad: float
 ) -> PassSchedule:
     """Return a schedule whose passes are as fast as stroke and speed limit allow.
 
@@ -275,7 +281,7 @@ def _fit_schedule(
             f"--stroke-rad {stroke_rad:g}: must be more than 0 and at most limits.angle_rad = "
             f"{limits.angle_rad:g} rad."
         )
-    cycles = _CYCLE_COUNTS[kind]
+    cycles = _CYCLE_COUNTS[excitation_name]
     travel_s = float(np.ptp(_passes_path(PassSchedule(relative_speeds, 1), profile.rig.rate_hz)))
     speed = min(
         _MAX_SPEED_RAD_S,
@@ -392,7 +398,7 @@ def _peak_torque(loop: ClosedLoop, reference: Real) -> float:
 
 
 def _checked_excitation(
-    kind: str,
+    excitation_name: str,
     schedule: PassSchedule,
     profile: Profile,
     loop: ClosedLoop,
@@ -427,4 +433,4 @@ def _checked_excitation(
         "sweep": (rest_ticks, end),
         "ring_down": (end, reference.size),
     }
-    return Excitation(kind, parameters, rate_hz, reference, segments)
+    return Excitation(excitation_name, parameters, rate_hz, reference, segments)

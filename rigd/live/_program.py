@@ -149,8 +149,8 @@ class RerunProgram:
                 # A backtrace follows this line, so it is not among the last lines.
                 self._without_graphics |= _NO_GRAPHICS_LINE.search(line) is not None
                 for pattern in (_GRPC_PORT_LINE, _PAGE_PORT_LINE):
-                    if found := pattern.search(line):
-                        self._ports[pattern] = int(found[1])
+                    if match := pattern.search(line):
+                        self._ports[pattern] = int(match[1])
 
 
 def _program_path() -> str:

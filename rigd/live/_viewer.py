@@ -250,14 +250,14 @@ class Viewer(_Window):
             return False
         self._connections += 1
         url = self._next_url(address)
-        done: list[bool] = []
+        successes: list[bool] = []
         # In a thread, because a frozen window never responds, and the wait would block Ctrl-C.
         self._connecting = threading.Thread(
-            target=_switch_server, args=(self.control_url, url, done), daemon=True
+            target=_switch_server, args=(self.control_url, url, successes), daemon=True
         )
         self._connecting.start()
         self._connecting.join(_SWITCH_TIMEOUT_S)
-        return any(done)
+        return any(successes)
 
     def _next_url(self, address: LiveAddress) -> str:
         """Return a URL of the live view's server that differs from the previous one."""
@@ -266,8 +266,8 @@ class Viewer(_Window):
         )
 
 
-def _switch_server(control_url: str, url: str, done: list[bool]) -> None:
-    """Switch a viewer to another server, and append True to `done` on success."""
+def _switch_server(control_url: str, url: str, successes: list[bool]) -> None:
+    """Switch a viewer to another server, and append True to `successes` on success."""
     from rerun.experimental import ViewerClient
 
     try:
@@ -283,4 +283,4 @@ def _switch_server(control_url: str, url: str, done: list[bool]) -> None:
         client.open(url)
     except (OSError, RuntimeError):  # the viewer is busy or about to end
         return
-    done.append(True)
+    successes.append(True)

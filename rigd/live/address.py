@@ -118,8 +118,8 @@ def announce(address: LiveAddress) -> None:
 def withdraw(address: LiveAddress) -> None:
     """Delete the file of a view's address, unless another process has replaced it."""
     path = _address_path(address.rig)
-    found = _read_address_file(path)
-    if found is not None and (found.pid, found.born) == (address.pid, address.born):
+    stored = _read_address_file(path)
+    if stored is not None and (stored.pid, stored.born) == (address.pid, address.born):
         path.unlink(missing_ok=True)
 
 
@@ -131,8 +131,8 @@ def find(rig: str) -> LiveAddress | None:
 
 def running() -> list[LiveAddress]:
     """Return the addresses of all running live views of this user."""
-    found = map(_read_address_file, address_files(f"{_FILE_PREFIX}*{_FILE_SUFFIX}"))
-    return [address for address in found if address is not None and address.alive]
+    addresses = map(_read_address_file, address_files(f"{_FILE_PREFIX}*{_FILE_SUFFIX}"))
+    return [address for address in addresses if address is not None and address.alive]
 
 
 def _address_path(rig: str) -> Path:
@@ -145,21 +145,21 @@ def _read_address_file(path: Path) -> LiveAddress | None:
 
     The contents are checked because they are shown on terminals.
     """
-    found = read_address(path)
+    contents = read_address(path)
     try:
-        address = LiveAddress(**found)
+        address = LiveAddress(**contents)
     except TypeError:
         return None
-    return address if _is_valid(found) else None
+    return address if _is_valid(contents) else None
 
 
-def _is_valid(found: dict[str, object]) -> bool:
+def _is_valid(contents: dict[str, object]) -> bool:
     """Return whether the fields read from an address file have valid values."""
-    rig = found.pop("rig")
-    ports = (found["grpc_port"], found["page_port"])
+    rig = contents.pop("rig")
+    ports = (contents["grpc_port"], contents["page_port"])
     return (
         isinstance(rig, str)
         and rig.isprintable()
-        and all(type(number) is int for number in found.values())
+        and all(type(number) is int for number in contents.values())
         and all(0 < port < 1 << 16 for port in ports if isinstance(port, int))
     )

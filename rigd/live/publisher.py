@@ -192,10 +192,11 @@ class _Publisher:
         self._channels.shared_state.beat(StateField.LIVE_BEAT)
         if self._shown_session is not None:
             self._shown_session.queue_new_records()
-        before = self._drawing_stream.connections
+        previous_connections = self._drawing_stream.connections
         if self._drawing_stream.ready() and self._shown_session is not None:
             self._shown_session.send(
-                self._drawing_stream, connected=self._drawing_stream.connections != before
+                self._drawing_stream,
+                connected=self._drawing_stream.connections != previous_connections,
             )
         self._announce_address()
 
@@ -420,12 +421,12 @@ def last_response(session: "LiveSession", shown_last: LastResponse | None) -> La
         shown_last = None
     if session.folder is None:
         return shown_last
-    found = last_quick_look(
+    newest = last_quick_look(
         session.folder, specimen, but=session.subject.name, usable=itemgetter("response")
     )
-    if found is None:
+    if newest is None:
         return shown_last
-    path, quick_look = found
+    path, quick_look = newest
     # Names of session files begin with the time of the session.
     if shown_last is not None and path.stem < shown_last.session:
         return shown_last

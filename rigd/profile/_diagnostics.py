@@ -241,10 +241,10 @@ def _obstacle_problems(values: Mapping[str, Any]) -> Iterator[str]:
         values["beam.density_kg_per_m"],
         values["beam.bending_stiffness_n_m2"],
     )
-    given = {name: values.get(f"simulation.{name}") for name in INCOMPATIBLE_WITH_OBSTACLES}
+    effects = {name: values.get(f"simulation.{name}") for name in INCOMPATIBLE_WITH_OBSTACLES}
     for text in values.get("simulation.obstacles") or ():
         try:
-            check_obstacles([parse_obstacle(text)], beam, given)
+            check_obstacles([parse_obstacle(text)], beam, effects)
         except ObstacleError as error:
             yield f"simulation.obstacles: {error}"
 
@@ -283,15 +283,15 @@ def _unreachable_limits(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def missing_key_messages(absent: list[str], given: Mapping[str, Any]) -> Iterator[str]:
+def missing_key_messages(absent: list[str], values: Mapping[str, Any]) -> Iterator[str]:
     """Yield a message for each missing key or section.
 
-    `absent` has the missing keys, `given` the values of the file.
+    `absent` has the missing keys, `values` the values of the file.
     """
     reported = set()
     for key in absent:
         section = key.rpartition(".")[0]
-        if section and not any(k.rpartition(".")[0] == section for k in given):
+        if section and not any(k.rpartition(".")[0] == section for k in values):
             if section not in reported:
                 reported.add(section)
                 yield f"section [{section}] is missing."
@@ -301,31 +301,31 @@ def missing_key_messages(absent: list[str], given: Mapping[str, Any]) -> Iterato
             yield f'{key} is missing; add it as {{ value = …, source = "…" }}{_unit(key, " in")}.'
 
 
-def unknown_key_message(key: str, given: Mapping[str, Any]) -> str:
+def unknown_key_message(key: str, values: Mapping[str, Any]) -> str:
     """Return the message for an unknown key, with the key that was probably meant."""
     if key in SECTIONS:
-        return f"{key} = {_text(given[key])} must be a section; write [{key}] and its keys below."
+        return f"{key} = {_text(values[key])} must be a section; write [{key}] and its keys below."
     section = key.rpartition(".")[0]
-    known = [k for k in key_types() if k.rpartition(".")[0] == section]
-    if not known:
+    section_keys = [k for k in key_types() if k.rpartition(".")[0] == section]
+    if not section_keys:
         similar = difflib.get_close_matches(section or key, SECTIONS, 1)
         hint = (
             f"did you mean [{similar[0]}]?" if similar else f"sections are {', '.join(SECTIONS)}."
         )
         return f"{key} is not a key of a profile; {hint}"
-    for candidate in known:
+    for candidate in section_keys:
         suffix = suffix_of(candidate)
-        stem = candidate.removesuffix(suffix)
-        if suffix and key.startswith(stem + "_"):
+        key_without_unit = candidate.removesuffix(suffix)
+        if suffix and key.startswith(key_without_unit + "_"):
             return (
-                f"{key} = {_text(given[key])} has the wrong unit "
-                f"('{key.removeprefix(stem + '_')}'); write {candidate}, the value in "
+                f"{key} = {_text(values[key])} has the wrong unit "
+                f"('{key.removeprefix(key_without_unit + '_')}'); write {candidate}, the value in "
                 f"{UNITS[suffix]}."
             )
-    similar = difflib.get_close_matches(key, known, 1)
+    similar = difflib.get_close_matches(key, section_keys, 1)
     if similar:
         return f"{key} is unknown; did you mean {similar[0]}{_unit(similar[0], ', in')}?"
-    names = ", ".join(k.rpartition(".")[2] for k in known)
+    names = ", ".join(k.rpartition(".")[2] for k in section_keys)
     return f"{key} is unknown; {f'[{section}]' if section else 'the top'} has {names}."
 
 
@@ -353,20 +353,20 @@ def wrong_value_message(detail: ErrorDetails) -> str:
     key, *position = detail["loc"]
     if detail["type"] == "missing":  # one of the six
         position = []
-    where = f"{key}[{position[0]}]" if position else str(key)
-    what = f"{where} = {_text(detail['input'])}{_unit(str(key))}"
+    item_key = f"{key}[{position[0]}]" if position else str(key)
+    statement = f"{item_key} = {_text(detail['input'])}{_unit(str(key))}"
     if detail["type"] == "literal_error":
         remedy = f"must be {detail['ctx']['expected']}".replace("'", '"')
     elif detail["type"] in _BOUND_WORDS:
-        name, words = _BOUND_WORDS[detail["type"]]
-        remedy = f"must be {words} {detail['ctx'][name]:g}"
+        name, bound_words = _BOUND_WORDS[detail["type"]]
+        remedy = f"must be {bound_words} {detail['ctx'][name]:g}"
         if str(key).startswith("beam.damping."):
             remedy += ": a negative coefficient or an order of 2 or more is an unstable beam"
     elif detail["type"] == "tuple_type" and not is_number(key_types()[str(key)]):
         remedy = "must be an array of texts in quotes"
     else:
         remedy = f"must be {_REQUIRED_TYPES.get(detail['type'], detail['msg'])}"
-    return f"{what} {remedy}."
+    return f"{statement} {remedy}."
 
 
 def _unit(key: str, before: str = "") -> str:

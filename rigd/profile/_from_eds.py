@@ -172,8 +172,8 @@ class Draft:
         """
         accepted = Setting(_ACCEPT_KEY, tuple(self._accepted))
         text = with_settings(self._base.text, [*self._settings.values(), accepted])
-        found = check_suitability(self._eds, profile_of(text, self._path).rig).findings
-        return [each for each in found if each.accept and each.grade is Grade.REFUSED]
+        findings = check_suitability(self._eds, profile_of(text, self._path).rig).findings
+        return [each for each in findings if each.accept and each.grade is Grade.REFUSED]
 
     def accept(self, name: str) -> None:
         """Accept a missing feature of the drive in the draft, as decided by the operator.
@@ -248,9 +248,13 @@ class Draft:
         If the operator has accepted none yet, the setting is written as a comment.
         """
         undecided = [finding.accept for finding in self.unaccepted_findings()]
-        own = self._manufacturer_limits() if TORQUE_LIMIT in (*undecided, *self._accepted) else ""
+        limit_objects = (
+            self._manufacturer_limits() if TORQUE_LIMIT in (*undecided, *self._accepted) else ""
+        )
         hint = (
-            f" For a torque limit of its own see {own}, set by cia402.set_objects." if own else ""
+            f" For a torque limit of its own see {limit_objects}, set by cia402.set_objects."
+            if limit_objects
+            else ""
         )
         if self._accepted:
             why = "The drive lacks, by its file, what these names stand for (docs/devices.md)."
@@ -309,7 +313,7 @@ class Draft:
     def _missing_object_settings(self) -> Iterator[Setting]:
         """Yield a setting of 0 for each optional object that the drive lacks."""
         missing_names = self._missing_feature_names()
-        for missing, key, why in (
+        for is_missing, key, why in (
             (
                 not self._eds.get(MAX_SPEED_RPM),
                 "max_speed_rad_s",
@@ -322,7 +326,7 @@ class Draft:
             ),
             (TORQUE_FEEDBACK in missing_names, "torque_tolerance_percent", "6077 (actual torque)"),
         ):
-            if missing:
+            if is_missing:
                 yield Setting(f"cia402.{key}", 0.0, "datasheet", f"The drive has no object {why}.")
 
     def _manufacturer_limits(self) -> str:
@@ -330,12 +334,12 @@ class Draft:
 
         The text is empty if there are none.
         """
-        found = [
+        object_names = [
             f"{e.index:04X}:{e.sub:X} ({e.name}{'' if e.default is None else f', {e.default}'})"
             for e in self._eds.entries.values()
             if e.index in _MANUFACTURER_INDICES and e.writable and _TORQUE_LIMIT_NAME.search(e.name)
         ]
-        return " or ".join(found[:_MAX_NAMED_OBJECTS])
+        return " or ".join(object_names[:_MAX_NAMED_OBJECTS])
 
     def _head_comment(self) -> list[str]:
         """Return the lines of the comment at the beginning of the profile."""

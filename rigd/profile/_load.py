@@ -167,17 +167,17 @@ def _find_profile(name_or_path: str | Path) -> Path:
     """Return the path of a profile, or raise ProfileError if there is none."""
     if not str(name_or_path):
         raise ProfileError(f"No profile is named; {_known_profiles_text()}, or give a .toml file.")
-    given = Path(name_or_path)
-    if given.suffix == ".toml" or given.parent != Path():
-        if given.is_file():
-            return given
-        raise ProfileError(f"{given}: there is no such file; {_known_profiles_text()}.")
+    given_path = Path(name_or_path)
+    if given_path.suffix == ".toml" or given_path.parent != Path():
+        if given_path.is_file():
+            return given_path
+        raise ProfileError(f"{given_path}: there is no such file; {_known_profiles_text()}.")
     files = profile_files()
-    if str(given) in files:
-        return files[str(given)][0].path
+    if str(given_path) in files:
+        return files[str(given_path)][0].path
     raise ProfileError(
-        f"There is no profile '{given}'; {_known_profiles_text()}. Make one of that name by "
-        f"'rigd profiles copy sim {given}', or give the path of a .toml file."
+        f"There is no profile '{given_path}'; {_known_profiles_text()}. Make one of that name by "
+        f"'rigd profiles copy sim {given_path}', or give the path of a .toml file."
     )
 
 
@@ -194,14 +194,14 @@ def _known_profiles_text() -> str:
 
 def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
     """Make the drive's EDS path in `values` absolute; yield a message if there is no file."""
-    given = values.get("cia402.eds")
-    if not given:
+    eds_name = values.get("cia402.eds")
+    if not eds_name:
         return
-    eds = path.resolve().parent / given
+    eds = path.resolve().parent / eds_name
     values["cia402.eds"] = str(eds)
     if not eds.is_file():
         yield (
-            f'cia402.eds = "{given}": there is no file {eds}; give its path, relative to the '
+            f'cia402.eds = "{eds_name}": there is no file {eds}; give its path, relative to the '
             "profile's folder, or remove the key."
         )
 
@@ -280,20 +280,24 @@ def validate(
         Keys whose value is unknown; their NaN is not checked.
     """
     # TOML has only arrays, and strict validation requires tuples.
-    given = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    tuple_values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     try:
-        known = {key: value for key, value in given.items() if key not in unknown}
-        model = _validation_model(absent, unknown).model_validate(known)
+        known_values = {key: value for key, value in tuple_values.items() if key not in unknown}
+        model = _validation_model(absent, unknown).model_validate(known_values)
     except ValidationError as error:
         details = error.errors(include_url=False)
-        missing = [str(d["loc"][0]) for d in details if d["type"] == "missing" and not d["loc"][1:]]
-        problems.extend(diagnostics.missing_key_messages(missing, given))
+        missing_keys = [
+            str(d["loc"][0]) for d in details if d["type"] == "missing" and not d["loc"][1:]
+        ]
+        problems.extend(diagnostics.missing_key_messages(missing_keys, tuple_values))
         for detail in details:
             if detail["type"] == "extra_forbidden":
-                problems.append(diagnostics.unknown_key_message(str(detail["loc"][0]), given))
-            elif str(detail["loc"][0]) not in missing:
+                problems.append(
+                    diagnostics.unknown_key_message(str(detail["loc"][0]), tuple_values)
+                )
+            elif str(detail["loc"][0]) not in missing_keys:
                 problems.append(diagnostics.wrong_value_message(detail))
-        return given
+        return tuple_values
     usable: dict[str, Any] = model.model_dump(by_alias=True)
     problems.extend(diagnostics.implausible_numbers(usable))
     return usable | dict.fromkeys(unknown, math.nan)

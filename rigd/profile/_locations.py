@@ -51,11 +51,11 @@ def profile_files() -> dict[str, list[ProfileFile]]:
 
     If several files have the same name, the first one is used and hides the others.
     """
-    found: dict[str, list[ProfileFile]] = {}
+    files_by_name: dict[str, list[ProfileFile]] = {}
     for origin, folder in _search_folders():
         for path in folder.glob("*.toml"):
-            found.setdefault(path.stem, []).append(ProfileFile(path.stem, path, origin))
-    return dict(sorted(found.items()))
+            files_by_name.setdefault(path.stem, []).append(ProfileFile(path.stem, path, origin))
+    return dict(sorted(files_by_name.items()))
 
 
 def specimen_files() -> dict[str, Path]:
@@ -64,12 +64,15 @@ def specimen_files() -> dict[str, Path]:
     Files in ``specimens`` of the working folder precede those of the user's own folder
     (``$XDG_CONFIG_HOME/rigd/specimens``).
     """
-    own = user_folder()
-    found: dict[str, Path] = {}
-    for folder in (SPECIMEN_FOLDER, *([own.with_name("specimens")] if own else [])):
+    profile_folder = user_folder()
+    paths_by_name: dict[str, Path] = {}
+    for folder in (
+        SPECIMEN_FOLDER,
+        *([profile_folder.with_name("specimens")] if profile_folder else []),
+    ):
         for path in folder.glob("*.toml"):
-            found.setdefault(path.stem, path)
-    return dict(sorted(found.items()))
+            paths_by_name.setdefault(path.stem, path)
+    return dict(sorted(paths_by_name.items()))
 
 
 def user_folder() -> Path | None:

@@ -142,9 +142,10 @@ def _describe_specimen(profile: Profile, specimen: Specimen) -> str:
     prefix = f"Specimen {specimen.name} ({specimen.path}): "
     differences = [
         f"{name.removesuffix(suffix_of(name)).replace('_', ' ')} "
-        f"{own:g} {unit_of(name)} (profile: {its:g})"
+        f"{specimen_value:g} {unit_of(name)} (profile: {its:g})"
         for name in (each.name for each in fields(Beam))
-        if (own := getattr(specimen.beam, name)) != (its := getattr(profile.rig.beam, name))
+        if (specimen_value := getattr(specimen.beam, name))
+        != (its := getattr(profile.rig.beam, name))
     ]
     if specimen.tip_mass_kg is not None:
         differences.append(f"tip mass {1e3 * specimen.tip_mass_kg:g} g")

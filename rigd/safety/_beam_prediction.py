@@ -77,12 +77,12 @@ class BeamPrediction:
             rows = slice(2 * number, 2 * number + 2)
             step_factor = cexp(pole * period_s)
             now = (step_factor - 1.0 - pole * period_s) / (pole**2 * period_s)
-            before = (step_factor - 1.0) / pole - now
+            previous_gain = (step_factor - 1.0) / pole - now
             a[rows, rows] = (
                 (step_factor.real, -step_factor.imag),
                 (step_factor.imag, step_factor.real),
             )
-            a[rows, 2 * m + 1] = before.real, before.imag
+            a[rows, 2 * m + 1] = previous_gain.real, previous_gain.imag
             a[rows, 2 * m + 2] = now.real, now.imag
             factor = stiffness_nm * abs(pole) ** 2 / (2j * pole.imag)
             error += 2.0 * np.array([factor.real, -factor.imag]) @ a[rows]

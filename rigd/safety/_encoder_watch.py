@@ -325,10 +325,10 @@ class EncoderWatch:
     def _check_momentum(self) -> Violation | None:
         """Return a violation if the torques cannot have stopped the shaft so suddenly."""
         angles = self._angles
-        before = -1 - _STANDSTILL_TICKS_AT_STOP
-        if len(angles) < SPEED_TICKS - before:
+        index_before_stop = -1 - _STANDSTILL_TICKS_AT_STOP
+        if len(angles) < SPEED_TICKS - index_before_stop:
             return None
-        moved_rad = angles[before] - angles[before - SPEED_TICKS]
+        moved_rad = angles[index_before_stop] - angles[index_before_stop - SPEED_TICKS]
         if (
             abs(moved_rad) < _MIN_STEPS_PER_TICK_AT_STOP * SPEED_TICKS * self._resolution_rad
             or not moved_rad

@@ -222,7 +222,7 @@ class LimitWatch:
             Violation furthest beyond its limit, or None. `warning` is set if a value is near its
             limit.
         """
-        moved, before = angle_rad - self._previous_angle_rad, self._previous_moved_rad
+        moved, previous_moved_rad = angle_rad - self._previous_angle_rad, self._previous_moved_rad
         a, e, v, j = (
             self._angle_warning,
             self._error_warning,
@@ -236,7 +236,7 @@ class LimitWatch:
             and -a < angle_rad < a
             and -e < reference_rad - angle_rad < e
             and -v < moved < v
-            and -j < moved - before < j
+            and -j < moved - previous_moved_rad < j
             and -w0 < fx < w0
             and -w1 < fy < w1
             and -w2 < fz < w2
@@ -246,7 +246,7 @@ class LimitWatch:
             and not angle_stale
         ):
             self._previous_angle_rad = angle_rad
-            self._second_last_moved_rad = before
+            self._second_last_moved_rad = previous_moved_rad
             self._previous_moved_rad = moved
             self._previous_elapsed_ticks = 1
             self._ticks_without_jump_check = 0
@@ -277,9 +277,9 @@ class LimitWatch:
                 "N" if i < _FORCE_AXES else "N·m",
                 value,
                 limit,
-                near,
+                warning_level,
             )
-            for i, (axis, value, limit, near) in enumerate(
+            for i, (axis, value, limit, warning_level) in enumerate(
                 zip(_AXES, wrench, self._wrench_limits, self._wrench_warnings, strict=True)
             )
         )
@@ -412,11 +412,11 @@ class LimitWatch:
 
         The next sample is flagged if a percentage is near its limit.
         """
-        before, self.warning = self.warning, False
+        previous_warning, self.warning = self.warning, False
         violation = self._assess(checked_values)
         # The next sample is flagged.
         self._fraction_near = self._fraction_near or self.warning
-        self.warning = before or self.warning
+        self.warning = previous_warning or self.warning
         return violation
 
     def check_slow(
@@ -454,7 +454,7 @@ class LimitWatch:
         self._heat_nm2 = self._heat_nm2 * exp(
             -max(0.0, elapsed_s) / self._time_constant_s
         ) + torque_squares_nm2 / (self._rate_hz * self._time_constant_s)
-        before, self.warning = self.warning, False
+        previous_warning, self.warning = self.warning, False
         violation = self._assess(
             (
                 _checked_value("i²t", sqrt(self._heat_nm2), self._continuous_nm),
@@ -462,7 +462,7 @@ class LimitWatch:
                 _checked_value("disk space", disk_free_mb, self._limits.disk_free_mb),
             )
         )
-        self._slow_value_near, self.warning = self.warning, before or self.warning
+        self._slow_value_near, self.warning = self.warning, previous_warning or self.warning
         return violation
 
     def check_tare(self, drift_nm: float) -> Violation | None:
@@ -484,7 +484,7 @@ class LimitWatch:
         A value that is not a number counts as infinitely far beyond its limit.
         """
         worst, worst_ratio = None, 1.0
-        near = []
+        near_limit = []
         for checked in checked_values:
             name, _, _, value, limit, warning = checked
             if BY_NAME[name].below:
@@ -495,11 +495,11 @@ class LimitWatch:
             if ratio > worst_ratio:
                 worst, worst_ratio = checked, ratio
             elif is_near:
-                near.append(checked)
+                near_limit.append(checked)
         if worst is not None:
             self.warning = True
             return self._violation_with_cause(worst)
-        for checked in near:
+        for checked in near_limit:
             self.warning = True
             channel = checked[1] or checked[0]
             if channel not in self._last_warnings:

@@ -124,10 +124,13 @@ class ScaleWatch:
         """Return a violation if the ratio is significantly beyond its limit."""
         ratio, deviation = self.estimate()
         row = BY_NAME["scales"]
-        low, high = ratio - _SIGNIFICANT_STDS * deviation, ratio + _SIGNIFICANT_STDS * deviation
+        lower_bound, upper_bound = (
+            ratio - _SIGNIFICANT_STDS * deviation,
+            ratio + _SIGNIFICANT_STDS * deviation,
+        )
         limit = self._limit
-        if low > limit:
+        if lower_bound > limit:
             return row.violated(ratio, limit)
-        if high < 1.0 / limit:
+        if upper_bound < 1.0 / limit:
             return row.violated(ratio, 1.0 / limit, below=True)
         return None

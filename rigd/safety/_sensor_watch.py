@@ -102,7 +102,7 @@ class SensorWatch:
         if n < _MIN_LEARNED_READINGS:
             return None
         fractions = [count / n for count in self._repeat_counts]
-        least = max(_MIN_FROZEN_READINGS, ceil(_MIN_FROZEN_S * self._rate_hz)) - 1
+        min_run = max(_MIN_FROZEN_READINGS, ceil(_MIN_FROZEN_S * self._rate_hz)) - 1
         unlimited = 2**62
         self._limits = []
         for fraction, noisy in zip(fractions, self._has_noise, strict=True):
@@ -111,7 +111,7 @@ class SensorWatch:
             else:
                 repeat_probability = max(fraction, 1.0 / n)
                 self._limits.append(
-                    max(least, ceil(log(_MIN_RUN_PROBABILITY) / log(repeat_probability)))
+                    max(min_run, ceil(log(_MIN_RUN_PROBABILITY) / log(repeat_probability)))
                 )
         self._fraction_limits = [
             fraction
@@ -126,7 +126,7 @@ class SensorWatch:
         self._repeat_counts = [0] * len(fractions)
         self._counted_ticks = 0
         if self._has_noise[-1] and fractions[-1] > _NO_NOISE_FRACTION:
-            return BY_NAME["frozen sensor"].violated(self._runs[-1], least)
+            return BY_NAME["frozen sensor"].violated(self._runs[-1], min_run)
         for channel, fraction, noisy in zip(
             self._channels[:-1], fractions, self._has_noise, strict=False
         ):
@@ -179,9 +179,9 @@ class SensorWatch:
                     and runs[number] <= limits[number]
                 ):
                     all_channels = 2 * repeat_counts[-1] > count
-                    part = "whole wrench" if all_channels else self._channels[number]
+                    repeated_part = "whole wrench" if all_channels else self._channels[number]
                     return BY_NAME["repeated wrench"].violated(
-                        100.0 * fraction, 100.0 * limit, part
+                        100.0 * fraction, 100.0 * limit, repeated_part
                     )
         if max(runs) <= min(limits):
             return None

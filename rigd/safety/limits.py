@@ -128,14 +128,14 @@ class Violation:
         value, limit = (f"{number:.4g} {self.unit}".rstrip() for number in (self.value, self.limit))
         if self.warning is not None:
             side = "below" if self.below else "above"
-            where = f", {self.key}" if self.key else ""
+            key_text = f", {self.key}" if self.key else ""
             return (
                 f"{channel} {value} {side} warning level {self.warning:.4g} {self.unit} "
-                f"(limit {self.limit:.4g}{where}).{remedy}"
+                f"(limit {self.limit:.4g}{key_text}).{remedy}"
             )
         how = "below" if self.below else "exceeds"
-        where = f" ({self.key})" if self.key else ""
-        return f"{channel} {value} {how} limit {limit}{where}.{remedy}"
+        key_text = f" ({self.key})" if self.key else ""
+        return f"{channel} {value} {how} limit {limit}{key_text}.{remedy}"
 
 
 # Table of interlocks

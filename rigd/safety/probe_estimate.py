@@ -115,10 +115,10 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
     delay_ticks = max(0, round(rig.command_delay_s * rig.rate_hz))
     command = np.concatenate([np.zeros(delay_ticks), move.torques_nm])[: angle.size]
     is_moving: NDArray[np.bool_] = np.abs(speed) > _MIN_SPEED_FRACTION * max_speed
-    found = _fit_motor_equation(
+    motor_fit = _fit_motor_equation(
         smooth(command), acceleration, speed, beam_nm, is_moving, window.size
     )
-    scale, scale_std, inertia, inertia_std, coulomb, viscous = found
+    scale, scale_std, inertia, inertia_std, coulomb, viscous = motor_fit
     if ratio and ratio_std and scale and scale_std and inertia and inertia_std:
         # Both uncertainties enter the fitted torque of the beam.
         relative_std = ratio_std / ratio
@@ -267,26 +267,26 @@ def contradiction(
     str
         Message with advice, or an empty string if there is no contradiction.
     """
-    found = _motion_contradiction(rig, end)
-    if not found and (end is ProbeEnd.PULLED or not _is_accepted(estimate.coupling_ratio)):
-        found = _coupling_contradiction(estimate, motor=motor)
-    if not found and motor:
-        found = _motor_contradiction(estimate)
-    if not found and end is ProbeEnd.AWAY and motor:
-        found = (
+    message = _motion_contradiction(rig, end)
+    if not message and (end is ProbeEnd.PULLED or not _is_accepted(estimate.coupling_ratio)):
+        message = _coupling_contradiction(estimate, motor=motor)
+    if not message and motor:
+        message = _motor_contradiction(estimate)
+    if not message and end is ProbeEnd.AWAY and motor:
+        message = (
             f"The shaft left the bounds of the probing move after {estimate.travel_rad:.2g} rad at "
             f"up to {estimate.speed_rad_s:.2g} rad/s: check motor.inertia_kg_m2, "
             "motor.rated_torque_nm and encoder.resolution_rad."
         )
-    return f"Probing move: {found} {_ADVICE}" if found else ""
+    return f"Probing move: {message} {_ADVICE}" if message else ""
 
 
 def doubts(estimate: ProbeEstimate) -> list[str]:
     """Return a warning for each ratio of a probing move that is accepted but unusual."""
-    low, high = WARNING_BAND
+    lowest_ratio, highest_ratio = WARNING_BAND
     return [
-        f"Probing move: {what} is {ratio:.2f} times what the profile states ({keys})."
-        for what, ratio, keys in (
+        f"Probing move: {quantity} is {ratio:.2f} times what the profile states ({keys})."
+        for quantity, ratio, keys in (
             (
                 "the beam's torque at the measured angle",
                 estimate.coupling_ratio,
@@ -295,7 +295,7 @@ def doubts(estimate: ProbeEstimate) -> list[str]:
             ("the motor's torque", estimate.torque_ratio, "motor.rated_torque_nm"),
             ("the motor's inertia", estimate.inertia_ratio, "motor.inertia_kg_m2"),
         )
-        if ratio is not None and not low <= ratio <= high
+        if ratio is not None and not lowest_ratio <= ratio <= highest_ratio
     ]
 
 
@@ -305,8 +305,8 @@ _COUPLING_RATIO_KEYS = "encoder.resolution_rad, sensor.projection and calibratio
 
 def _is_accepted(ratio: float | None) -> bool:
     """Return whether a ratio is known and within `RATIO_BAND`."""
-    low, high = RATIO_BAND
-    return ratio is not None and low <= ratio <= high
+    lowest_ratio, highest_ratio = RATIO_BAND
+    return ratio is not None and lowest_ratio <= ratio <= highest_ratio
 
 
 def _motion_contradiction(rig: ProbedRig, end: ProbeEnd | None) -> str:
@@ -389,13 +389,13 @@ def _motor_contradiction(estimate: ProbeEstimate) -> str:
          "the inertia of the profile (motor.inertia_kg_m2)"),
     )  # fmt: skip
     unknown = []
-    for verb, ratio, std, what in rows:
+    for verb, ratio, std, quantity in rows:
         if ratio is None or std is None:
-            unknown.append(what)
+            unknown.append(quantity)
         elif not _is_accepted(ratio):
-            return f"{verb} {ratio:.2g} ± {std:.1g} times {what}."
+            return f"{verb} {ratio:.2g} ± {std:.1g} times {quantity}."
         elif std > _MAX_RELATIVE_STD * ratio:
-            unknown.append(what)
+            unknown.append(quantity)
     if unknown:
         return f"it could not be determined how far the motor agrees with {' and '.join(unknown)}."
     return ""

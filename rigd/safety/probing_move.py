@@ -100,8 +100,10 @@ class BeamFollower:
         """
         previous_rad, self._angle_rad = self._angle_rad, angle_rad
         states, torque_nm = self._states, 0.0
-        for number, (turn, first, last, stiffness) in enumerate(self._oscillators):
-            state = states[number] = turn * states[number] + first * previous_rad + last * angle_rad
+        for number, (step_factor, first, last, stiffness) in enumerate(self._oscillators):
+            state = states[number] = (
+                step_factor * states[number] + first * previous_rad + last * angle_rad
+            )
             torque_nm += stiffness * (angle_rad - 2.0 * state.real)
         return torque_nm
 
@@ -113,10 +115,10 @@ def _linear_input_step(
 
     The new state is ``a z + b u_before + c u_now`` if u is a straight line over the period.
     """
-    turn = exp(pole * period_s)
-    constant = (turn - 1.0) / pole
-    slope = (turn - 1.0 - pole * period_s) / (pole * pole * period_s)
-    return turn, residue * (constant - slope), residue * slope
+    step_factor = exp(pole * period_s)
+    constant = (step_factor - 1.0) / pole
+    slope = (step_factor - 1.0 - pole * period_s) / (pole * pole * period_s)
+    return step_factor, residue * (constant - slope), residue * slope
 
 
 # Plan

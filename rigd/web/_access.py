@@ -110,9 +110,9 @@ class WebAccess:
 
     def may_act(self, request: web.Request) -> bool:
         """Return whether a request has the token that permits it to act."""
-        scheme, _, given = request.headers.get("Authorization", "").partition(" ")
+        scheme, _, given_token = request.headers.get("Authorization", "").partition(" ")
         return scheme == "Bearer" and hmac.compare_digest(
-            given.encode(errors="surrogateescape"), self._token
+            given_token.encode(errors="surrogateescape"), self._token
         )
 
     def may_command(self, request: web.Request, command: str, parameters: object) -> bool:
@@ -148,14 +148,14 @@ async def read_json_object(request: web.Request) -> dict[str, Any]:
         If the body is no JSON object, or does not arrive in time.
     """
     try:
-        given = json.loads(await asyncio.wait_for(request.read(), _BODY_TIMEOUT_S))
+        value = json.loads(await asyncio.wait_for(request.read(), _BODY_TIMEOUT_S))
     except TimeoutError:
         raise web.HTTPRequestTimeout(reason="The request did not come to its end.") from None
     except (ValueError, RecursionError):
-        given = None
-    if not isinstance(given, dict):
+        value = None
+    if not isinstance(value, dict):
         raise web.HTTPBadRequest(reason="The request is not a JSON object.")
-    return given
+    return value
 
 
 def refusal_response(status: int, text: str) -> web.Response:

@@ -102,12 +102,12 @@ class Library:
         but
             Name of a session to exclude, because it is running.
         """
-        found = await asyncio.to_thread(
+        newest = await asyncio.to_thread(
             partial(last_quick_look, self._folder, specimen, but=but, usable=itemgetter("response"))
         )
-        if found is None:
+        if newest is None:
             return None
-        path, quick_look = found
+        path, quick_look = newest
         description = {"type": "last", "path": str(path), "specimen": specimen}
         return {**quick_look["response"], **description, "id": path.stem}
 
@@ -190,10 +190,12 @@ class Library:
     async def _report(self, request: web.Request) -> web.StreamResponse:
         """Send a file of a session's report."""
         path = self._requested_session(request)
-        found = next((row for row in await self.rows() if row.path.name == path.name), None)
-        if found is None or found.report is None:
+        session_row = next((row for row in await self.rows() if row.path.name == path.name), None)
+        if session_row is None or session_row.report is None:
             return refusal_response(404, "There is no report of it.")
-        return self._report_file(found.report.parent, request.match_info.get("name", REPORT_PAGE))
+        return self._report_file(
+            session_row.report.parent, request.match_info.get("name", REPORT_PAGE)
+        )
 
     async def _campaign(self, request: web.Request) -> web.StreamResponse:
         """Send a file of a campaign's report."""

@@ -161,11 +161,11 @@ class OperatorPageServer:
 
     async def _command(self, request: web.Request) -> web.Response:
         """Send a command of the page to the daemon, and its reply to the page."""
-        given = await read_json_object(request)
-        command = given.get("command")
+        request_object = await read_json_object(request)
+        command = request_object.get("command")
         if not isinstance(command, str) or command not in _COMMANDS:
             return refusal_response(400, f"command: there are {', '.join(sorted(_COMMANDS))}.")
-        if not self._access.may_command(request, command, given.get("parameters")):
+        if not self._access.may_command(request, command, request_object.get("parameters")):
             return refusal_response(
                 403, "The token is missing or wrong: open the address of rigd status."
             )
@@ -173,7 +173,7 @@ class OperatorPageServer:
             if command == "stop":
                 reply = await self._stop()
             else:
-                reply = await self._link.send_request(given)
+                reply = await self._link.send_request(request_object)
         except (DaemonError, DaemonGoneError) as error:
             return refusal_response(503, str(error))
         except (BusyError, RefusedByDaemonError) as error:

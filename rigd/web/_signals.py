@@ -88,14 +88,14 @@ class SignalEnvelopes:
         """Add a block, and return the message with the points that it completes, or None."""
         ticks = max(1, round(ENVELOPE_POINT_S * block.rate_hz))
         values = block.values
-        missing = block.first_tick - self._next_tick
-        if missing < 0 or missing > _STORED_DURATION_S * block.rate_hz:
+        missing_ticks = block.first_tick - self._next_tick
+        if missing_ticks < 0 or missing_ticks > _STORED_DURATION_S * block.rate_hz:
             self._points.clear()
             self._next_point = block.first_tick // ticks
             self._incomplete_point = []
-            missing = block.first_tick - self._next_point * ticks
-        if missing:
-            self._incomplete_point.append(np.full((3, missing), np.nan))
+            missing_ticks = block.first_tick - self._next_point * ticks
+        if missing_ticks:
+            self._incomplete_point.append(np.full((3, missing_ticks), np.nan))
         self._incomplete_point.append(values)
         self._next_tick = block.first_tick + values.shape[1]
         pending = np.concatenate(self._incomplete_point, axis=1)
@@ -105,8 +105,8 @@ class SignalEnvelopes:
             return None
         bins = pending[:, : count * ticks].reshape(3, count, ticks)
         # Unlike nanmin and nanmax, these do not warn of points without known values.
-        least, greatest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
-        extremes = np.stack((least, greatest), axis=1).reshape(6, count).round(_DECIMALS)
+        smallest, largest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
+        extremes = np.stack((smallest, largest), axis=1).reshape(6, count).round(_DECIMALS)
         points = [tuple(_without_nan(column)) for column in extremes.T]
         first, self._next_point = self._next_point, self._next_point + count
         self._points.extend(points)
